@@ -1,0 +1,1 @@
+"""Agents that learn to walk: they know Gymnasium, not robots."""

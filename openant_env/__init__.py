@@ -1,0 +1,1 @@
+"""Gymnasium environments of the Open Ant, simulated and real, built from one robot folder."""

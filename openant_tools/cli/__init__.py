@@ -1,0 +1,101 @@
+"""The `openant` command: parsing and printing only. Every command's work is done by the room it belongs to."""
+
+from __future__ import annotations
+
+import importlib
+import signal
+import sys
+from collections.abc import Sequence
+from types import FrameType
+
+import click
+
+from openant_tools.errors import OpenAntError
+
+__all__ = ["main"]
+
+# command → (module of this package, section of the manual, one line of help). A module is imported only when its
+# command is used, so that `openant --help` answers at once.
+COMMANDS: dict[str, tuple[str, str, str]] = {
+    "demo": ("demo", "Start here", "The whole way on a virtual robot: record, identify, learn, report."),
+    "virtual": ("virtual", "Robot", "A virtual Open Ant that speaks the real protocols."),
+    "config": ("config", "Robot", "Check, show, import and export the robot's configuration."),
+    "comms": ("comms", "Robot", "The bus: scan, watch, measure."),
+    "rec": ("rec", "Data", "Recordings: info, repair, export, import."),
+    "sysid": ("sysid", "Data", "Record excitations and fit a calibrated model to them."),
+    "train": ("train", "Learning", "Train an agent in simulation or on the robot."),
+    "eval": ("eval", "Learning", "Play a trained agent and measure its reward per second."),
+}
+
+INTERRUPTED = 130
+
+
+class Manual(click.Group):
+    """The top-level group: imports a command's module on use and lists commands by section."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(f"openant_tools.cli.{COMMANDS[cmd_name][0]}")
+        command = getattr(module, "eval_" if cmd_name == "eval" else cmd_name)
+        assert isinstance(command, click.Command)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for name, (_, section, line) in COMMANDS.items():
+            sections.setdefault(section, []).append((name, line))
+        for section, rows in sections.items():
+            with formatter.section(section):
+                formatter.write_dl(rows)
+
+
+@click.group(
+    cls=Manual,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    epilog="Each command explains itself: `openant sysid fit --help`. Exit codes: 0 done, 1 a finding that says no, "
+    "2 bad input or no hardware, 130 interrupted.",
+)
+@click.version_option(package_name="openant-tools", prog_name="openant")
+def openant() -> None:
+    """Open Ant Tools: from a box of parts to a robot that learns, and a simulation of it that you can trust.
+
+    \b
+    First success, without any hardware:
+      openant demo                                   the whole way on a virtual robot, in minutes
+    \b
+    The same, step by step:
+      openant virtual start --ready-file robot.json  a virtual Open Ant on pseudo-terminals
+      openant sysid record --virtual robot.json --protocol stand --out run.mcap
+      openant sysid fit run.mcap --model ant.xml --out fit
+      openant train sac --robot my-ant --steps 30000 --out my-ant/runs/sac
+    """
+
+
+def _interrupt(signum: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line; exits with 0, 1, 2 or 130 (formats, section 6) and never shows a traceback for bad input."""
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        code = openant.main(args=argv, prog_name="openant", standalone_mode=False)
+        sys.exit(code if isinstance(code, int) else 0)
+    except OpenAntError as error:
+        click.echo(f"openant: {error}", err=True)
+        sys.exit(error.exit_code)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(2)
+    except OSError as error:
+        # A full disk, a missing directory, a permission: the operating system's own words name the cause.
+        where = f"{error.filename}: " if error.filename else ""
+        click.echo(f"openant: {where}{error.strerror or error}", err=True)
+        sys.exit(2)
+    except (KeyboardInterrupt, click.Abort):
+        click.echo("openant: interrupted", err=True)
+        sys.exit(INTERRUPTED)

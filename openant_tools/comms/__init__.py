@@ -1,0 +1,1 @@
+"""Everything that touches hardware: protocol codecs, bus, IMU and camera drivers, the engine that owns them."""

@@ -1,0 +1,37 @@
+"""The errors that a user sees: one line that says what is wrong, where, and what to do about it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = ["BadInput", "HardwareFault", "OpenAntError"]
+
+
+class OpenAntError(Exception):
+    """An error meant for the person at the keyboard; the command line prints it as one line, never as a traceback.
+
+    Args:
+        what: what is wrong, in plain words.
+        where: the file, and the place in it (line, column, joint, key), or the port and the servo.
+        remedy: what to do about it.
+    """
+
+    exit_code = 2
+
+    def __init__(self, what: str, *, where: str | Path | None = None, remedy: str | None = None) -> None:
+        self.what = what
+        self.where = None if where is None else str(where)
+        self.remedy = remedy
+        super().__init__(what)
+
+    def __str__(self) -> str:
+        line = f"{self.where}: {self.what}" if self.where else self.what
+        return f"{line} → {self.remedy}" if self.remedy else line
+
+
+class BadInput(OpenAntError):
+    """Something given to us (a file, an option, a model) cannot be used as it is."""
+
+
+class HardwareFault(OpenAntError):
+    """A robot, real or virtual, that does not answer as it should."""

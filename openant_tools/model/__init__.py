@@ -1,0 +1,1 @@
+"""Reading, changing and writing MJCF; rollouts in batches on all cores."""

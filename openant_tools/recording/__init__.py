@@ -1,0 +1,1 @@
+"""The append-only recording and run tables: reading, writing, repair, export."""

@@ -1,0 +1,1 @@
+"""Reports that open offline: HTML with pictures."""

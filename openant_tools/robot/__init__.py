@@ -1,0 +1,1 @@
+"""What an Open Ant is: joints, servo models, geometry, the nominal MJCF and `robot.toml`."""

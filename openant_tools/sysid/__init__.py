@@ -1,0 +1,1 @@
+"""System identification: excitation, fitting, verdicts, the calibrated MJCF."""

@@ -1,0 +1,1 @@
+"""The virtual robot: servos, flight controller and camera behind their real protocols."""
