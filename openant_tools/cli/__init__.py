@@ -80,7 +80,7 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run the command line; exits with 0, 1, 2 or 130 (formats, section 6) and never shows a traceback for bad input."""
+    """Run the command line; exits with 0, 1, 2 or 130 (formats, section 6), never a traceback for bad input."""
     signal.signal(signal.SIGTERM, _interrupt)
     try:
         code = openant.main(args=argv, prog_name="openant", standalone_mode=False)
