@@ -75,13 +75,23 @@ class Run:
         return self.facts.joints
 
     @property
+    def model_path(self) -> Path | None:
+        """The MJCF that the run names; a relative path leads from the run's own folder."""
+        if self.facts.model is None:
+            return None
+        return (self.path.parent if self.path else Path()) / self.facts.model
+
+    @property
     def duration_s(self) -> float:
         return float(self.t[-1] - self.t[0]) if len(self.t) else 0.0
 
     def has(self, signal: str, joints: Iterable[str] | None = None) -> bool:
         """Whether `signal` is there with at least one valid sample for any of the joints (default: all)."""
-        names = [f"{signal}.{joint}" for joint in (self.joints if joints is None else joints)]
-        return any(name in self.columns and bool(np.isfinite(self.columns[name]).any()) for name in names)
+        for joint in self.joints if joints is None else joints:
+            values = self.columns.get(f"{signal}.{joint}")
+            if values is not None and bool((values != "" if values.dtype.kind in "OU" else np.isfinite(values)).any()):
+                return True
+        return False
 
     def signal(self, signal: str, joints: Sequence[str] | None = None, default: float = np.nan) -> Array:
         """The columns `signal.J` side by side, (n, joints); `default` stands where a joint has no such column."""

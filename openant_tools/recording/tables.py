@@ -1,0 +1,288 @@
+"""Runs as tables, in and out: NAME.parquet or NAME.csv with the facts beside it in NAME.json (formats, section 1)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv as pa_csv
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from openant_tools.errors import BadInput
+from openant_tools.files import atomic_writer
+from openant_tools.recording.facts import facts_from_json, facts_to_json
+from openant_tools.recording.plausibility import check_columns, check_run, check_time, need_signals
+from openant_tools.recording.run import BODY_COLUMNS, JOINT_SIGNALS, Facts, Run
+
+__all__ = ["read_run", "read_table", "write_table"]
+
+_MISSING = ("", "nan", "NaN", "NAN", "null", "NULL", "None", "NA", "N/A")
+
+
+def read_run(path: str | Path, *, need: Sequence[str] = ("cmd", "pos")) -> Run:
+    """The run at `path`: a native recording (.mcap) or a table (.parquet, .csv), checked.
+
+    Args:
+        path: the file, or its name without the suffix.
+        need: signals without which the run is of no use to the caller; `()` takes any run, such as a log of the bus.
+
+    Raises:
+        BadInput: the file, the column and the row of what cannot be, and what to do about it.
+    """
+    path = _find(Path(path))
+    if path.suffix == ".mcap":
+        from openant_tools.recording.reader import read_recording
+
+        run = read_recording(path).run
+        check_time(run.t, str(path))
+    else:
+        run = read_table(path)
+    need_signals(run, need, str(path))
+    return run
+
+
+def read_table(path: str | Path) -> Run:
+    """The table at `path` (.parquet or .csv), checked row by row; see `read_run`."""
+    path = Path(path)
+    columns = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
+    if "t" not in columns:
+        raise BadInput(
+            "there is no column t",
+            where=path,
+            remedy="the first column of a run is t, the time in s" + (f"; here are {_few(columns)}" if columns else ""),
+        )
+    facts_path = path.with_suffix(".json")
+    if facts_path.exists():
+        facts = facts_from_json(_read_text(facts_path), str(facts_path))
+    else:
+        facts = Facts(joints=_joints_of(list(columns), path))
+    check_columns(list(columns), facts.joints, str(path))
+    t = columns.pop("t")
+    if t.dtype.kind != "f":
+        raise BadInput("t is not a number", where=f"{path}, column t", remedy="give the time in s, as a number")
+    run = Run(name=path.stem, facts=facts, t=t, columns=columns, path=path)
+    check_run(run, str(path))
+    return run
+
+
+def write_table(run: Run, path: str | Path) -> None:
+    """Write `run` to `path` (.parquet or .csv) and its facts beside it (.json); each file appears whole or not at all.
+
+    Missing samples become null (empty in CSV). A relative `facts.model` is rewritten so that it still leads from the
+    new place to the same file.
+    """
+    path = Path(path)
+    if path.suffix not in (".parquet", ".csv"):
+        raise BadInput("a table is .parquet or .csv", where=path, remedy="name it NAME.parquet")
+    facts = run.facts
+    if run.model_path is not None and facts.model is not None and not Path(facts.model).is_absolute():
+        facts = replace(facts, model=os.path.relpath(run.model_path, path.parent))
+    arrays = {"t": pa.array(run.t)}
+    for name in _in_order(run):
+        values = run.columns[name]
+        if values.dtype.kind == "f":
+            arrays[name] = pa.array(values, mask=np.isnan(values))
+        else:
+            arrays[name] = pa.array(values.tolist() if values.dtype.kind in "OU" else values)
+    table = pa.table(arrays)
+    with atomic_writer(path) as stream, atomic_writer(path.with_suffix(".json")) as facts_stream:
+        if path.suffix == ".parquet":
+            pq.write_table(table, stream, compression="zstd")
+        else:
+            _write_csv(table, stream)
+        facts_stream.write(facts_to_json(facts).encode())
+        # What is left in the buffers goes to the disk before either file takes its place: a full disk makes neither.
+        stream.flush()
+        facts_stream.flush()
+
+
+def _find(path: Path) -> Path:
+    if path.is_dir():
+        inside = sorted(file.name for file in path.iterdir() if file.suffix in (".mcap", ".parquet", ".csv"))
+        raise BadInput(
+            "this is a folder, not a run", where=path, remedy=f"name one of {_few(inside)}" if inside else None
+        )
+    if path.suffix == ".json" and path.exists():
+        path = path.with_suffix("")
+    if path.exists():
+        if path.suffix not in (".mcap", ".parquet", ".csv"):
+            raise BadInput(
+                "this is not a run", where=path, remedy="a run is a .mcap recording or a .parquet or .csv table"
+            )
+        return path
+    for suffix in (".mcap", ".parquet", ".csv"):
+        candidate = path.with_name(path.name + suffix)
+        if candidate.exists():
+            return candidate
+    raise BadInput(
+        "there is no such file", where=path, remedy="check the name; `openant rec info FILE` shows what a run holds"
+    )
+
+
+def _few(names: Any, count: int = 8) -> str:
+    names = list(names)
+    return ", ".join(names[:count]) + (", …" if len(names) > count else "")
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise BadInput("this is not text in UTF-8", where=path, remedy="save it as UTF-8") from error
+
+
+def _joints_of(names: Sequence[str], path: Path) -> tuple[str, ...]:
+    """The joints of a table without facts, in the order of their columns."""
+    for signal in ("pos", "cmd", *JOINT_SIGNALS):
+        joints = tuple(name.partition(".")[2] for name in names if name.startswith(f"{signal}."))
+        if joints:
+            return joints
+    raise BadInput(
+        "there is no column of a joint, such as pos.knee_fl",
+        where=path,
+        remedy=f"name the columns SIGNAL.JOINT ({_few(JOINT_SIGNALS, 5)}); here are {_few(names)}",
+    )
+
+
+def _read_parquet(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        table = pq.read_table(path, partitioning=None)
+    except (pa.ArrowException, OSError) as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        raise BadInput(
+            "this is not a whole parquet file (cut or damaged)",
+            where=path,
+            remedy="copy or export it again; a parquet file cut short has lost its index and cannot be repaired",
+        ) from error
+    twice = {name for name in table.column_names if table.column_names.count(name) > 1}
+    if twice:
+        raise BadInput(f"column {sorted(twice)[0]} is there twice", where=path, remedy="keep one of them")
+    return {name: _numbers(name, table[name].combine_chunks(), path) for name in table.column_names}
+
+
+def _read_csv(path: Path) -> dict[str, NDArray[Any]]:
+    text = _read_text(path)
+    header = next(csv.reader(io.StringIO(text)), [])
+    names = [name.strip() for name in header]
+    if not any(names):
+        raise BadInput("the run is empty: no header, no rows", where=path, remedy="record again, or export it again")
+    if len(names) == 1 and (";" in names[0] or "\t" in names[0]):
+        raise BadInput(
+            "the values are not separated by commas",
+            where=f"{path}, line 1",
+            remedy="save it with commas between values and points in numbers",
+        )
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise BadInput(f"column {sorted(twice)[0]} is there twice", where=path, remedy="keep one of them")
+    bad: list[pa_csv.InvalidRow] = []
+
+    def remember(row: pa_csv.InvalidRow) -> str:
+        bad.append(row)
+        return "skip"
+
+    try:
+        table = pa_csv.read_csv(
+            io.BytesIO(text.encode()),
+            # One thread: only so does Arrow count the rows that it finds wrong.
+            read_options=pa_csv.ReadOptions(column_names=names, skip_rows=1, use_threads=False),
+            parse_options=pa_csv.ParseOptions(invalid_row_handler=remember),
+            convert_options=pa_csv.ConvertOptions(
+                column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False
+            ),
+        )
+    except pa.ArrowException as error:
+        raise BadInput(f"this is not a whole CSV file: {error}", where=path, remedy="export it again") from error
+    if bad:
+        where = f"{path}, line {bad[0].number}" if bad[0].number is not None else path
+        raise BadInput(
+            f"a row has {bad[0].actual_columns} values where the header names {bad[0].expected_columns} columns",
+            where=where,
+            remedy="the file was cut or edited: complete that row or delete it",
+        )
+    return {name: _numbers(name, table[name].combine_chunks(), path) for name in names}
+
+
+def _numbers(name: str, column: pa.Array, path: Path) -> NDArray[Any]:
+    """One column as float64 with NaN where a sample is missing; words where the format holds words or knows nothing."""
+    signal = name.partition(".")[0]
+    ours = name == "t" or name in BODY_COLUMNS or (signal in JOINT_SIGNALS and "." in name)
+    if isinstance(column, pa.ChunkedArray):
+        column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
+    if pa.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    if signal == "err" and "." in name:
+        if pa.types.is_null(column.type):
+            return np.full(len(column), "", dtype=object)
+        words = column.cast(pa.string()).fill_null("").to_pylist()
+        return np.array([word.strip() for word in words], dtype=object)
+    if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
+        return _parsed(name, column, path, ours)
+    if (
+        pa.types.is_floating(column.type)
+        or pa.types.is_integer(column.type)
+        or pa.types.is_boolean(column.type)
+        or pa.types.is_null(column.type)
+        or pa.types.is_decimal(column.type)
+    ):
+        values = pc.fill_null(column.cast(pa.float64(), safe=False), np.nan)
+        return np.array(values.to_numpy(zero_copy_only=False), dtype=float)
+    if ours:
+        raise BadInput(
+            f"the values are {column.type}, not numbers", where=f"{path}, column {name}", remedy="store float64"
+        )
+    return np.array(column.to_pylist(), dtype=object)
+
+
+def _parsed(name: str, column: pa.Array, path: Path, ours: bool) -> NDArray[Any]:
+    texts = pc.utf8_trim_whitespace(column.cast(pa.string()))
+    missing = pc.or_kleene(pc.is_null(texts), pc.is_in(texts, value_set=pa.array(_MISSING)))
+    flags = {"true": "1", "True": "1", "TRUE": "1", "false": "0", "False": "0", "FALSE": "0"}
+    numbers = pc.if_else(missing, pa.scalar(None, pa.string()), texts)
+    for word, digit in flags.items():
+        numbers = pc.if_else(pc.equal(numbers, word), digit, numbers)
+    try:
+        values = pc.fill_null(numbers.cast(pa.float64()), np.nan)
+    except pa.ArrowInvalid:
+        if not ours:
+            return np.array([text or "" for text in texts.to_pylist()], dtype=object)
+        row, word = next((row, word) for row, word in enumerate(numbers.to_pylist()) if not _is_number(word))
+        remedy = "leave a missing sample empty" if "," not in word else "write numbers with a point, not a comma"
+        raise BadInput(
+            f"{word[:40]!r} is not a number", where=f"{path}, column {name}, row {row + 1}", remedy=remedy
+        ) from None
+    return np.array(values.to_numpy(zero_copy_only=False), dtype=float)
+
+
+def _is_number(word: str | None) -> bool:
+    try:
+        float(word or "0")
+    except ValueError:
+        return False
+    return True
+
+
+def _in_order(run: Run) -> list[str]:
+    """Column names as a reader expects them: joint by joint in the run's order, then the body, then the rest."""
+    wanted = [f"{signal}.{joint}" for joint in run.joints for signal in JOINT_SIGNALS] + list(BODY_COLUMNS)
+    first = [name for name in wanted if name in run.columns]
+    return first + [name for name in run.columns if name not in set(first)]
+
+
+def _write_csv(table: pa.Table, stream: Any) -> None:
+    try:
+        pa_csv.write_csv(table, stream, pa_csv.WriteOptions(quoting_style="none"))
+    except pa.ArrowInvalid:  # a text with a comma or a quote in it
+        stream.seek(0)
+        stream.truncate()
+        pa_csv.write_csv(table, stream, pa_csv.WriteOptions(quoting_style="needed"))
