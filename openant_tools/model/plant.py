@@ -1,0 +1,194 @@
+"""A model set up for one kind of run: compiled, its position servos found, ready to be rolled out.
+
+One MJCF serves two setups (formats, section 1). On the **stand** the free joint is removed, the torso stays where the
+model puts it, gravity is on and nothing of the robot touches the world; contacts of the robot with itself stay as in
+the model. On the **floor** the model is compiled as it is.
+"""
+
+from __future__ import annotations
+
+import copy
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.errors import BadInput
+
+__all__ = ["Plant", "Setup", "load_plant", "setup_of"]
+
+Ints = NDArray[np.int64]
+
+#: an actuator in this group is one whose torque is off: it is disabled as a group, which is how MuJoCo drops its force
+TORQUE_OFF_GROUP = 30
+
+
+class Setup(StrEnum):
+    """How the robot stands in a run."""
+
+    STAND = "stand"
+    FLOOR = "floor"
+
+
+def setup_of(words: str | None) -> Setup:
+    """The setup that a run's `setup` means: `floor`, or anything else (a bench, a stand, nothing said) as fixed."""
+    return Setup.FLOOR if words is not None and words.strip().lower() == Setup.FLOOR else Setup.STAND
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A compiled model and where its position servos are in it.
+
+    Attributes:
+        model: compiled for `setup`.
+        setup: stand or floor.
+        joints: names of the servo joints, in the order asked for.
+        qpos, dof: (joints,) addresses of each joint's position and velocity.
+        actuator: (joints,) id of the actuator that drives each joint.
+        ctrl: (joints,) address of that actuator's position setpoint in `ctrl`.
+        tree: (joints,) kinematic tree of each joint; joints of different trees do not move each other on the stand.
+        path: the file the model was read from.
+    """
+
+    model: mujoco.MjModel
+    setup: Setup
+    joints: tuple[str, ...]
+    qpos: Ints
+    dof: Ints
+    actuator: Ints
+    ctrl: Ints
+    tree: Ints
+    path: Path
+
+    @property
+    def timestep(self) -> float:
+        return float(self.model.opt.timestep)
+
+    @property
+    def free_joint(self) -> int | None:
+        """The id of the free joint of the base, None on the stand or where the model has none."""
+        free = np.flatnonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+        return int(free[0]) if len(free) else None
+
+    def with_torque_off(self, model: mujoco.MjModel, off: NDArray[np.bool_]) -> mujoco.MjModel:
+        """A copy of `model` (same layout as the plant's) in which the joints marked in `off` have no torque."""
+        if not off.any():
+            return model
+        limp = copy.copy(model)
+        limp.actuator_group[self.actuator[off]] = TORQUE_OFF_GROUP
+        limp.opt.disableactuator |= 1 << TORQUE_OFF_GROUP
+        return limp
+
+
+def load_plant(path: Path | str, joints: Sequence[str] | None = None, setup: Setup = Setup.STAND) -> Plant:
+    """Read an MJCF and set it up.
+
+    Args:
+        path: the MJCF.
+        joints: names of the joints to play and compare; None takes every joint that a position servo drives.
+        setup: stand or floor.
+
+    Raises:
+        BadInput: the file is missing or MuJoCo cannot load it, it has no position-controlled joint, or it lacks one of
+            `joints`.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise BadInput("no such model file", where=path, remedy="name an MJCF with --model MODEL.xml")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        original = spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise BadInput(f"MuJoCo cannot load it: {' '.join(str(error).split())}", where=path) from error
+    if original.nu == 0:
+        raise BadInput(
+            "the model has no actuators", where=path, remedy="give each joint a <position> actuator in its MJCF"
+        )
+    servos = position_servos(original)
+    if not servos:
+        raise BadInput(
+            "no joint of the model is driven by a position servo",
+            where=path,
+            remedy="use <position> actuators (or <general> with biasprm '0 -kp -kv', <pid>, <dcmotor input=\"pos\">)",
+        )
+    if joints is None:
+        joints = list(servos)
+    for joint in joints:
+        if joint not in servos:
+            near = difflib.get_close_matches(joint, list(servos), n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"its position-controlled joints are {', '.join(servos)}"
+            raise BadInput(f"the model has no position-controlled joint {joint!r}", where=path, remedy=hint)
+
+    model = _on_stand(spec, original) if setup is Setup.STAND else original
+    actuator = [servos[joint] for joint in joints]
+    ids = [model.joint(joint).id for joint in joints]
+    dof = model.jnt_dofadr[ids].astype(np.int64)
+    return Plant(
+        model=model,
+        setup=setup,
+        joints=tuple(joints),
+        qpos=model.jnt_qposadr[ids].astype(np.int64),
+        dof=dof,
+        actuator=np.array(actuator, np.int64),
+        ctrl=model.actuator_ctrladr[actuator].astype(np.int64),
+        tree=model.dof_treeid[dof].astype(np.int64),
+        path=path,
+    )
+
+
+def position_servos(model: mujoco.MjModel) -> dict[str, int]:
+    """Joint name → id of the actuator that controls its position, in the order of the actuators.
+
+    A position servo pulls towards its setpoint: affine bias −kp on the joint's position (`position`, `general`, `pid`),
+    or a DC motor. Where several drive one joint, the one of the joint's own name counts.
+    """
+    servos: dict[str, int] = {}
+    for i in range(model.nactuator):
+        if model.actuator_trntype[i] != mujoco.mjtTrn.mjTRN_JOINT:
+            continue
+        joint = int(model.actuator_trnid[i, 0])
+        if int(model.jnt_type[joint]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+            continue
+        affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and model.actuator_biasprm[i, 1] < 0
+        dcmotor = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_DCMOTOR
+        name = model.joint(joint).name
+        if (affine or dcmotor) and (name not in servos or model.actuator(i).name == name):
+            servos[name] = i
+    return servos
+
+
+def _on_stand(spec: mujoco.MjSpec, original: mujoco.MjModel) -> mujoco.MjModel:
+    """Compile `spec` with its base fixed and no contact with the world; `original` is the same spec as it was given."""
+    weld, parent = original.body_weldid, original.body_parentid
+    # Elements keep the ids of the first compilation until the next, so the original's tables describe the spec's.
+    free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
+    for geom in spec.geoms:
+        if weld[original.geom_bodyid[geom.id]] == 0:
+            geom.contype = geom.conaffinity = 0
+    for pair in list(spec.pairs):
+        ends = original.geom(pair.geomname1).bodyid, original.geom(pair.geomname2).bodyid
+        if any(weld[body] == 0 for body in ends):
+            spec.delete(pair)
+
+    # Once the base is welded to the world, MuJoCo's parent-child filter no longer keeps it from touching its own legs.
+    # The pairs that the filter kept apart before are excluded by name, so that self-contacts stay as in the model.
+    bodies = {body.id: body for body in spec.bodies}
+    bases = {int(weld[joint.parent.id]) for joint in free}
+    for child in range(1, original.nbody):
+        above = int(weld[parent[weld[child]]])
+        if above not in bases or int(weld[child]) == above:
+            continue
+        for base in np.flatnonzero(weld == above):
+            for body in (bodies[int(base)], bodies[child]):
+                body.name = body.name or f"unnamed_body_{body.id}"
+            spec.add_exclude(bodyname1=bodies[int(base)].name, bodyname2=bodies[child].name)
+    for joint in free:
+        spec.delete(joint)
+    for key in list(spec.keys):
+        spec.delete(key)  # a keyframe's qpos counts the free joint's seven numbers
+    return spec.compile()

@@ -1,0 +1,352 @@
+"""Rollouts of many models over many recorded runs: the one engine behind identification, the gap and its diagnosis.
+
+Contract
+
+* **What is simulated.** Each run is cut into *segments*. A segment starts at a row in which every joint was measured,
+  with the measured positions and the velocities that fit the neighbouring positions, and is simulated with the run's
+  own commands until the next one starts: every `horizon` seconds, or once for the whole run (`horizon=None`).
+* **Time.** Rows may come at any strictly increasing times. A segment steps from its first row's time on the model's own
+  time step; positions between two steps are interpolated linearly. A command acts from its own time on (`cmd_t`, else
+  the row's `t`), held until the next; each step sees its mean over the step, so that results vary smoothly with delays
+  and time stamps instead of by whole steps. A missing command leaves the one before in force.
+* **Start of a segment.** Setpoint filters and slew limiters hold the first command, as do the delay buffers; all other
+  activations are zero (formats, section 5). Without a measured base, a robot on the floor starts settled on its feet.
+* **Torque off** (`torque.J` = 0) disables that joint's actuator from its row to the next; what stands in the joint
+  stays.
+* **Gaps.** A row with a missing sample is simulated all the same; what to compare is the caller's choice. Rows before
+  the first complete one are NaN.
+* **Many models.** A call rolls out V variants of the model in one batch on all cores. They must share the layout of the
+  plant's model (same compiled sizes); parameters may differ freely. Results do not depend on the number of threads.
+* **Memory** is bounded: states are sampled at the rows in chunks and never kept for a whole run.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from openant_tools.errors import BadInput
+from openant_tools.model.plant import Plant, Setup
+from openant_tools.recording.run import Run
+
+__all__ = ["Rollouts", "Trajectories", "initial_velocities"]
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+#: rows are compared, and segments started, on positions; the slope over this span (s) on both sides gives the velocity
+VELOCITY_SPAN_S = 0.02
+#: states kept at a time while a batch runs
+CHUNK_BYTES = 64 * 2**20
+#: how long a robot without a measured base is left to settle on its feet before a floor run
+SETTLE_S = 1.0
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Simulated positions and velocities at the rows of all runs, one after another.
+
+    Attributes:
+        pos: (variants, rows, joints) rad.
+        vel: (variants, rows, joints) rad/s.
+        rows: for each run, the slice of its rows.
+    """
+
+    pos: Array
+    vel: Array
+    rows: tuple[slice, ...]
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """A stretch of one run, ready to be stepped."""
+
+    run: int
+    first: int  # row of the run
+    state: Array  # (nstate,) integration state at its start
+    control: Array  # (steps, nu)
+    step: Ints  # (rows,) step before each row
+    fraction: Array  # (rows,) of the step after it
+    row: Ints  # (rows,) index among the rows of all runs
+    torque_off: dict[int, Bools]  # step → joints off from there on; always has 0
+
+
+class Rollouts:
+    """Runs prepared for one plant: called with variants of its model, returns what each would have done.
+
+    Args:
+        plant: the model, set up as the runs were made.
+        runs: recorded runs that command every joint of the plant.
+        horizon: seconds between re-initialisations from measurement; None simulates each run from its start.
+        nthread: threads; 0 takes all cores.
+
+    Raises:
+        BadInput: a run has no row in which all joints were measured, or no commands.
+    """
+
+    def __init__(self, plant: Plant, runs: Sequence[Run], horizon: float | None = None, nthread: int = 0) -> None:
+        self.plant = plant
+        self.runs = tuple(runs)
+        self.horizon = horizon
+        self.nthread = nthread
+        ends = np.cumsum([0, *(len(run.t) for run in runs)])
+        self.rows = tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(ends))
+        segments = [
+            segment for k, run in enumerate(runs) for segment in _segments(plant, run, k, self.rows[k].start, horizon)
+        ]
+        # The longest first, so that those still running are always the first simulations of the batch.
+        self._segments = sorted(segments, key=lambda segment: -len(segment.control))
+        self._batches: dict[int, Batch] = {}
+
+    @property
+    def steps(self) -> int:
+        """Simulation steps of one variant."""
+        return sum(len(segment.control) for segment in self._segments)
+
+    def __call__(self, models: Sequence[mujoco.MjModel] | None = None) -> Trajectories:
+        """Roll out every run on each of `models` (default: the plant's own)."""
+        variants = [self.plant.model] if models is None else list(models)
+        segments, nv = self._segments, len(variants)
+        plant = self.plant
+        batch = self._batch(nv)
+        batch.state[:] = np.repeat([segment.state for segment in segments], nv, axis=0)
+        lengths = np.array([len(segment.control) for segment in segments])
+        total, nj = self.rows[-1].stop, len(plant.joints)
+        pos, vel = np.full((nv, total, nj), np.nan), np.full((nv, total, nj), np.nan)
+
+        changes = {step for segment in segments for step in segment.torque_off}
+        limp = {(v, _key(np.zeros(nj, bool))): model for v, model in enumerate(variants)}
+        off = [segment.torque_off[0] for segment in segments]
+        last = [(segment.state[self._qpos], segment.state[self._qvel]) for segment in segments]
+        last_pos = np.array([p for p, _ in last])[:, None, :].repeat(nv, axis=1)
+        last_vel = np.array([v for _, v in last])[:, None, :].repeat(nv, axis=1)
+
+        per_step = nv * len(segments) * 8 * (plant.model.nq + plant.model.nv)
+        chunk = max(16, CHUNK_BYTES // per_step)
+        edges = sorted({0, *changes, *lengths.tolist(), *range(0, int(lengths[0]), chunk)})
+        for begin, end in itertools.pairwise(edges):
+            active = int((lengths > begin).sum())
+            if begin in changes:
+                for s in range(active):
+                    off[s] = segments[s].torque_off.get(begin, off[s])
+                batch.set_models(
+                    [self._limp(limp, variants[v], v, off[s]) for s in range(len(segments)) for v in range(nv)]
+                )
+            control = np.repeat([segment.control[begin:end] for segment in segments[:active]], nv, axis=0)
+            record = batch.rollout(
+                end - begin, control, record=("qpos", "qvel"), ids=np.arange(active * nv, dtype=np.int32)
+            )
+            shape = (active, nv, end - begin, -1)
+            qpos = record["qpos"].reshape(shape)[..., plant.qpos]
+            qvel = record["qvel"].reshape(shape)[..., plant.dof]
+            qpos = np.concatenate([last_pos[:active, :, None], qpos], axis=2)
+            qvel = np.concatenate([last_vel[:active, :, None], qvel], axis=2)
+            for s in range(active):
+                segment = segments[s]
+                here = (segment.step >= begin) & (segment.step < end)
+                k, f = segment.step[here] - begin, segment.fraction[here][:, None]
+                pos[:, segment.row[here]] = qpos[s][:, k] * (1 - f) + qpos[s][:, k + 1] * f
+                vel[:, segment.row[here]] = qvel[s][:, k] * (1 - f) + qvel[s][:, k + 1] * f
+            last_pos[:active], last_vel[:active] = qpos[:, :, -1], qvel[:, :, -1]
+        return Trajectories(pos, vel, self.rows)
+
+    @property
+    def _qpos(self) -> Ints:
+        return 1 + self.plant.qpos  # the integration state starts with the time
+
+    @property
+    def _qvel(self) -> Ints:
+        return 1 + self.plant.model.nq + self.plant.dof
+
+    def _batch(self, nv: int) -> Batch:
+        if nv not in self._batches:
+            self._batches[nv] = Batch(self.plant.model, nv * len(self._segments), self.nthread)
+        return self._batches[nv]
+
+    def _limp(
+        self, cache: dict[tuple[int, bytes], mujoco.MjModel], model: mujoco.MjModel, variant: int, off: Bools
+    ) -> mujoco.MjModel:
+        key = (variant, _key(off))
+        if key not in cache:
+            cache[key] = self.plant.with_torque_off(model, off)
+        return cache[key]
+
+
+def _key(off: Bools) -> bytes:
+    return off.tobytes()
+
+
+def initial_velocities(t: Array, pos: Array, row: int) -> Array:
+    """Joint velocities at a row, (joints,) rad/s, from the slope of the positions around it.
+
+    A servo's velocity register is coarse and late; the positions on both sides are neither. Least squares over the
+    rows within VELOCITY_SPAN_S (at least one neighbour on each side where there is one); 0 where nothing is known.
+    """
+    near = np.abs(t - t[row]) <= VELOCITY_SPAN_S
+    near[max(0, row - 1) : row + 2] = True
+    out = np.zeros(pos.shape[1])
+    for j in range(pos.shape[1]):
+        ok = near & np.isfinite(pos[:, j])
+        if ok.sum() >= 2:
+            dt = t[ok] - t[ok].mean()
+            out[j] = dt @ (pos[ok, j] - pos[ok, j].mean()) / (dt @ dt)
+    return out
+
+
+def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | None) -> list[_Segment]:
+    t, pos = run.t, run.signal("pos", plant.joints)
+    cmd = _held(run.signal("cmd", plant.joints))
+    if cmd is None:
+        raise BadInput("some joint was never commanded", where=run.path or run.name, remedy="drop it with --joint")
+    whole = np.flatnonzero(np.isfinite(pos).all(axis=1))
+    if len(whole) < 2:
+        raise BadInput(
+            "no two rows have a position of every joint",
+            where=run.path or run.name,
+            remedy="check the pos.* columns, or choose fewer joints with --joint",
+        )
+    starts = [int(whole[0])]
+    if horizon is not None:
+        for row in whole[1:]:
+            if t[row] - t[starts[-1]] >= horizon - 1e-9 and row < len(t) - 1:
+                starts.append(int(row))
+    h, model = plant.timestep, plant.model
+    torque_off = run.signal("torque", plant.joints, default=1.0) == 0
+    command_times = run.command_times
+    segments = []
+    for first, stop in zip(starts, [*starts[1:], len(t)], strict=True):
+        # The row at which the next segment starts belongs to that one.
+        rows = np.arange(first, stop)
+        at = (t[rows] - t[first]) / h
+        step = np.floor(at + 1e-9).astype(np.int64)
+        nstep = int(step[-1]) + 1
+        setpoint = _mean_over_steps(command_times, cmd, t[first] + h * np.arange(nstep + 1))
+        control = np.zeros((nstep, model.nu))
+        control[:, plant.ctrl] = setpoint
+        off = {0: torque_off[first]}
+        for row in rows[1:]:
+            if (torque_off[row] != torque_off[row - 1]).any():
+                off[min(nstep - 1, round((t[row] - t[first]) / h))] = torque_off[row]
+        velocity = initial_velocities(t, pos, first)
+        segments.append(
+            _Segment(
+                run=index,
+                first=first,
+                state=_initial_state(plant, run, first, pos[first], velocity, setpoint[0]),
+                control=control,
+                step=step,
+                fraction=np.clip(at - step, 0.0, 1.0),
+                row=offset + rows,
+                torque_off=off,
+            )
+        )
+    return segments
+
+
+def _held(cmd: Array) -> Array | None:
+    """Commands with every missing one replaced by the one before it; None where a joint has none at all."""
+    out = cmd.copy()
+    for j in range(cmd.shape[1]):
+        given = np.flatnonzero(np.isfinite(cmd[:, j]))
+        if not len(given):
+            return None
+        source = np.searchsorted(given, np.arange(len(cmd)), side="right") - 1
+        out[:, j] = cmd[given[np.maximum(source, 0)], j]
+    return out
+
+
+def _mean_over_steps(times: Array, values: Array, edges: Array) -> Array:
+    """The mean of a staircase over each interval between edges, (intervals, columns).
+
+    The staircase has `values[k]` from `times[k]` until the next; before the first time it has the first value.
+    """
+    order = np.argsort(times, kind="stable")
+    times, values = times[order], values[order]
+    knots = np.concatenate([[min(times[0], edges[0]) - 1.0], times, [max(times[-1], edges[-1]) + 1.0]])
+    levels = np.concatenate([values[:1], values])
+    area = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(levels * np.diff(knots)[:, None], axis=0)])
+    at = np.stack([np.interp(edges, knots, column) for column in area.T], axis=1)
+    return np.diff(at, axis=0) / np.diff(edges)[:, None]
+
+
+def _initial_state(plant: Plant, run: Run, row: int, pos: Array, vel: Array, command: Array) -> Array:
+    """(nstate,) integration state at a row: measured joints, settled or measured base, filled setpoints and buffers."""
+    model = plant.model
+    data = mujoco.MjData(model)
+    data.qpos[plant.qpos] = pos
+    if plant.setup is Setup.FLOOR and plant.free_joint is not None:
+        _place_base(plant, data, run, row, command)
+        data.qpos[plant.qpos] = pos
+    data.qvel[plant.dof] = vel
+    fill_setpoints(plant, data, command)
+    data.qacc_warmstart[:] = 0
+    state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION))
+    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+    return state
+
+
+def fill_setpoints(plant: Plant, data: mujoco.MjData, command: Array) -> None:
+    """Set controls, setpoint activations and delay buffers as if `command` (joints,) had been in force for ever."""
+    model = plant.model
+    data.act[:] = 0
+    for k, i in enumerate(plant.actuator):
+        data.ctrl[plant.ctrl[k]] = command[k]
+        adr, num = int(model.actuator_actadr[i]), int(model.actuator_actnum[i])
+        dyn = model.actuator_dyntype[i]
+        if num and dyn in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT):
+            data.act[adr + num - 1] = command[k]
+        elif num and dyn == mujoco.mjtDyn.mjDYN_PID and model.actuator_dynprm[i, 1] > 0:
+            data.act[adr] = command[k]  # [slew, integral]
+        if model.actuator_history[i, 0] > 0:
+            nsample, width = int(model.actuator_history[i, 0]), int(model.actuator_ctrlnum[i])
+            values = np.zeros((nsample, width))
+            values[:, 0] = command[k]
+            mujoco.mj_initCtrlHistory(model, data, int(i), None, values)
+
+
+def _place_base(plant: Plant, data: mujoco.MjData, run: Run, row: int, command: Array) -> None:
+    """Put the free base where it was measured, else settled on the floor with the run's heading."""
+    model, joint = plant.model, plant.free_joint
+    assert joint is not None
+    adr, dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+    place = np.array([run.column(f"base.{axis}")[row] for axis in "xyz"])
+    quat = np.array([run.column(f"base.{axis}")[row] for axis in ("qw", "qx", "qy", "qz")])
+    yaw = run.column("base.yaw")[row]
+    if not np.isfinite(yaw):
+        yaw = run.facts.heading_rad or 0.0
+    if np.isfinite(place).all() and np.isfinite(quat).all():
+        data.qpos[adr : adr + 3], data.qpos[adr + 3 : adr + 7] = place, quat / np.linalg.norm(quat)
+        around = slice(max(0, row - 5), row + 6)
+        where = np.stack([run.column(f"base.{axis}")[around] for axis in "xyz"], axis=1)
+        data.qvel[dof : dof + 3] = initial_velocities(run.t[around], where, row - around.start)
+        gyro = np.array([run.column(f"gyro.{axis}")[row] for axis in "xyz"])
+        data.qvel[dof + 3 : dof + 6] = np.where(np.isfinite(gyro), gyro, 0.0)
+        return
+    # Let the robot find its own height and attitude, then turn it to the heading and move it to where it was seen.
+    settling = copy.copy(model)
+    rest = mujoco.MjData(settling)
+    rest.qpos[plant.qpos] = data.qpos[plant.qpos]
+    fill_setpoints(plant, rest, command)
+    rest.qpos[adr + 3 : adr + 7] = _turned(np.array([1.0, 0, 0, 0]), yaw)
+    for _ in range(round(SETTLE_S / plant.timestep)):
+        rest.qvel[plant.dof] = 0  # held at the measured pose; only the base moves
+        rest.qpos[plant.qpos] = data.qpos[plant.qpos]
+        mujoco.mj_step(settling, rest)
+    data.qpos[adr : adr + 7] = rest.qpos[adr : adr + 7]
+    seen = np.isfinite(place)
+    data.qpos[adr : adr + 3][seen] = place[seen]
+
+
+def _turned(quat: Array, yaw: float) -> Array:
+    turn = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+    out = np.empty(4)
+    mujoco.mju_mulQuat(out, turn, quat)
+    return out
