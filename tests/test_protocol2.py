@@ -206,7 +206,7 @@ def test_sync_reads_equal_the_sdk_byte_for_byte(several: list[int], address: int
 @given(ids, st.integers(0, 255), st.binary(max_size=60))
 def test_the_sdk_reads_our_statuses(id: int, error: int, params: bytes) -> None:
     packets = sdk.PacketHandler(2.0)
-    packet, result = packets.rxPacket(Recorder(Status(id, error, params).encode()))
+    packet, result = packets.rxPacket(Recorder(Status(id, error, params).encode()), False)
     assert result == sdk.COMM_SUCCESS
     assert packet[4] == id
     assert bytes(packet[8:-2])[: 1 + len(params)] == bytes((error,)) + params
