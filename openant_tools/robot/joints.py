@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-__all__ = ["JOINTS", "JOINT_NAMES", "LEGS", "Joint", "Leg"]
+__all__ = ["JOINTS", "JOINT_NAMES", "LEGS", "Joint", "Kind", "Leg"]
 
 Kind = Literal["hip", "knee"]
 

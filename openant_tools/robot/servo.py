@@ -129,6 +129,8 @@ class ServoModel:
             manual's; measurements on a relative (XL330) found 256 for P, so these are data, not law.
         control_period_s: period of the position loop, by which the D gain takes its difference. Not published; an
             assumption.
+        rotor_inertia_kg_m2: of the motor before the gear. Not published; the size that fits a rotor of this class
+            (some 16 mm wide, some grams), good to a factor of two. Identification replaces it.
     """
 
     name: str
@@ -149,6 +151,7 @@ class ServoModel:
     position_i_divisor: float = 65536.0
     position_d_divisor: float = 16.0
     control_period_s: float = 1e-3
+    rotor_inertia_kg_m2: float = 1e-7
     registers: Mapping[str, Register] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -190,6 +193,11 @@ class ServoModel:
     def electrical_damping_nm_s_rad(self) -> float:
         """τ_stall / ω_no-load: the slope of the torque-speed line, the same at any supply."""
         return self.stall_torque_nm / self.no_load_rad_s
+
+    @property
+    def armature_kg_m2(self) -> float:
+        """The rotor's inertia at the output, gear ratio² · rotor inertia; as uncertain as the latter."""
+        return self.gear_ratio**2 * self.rotor_inertia_kg_m2
 
     def stall_torque_at(self, supply_v: float | None = None, duty: float = 1.0) -> float:
         """N·m at stall: τ_stall · duty · V / V_nominal, since stall current is V / R."""
