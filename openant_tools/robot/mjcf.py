@@ -7,6 +7,7 @@ as a comment in the file.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from textwrap import indent
@@ -38,7 +39,16 @@ IMPRATIO = 10
 
 
 def _n(*values: float) -> str:
-    return " ".join(f"{value:.6g}" for value in values)
+    # Adding 0 turns −0 into 0.
+    return " ".join(f"{value + 0:.6g}" for value in values)
+
+
+def _look_from(x: float, y: float, z: float) -> str:
+    """Position and axes of a camera that looks from there at the origin with the horizon level."""
+    across, distance = math.hypot(x, y), math.hypot(x, y, z)
+    right = (-y / across, x / across, 0.0)
+    up = (-x * z / (across * distance), -y * z / (across * distance), across / distance)
+    return f'pos="{_n(x, y, z)}" xyaxes="{_n(*right, *up)}"'
 
 
 def _joint(joint: Joint) -> str:
@@ -130,7 +140,7 @@ def nominal_mjcf(kit: str = "standard") -> str:
     <global offwidth="1280" offheight="960"/>
     <quality shadowsize="4096" offsamples="8"/>
     <headlight ambient="0.35 0.35 0.37" diffuse="0.35 0.35 0.35" specular="0.1 0.1 0.1"/>
-    <map znear="0.02" zfar="60" fogstart="6" fogend="18"/>
+    <map znear="0.02" zfar="60" shadowclip="3.5" fogstart="6" fogend="18"/>
     <rgba haze="0.86 0.89 0.93 1"/>
   </visual>
 
@@ -139,7 +149,7 @@ def nominal_mjcf(kit: str = "standard") -> str:
 height="1536"/>
     <texture name="tiles" type="2d" builtin="checker" mark="edge" rgb1="0.80 0.82 0.84" rgb2="0.74 0.77 0.80" \
 markrgb="0.90 0.91 0.92" width="512" height="512"/>
-    <material name="floor" texture="tiles" texrepeat="5 5" texuniform="true" reflectance="0.06"/>
+    <material name="floor" texture="tiles" texrepeat="5 5" texuniform="true"/>
     <material name="shell" rgba="0.16 0.19 0.23 1" specular="0.5" shininess="0.6"/>
     <material name="link" rgba="0.94 0.94 0.92 1" specular="0.3" shininess="0.4"/>
     <material name="shin" rgba="0.90 0.37 0.08 1" specular="0.3" shininess="0.4"/>
@@ -152,7 +162,7 @@ markrgb="0.90 0.91 0.92" width="512" height="512"/>
          Damping is what the motors' back-EMF brakes, stall torque over free speed. It is counted once, in the joint,
          and the actuators' kv is 0: force range clips whatever is in the actuator, so that with the damping inside a
          saturated servo would not slow down towards its speed limit. (A servo without torque brakes less than this.)
-         The force range is what the platform's PWM limit of {_n(100 * PLATFORM_PWM_LIMIT)} % leaves of the stall torque.
+         Force range is what the platform's PWM limit of {_n(100 * PLATFORM_PWM_LIMIT)} % leaves of the stall torque.
          kp is the factory's P gain in N·m/rad. Armature is an estimate: gear ratio² times a rotor of 1e-7 kg·m². -->
 {classes}
     <default class="link">
@@ -174,15 +184,17 @@ solimp="{_n(*SOLIMP)}" material="link"/>
   </default>
 
   <worldbody>
-    <light directional="true" pos="0 0 3" dir="0.35 0.5 -1" diffuse="0.65 0.64 0.62" specular="0.25 0.25 0.25"/>
     <!-- MuJoCo takes the larger friction of two geoms, so that a floor more slippery than the feet would change
          nothing. Priority lets the floor's friction and softness decide. -->
     <geom name="floor" type="plane" size="40 40 1" material="floor" priority="1" condim="3" \
 friction="{_n(*FLOOR_FRICTION)}" solref="{_n(*SOLREF)}" solimp="{_n(*SOLIMP)}"/>
     <body name="torso" pos="0 0 {_n(STAND_HEIGHT)}">
       <freejoint name="root"/>
-      <camera name="track" mode="trackcom" pos="0 -3 0.4" xyaxes="1 0 0 0 0 1"/>
-      <camera name="portrait" mode="trackcom" pos="0.52 -0.62 0.27" xyaxes="0.766 0.643 0 -0.2 0.238 0.95" fovy="40"/>
+      <!-- The light walks along: shadows are drawn on a patch of floor around the point it looks at. -->
+      <light name="sun" mode="trackcom" directional="true" pos="-0.3 -0.5 1.5" dir="0.3 0.5 -1.5" \
+diffuse="0.6 0.59 0.57" specular="0.25 0.25 0.25"/>
+      <camera name="track" mode="trackcom" {_look_from(0.0, -1.0, 0.42)}/>
+      <camera name="portrait" mode="trackcom" {_look_from(0.66, -0.16, 0.33)}/>
       <site name="imu_location" size="0.005" rgba="0 0 0 0"/>
       <site name="eye_left" pos="0.05 0.03 0.02" size="0.02" rgba="1 1 1 1"/>
       <site name="eye_right" pos="0.05 -0.03 0.02" size="0.02" rgba="1 1 1 1"/>
