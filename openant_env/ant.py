@@ -1,0 +1,425 @@
+"""The simulated Open Ant as a Gymnasium environment: `gymnasium.make("openant/Ant-v0")`.
+
+A step of this environment is one call of `mj_step` over all its physics steps, one gather from the sensor readings,
+and a microsecond of plain arithmetic: it costs little more than the physics alone (benchmarks/env_speed.py).
+
+Timing contract: an action becomes the servos' commands at once and holds for `dt`; the observation returned is
+what the sensors read at the last physics step of that time, all at the same instant.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_env.actions import action_map
+from openant_env.metrics import AverageReward
+from openant_env.observations import ORDERS, layout
+from openant_env.rendering import Painter
+from openant_env.robots import SimulatedRobot, simulated_robot
+from openant_env.tasks import BackAndForth, make_task
+from openant_tools.errors import BadInput
+from openant_tools.model.rollout import fill_setpoints
+
+__all__ = ["Ant"]
+
+#: s, the paper's step of SAC.
+DT_S = 0.12
+#: s that the robot stands before the first observation, so that it neither falls nor swings at reset.
+SETTLE_S = 2.0
+#: m, from which the robot is let down onto the floor before it settles (the published simulation's start).
+START_HEIGHT_M = 0.2
+
+Observation = NDArray[np.float32]
+OnFall = Literal["truncate", "terminate", "ignore"]
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+class Ant(gymnasium.Env[Observation, NDArray[Any]]):
+    """A walking Open Ant on a floor, without episodes.
+
+    Actions: (8,) in −1…1, one a joint, mapped onto `action_range` and kept within the calibrated limits.
+    Observations: (24,) float32 in the order of `observation_names`; SI units, neither scaled nor clipped.
+    Reward: m, the displacement along the reward direction (`openant_env.tasks`). An average reward per second of
+    0.05 is a robot that walks 5 cm/s where it should.
+
+    It ends only where a real robot would need help: `truncated` with `info["reason"]` once the robot lies on its back
+    (`on_fall`), the physics has come apart, or `time_limit_s` has passed.
+
+    Args:
+        robot: a robot's folder (or its robot.toml); its calibrated model and limits are used. None: the bundled
+            nominal robot.
+        kit: `"standard"` or `"lite"`, which nominal robot.
+        task: `"back-and-forth"` or `"forward"`.
+        task_options: for back-and-forth `radius_m`, `origin`, `scored` (`"paper"` or `"platform"`).
+        dt: s, the time of one step; a whole number of the model's timesteps.
+        action_range: `"paper"`, `"platform"`, `"platform-sarsa"` or `"limits"` (`openant_env.actions`).
+        observation_order: `"platform"` or `"paper"` (`openant_env.observations`).
+        effects: which of the robot's `[[effect]]` entries act: True (all that are enabled), False, or their names.
+        on_fall: what lying on the back means: `"truncate"`, `"terminate"`, or `"ignore"`.
+        time_limit_s: s after which to truncate; None: never.
+        render_mode: None or `"rgb_array"`.
+        width, height: pixels of a rendered picture.
+
+    Raises:
+        BadInput: in one line, what of the robot's folder or of the arguments cannot be used.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": round(1.0 / DT_S)}  # noqa: RUF012
+
+    def __init__(
+        self,
+        *,
+        robot: str | Path | None = None,
+        kit: str | None = None,
+        task: str = BackAndForth.name,
+        task_options: Mapping[str, Any] | None = None,
+        dt: float = DT_S,
+        action_range: str = "paper",
+        observation_order: str = "platform",
+        effects: bool | Sequence[str] = True,
+        on_fall: OnFall = "truncate",
+        time_limit_s: float | None = None,
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 360,
+    ) -> None:
+        self._arguments = {
+            "robot": robot, "kit": kit, "task": task, "task_options": task_options, "dt": dt,
+            "action_range": action_range, "observation_order": observation_order, "effects": effects,
+            "on_fall": on_fall, "time_limit_s": time_limit_s, "render_mode": render_mode, "width": width,
+            "height": height,
+        }  # fmt: skip
+        if on_fall not in ("truncate", "terminate", "ignore"):
+            raise BadInput(f"on_fall is {on_fall!r}", remedy="use 'truncate', 'terminate' or 'ignore'")
+        if render_mode not in (None, "rgb_array"):
+            raise BadInput(f"render mode {render_mode!r} does not exist", remedy="use 'rgb_array' or None")
+        if observation_order not in ORDERS:
+            raise BadInput(
+                f"no such order of observations: {observation_order!r}", remedy=f"choose one of {', '.join(ORDERS)}"
+            )
+        if time_limit_s is not None and not time_limit_s > 0.0:
+            raise BadInput(f"the time limit is {time_limit_s} s", remedy="give a time above 0, or None for no limit")
+        self.robot: SimulatedRobot = simulated_robot(robot, kit=kit, effects=effects)
+        self._plant = self.robot.load()
+        self.model: mujoco.MjModel = self._plant.model
+        # MuJoCo would start a simulation that has come apart afresh without a word.
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.data = mujoco.MjData(self.model)
+        self.dt = float(dt)
+        self._substeps = _whole_steps(self.dt, self.model.opt.timestep, self.robot.model_path)
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self.dt))}
+        self.render_mode = render_mode
+        self._size = (width, height)
+        self._painter: Painter | None = None
+
+        joints = self.robot.joints
+        self.actions = action_map(action_range, joints, self.robot.low, self.robot.high)
+        self.layout = layout(joints, observation_order)
+        self.task = make_task(task, task_options)
+        self.average_reward = AverageReward()
+        self._on_fall = on_fall
+        self._time_limit_s = math.inf if time_limit_s is None else float(time_limit_s)
+
+        size = len(self.layout)
+        low, high = np.full(size, -np.inf, np.float32), np.full(size, np.inf, np.float32)
+        direction = self.layout.slices["direction"]
+        # A unit vector computed in single precision may stick out by its rounding error.
+        low[direction], high[direction] = -1.0 - 1e-6, 1.0 + 1e-6
+        self.observation_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(joints),), np.float32)
+
+        self._bind()
+        self._settled = self._settle()
+        self._seconds = 0.0
+        self._observation = np.zeros(size, np.float32)
+
+    # ------------------------------------------------------------------------------------------------ what it is
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        """What each number of an observation is, such as `position.hip_rr`."""
+        return self.layout.names
+
+    @property
+    def observation_bounds(self) -> tuple[Observation, Observation]:
+        """Low and high, each (24,), that observations keep to in practice: the robot's measured bounds where its
+        folder has them, else nominal ones. Not a promise: use them to normalise, never to clip what you learn from."""
+        return self.robot.bounds(self.layout)
+
+    def _bind(self) -> None:
+        """Look every name up once, and keep views into the simulation's memory, which never moves."""
+        model, data, joints = self.model, self.data, self.robot.joints
+        where = self.robot.model_path
+        self._setpoints = self._plant.ctrl
+        self._free_qpos, torso = _free_body(model, where)
+        self._ctrl = data.ctrl
+        self._sensordata = data.sensordata
+        self._torso_position = data.xpos[torso]
+        self._torso_rotation = data.xmat[torso]
+        self._command = np.empty(len(joints))
+
+        index = np.zeros(len(self.layout), np.intp)
+        index[self.layout.slices["position"]] = [_sensor(model, f"pos.{joint}", 1, where) for joint in joints]
+        index[self.layout.slices["velocity"]] = [_sensor(model, f"vel.{joint}", 1, where) for joint in joints]
+        for block, name in (("acceleration", "accelerometer"), ("angular_velocity", "gyro")):
+            index[self.layout.slices[block]] = _sensor(model, name, 3, where) + np.arange(3)
+        self._sensor_index = index
+        self._reading = np.empty(len(index))
+        self._direction_at = self.layout.slices["direction"].start
+
+    def _settle(self) -> NDArray[np.float64]:
+        """The state of a robot that stands with the command of action 0: setpoint filters and delay buffers full."""
+        model, data = self.model, self.data
+        mujoco.mj_resetData(model, data)
+        rest = self.actions.rest
+        data.qpos[self._free_qpos : self._free_qpos + 3] = (0.0, 0.0, START_HEIGHT_M)
+        data.qpos[self._plant.qpos] = rest
+        fill_setpoints(self._plant, data, rest)
+        mujoco.mj_step(model, data, nstep=max(1, round(SETTLE_S / model.opt.timestep)))
+        if not np.isfinite(data.qpos).all() or self._torso_rotation[8] < 0.0:
+            raise BadInput(
+                "the robot does not come to stand in this model",
+                where=self.robot.model_path,
+                remedy="check masses, stiffness and the timestep",
+            )
+        data.qvel[:] = 0.0
+        state = np.empty(mujoco.mj_stateSize(model, _STATE))
+        mujoco.mj_getState(model, data, state, _STATE)
+        return state
+
+    # ---------------------------------------------------------------------------------------------- reset and step
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Stand the robot up at the circle's centre with a random heading.
+
+        Args:
+            seed: of the heading and of the reward direction.
+            options: `heading_rad`, `position` (x, y in m) and `direction_rad` (the first reward direction) to choose
+                them.
+        """
+        super().reset(seed=seed)
+        chosen = options or {}
+        unknown = set(chosen) - {"heading_rad", "position", "direction_rad"}
+        if unknown:
+            raise BadInput(f"no such reset option: {sorted(unknown)[0]}", remedy="heading_rad, position, direction_rad")
+        heading = chosen.get("heading_rad")
+        if heading is None:
+            heading = self.np_random.uniform(-math.pi, math.pi)
+        x, y = chosen.get("position", (self.task.ox, self.task.oy) if isinstance(self.task, BackAndForth) else (0, 0))
+
+        model, data = self.model, self.data
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_setState(model, data, self._settled, _STATE)
+        free = self._free_qpos
+        data.qpos[free : free + 2] = x, y
+        # The settled robot may have turned by a hair: take its yaw out, then turn it to the chosen heading.
+        w, qx, qy, qz = data.qpos[free + 3 : free + 7]
+        turn = heading - math.atan2(2.0 * (w * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
+        turned = np.empty(4)
+        yaw = np.array([math.cos(0.5 * turn), 0.0, 0.0, math.sin(0.5 * turn)])
+        mujoco.mju_mulQuat(turned, yaw, data.qpos[free + 3 : free + 7].copy())
+        data.qpos[free + 3 : free + 7] = turned
+        mujoco.mj_forward(model, data)
+
+        torso_x, torso_y, _ = self._torso_position.tolist()
+        self.task.reset(torso_x, torso_y, self.np_random, chosen.get("direction_rad"))
+        self.average_reward.clear()
+        self._seconds = 0.0
+        hx, hy = self._heading()
+        self._observation = self._observe(hx, hy)
+        return self._observation.copy(), self._info(torso_x, torso_y, hx, hy)
+
+    def step(self, action: NDArray[Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Command the joints for `dt` seconds.
+
+        Args:
+            action: (8,), clipped to −1…1.
+
+        Returns:
+            Observation (24,), reward (m), terminated, truncated, and info: `position` (m), `heading` and
+            `reward_direction` (unit vectors in the world), `average_reward_m_s` (over 120 s, since reset), `time_s`
+            (since reset), `dt` (s, of this step), and `reason` where it ended. Everything is the caller's to keep.
+
+        Raises:
+            BadInput: the action has another shape, or is not finite.
+        """
+        command, actions = self._command, self.actions
+        if np.shape(action) != command.shape:
+            raise BadInput(f"an action has shape {np.shape(action)}", remedy=f"give {len(command)} numbers")
+        np.minimum(np.maximum(action, -1.0, out=command), 1.0, out=command)
+        command *= actions.half
+        command += actions.centre
+        if actions.clipped:
+            np.minimum(np.maximum(command, actions.low, out=command), actions.high, out=command)
+        if not math.isfinite(command.sum()):
+            raise BadInput(
+                f"an action is not finite: {np.asarray(action)}", remedy="look for NaN in the agent's networks"
+            )
+        self._ctrl[self._setpoints] = command
+        mujoco.mj_step(self.model, self.data, nstep=self._substeps)
+        self._seconds += self.dt
+
+        x, y, _ = self._torso_position.tolist()
+        hx, hy = self._heading()
+        if not math.isfinite(self._sensordata.sum() + x + y):
+            # The last sound observation stands in for what can no longer be measured; a learner must not see NaN.
+            info = self._info(math.nan, math.nan, math.nan, math.nan)
+            return self._observation.copy(), 0.0, False, True, {**info, "reason": "the physics has come apart"}
+        reward = self.task.reward(x, y)
+        self.average_reward.add(reward, self.dt)
+        self._observation = self._observe(hx, hy)
+        info = self._info(x, y, hx, hy)
+        terminated = truncated = False
+        if self._torso_rotation[8] < 0.0 and self._on_fall != "ignore":
+            terminated, truncated = self._on_fall == "terminate", self._on_fall == "truncate"
+            info["reason"] = "the robot lies on its back"
+        elif self._seconds >= self._time_limit_s - 0.5 * self.dt:
+            truncated = True
+            info["reason"] = "time limit"
+        return self._observation.copy(), reward, terminated, truncated, info
+
+    def _heading(self) -> tuple[float, float]:
+        """The torso's x axis in the plane, a unit vector; east where it points straight up."""
+        forward_x, _, _, forward_y = self._torso_rotation[:4].tolist()
+        length = math.hypot(forward_x, forward_y)
+        return (forward_x / length, forward_y / length) if length > 1e-9 else (1.0, 0.0)
+
+    def _observe(self, hx: float, hy: float) -> Observation:
+        reading = self._reading
+        # mode="clip" lets numpy write into `out` without a buffer between; every index is in range.
+        self._sensordata.take(self._sensor_index, out=reading, mode="clip")
+        at = self._direction_at
+        reading[at], reading[at + 1] = self.task.observed_direction(hx, hy)
+        return reading.astype(np.float32)
+
+    def _info(self, x: float, y: float, hx: float, hy: float) -> dict[str, Any]:
+        task = self.task
+        return {
+            "position": np.array((x, y)),
+            "heading": np.array((hx, hy)),
+            "reward_direction": np.array((task.ux, task.uy)),
+            "average_reward_m_s": self.average_reward.value,
+            "time_s": self._seconds,
+            "dt": self.dt,
+        }
+
+    # --------------------------------------------------------------------------------------------------- pictures
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """The robot, the reward direction, and the circle it turns at, (height, width, 3); None without `rgb_array`.
+
+        Raises:
+            NoOpenGL: there is nothing to draw with on this machine.
+        """
+        if self.render_mode is None:
+            return None
+        if self._painter is None:
+            self._painter = Painter(self.model, *self._size)
+        x, y, z = self._torso_position.tolist()
+        task = self.task
+        circle = (task.ox, task.oy, task.radius_m) if isinstance(task, BackAndForth) else None
+        return self._painter.frame(self.data, look_at=(x, y, z), arrow=(task.ux, task.uy), circle=circle)
+
+    def close(self) -> None:
+        """Give the OpenGL context back, if there is one."""
+        if self._painter is not None:
+            self._painter.close()
+            self._painter = None
+
+    # ------------------------------------------------------------------------------------------- going on elsewhere
+
+    def get_state(self) -> dict[str, Any]:
+        """All that a step depends on, as plain numbers, lists and arrays: `set_state` goes on from it bit for bit."""
+        state = np.empty(mujoco.mj_stateSize(self.model, _STATE))
+        mujoco.mj_getState(self.model, self.data, state, _STATE)
+        return {
+            "physics": state,
+            "task": self.task.get_state(),
+            "average_reward": self.average_reward.get_state(),
+            "seconds": self._seconds,
+            "observation": self._observation.copy(),
+            "random": self.np_random.bit_generator.state,
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on where `get_state` was called, in this process or in another.
+
+        Raises:
+            BadInput: the state is one of another model.
+        """
+        physics = np.asarray(state["physics"], np.float64)
+        if physics.shape != self._settled.shape:
+            raise BadInput(
+                "this saved state belongs to another model",
+                where=self.robot.model_path,
+                remedy="use the model that it was saved with",
+            )
+        mujoco.mj_setState(self.model, self.data, physics, _STATE)
+        mujoco.mj_forward(self.model, self.data)
+        # mj_forward leaves a warm start of its own behind; the saved one makes the next step the same, bit for bit.
+        mujoco.mj_setState(self.model, self.data, physics, _STATE)
+        self.task.set_state(state["task"])
+        self.average_reward.set_state(state["average_reward"])
+        self._seconds = float(state["seconds"])
+        self._observation = np.asarray(state["observation"], np.float32)
+        self.np_random.bit_generator.state = state["random"]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"arguments": self._arguments, "spec": self.spec, "state": self.get_state()}
+
+    def __setstate__(self, pickled: dict[str, Any]) -> None:
+        self.__init__(**pickled["arguments"])  # type: ignore[misc]
+        self.spec = pickled["spec"]
+        self.set_state(pickled["state"])
+
+
+def _whole_steps(dt: float, timestep: float, where: Path) -> int:
+    """How many physics steps a step of the environment takes.
+
+    Raises:
+        BadInput: dt is no whole number of them.
+    """
+    ratio = dt / timestep if timestep > 0.0 else math.nan
+    steps = round(ratio) if math.isfinite(ratio) else 0
+    if steps < 1 or abs(ratio - steps) > 1e-6 * steps:
+        below = max(1, math.floor(ratio)) * timestep if math.isfinite(ratio) else timestep
+        raise BadInput(
+            f"dt = {dt:g} s is no whole number of the model's timestep of {timestep:g} s",
+            where=where,
+            remedy=f"use dt = {below:g} or {below + timestep:g}",
+        )
+    return steps
+
+
+def _free_body(model: mujoco.MjModel, where: Path) -> tuple[int, int]:
+    """Where the free joint's coordinates begin in qpos, and the body that it moves."""
+    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+    if len(free) != 1:
+        raise BadInput(
+            f"the model has {len(free)} free joints; a walking robot has one",
+            where=where,
+            remedy="give the torso a <freejoint/>",
+        )
+    return int(model.jnt_qposadr[free[0]]), int(model.jnt_bodyid[free[0]])
+
+
+def _sensor(model: mujoco.MjModel, name: str, size: int, where: Path) -> int:
+    """Where a sensor's reading begins in sensordata."""
+    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
+    if index < 0 or model.sensor_dim[index] != size:
+        raise BadInput(
+            f"the model has no sensor {name} of {size} number{'s' if size > 1 else ''}",
+            where=where,
+            remedy="add a <gyro> and an <accelerometer> of these names at the IMU's site",
+        )
+    return int(model.sensor_adr[index])

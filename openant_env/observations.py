@@ -1,0 +1,67 @@
+"""The 24 observations of the Open Ant and the orders in which people write them down.
+
+One observation is made of five blocks: joint positions (rad) and velocities (rad/s), a planar direction (unit
+vector), the torso's specific force (m/s², +9.81 on z at rest) and its angular velocity (rad/s), both in the body frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+__all__ = ["ORDERS", "Block", "Layout", "layout"]
+
+#: block → size, None where it is one number a joint.
+BLOCKS: Mapping[str, int | None] = {
+    "position": None,
+    "velocity": None,
+    "direction": 2,
+    "acceleration": 3,
+    "angular_velocity": 3,
+}
+Block = str
+
+#: name → the blocks in order. `platform`: the published software. `paper`: the order of the paper's sentence.
+ORDERS: Mapping[str, tuple[Block, ...]] = {
+    "platform": ("position", "velocity", "direction", "acceleration", "angular_velocity"),
+    "paper": ("position", "velocity", "angular_velocity", "acceleration", "direction"),
+}
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each block stands in an observation.
+
+    Attributes:
+        order: the name in `ORDERS`.
+        slices: block → its place.
+        names: one name a number, such as `position.hip_rr` or `acceleration.z`.
+    """
+
+    order: str
+    slices: Mapping[Block, slice]
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def layout(joints: Sequence[str], order: str = "platform") -> Layout:
+    """The layout of an observation of these joints.
+
+    Args:
+        joints: joint names in the order of the actions.
+        order: a name in `ORDERS`.
+
+    Raises:
+        KeyError: no such order.
+    """
+    axes = {2: ("along", "left"), 3: ("x", "y", "z")}
+    slices: dict[Block, slice] = {}
+    names: list[str] = []
+    for block in ORDERS[order]:
+        size = BLOCKS[block]
+        parts = tuple(joints) if size is None else axes[size]
+        slices[block] = slice(len(names), len(names) + len(parts))
+        names += [f"{block}.{part}" for part in parts]
+    return Layout(order, slices, tuple(names))

@@ -1,0 +1,136 @@
+"""Pictures of a simulated robot, drawn off screen and only when asked for."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.errors import BadInput
+
+__all__ = ["NoOpenGL", "Painter"]
+
+Image = NDArray[np.uint8]
+ARROW_RGBA = (0.0, 0.447, 0.698, 1.0)  # Okabe–Ito blue
+CIRCLE_RGBA = (0.337, 0.706, 0.914, 1.0)  # Okabe–Ito sky blue
+CIRCLE_SEGMENTS = 48
+
+
+class NoOpenGL(BadInput):
+    """This machine has no OpenGL to draw with."""
+
+
+def _backends() -> list[str]:
+    """MuJoCo's OpenGL backends, the likeliest to work first."""
+    chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
+    if chosen in ("glfw", "egl", "osmesa", "cgl"):
+        return [chosen]
+    if platform.system() == "Darwin":
+        return ["cgl", "glfw"]
+    has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    return ["glfw", "egl"] if has_display else ["egl", "osmesa"]
+
+
+def _gl_context(width: int, height: int) -> Any:
+    # MuJoCo's own Renderer takes its backend from the environment as it was when mujoco was first imported, and
+    # fails on a machine without display unless that was set; here the choice is made when a picture is wanted.
+    reasons = []
+    for backend in _backends():
+        try:
+            context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+            context.make_current()
+        except Exception as error:  # each backend fails in its own way: ImportError, AttributeError, GLError, …
+            reasons.append(f"{backend}: {error or type(error).__name__}".splitlines()[0])
+        else:
+            return context
+    raise NoOpenGL(
+        f"no picture of the robot can be drawn, there is no OpenGL here ({'; '.join(reasons)})",
+        remedy="install an EGL or OSMesa library, or go on without pictures",
+    )
+
+
+class Painter:
+    """Draws a model's state from a camera that follows the robot.
+
+    Args:
+        model: the compiled model; its off-screen buffer is enlarged where needed.
+        width, height: pixels.
+
+    Raises:
+        NoOpenGL: there is nothing to draw with.
+    """
+
+    def __init__(self, model: mujoco.MjModel, width: int = 480, height: int = 360) -> None:
+        model.vis.global_.offwidth = max(width, model.vis.global_.offwidth)
+        model.vis.global_.offheight = max(height, model.vis.global_.offheight)
+        self._gl = _gl_context(width, height)
+        self._model = model
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+        self._scene = mujoco.MjvScene(model, 1000)
+        self._option = mujoco.MjvOption()
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+
+    def frame(
+        self,
+        data: mujoco.MjData,
+        *,
+        look_at: tuple[float, float, float],
+        arrow: tuple[float, float] | None = None,
+        circle: tuple[float, float, float] | None = None,
+        azimuth_deg: float = 90.0,
+        elevation_deg: float = -35.0,
+        distance_m: float = 1.4,
+    ) -> Image:
+        """One picture, (height, width, 3).
+
+        Args:
+            data: the state; its positions must be up to date (`mj_kinematics`).
+            look_at: m, the point in the middle of the picture.
+            arrow: a unit vector in the plane, drawn above the robot.
+            circle: x, y and radius in m, drawn on the floor.
+            azimuth_deg, elevation_deg, distance_m: where the camera stands.
+        """
+        self._gl.make_current()
+        camera = mujoco.MjvCamera()
+        camera.lookat[:] = look_at
+        camera.azimuth, camera.elevation, camera.distance = azimuth_deg, elevation_deg, distance_m
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self._model, data, self._option, None, camera, everything, self._scene)
+        if circle is not None:
+            x, y, radius = circle
+            angles = np.linspace(0.0, 2.0 * np.pi, CIRCLE_SEGMENTS + 1)
+            points = np.column_stack(
+                [x + radius * np.cos(angles), y + radius * np.sin(angles), np.full_like(angles, 2e-3)]
+            )
+            for a, b in zip(points[:-1], points[1:], strict=True):
+                self._connect(mujoco.mjtGeom.mjGEOM_CAPSULE, 0.004, a, b, CIRCLE_RGBA)
+        if arrow is not None:
+            start = np.array([look_at[0], look_at[1], look_at[2] + 0.12])
+            end = start + 0.25 * np.array([arrow[0], arrow[1], 0.0])
+            self._connect(mujoco.mjtGeom.mjGEOM_ARROW, 0.012, start, end, ARROW_RGBA)
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        pixels = np.empty((self._rect.height, self._rect.width, 3), np.uint8)
+        mujoco.mjr_readPixels(pixels, None, self._rect, self._context)
+        return pixels[::-1].copy()
+
+    def _connect(
+        self, kind: mujoco.mjtGeom, width: float, start: NDArray[Any], end: NDArray[Any], rgba: tuple[float, ...]
+    ) -> None:
+        scene = self._scene
+        if scene.ngeom >= scene.maxgeom:
+            return
+        geom = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), np.array(rgba, np.float32))
+        mujoco.mjv_connector(geom, kind, width, np.asarray(start, float), np.asarray(end, float))
+        scene.ngeom += 1
+
+    def close(self) -> None:
+        """Give the OpenGL context back."""
+        self._context.free()
+        self._gl.free()
