@@ -1,0 +1,464 @@
+"""A Dynamixel bus by IDs and addresses: every instruction, deadlines by arithmetic, losses by cause.
+
+A request's deadline is the time its bytes and its answers take on the wire at this baud rate, plus each servo's return
+delay, the adapter's latency timer and a margin for the operating system. Nothing is retried behind the caller's back:
+where a retry is asked for, it is counted.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from openant_tools.comms import protocol2 as p2
+from openant_tools.comms.clock import Clock
+from openant_tools.comms.faults import BrokenAnswer, Cause, Refused, missing_answers, refusal_words
+from openant_tools.comms.line import Line
+from openant_tools.comms.protocol2 import Garbage, Instruction, JoinedStatus, Parser, Reason, Status
+from openant_tools.comms.statistics import BusStatistics
+
+__all__ = ["Answer", "Bus", "Found", "Timing"]
+
+#: 8N1: a byte is ten bits on the wire.
+BITS_PER_BYTE = 10
+#: A status carries this many bytes besides its data.
+STATUS_OVERHEAD = 11
+#: Fast Sync Read came with this firmware (ROBOTIS e-manual).
+FAST_READ_FIRMWARE = 45
+_MARK = p2.HEADER[:3]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What a deadline is made of.
+
+    Attributes:
+        return_delay_s: what a servo waits before it answers (register 9), the largest on this bus. The factory's.
+        latency_timer_s: after this time without more bytes an FTDI adapter hands over what it has.
+        margin_s: for the operating system on either side.
+        grace_s: how much longer to listen for answers that are then counted as late.
+        write_read_gap_s: quiet time that servos need after a broadcast write before they hear a request. Measured on
+            the platform: 0.1 ms loses most reads, 0.2 ms none (platform's driver, 40 reads each).
+    """
+
+    return_delay_s: float = 500e-6
+    latency_timer_s: float = 16e-3
+    margin_s: float = 3e-3
+    grace_s: float = 3e-3
+    write_read_gap_s: float = 0.2e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What one servo answered to one request.
+
+    Attributes:
+        data: its parameters; None where no valid answer came. A late answer's data are kept.
+        error: the raw error byte: alert bit and refusal code.
+        cause: None where a valid answer came in time.
+        rtt: s from the request's first byte to this answer's last, where it came.
+    """
+
+    id: int
+    data: bytes | None
+    error: int = 0
+    cause: Cause | None = None
+    rtt: float | None = None
+
+    @property
+    def ok(self) -> bool:
+        """A valid answer came in time, alert or not."""
+        return self.cause is None
+
+    @property
+    def alert(self) -> bool:
+        return bool(self.error & p2.ALERT_BIT)
+
+    @property
+    def refusal(self) -> int:
+        """The error code without the alert bit; 0 where the instruction was done."""
+        return self.error & ~p2.ALERT_BIT & 0xFF
+
+    @property
+    def word(self) -> str:
+        """As `err.J` of a run table wants it."""
+        if self.cause is not None:
+            return self.cause.value
+        return Cause.ALERT.value if self.alert else ""
+
+
+@dataclass(frozen=True)
+class Found:
+    """A servo that answered a ping."""
+
+    id: int
+    model_number: int
+    firmware: int
+    alert: bool = False
+
+
+@dataclass
+class Bus:
+    """One half-duplex bus.
+
+    Attributes:
+        names: id → what to call the servo in messages.
+        timing: see `Timing`; set from what was measured.
+        statistics: every request and every loss so far.
+        fast: ids whose firmware knows Fast Sync Read; where it fails, plain Sync Read is used from then on.
+    """
+
+    line: Line
+    clock: Clock
+    timing: Timing = field(default_factory=Timing)
+    names: Mapping[int, str] = field(default_factory=dict)
+    statistics: BusStatistics = field(default_factory=BusStatistics)
+    fast: set[int] = field(default_factory=set)
+    #: requests that may be sent again by `read` and `write` (never by sync reads); each is counted
+    retries: int = 2
+
+    def __post_init__(self) -> None:
+        self._quiet_from = 0.0
+
+    # ---- one instruction each ------------------------------------------------------------------------------------
+
+    def ping(self, id: int) -> Found | None:
+        """The servo with this ID, or None where none answers."""
+        answer = self._exchange(p2.ping(id), [id], 3)[0]
+        return _found(answer) if answer.ok else None
+
+    def broadcast_ping(self, *, first_s: float = 0.2, quiet_s: float = 0.1) -> list[Found]:
+        """Everyone at this baud rate, by ID.
+
+        Servos answer in turn of their IDs. How long a turn is nobody publishes; ROBOTIS' SDK allows 3 ms for each of
+        252 and always waits for all. We stop once the line has stayed quiet: `first_s` (s) before the first answer,
+        `quiet_s` after one.
+
+        Raises:
+            BrokenAnswer: answers collide: several servos share an ID.
+        """
+        started = self._send(p2.ping(p2.BROADCAST).encode())
+        parser, found, garbage = Parser(), dict[int, Found](), 0
+        deadline = started + first_s + self.wire_s(STATUS_OVERHEAD + 3)
+        while self.clock.wait_readable(self.line, deadline):
+            for item in parser.feed(self.line.read()):
+                if isinstance(item, Status) and len(item.params) >= 3:
+                    found[item.id] = _found(Answer(item.id, item.params, item.error))
+                elif isinstance(item, Garbage):
+                    garbage += len(item.data)
+            deadline = max(deadline, self.clock.now() + quiet_s)
+        garbage += sum(len(item.data) for item in parser.flush() if isinstance(item, Garbage))
+        self.statistics.noise_bytes += garbage
+        if garbage and not found:
+            raise BrokenAnswer(
+                f"answers to a broadcast ping collide ({garbage} bytes that are no packet) at {self.line.baud} baud",
+                where=self.line.path,
+                remedy="several servos share an id, as factory-fresh ones do: connect one at a time",
+            )
+        return [found[id] for id in sorted(found)]
+
+    def read(self, id: int, address: int, count: int) -> bytes:
+        """`count` bytes from `address`.
+
+        Raises:
+            NoAnswer, BrokenAnswer: even after `retries` more requests.
+            Refused: there is no such register.
+        """
+        answer = self._insist(p2.read(id, address, count), id, count, f"register {address}")
+        assert answer.data is not None
+        if len(answer.data) != count:
+            raise BrokenAnswer(f"{len(answer.data)} bytes instead of {count}", where=self._place(id))
+        return answer.data
+
+    def write(self, id: int, address: int, data: bytes, what: str | None = None) -> None:
+        """Write and wait for the servo's word. Raises as `read`; `what` names the register in messages."""
+        self._insist(p2.write(id, address, data), id, 0, what or f"register {address}")
+
+    def reg_write(self, id: int, address: int, data: bytes) -> None:
+        """As `write`, done once `action` comes."""
+        self._insist(p2.reg_write(id, address, data), id, 0, f"register {address}")
+
+    def action(self, id: int = p2.BROADCAST) -> None:
+        self._order(p2.action(id), id, "action")
+
+    def reboot(self, id: int) -> None:
+        """The servo is mute for a while (about 0.3 to 0.5 s) afterwards."""
+        self._order(p2.reboot(id), id, "reboot")
+
+    def factory_reset(self, id: int, option: int) -> None:
+        """See `protocol2.factory_reset`. The servo reboots, perhaps under another ID and at another baud rate."""
+        self._order(p2.factory_reset(id, option), id, "factory reset")
+
+    def clear_multi_turn(self, id: int) -> None:
+        self._order(p2.clear_multi_turn(id), id, "clear")
+
+    def backup(self, id: int) -> None:
+        self._order(p2.control_table_backup(id), id, "control table backup")
+
+    def restore(self, id: int) -> None:
+        """The servo reboots with its backup."""
+        self._order(p2.control_table_restore(id), id, "control table restore")
+
+    def sync_write(self, address: int, count: int, data: Mapping[int, bytes]) -> float:
+        """Write the same registers of several servos; none answers. The time its last byte has left."""
+        return self.send(p2.sync_write(address, count, data).encode())
+
+    def bulk_write(self, items: Sequence[tuple[int, int, bytes]]) -> float:
+        """Write (id, address, data) each; none answers. The time its last byte has left."""
+        return self.send(p2.bulk_write(items).encode())
+
+    def send(self, packet: bytes) -> float:
+        """Send what nobody answers; returns when its last byte has left (s), by the baud rate."""
+        self._send(packet)
+        return self._quiet_from
+
+    def sync_read(self, address: int, count: int, ids: Sequence[int]) -> list[Answer]:
+        """The same registers of several servos, in the order of `ids`. Never raises for a silent servo."""
+        if self.fast.issuperset(ids) and len(ids) > 1:
+            answers = self._fast_sync_read(address, count, ids)
+            if answers[0] is not None and all(answer is not None for answer in answers):
+                return [answer for answer in answers if answer is not None]
+            # A joined reply ends at the first silent servo: ask those behind it one by one, and joined no more.
+            self.statistics.fast_read_fallbacks += 1
+            self.fast.clear()
+            rest = [id for id, answer in zip(ids, answers, strict=True) if answer is None]
+            others = iter(self._exchange(p2.sync_read(address, count, rest), rest, count))
+            return [answer or next(others) for answer in answers]
+        return self._exchange(p2.sync_read(address, count, ids), ids, count)
+
+    def bulk_read(self, items: Sequence[tuple[int, int, int]]) -> list[Answer]:
+        """(id, address, bytes) each, answered in that order. Never raises for a silent servo."""
+        ids = [id for id, _, _ in items]
+        return self._exchange(p2.bulk_read(items), ids, max(count for _, _, count in items))
+
+    # ---- what must be there --------------------------------------------------------------------------------------
+
+    def require(self, answers: Iterable[Answer]) -> list[Answer]:
+        """The same answers, where all came; else the error that names the place.
+
+        Raises:
+            NoAnswer, BrokenAnswer: see `faults.missing_answers`.
+        """
+        answers = list(answers)
+        if all(answer.ok for answer in answers):
+            return answers
+        broken = [answer for answer in answers if answer.cause in (Cause.CRC, Cause.SHORT)]
+        if broken and all(answer.ok or answer in broken for answer in answers):
+            names = ", ".join(self._name(answer.id) for answer in broken)
+            raise BrokenAnswer(
+                f"answers arrive broken from {names} ({broken[0].word})",
+                where=self.line.path,
+                remedy="a loose connector, two servos with one id, or noise: wiggle the cable before "
+                f"{self._name(broken[0].id)} and look at `openant comms watch`",
+            )
+        raise missing_answers(
+            [self._name(answer.id) for answer in answers],
+            [answer.data is not None for answer in answers],
+            where=self.line.path,
+            speed=f"{self.line.baud} baud",
+        )
+
+    def close(self) -> None:
+        self.line.close()
+
+    # ---- how it is done ------------------------------------------------------------------------------------------
+
+    def _name(self, id: int) -> str:
+        return f"{self.names[id]} (id {id})" if id in self.names else f"servo {id}"
+
+    def _place(self, id: int) -> str:
+        return f"{self.line.path}, {self._name(id)}"
+
+    def wire_s(self, count: int) -> float:
+        """How long `count` bytes take on the wire."""
+        return count * BITS_PER_BYTE / self.line.baud
+
+    def _send(self, packet: bytes) -> float:
+        """Write a packet after the gap that the last one needs; returns when its first byte left."""
+        gap = self._quiet_from + self.timing.write_read_gap_s
+        if self.clock.now() < gap:
+            self.clock.sleep_until(gap)
+        stale = self.line.read()
+        if stale:
+            self._count_stale(stale)
+        started = self.clock.now()
+        self.line.write(packet)
+        self._quiet_from = started + self.wire_s(len(packet))
+        return started
+
+    def _count_stale(self, data: bytes) -> None:
+        """Bytes nobody waits for any more: answers too late even for the grace, or noise."""
+        parser = Parser()
+        for item in parser.feed(data) + parser.flush():
+            if isinstance(item, Garbage):
+                self.statistics.noise_bytes += len(item.data)
+            elif isinstance(item, Status):
+                servo = self.statistics.of(item.id)
+                servo.lost[Cause.LATE] = servo.lost.get(Cause.LATE, 0) + 1
+                if servo.lost.get(Cause.TIMEOUT, 0):
+                    servo.lost[Cause.TIMEOUT] -= 1
+
+    def _patience(self, sent: int, replies: int, count: int) -> tuple[float, float]:
+        """(whole, quiet): s from the request's first byte to the last answer's last; s without a byte that mean none
+        will come."""
+        timing = self.timing
+        one = self.wire_s(count + STATUS_OVERHEAD) + timing.return_delay_s
+        spare = timing.latency_timer_s + timing.margin_s
+        return self.wire_s(sent) + replies * one + spare, one + spare
+
+    def _exchange(self, instruction: Instruction, ids: Sequence[int], count: int) -> list[Answer]:
+        """Send a request and collect one answer of `count` bytes from each of `ids`."""
+        packet = instruction.encode()
+        whole, quiet = self._patience(len(packet), len(ids), count)
+        started = self._send(packet)
+        deadline = started + whole
+        size = count + STATUS_OVERHEAD
+        buffer = bytearray()
+        edges: list[tuple[int, float, bool]] = []  # (bytes so far, when, whether in time)
+        # A refusal is shorter than an answer and stuffing makes it longer: the length field tells, once it is there.
+        heads = [p2.HEADER + bytes((id,)) for id in ids]
+        known, at_known, plain, expected = 0, 0, True, size * len(ids)
+        in_time = True
+        wait, read, now = self.clock.wait_readable, self.line.read, self.clock.now
+        while len(buffer) < expected:
+            if not wait(self.line, deadline):
+                if not in_time or self.timing.grace_s <= 0:
+                    break
+                in_time, deadline = False, deadline + self.timing.grace_s
+                continue
+            buffer += read()
+            at = now()
+            edges.append((len(buffer), at, in_time))
+            while known < len(ids) and len(buffer) >= at_known + 7 and buffer.startswith(heads[known], at_known):
+                actual = 7 + (buffer[at_known + 5] | buffer[at_known + 6] << 8)
+                if actual != size:
+                    plain, expected = False, expected + actual - size
+                known, at_known = known + 1, at_known + actual
+            if len(buffer) < expected and in_time:
+                deadline = min(deadline, max(at, started + self.wire_s(len(packet))) + quiet)
+        if buffer:
+            self._quiet_from = self.clock.now() - self.timing.write_read_gap_s
+        answers: list[Answer] = []
+        if plain and known == len(ids) and len(buffer) == expected and in_time:
+            # The usual case: every head where it should be; checksums and stuffing are left to look at.
+            for k, id in enumerate(ids):
+                part = bytes(buffer[k * size : (k + 1) * size])
+                if part[7] != p2.Inst.STATUS or p2.crc16(part[:-2]) != part[-2] | part[-1] << 8 or _MARK in part[7:]:
+                    answers.clear()
+                    break
+                answers.append(Answer(id, part[9:-2], part[8], None, _when((k + 1) * size, edges)[0] - started))
+        if not answers:
+            answers = self._sort_out(bytes(buffer), ids, edges, started)
+        for answer in answers:
+            self.statistics.count(answer.id, answer.cause, answer.rtt, answer.alert)
+        return answers
+
+    def _sort_out(
+        self, data: bytes, ids: Sequence[int], edges: list[tuple[int, float, bool]], started: float
+    ) -> list[Answer]:
+        """Answers from a stream in which something is missing, broken, stuffed or late."""
+        parser = Parser()
+        got: dict[int, Answer] = {}
+        broken: list[tuple[int, Cause]] = []  # (position in `ids` behind which it stands, cause)
+        position, at = 0, 0
+        for item in parser.feed(data) + parser.flush():
+            if isinstance(item, Status):
+                at += len(item.encode())
+                if item.id in ids and item.id not in got:
+                    when, in_time = _when(at, edges)
+                    cause = None if in_time else Cause.LATE
+                    got[item.id] = Answer(item.id, item.params, item.error, cause, when - started)
+                    position = ids.index(item.id) + 1
+                else:
+                    self.statistics.noise_bytes += len(item.encode())
+            elif isinstance(item, Garbage):
+                at += len(item.data)
+                self.statistics.noise_bytes += len(item.data)
+                broken.append((position, Cause.SHORT if item.reason is Reason.SHORT else Cause.CRC))
+            elif isinstance(item, JoinedStatus):
+                at += len(item.raw)
+            else:
+                at += len(item.encode())  # our own request, echoed by an adapter without echo suppression
+        answers: list[Answer] = []
+        for k, id in enumerate(ids):
+            answer = got.get(id)
+            if answer is None:
+                # Garbage belongs to the first silent servo behind whose predecessor it stands.
+                mine = next((entry for entry in broken if entry[0] <= k), None)
+                if mine is not None:
+                    broken.remove(mine)
+                answer = Answer(id, None, 0, Cause.TIMEOUT if mine is None else mine[1])
+            answers.append(answer)
+        return answers
+
+    def _fast_sync_read(self, address: int, count: int, ids: Sequence[int]) -> list[Answer | None]:
+        """The verified part of a joined reply; None for those it does not reach."""
+        packet = p2.fast_sync_read(address, count, ids).encode()
+        whole, quiet = self._patience(len(packet), len(ids), count)
+        started = self._send(packet)
+        deadline = started + whole
+        expected, buffer = 8 + len(ids) * (count + 4), bytearray()
+        edges: list[tuple[int, float, bool]] = []
+        while len(buffer) < expected and self.clock.wait_readable(self.line, deadline):
+            buffer += self.line.read()
+            edges.append((len(buffer), self.clock.now(), True))
+            deadline = min(deadline, max(edges[-1][1] + quiet, started + self.wire_s(len(packet)) + quiet))
+        if buffer:
+            self._quiet_from = self.clock.now() - self.timing.write_read_gap_s
+        at = buffer.find(p2.HEADER)
+        parts = p2.split_joined(bytes(buffer[max(at, 0) :]), [(id, count) for id in ids])
+        answers: list[Answer | None] = [None] * len(ids)
+        for k, part in enumerate(parts):
+            when, _ = _when(at + 8 + (k + 1) * (count + 4), edges)
+            answers[k] = Answer(part.id, part.params, part.error, None, when - started)
+            self.statistics.count(part.id, None, when - started, bool(part.error & p2.ALERT_BIT))
+        if len(parts) < len(ids):
+            broken = len(buffer) - max(at, 0) - 8 - len(parts) * (count + 4)
+            cause = Cause.TIMEOUT if broken <= 0 else Cause.SHORT if len(buffer) < expected else Cause.CRC
+            self.statistics.count(ids[len(parts)], cause, None, False)
+        return answers
+
+    def _insist(self, instruction: Instruction, id: int, count: int, what: str) -> Answer:
+        """One servo's answer, asked for again up to `retries` times; raises where it says no or nothing."""
+        for attempt in range(1 + self.retries):
+            if attempt:
+                self.statistics.of(id).retries += 1
+            answer = self._exchange(instruction, [id], count)[0]
+            if answer.data is not None:
+                break
+        else:
+            self.require([answer])
+        self._check(answer, what)
+        return answer
+
+    def _order(self, instruction: Instruction, id: int, what: str) -> None:
+        """An instruction with an effect: not sent twice, since the first may have been done. Broadcasts go unheard."""
+        if id == p2.BROADCAST:
+            self.send(instruction.encode())
+            return
+        [answer] = self._exchange(instruction, [id], 0)
+        if answer.data is None:
+            self.require([answer])
+        self._check(answer, what)
+
+    def _check(self, answer: Answer, what: str) -> None:
+        if answer.refusal:
+            why, remedy = refusal_words(answer.refusal)
+            raise Refused(
+                answer.id, answer.refusal, f"refuses {what}: {why}", where=self._place(answer.id), remedy=remedy
+            )
+
+
+def _found(answer: Answer) -> Found:
+    assert answer.data is not None
+    model, firmware = struct.unpack("<HB", answer.data[:3])
+    return Found(answer.id, model, firmware, answer.alert)
+
+
+def _when(count: int, edges: Sequence[tuple[int, float, bool]]) -> tuple[float, bool]:
+    """When the byte number `count` had arrived, and whether in time."""
+    for total, at, in_time in edges:
+        if total >= count:
+            return at, in_time
+    return edges[-1][1], edges[-1][2]

@@ -1,0 +1,165 @@
+"""The clock that engine and drivers live by: the host's own, or a virtual robot's that is stepped.
+
+Nothing in a driver sleeps or asks the time but through a `Clock`, so that the same code runs a real robot in real time
+and a virtual one as fast as it can be computed.
+"""
+
+from __future__ import annotations
+
+import json
+import select
+import socket
+import time
+from pathlib import Path
+from typing import Any, Protocol
+
+from openant_tools.comms.line import Line
+from openant_tools.errors import HardwareFault
+
+__all__ = ["Clock", "RealClock", "SteppedClock", "VirtualControl"]
+
+#: `sleep` overshoots by 0.1 ms at best on Linux: the last stretch is spun where a deadline is to be met.
+SPIN_S = 0.15e-3
+#: Real time that a stepped virtual robot may need to answer; it computes physics meanwhile.
+CONTROL_TIMEOUT_S = 30.0
+
+
+class Clock(Protocol):
+    """Time in s, monotonic, of no particular origin."""
+
+    @property
+    def stepped(self) -> bool:
+        """Whether time stands still while nobody waits."""
+        ...
+
+    def now(self) -> float: ...
+
+    def sleep_until(self, t: float) -> None:
+        """Return at `t`, at once where that has passed."""
+        ...
+
+    def wait_readable(self, line: Line, deadline: float) -> bool:
+        """True as soon as `line` has bytes to read, False at the deadline. Bytes that already lie there count
+        even after the deadline: then it was this process that was late, not they."""
+        ...
+
+
+class RealClock:
+    """The host's monotonic clock, the same one for all processes."""
+
+    stepped = False
+
+    def now(self) -> float:
+        return time.monotonic()
+
+    def sleep_until(self, t: float) -> None:
+        rest = t - time.monotonic()
+        if rest > SPIN_S:
+            time.sleep(rest - SPIN_S)
+        while time.monotonic() < t:
+            pass
+
+    def wait_readable(self, line: Line, deadline: float) -> bool:
+        ready, _, _ = select.select([line], [], [], max(0.0, deadline - time.monotonic()))
+        return bool(ready)
+
+
+class VirtualControl:
+    """The control socket of a virtual robot: one line of JSON out, one back."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = str(path)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._socket.settimeout(CONTROL_TIMEOUT_S)
+        try:
+            self._socket.connect(self.path)
+        except OSError as error:
+            raise HardwareFault(
+                f"no virtual robot listens here ({error.strerror})",
+                where=self.path,
+                remedy="start one with `openant virtual start --ready-file FILE` and name that file",
+            ) from None
+        self._rest = b""
+
+    def ask(self, do: str, **fields: Any) -> dict[str, Any]:
+        """Send one request; its answer. Raises HardwareFault where the robot has gone or refuses."""
+        try:
+            self._socket.sendall(json.dumps({"do": do, **fields}).encode() + b"\n")
+            while b"\n" not in self._rest:
+                data = self._socket.recv(65536)
+                if not data:
+                    raise ConnectionResetError("it closed the connection")
+                self._rest += data
+        except OSError as error:
+            raise HardwareFault(
+                f"the virtual robot stopped answering ({error})", where=self.path, remedy="start it again"
+            ) from None
+        line, _, self._rest = self._rest.partition(b"\n")
+        answer: dict[str, Any] = json.loads(line)
+        if "error" in answer:
+            raise HardwareFault(f"the virtual robot refuses {do!r}: {answer['error']}", where=self.path)
+        return answer
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class SteppedClock:
+    """A virtual robot's clock: it moves only while somebody waits, as fast as the physics can be computed.
+
+    Pseudo-terminals deliver when they please, so before time moves the robot is told how many bytes have been
+    written, and after it how many to expect.
+    """
+
+    stepped = True
+
+    def __init__(self, control: VirtualControl, *, bus: Line | None = None, imu: Line | None = None) -> None:
+        self._control = control
+        self._lines: dict[str, Line] = {}
+        self._sent: dict[str, int] = {"bus": 0, "imu": 0}
+        self._settled: dict[str, int] = {}
+        answer = control.ask("now")
+        if not answer["stepped"]:
+            raise HardwareFault(
+                "this virtual robot runs in real time", where=control.path, remedy='[clock] mode = "stepped"'
+            )
+        self._t = float(answer["t"])
+        if bus is not None:
+            self.attach("bus", bus)
+        if imu is not None:
+            self.attach("imu", imu)
+
+    def attach(self, name: str, line: Line) -> None:
+        """Take `line` as the robot's "bus" or "imu"."""
+        self._lines[name] = line
+        self._settled[name] = line.written
+
+    def now(self) -> float:
+        return self._t
+
+    def sleep_until(self, t: float) -> None:
+        if any(line.written != self._settled[name] for name, line in self._lines.items()):
+            self._settle()
+        if t > self._t:
+            self._t = float(self._control.ask("advance", to=t)["t"])
+
+    def wait_readable(self, line: Line, deadline: float) -> bool:
+        name = next(name for name, known in self._lines.items() if known is line)
+        if line.received >= self._sent[name]:
+            self._settle()
+        if line.received >= self._sent[name]:
+            self.sleep_until(deadline)
+            self._settle()
+        if line.received >= self._sent[name] or self._t > deadline:
+            return False
+        ready, _, _ = select.select([line], [], [], CONTROL_TIMEOUT_S)
+        if not ready:
+            raise HardwareFault("the virtual robot's bytes do not arrive", where=line.path)
+        return True
+
+    def _settle(self) -> None:
+        self._settled = {name: line.written for name, line in self._lines.items()}
+        answer = self._control.ask("settle", **{f"{name}_written": count for name, count in self._settled.items()})
+        self._t = max(self._t, float(answer["t"]))
+        for name in self._sent:
+            self._sent[name] = int(answer.get(f"{name}_sent", self._sent[name]))

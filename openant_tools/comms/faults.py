@@ -1,0 +1,107 @@
+"""What went wrong on the bus, in words that name the cause and the next thing to do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
+
+from openant_tools.comms.protocol2 import Error
+from openant_tools.errors import HardwareFault
+
+__all__ = ["BrokenAnswer", "Cause", "NoAnswer", "Refused", "missing_answers", "refusal_words"]
+
+
+class Cause(StrEnum):
+    """Why a valid answer did not come in time; the words of `err.J` in a run table (formats, section 1)."""
+
+    TIMEOUT = "timeout"
+    CRC = "crc"
+    SHORT = "short"
+    LATE = "late"
+    PORT = "port"
+    #: a valid answer with its alert bit: no loss
+    ALERT = "alert"
+
+
+class NoAnswer(HardwareFault):
+    """One or more servos stayed silent."""
+
+
+class BrokenAnswer(HardwareFault):
+    """Bytes came, but no answer could be read from them."""
+
+
+class Refused(HardwareFault):
+    """The servo understood and said no.
+
+    Attributes:
+        id: which servo.
+        code: its error code, see `protocol2.Error`.
+    """
+
+    def __init__(self, id: int, code: int, what: str, *, where: str | None = None, remedy: str | None = None) -> None:
+        super().__init__(what, where=where, remedy=remedy)
+        self.id = id
+        self.code = code
+
+
+_REFUSALS: Mapping[int, tuple[str, str]] = {
+    Error.RESULT_FAIL: (
+        "it could not do it",
+        "stop the motion and switch torque off first; after a shutdown reboot the servo",
+    ),
+    Error.INSTRUCTION: ("it does not know this instruction", "its firmware may be too old for it"),
+    Error.CRC: ("our packet reached it broken", "look at the cable before this servo"),
+    Error.DATA_RANGE: (
+        "the value is outside the register's range, or the Bus Watchdog has tripped and locked the goals",
+        "read bus_watchdog: where it reads -1, write 0 to clear it",
+    ),
+    Error.DATA_LENGTH: ("too few bytes for this register", "write the whole register"),
+    Error.DATA_LIMIT: ("the value is beyond a limit that the servo is set to", "look at its limit registers"),
+    Error.ACCESS: (
+        "this register cannot be written now",
+        "EEPROM is locked while torque is on: switch torque off first; read-only registers never take a write",
+    ),
+}
+
+
+def refusal_words(code: int) -> tuple[str, str]:
+    """What an error code says, and what to do about it."""
+    return _REFUSALS.get(code, (f"it answers with the unknown error code {code}", "look at the servo's manual"))
+
+
+def missing_answers(asked: Sequence[str], answered: Sequence[bool], *, where: str, speed: str) -> NoAnswer:
+    """The error for a chain in which some servos did not answer.
+
+    Args:
+        asked: the servos' names, in the order of the question.
+        answered: whether each did.
+        where: the port.
+        speed: the baud rate, spelled out.
+    """
+    silent = [name for name, ok in zip(asked, answered, strict=True) if not ok]
+    if len(silent) == len(asked):
+        if len(asked) == 1:
+            return NoAnswer(
+                f"{asked[0]} does not answer at {speed}",
+                where=where,
+                remedy="look at its cable, id and baud rate: `openant comms scan` tries all",
+            )
+        return NoAnswer(
+            f"nothing answered at {speed}: none of {len(asked)} servos",
+            where=where,
+            remedy="is the supply on, and the first cable in? `openant comms scan` tries all baud rates",
+        )
+    first = answered.index(False)
+    if not any(answered[first:]):
+        last = asked[first - 1]
+        return NoAnswer(
+            f"the first {first} of {len(asked)} servos answered, then silence from {asked[first]}",
+            where=where,
+            remedy=f"look at the cable between {last} and {asked[first]}, then at {asked[first]} itself",
+        )
+    return NoAnswer(
+        f"{len(silent)} of {len(asked)} servos did not answer: {', '.join(silent)}",
+        where=where,
+        remedy=f"those behind them do: look at the connectors of {silent[0]}, and at its id",
+    )

@@ -1,0 +1,211 @@
+"""Serial ports: which are there, which is a servo bus, who holds one, and why one does not open.
+
+A port is told by its USB identity, never by sending bytes: Betaflight takes `R` followed by silence as "reboot to the
+boot loader", and any packet's checksum may end so. What the host knows is behind `Host`, so that all of this is tested
+on recorded trees of /sys, /proc and /dev.
+"""
+
+from __future__ import annotations
+
+import errno
+import grp
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from openant_tools.errors import HardwareFault
+
+__all__ = ["FLIGHT_CONTROLLER", "U2D2", "Host", "Port", "explain_open_error", "udev_rule"]
+
+#: USB VID:PID of ROBOTIS' U2D2 (FTDI FT232H) and of STM32 flight controllers (virtual COM port).
+U2D2 = ("0403", "6014")
+FLIGHT_CONTROLLER = ("0483", "5740")
+#: 1 ms instead of the driver's 16: every reply of a servo is shorter than the adapter's buffer.
+WANTED_LATENCY_MS = 1
+_TTY_MAJOR_NAMES = ("ttyUSB", "ttyACM")
+
+Kind = Literal["bus", "imu", "unknown"]
+
+
+@dataclass(frozen=True)
+class Port:
+    """One serial port of this host.
+
+    Attributes:
+        path: the device, such as /dev/ttyUSB0.
+        by_id: the path that stays the same over re-plugging and reboots, where there is one.
+        kind: what its USB identity says it is.
+        latency_timer_ms: of an FTDI adapter.
+    """
+
+    path: str
+    by_id: str | None = None
+    vendor_id: str = ""
+    product_id: str = ""
+    serial_number: str = ""
+    product: str = ""
+    driver: str = ""
+    latency_timer_ms: int | None = None
+
+    @property
+    def kind(self) -> Kind:
+        identity = (self.vendor_id, self.product_id)
+        return "bus" if identity == U2D2 else "imu" if identity == FLIGHT_CONTROLLER else "unknown"
+
+    @property
+    def stable_path(self) -> str:
+        return self.by_id or self.path
+
+
+@dataclass(frozen=True)
+class Holder:
+    """A process that has a port open."""
+
+    pid: int
+    command: str
+
+
+@dataclass(frozen=True)
+class Host:
+    """What this module asks of the machine: three trees. Tests give it recorded ones."""
+
+    sys: Path = Path("/sys")
+    proc: Path = Path("/proc")
+    dev: Path = Path("/dev")
+
+    def ports(self) -> list[Port]:
+        """Every USB serial port, buses first, then by path."""
+        found = [self._port(tty) for tty in self._ttys()]
+        order = {"bus": 0, "imu": 1, "unknown": 2}
+        return sorted(found, key=lambda port: (order[port.kind], port.path))
+
+    def _ttys(self) -> Iterator[Path]:
+        folder = self.sys / "class" / "tty"
+        if folder.is_dir():
+            yield from sorted(tty for tty in folder.iterdir() if tty.name.startswith(_TTY_MAJOR_NAMES))
+
+    def _port(self, tty: Path) -> Port:
+        interface = (tty / "device").resolve()
+        usb = next((at for at in (interface, *interface.parents) if (at / "idVendor").is_file()), None)
+        driver = (tty / "device" / "driver").resolve().name if (tty / "device" / "driver").exists() else ""
+        return Port(
+            path=str(self.dev / tty.name),
+            by_id=self._by_id(tty.name),
+            vendor_id=_text(usb / "idVendor") if usb else "",
+            product_id=_text(usb / "idProduct") if usb else "",
+            serial_number=_text(usb / "serial") if usb else "",
+            product=_text(usb / "product") if usb else "",
+            driver=driver,
+            latency_timer_ms=self.latency_timer_ms(str(self.dev / tty.name)),
+        )
+
+    def _by_id(self, name: str) -> str | None:
+        folder = self.dev / "serial" / "by-id"
+        if folder.is_dir():
+            for link in sorted(folder.iterdir()):
+                if link.is_symlink() and Path(os.readlink(link)).name == name:
+                    return str(link)
+        return None
+
+    # ---- the latency timer ---------------------------------------------------------------------------------------
+
+    def _latency_file(self, path: str) -> Path:
+        return self.sys / "bus" / "usb-serial" / "devices" / self._name(path) / "latency_timer"
+
+    def latency_timer_ms(self, path: str) -> int | None:
+        """What the FTDI driver waits before it hands over a short reply; None where the port has no such timer."""
+        text = _text(self._latency_file(path))
+        return int(text) if text.isdigit() else None
+
+    def set_latency_timer_ms(self, path: str, value: int = WANTED_LATENCY_MS) -> bool:
+        """Set it and read it back. False where it did not take: see `udev_rule`."""
+        try:
+            self._latency_file(path).write_text(str(value))
+        except OSError:
+            pass  # no such timer, or not ours to write: the value read back says so
+        return self.latency_timer_ms(path) == value
+
+    # ---- who holds it, and why it does not open ------------------------------------------------------------------
+
+    def _name(self, path: str) -> str:
+        return Path(os.path.realpath(path)).name
+
+    def holders(self, path: str) -> list[Holder]:
+        """Processes that have the port open, as far as this user may see them."""
+        name, found = self._name(path), list[Holder]()
+        try:
+            processes = sorted(
+                (entry for entry in self.proc.iterdir() if entry.name.isdigit()), key=lambda p: int(p.name)
+            )
+        except OSError:
+            return found
+        for process in processes:
+            try:
+                targets = [os.readlink(descriptor) for descriptor in (process / "fd").iterdir()]
+            except OSError:
+                continue  # another user's, or gone meanwhile
+            if any(Path(target).name == name and "/dev/" in target for target in targets):
+                words = _bytes(process / "cmdline").replace(b"\0", b" ").decode(errors="replace").strip()
+                found.append(Holder(int(process.name), words or _text(process / "comm")))
+        return found
+
+    def missing_group(self, path: str) -> str | None:
+        """The group that owns the port, where this user is not in it."""
+        try:
+            gid = os.stat(path).st_gid
+        except OSError:
+            return None
+        if os.geteuid() == 0 or gid in os.getgroups():
+            return None
+        try:
+            return grp.getgrgid(gid).gr_name
+        except KeyError:
+            return str(gid)
+
+
+def udev_rule() -> str:
+    """The rule that sets every U2D2's latency timer to 1 ms when it is plugged, and how to install it."""
+    rule = f'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{{latency_timer}}="{WANTED_LATENCY_MS}"'
+    return (
+        f"echo '{rule}' | sudo tee /etc/udev/rules.d/99-openant-latency.rules\n"
+        "sudo udevadm control --reload && sudo udevadm trigger --action=add --subsystem-match=usb-serial"
+    )
+
+
+def explain_open_error(path: str, error: Exception, host: Host | None = None) -> HardwareFault:
+    """Why a port does not open, and what to do: missing, busy and by whom, or forbidden and which group."""
+    host = host or Host()
+    code = getattr(error, "errno", None)
+    if "://" in path:
+        return HardwareFault(f"nobody answers there ({error})", where=path, remedy="start the virtual robot first")
+    if code == errno.ENOENT or not os.path.exists(path):
+        known = [port.stable_path for port in host.ports() if port.kind == "bus"]
+        remedy = f"the bus that is plugged in is {known[0]}" if known else "plug the adapter in: `openant comms ports`"
+        return HardwareFault("there is no such port", where=path, remedy=remedy)
+    if code in (errno.EACCES, errno.EPERM):
+        group = host.missing_group(path)
+        remedy = f"run `sudo usermod -aG {group} $USER` and log in again" if group else "look at its permissions"
+        return HardwareFault("this user may not open it", where=path, remedy=remedy)
+    if code in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "lock" in str(error).lower():
+        holders = [holder for holder in host.holders(path) if holder.pid != os.getpid()]
+        if holders:
+            who = ", ".join(f"{holder.command} (process {holder.pid})" for holder in holders)
+            return HardwareFault(f"it is held by {who}", where=path, remedy="close that program first")
+        return HardwareFault("another program holds it", where=path, remedy="close that program first")
+    if sys.platform == "darwin" and "/tty." in path:
+        return HardwareFault(str(error), where=path, remedy=f"use {path.replace('/tty.', '/cu.')}")
+    return HardwareFault(f"it does not open ({error})", where=path, remedy="is this a serial port?")
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError:
+        return b""
+
+
+def _text(path: Path) -> str:
+    return _bytes(path).decode(errors="replace").strip()

@@ -1,0 +1,298 @@
+"""The servos of a robot by joint and register name, in SI units, on top of a bus.
+
+Joint angles follow one convention: joint = direction · (servo − zero), with the servo's own angle counted from its
+register's zero. Everything else is in the servo's own frame, as its registers hold it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from openant_tools.comms.bus import FAST_READ_FIRMWARE, Answer, Bus, Found
+from openant_tools.comms.faults import Cause, Refused
+from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.robot.registers import EEPROM_END, Register
+from openant_tools.robot.servo import HardwareError, ServoModel, hardware_errors, servo_model
+
+__all__ = ["BLOCK", "BLOCK_ADDRESS", "BLOCK_SIZE", "Block", "EepromWrite", "Servo", "Servos"]
+
+#: Registers 120…146 in one read: tick, moving, moving status, PWM, current or load, velocity, position, velocity and
+#: position trajectory, voltage, temperature.
+BLOCK_ADDRESS = 120
+BLOCK_SIZE = 27
+BLOCK = struct.Struct("<HBBhhiiiiHB")
+_GOAL = struct.Struct("<i")
+#: A clear of the watchdog and its trip value (register 98).
+WATCHDOG_TRIPPED = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Registers 120…146 of one servo, in counts."""
+
+    tick: int
+    moving: int
+    moving_status: int
+    pwm: int
+    effort: int
+    velocity: int
+    position: int
+    velocity_trajectory: int
+    position_trajectory: int
+    voltage: int
+    temperature: int
+
+
+@dataclass(frozen=True)
+class Servo:
+    """One servo of the robot: who it is, and how its angle is its joint's.
+
+    Attributes:
+        direction: +1 or −1; joint = direction · (servo − zero).
+        zero_rad: servo angle at the joint's zero.
+    """
+
+    joint: str
+    id: int
+    model: ServoModel
+    direction: int = 1
+    zero_rad: float = 0.0
+    firmware: int | None = None
+
+    def to_joint(self, servo_rad: float) -> float:
+        return self.direction * (servo_rad - self.zero_rad)
+
+    def to_servo(self, joint_rad: float) -> float:
+        return self.direction * joint_rad + self.zero_rad
+
+
+@dataclass(frozen=True)
+class EepromWrite:
+    """One change of a servo's permanent memory, for the journal; counts."""
+
+    joint: str
+    id: int
+    register: str
+    old: int
+    new: int
+
+
+@dataclass
+class Servos:
+    """The servos of one bus.
+
+    Attributes:
+        journal: every EEPROM write done through this object, in order; the caller keeps it.
+    """
+
+    bus: Bus
+    servos: Sequence[Servo]
+    journal: list[EepromWrite] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._by_joint = {servo.joint: servo for servo in self.servos}
+        self.ids = [servo.id for servo in self.servos]
+        if len(set(self.ids)) != len(self.ids):
+            raise BadInput(f"two servos share an id: {sorted(self.ids)}", remedy="give each servo an id of its own")
+        self.bus.names = {servo.id: servo.joint for servo in self.servos}
+
+    def __getitem__(self, joint: str) -> Servo:
+        try:
+            return self._by_joint[joint]
+        except KeyError:
+            raise BadInput(f"no joint {joint!r}", remedy=f"the joints are {', '.join(self._by_joint)}") from None
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        return tuple(self._by_joint)
+
+    # ---- who is there --------------------------------------------------------------------------------------------
+
+    def identify(self) -> dict[str, Found]:
+        """Ping every servo; joint → what answered.
+
+        Raises:
+            NoAnswer: some are silent; the message names the cable.
+            HardwareFault: one is of another model than expected.
+        """
+        found: dict[str, Found] = {}
+        answers: list[Answer] = []
+        for servo in self.servos:
+            seen = self.bus.ping(servo.id) or self.bus.ping(servo.id)
+            answers.append(Answer(servo.id, b"" if seen else None, 0, None if seen else Cause.TIMEOUT))
+            if seen:
+                found[servo.joint] = seen
+        self.bus.require(answers)
+        for servo in self.servos:
+            seen = found[servo.joint]
+            if seen.model_number != servo.model.number:
+                raise HardwareFault(
+                    f"{servo.joint} (id {servo.id}) is a {_model_name(seen.model_number)}, not a {servo.model.name}",
+                    where=self.bus.line.path,
+                    remedy="correct its model in robot.toml, or the id of the servo: two may be swapped",
+                )
+        self.bus.fast = {servo.id for servo in self.servos if found[servo.joint].firmware >= FAST_READ_FIRMWARE}
+        return found
+
+    # ---- registers by name ---------------------------------------------------------------------------------------
+
+    def read_counts(self, register: str, joint: str) -> int:
+        servo, item = self._item(register, joint)
+        return item.decode(self.bus.read(servo.id, item.address, item.size))
+
+    def read(self, register: str, joint: str) -> float:
+        """A register in its SI unit, in the servo's own frame."""
+        return float(self._item(register, joint)[1].to_si(self.read_counts(register, joint)))
+
+    def read_all(self, register: str, joints: Iterable[str] | None = None) -> dict[str, int]:
+        """A register of many joints, joint → counts, by one sync read where its address is the same everywhere."""
+        wanted = [self[joint] for joint in (self.joints if joints is None else joints)]
+        items = {servo.joint: servo.model.register(register) for servo in wanted}
+        first = next(iter(items.values()))
+        answers = self.bus.sync_read(first.address, first.size, [servo.id for servo in wanted])
+        values: dict[str, int] = {}
+        for servo, answer in zip(wanted, answers, strict=True):
+            if answer.data is not None and len(answer.data) == first.size and not answer.refusal:
+                values[servo.joint] = items[servo.joint].decode(answer.data)
+            else:
+                values[servo.joint] = self.read_counts(register, servo.joint)  # alone, retried and counted
+        return values
+
+    def write(self, register: str, joint: str, value: float) -> None:
+        """Set a register in its SI unit; see `write_counts`."""
+        self.write_counts(register, joint, self._item(register, joint)[1].to_counts(value))
+
+    def write_counts(self, register: str, joint: str, counts: int) -> None:
+        """Set a register and prove it.
+
+        EEPROM is written only where the value differs, is read back, and stands in `journal`.
+
+        Raises:
+            BadInput: no such register, not writable, or out of its range.
+            Refused: the servo says no; the message names register and rule.
+            HardwareFault: it reads back as something else.
+        """
+        servo, item = self._item(register, joint)
+        if not item.writable:
+            raise BadInput(f"{register} of {joint} cannot be written")
+        item.check(counts)
+        old = None
+        if item.address < EEPROM_END:
+            old = item.decode(self.bus.read(servo.id, item.address, item.size))
+            if old == counts:
+                return
+        data = item.encode(counts)
+        try:
+            self.bus.write(servo.id, item.address, data, f"{register} = {counts}")
+        except Refused as refusal:
+            raise self._explained(refusal, servo) from None
+        if old is not None:
+            self.journal.append(EepromWrite(joint, servo.id, register, old, counts))
+            reader = counts if register == "id" else servo.id
+            now = item.decode(self.bus.read(reader, item.address, item.size))
+            if now != counts:
+                raise HardwareFault(
+                    f"{register} of {joint} (id {servo.id}) reads back {now} after writing {counts}",
+                    where=self.bus.line.path,
+                    remedy="write it again; a servo that forgets its memory must be replaced",
+                )
+
+    def write_all(self, register: str, counts: Mapping[str, int]) -> float:
+        """A RAM register of many joints by one sync write, unanswered; the time its last byte has left (s)."""
+        items = [(self[joint], self[joint].model.register(register), value) for joint, value in counts.items()]
+        for _, item, value in items:
+            item.check(value)
+        first = items[0][1]
+        data = {servo.id: item.encode(value) for servo, item, value in items}
+        return self.bus.sync_write(first.address, first.size, data)
+
+    def _item(self, register: str, joint: str) -> tuple[Servo, Register]:
+        servo = self[joint]
+        return servo, servo.model.register(register)
+
+    def _explained(self, refusal: Refused, servo: Servo) -> Refused:
+        """A refusal may be the watchdog's lock: say so only where it is."""
+        if refusal.code == 4 and "bus_watchdog" in servo.model.registers:
+            try:
+                tripped = self.read_counts("bus_watchdog", servo.joint) == WATCHDOG_TRIPPED
+            except HardwareFault:
+                tripped = False
+            if tripped:
+                return Refused(
+                    refusal.id, refusal.code, "its Bus Watchdog has tripped and locked the goals",
+                    where=refusal.where, remedy="connect again: that reports and clears it",
+                )  # fmt: skip
+        return refusal
+
+    # ---- every cycle ---------------------------------------------------------------------------------------------
+
+    def read_blocks(self) -> list[tuple[Answer, Block | None]]:
+        """Registers 120…146 of every servo, in order, in one request."""
+        answers = self.bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, self.ids)
+        return [
+            (answer, Block(*BLOCK.unpack(answer.data)) if answer.data and len(answer.data) == BLOCK_SIZE else None)
+            for answer in answers
+        ]
+
+    def goal_counts(self, joint_rad: Sequence[float]) -> list[int]:
+        """Goal positions in counts for joint angles (rad), in the order of `servos`."""
+        return [
+            round(servo.to_servo(angle) / servo.model.registers["goal_position"].scale)
+            for servo, angle in zip(self.servos, joint_rad, strict=True)
+        ]
+
+    def joint_rad(self, counts: Sequence[int]) -> list[float]:
+        """Joint angles (rad) of position counts."""
+        return [
+            servo.to_joint(count * servo.model.registers["present_position"].scale)
+            for servo, count in zip(self.servos, counts, strict=True)
+        ]
+
+    def write_goals(self, counts: Sequence[int]) -> float:
+        """Goal positions of all servos in counts; the time the last byte has left (s)."""
+        return self.bus.sync_write(116, 4, {id: _GOAL.pack(count) for id, count in zip(self.ids, counts, strict=True)})
+
+    # ---- torque, watchdog, errors --------------------------------------------------------------------------------
+
+    def set_torque(self, on: bool, joints: Iterable[str] | None = None) -> None:
+        """Torque of these joints (default all), each proven by its answer."""
+        for joint in self.joints if joints is None else joints:
+            servo = self[joint]
+            try:
+                self.bus.write(servo.id, 64, bytes((on,)), "torque on" if on else "torque off")
+            except Refused as refusal:
+                errors = self.hardware_errors(joint)
+                if not errors:
+                    raise
+                raise Refused(
+                    servo.id, refusal.code, f"torque stays off after {errors[0].name}",
+                    where=refusal.where, remedy=errors[0].advice,
+                ) from None  # fmt: skip
+
+    def torque_off_now(self) -> None:
+        """One unanswered packet that releases every servo, sent twice: the emergency way."""
+        for _ in range(2):
+            self.bus.sync_write(64, 1, dict.fromkeys(self.ids, b"\0"))
+
+    def hardware_errors(self, joint: str) -> tuple[HardwareError, ...]:
+        """What stands in Hardware Error Status (70), decoded."""
+        return hardware_errors(self.read_counts("hardware_error_status", joint))
+
+    def tripped_watchdogs(self) -> list[str]:
+        """Joints whose Bus Watchdog has tripped: their goals are locked and torque is still on."""
+        able = [servo.joint for servo in self.servos if (servo.firmware or 99) >= 38]
+        return [joint for joint, value in self.read_all("bus_watchdog", able).items() if value == WATCHDOG_TRIPPED]
+
+    def set_watchdogs(self, counts: int) -> None:
+        """Arm the Bus Watchdog of every servo (units of 20 ms), or clear it with 0."""
+        for joint in self.joints:
+            self.write_counts("bus_watchdog", joint, counts)
+
+
+def _model_name(number: int) -> str:
+    try:
+        return servo_model(number).name
+    except BadInput:
+        return f"servo of model number {number}"

@@ -1,0 +1,98 @@
+"""What the bus did so far, per servo: losses by cause, retries, and how long answers took."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from openant_tools.comms.faults import Cause
+
+__all__ = ["LATENCY_BIN_S", "BusStatistics", "ServoStatistics"]
+
+#: width of a histogram's bin; the last bin holds everything above
+LATENCY_BIN_S = 0.25e-3
+LATENCY_BINS = 160
+
+
+@dataclass
+class ServoStatistics:
+    """One servo's answers.
+
+    Attributes:
+        asked, answered: requests that wanted an answer, and valid answers in time.
+        lost: cause → how many.
+        retries: requests that were sent again; each is in `asked` too.
+        alerts: answers with the alert bit.
+        latency: counts per `LATENCY_BIN_S` of the time from the request's first byte to the answer's last.
+    """
+
+    asked: int = 0
+    answered: int = 0
+    retries: int = 0
+    alerts: int = 0
+    lost: dict[Cause, int] = field(default_factory=dict)
+    latency: list[int] = field(default_factory=lambda: [0] * LATENCY_BINS)
+
+    @property
+    def loss(self) -> float:
+        """Share of requests without a valid answer in time."""
+        return 1.0 - self.answered / self.asked if self.asked else 0.0
+
+    def latency_quantile(self, share: float) -> float | None:
+        """The time (s) within which `share` of the answers came, by the upper edge of the bin."""
+        goal, total = share * self.answered, 0
+        for k, count in enumerate(self.latency):
+            total += count
+            if total >= goal and total:
+                return (k + 1) * LATENCY_BIN_S
+        return None
+
+
+@dataclass
+class BusStatistics:
+    """All servos of a bus, and bytes that belonged to none."""
+
+    servos: dict[int, ServoStatistics] = field(default_factory=dict)
+    noise_bytes: int = 0
+    fast_read_fallbacks: int = 0
+
+    def of(self, id: int) -> ServoStatistics:
+        found = self.servos.get(id)
+        if found is None:
+            found = self.servos[id] = ServoStatistics()
+        return found
+
+    def count(self, id: int, cause: Cause | None, rtt: float | None, alert: bool) -> None:
+        """One request to one servo: answered (`cause` None, after `rtt` s), or lost."""
+        servo = self.servos.get(id) or self.of(id)
+        servo.asked += 1
+        if cause is None:
+            servo.answered += 1
+            servo.alerts += alert
+            if rtt is not None:
+                servo.latency[min(int(rtt / LATENCY_BIN_S), LATENCY_BINS - 1)] += 1
+        else:
+            servo.lost[cause] = servo.lost.get(cause, 0) + 1
+
+    def as_dict(self, names: Mapping[int, str] | None = None, ids: Iterable[int] | None = None) -> dict[str, object]:
+        """For JSON: per servo loss, causes, retries and latency quantiles."""
+        return {
+            "noise_bytes": self.noise_bytes,
+            "fast_read_fallbacks": self.fast_read_fallbacks,
+            "servos": [
+                {
+                    "id": id,
+                    **({"joint": names[id]} if names and id in names else {}),
+                    "asked": servo.asked,
+                    "answered": servo.answered,
+                    "loss": servo.loss,
+                    "lost": {cause.value: count for cause, count in sorted(servo.lost.items())},
+                    "retries": servo.retries,
+                    "alerts": servo.alerts,
+                    "latency_p50_s": servo.latency_quantile(0.5),
+                    "latency_p99_s": servo.latency_quantile(0.99),
+                }
+                for id, servo in sorted(self.servos.items())
+                if ids is None or id in ids
+            ],
+        }
