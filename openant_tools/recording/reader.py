@@ -118,7 +118,7 @@ class RecordScan:
                 if opcode == Opcode.METADATA:
                     yield Metadata.read(body)
                 else:
-                    yield from breakup_chunk(Chunk.read(body), validate_crc=True)  # type: ignore[misc]
+                    yield from breakup_chunk(Chunk.read(body), validate_crc=True)
             except GeneratorExit:
                 raise
             except Exception:
@@ -186,7 +186,7 @@ def read_recording(path: str | Path) -> Recording:
     columns = dict(run.columns)
     for samples, time in ((imu, "imu_t"), (pose, "pose_t")):
         merged = merge_nearest(samples, run.t)
-        if merged and not np.array_equal(merged["t"], run.t):
+        if merged and content["counts"]:
             columns[time] = merged["t"]
         columns |= {name: values for name, values in merged.items() if name != "t"}
     return Recording(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -81,6 +82,12 @@ class Run:
             return None
         return (self.path.parent if self.path else Path()) / self.facts.model
 
+    def facts_at(self, folder: Path) -> Facts:
+        """The facts as they read in another folder: a relative `model` still leads to the same file."""
+        if self.model_path is None or Path(str(self.facts.model)).is_absolute():
+            return self.facts
+        return replace(self.facts, model=os.path.relpath(self.model_path, folder))
+
     @property
     def duration_s(self) -> float:
         return float(self.t[-1] - self.t[0]) if len(self.t) else 0.0
@@ -115,12 +122,9 @@ class Run:
         return np.where(np.isfinite(cmd_t), cmd_t, self.t)
 
     def select(self, joints: Sequence[str]) -> Run:
-        """The same run with the columns of these joints only (and those of the body)."""
-        kept = {
-            name: values
-            for name, values in self.columns.items()
-            if name in BODY_COLUMNS or name.partition(".")[2] in joints
-        }
+        """The same run without the columns of its other joints."""
+        dropped = set(self.joints) - set(joints)
+        kept = {name: values for name, values in self.columns.items() if name.partition(".")[2] not in dropped}
         return replace(self, facts=replace(self.facts, joints=tuple(joints)), columns=kept)
 
     def between(self, start: float, stop: float) -> Run:

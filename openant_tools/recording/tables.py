@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ from openant_tools.recording.facts import facts_from_json, facts_to_json
 from openant_tools.recording.plausibility import check_columns, check_run, check_time, need_signals
 from openant_tools.recording.run import BODY_COLUMNS, JOINT_SIGNALS, Facts, Run
 
-__all__ = ["read_run", "read_table", "write_table"]
+__all__ = ["find_run", "read_run", "read_table", "write_table"]
 
 _MISSING = ("", "nan", "NaN", "NAN", "null", "NULL", "None", "NA", "N/A")
 
@@ -38,7 +36,7 @@ def read_run(path: str | Path, *, need: Sequence[str] = ("cmd", "pos")) -> Run:
     Raises:
         BadInput: the file, the column and the row of what cannot be, and what to do about it.
     """
-    path = _find(Path(path))
+    path = find_run(Path(path))
     if path.suffix == ".mcap":
         from openant_tools.recording.reader import read_recording
 
@@ -83,9 +81,6 @@ def write_table(run: Run, path: str | Path) -> None:
     path = Path(path)
     if path.suffix not in (".parquet", ".csv"):
         raise BadInput("a table is .parquet or .csv", where=path, remedy="name it NAME.parquet")
-    facts = run.facts
-    if run.model_path is not None and facts.model is not None and not Path(facts.model).is_absolute():
-        facts = replace(facts, model=os.path.relpath(run.model_path, path.parent))
     arrays = {"t": pa.array(run.t)}
     for name in _in_order(run):
         values = run.columns[name]
@@ -99,13 +94,14 @@ def write_table(run: Run, path: str | Path) -> None:
             pq.write_table(table, stream, compression="zstd")
         else:
             _write_csv(table, stream)
-        facts_stream.write(facts_to_json(facts).encode())
+        facts_stream.write(facts_to_json(run.facts_at(path.parent)).encode())
         # What is left in the buffers goes to the disk before either file takes its place: a full disk makes neither.
         stream.flush()
         facts_stream.flush()
 
 
-def _find(path: Path) -> Path:
+def find_run(path: Path) -> Path:
+    """The file that a RUN on the command line means: the suffix may be missing, or be that of its facts."""
     if path.is_dir():
         inside = sorted(file.name for file in path.iterdir() if file.suffix in (".mcap", ".parquet", ".csv"))
         raise BadInput(

@@ -140,6 +140,10 @@ class RecordingWriter:
             values["yaw"] = float(yaw)
         if quaternion is not None:
             values |= zip(("qw", "qx", "qy", "qz"), map(float, quaternion), strict=True)
+        self.pose_fields(t, values)
+
+    def pose_fields(self, t: float, values: Mapping[str, float]) -> None:
+        """Record where the body is by the names of formats: x, y, z, yaw, qw, qx, qy, qz; NaN is missing."""
         self._put((_POSE, t, values))
 
     def event(self, kind: str, **payload: Any) -> None:

@@ -1,0 +1,157 @@
+"""`openant rec`: look into recordings, make torn ones whole, turn them into tables and back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from openant_tools.cli.options import json_option
+
+if TYPE_CHECKING:
+    from openant_tools.recording.run import Run
+    from openant_tools.recording.summary import RunSummary
+
+__all__ = ["rec"]
+
+RUN = click.Path(path_type=Path)
+
+
+@click.group()
+def rec() -> None:
+    """Recordings: info, repair, export, import.
+
+    A RUN is a native recording (NAME.mcap, which survives a kill or a power cut) or a table (NAME.parquet or NAME.csv
+    with its facts in NAME.json), so that logs of other software can be used everywhere.
+    """
+
+
+@rec.command()
+@click.argument("run", type=RUN)
+@json_option
+def info(run: Path, json_file: Path | None) -> None:
+    """Show what RUN holds: joints, signals, rate and jitter, gaps, loss, facts."""
+    from dataclasses import asdict
+
+    from openant_tools.files import write_text
+    from openant_tools.recording.facts import facts_to_json
+    from openant_tools.recording.reader import read_recording
+    from openant_tools.recording.summary import summarize
+    from openant_tools.recording.tables import find_run, read_table
+
+    path = find_run(run)
+    more: dict[str, Any] = {}
+    if path.suffix == ".mcap":
+        recording = read_recording(path)
+        read = recording.run
+        more = {
+            "damage": recording.damage,
+            "started": recording.started,
+            "imu_samples": len(recording.imu.t),
+            "pose_samples": len(recording.pose.t),
+            "events": list(recording.events),
+            "has_config": recording.config is not None,
+        }
+    else:
+        read = read_table(path)
+    summary = summarize(read)
+    if json_file is not None:
+        facts = {"facts": json.loads(facts_to_json(read.facts))}
+        result = {"path": str(path)} | asdict(summary) | facts | more
+        write_text(json_file, json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+    for line in _lines(path, read, summary, more):
+        click.echo(line)
+
+
+@rec.command()
+@click.argument("run", type=RUN)
+@click.option("--out", type=RUN, default=None, metavar="FILE", help="Where to; default: in place, the old one kept.")
+def repair(run: Path, out: Path | None) -> None:
+    """Make a torn recording whole: every whole record before the tear, with a summary for viewers."""
+    from openant_tools.recording.repair import repair as repair_recording
+    from openant_tools.recording.tables import find_run
+
+    done = repair_recording(find_run(run), out)
+    if done.damage is None:
+        click.echo(f"{done.path}: whole already, {done.messages} records; nothing was written")
+    else:
+        click.echo(f"{done.path}: whole again, {done.messages} records kept ({done.damage})")
+        if done.original is not None:
+            click.echo(f"the torn file is kept as {done.original}")
+
+
+@rec.command()
+@click.argument("runs", type=RUN, nargs=-1, required=True, metavar="RUN...")
+@click.option("--to", "kind", type=click.Choice(["parquet", "csv"]), default="parquet", show_default=True)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    required=True,
+    metavar="DIR",
+    help="The folder to write to.",
+)
+def export(runs: tuple[Path, ...], kind: str, out: Path) -> None:
+    """Write RUN as a table: DIR/NAME.parquet (or .csv) in SI units, with its facts in DIR/NAME.json."""
+    from openant_tools.recording.tables import read_run, write_table
+
+    for name in runs:
+        run = read_run(name, need=())
+        path = out / f"{run.name}.{kind}"
+        write_table(run, path)
+        click.echo(f"{path}: {len(run.t)} rows, {len(run.columns)} columns; facts in {path.with_suffix('.json').name}")
+
+
+@rec.command(name="import")
+@click.argument("table", type=RUN)
+@click.option("--out", type=RUN, required=True, metavar="RUN", help="The recording to make (NAME.mcap).")
+def import_(table: Path, out: Path) -> None:
+    """Make a native recording of TABLE, so that viewers (Foxglove, Rerun, PlotJuggler) open it."""
+    from openant_tools.recording.convert import import_run
+    from openant_tools.recording.tables import read_run
+
+    run = read_run(table, need=())
+    path = import_run(run, out)
+    click.echo(f"{path}: {len(run.t)} rows of {', '.join(run.joints)}")
+
+
+def _lines(path: Path, run: Run, summary: RunSummary, more: dict[str, Any]) -> list[str]:
+    facts = run.facts
+    lines = [
+        str(path),
+        f"  {summary.rows} rows over {summary.duration_s:.2f} s, {summary.rate_hz:.1f} Hz "
+        f"(a row every {1e3 * summary.period_s:.2f} ms; 98 % within {1e3 * summary.period_low_s:.2f} … "
+        f"{1e3 * summary.period_high_s:.2f} ms, longest {1e3 * summary.period_longest_s:.2f} ms)",
+    ]
+    if more.get("damage"):
+        lines.append(f"  DAMAGED: {more['damage']} → `openant rec repair {path}`")
+    for gap in summary.gaps[:5]:
+        lines.append(f"  gap of {gap.duration_s:.3f} s at t = {gap.t:.3f} s (row {gap.row + 1})")
+    if len(summary.gaps) > 5:
+        lines.append(f"  … and {len(summary.gaps) - 5} more gaps")
+    width = max(len(joint.joint) for joint in summary.joints)
+    for joint in summary.joints:
+        span = "" if joint.pos_low is None else f"{joint.pos_low:+.3f} … {joint.pos_high:+.3f} rad"
+        errors = ", ".join(f"{count} {word}" for word, count in joint.errors.items())
+        lost = f"{100 * joint.lost:.2f} % lost" + (f" ({errors})" if errors else "")
+        lines.append(
+            f"  {joint.joint:<{width}}  {joint.motor or '–':<14}  {span:<22}  {lost:<14}  {' '.join(joint.signals)}"
+        )
+    if summary.body:
+        lines.append(f"  body: {' '.join(summary.body)}")
+    if summary.other:
+        lines.append(f"  other columns: {' '.join(summary.other)}")
+    for key in ("setup", "protocol", "repeat_of", "model", "supply_v", "ambient_c", "heading_rad", "notes"):
+        value = getattr(facts, key)
+        if value is not None:
+            lines.append(f"  {key}: {value}")
+    if facts.registers:
+        count = sum(len(table) for table in facts.registers.values())
+        lines.append(f"  registers: {count} settings of {len(facts.registers)} servos")
+    if more:
+        lines.append(
+            f"  started {more['started']['wall']}; {more['imu_samples']} IMU samples, {more['pose_samples']} poses, "
+            f"{len(more['events'])} events, {'with' if more['has_config'] else 'without'} the robot's config"
+        )
+    return lines
