@@ -1,0 +1,550 @@
+"""`robot.toml`: what is known of one robot, as frozen dataclasses, and what may not stand in it.
+
+The file belongs to its owner: comments, order and unknown keys stay as they are (`folder` writes it). Units are SI.
+"""
+
+from __future__ import annotations
+
+import datetime
+import difflib
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import ParseError, TOMLKitError
+
+from openant_tools.errors import BadInput
+from openant_tools.robot.fields import Problem, choice, number, port, read, switch, text, vector, whole
+from openant_tools.robot.joints import JOINT_NAMES, JOINTS, Kind
+from openant_tools.robot.kit import KITS, PLATFORM_PWM_LIMIT
+from openant_tools.robot.servo import BAUD_CODES, SERVO_MODELS, ServoModel
+
+__all__ = [
+    "ACTION_PRESETS", "CONFIG_NAME", "ActionRange", "Actions", "Bus", "Camera", "Effect", "Imu", "Motor", "Ports",
+    "Problem", "Provenance", "RobotConfig", "Timing", "parse_config", "read_document",
+]  # fmt: skip
+
+CONFIG_NAME = "robot.toml"
+TURN = 2 * math.pi
+#: Two turns: more than any mounting has, less than any angle in degrees.
+MAX_OFFSET_RAD = 2 * TURN
+MAX_ANGLE_RAD = math.pi
+#: Signals that can have measured bounds, by the names of run tables, with their largest conceivable size.
+OBSERVED: Mapping[str, tuple[str, float]] = {
+    "pos": ("rad", MAX_ANGLE_RAD), "vel": ("rad/s", 100.0), "acc": ("m/s²", 320.0), "gyro": ("rad/s", 70.0),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Ports:
+    """Where the robot is plugged in; "" while unknown.
+
+    Attributes:
+        bus: serial device of the servos' adapter; best a path below /dev/serial/by-id, which survives replugging.
+        imu: serial device of the flight controller.
+        camera: number or device of the overhead camera.
+    """
+
+    bus: str | int = port()
+    imu: str | int = port()
+    camera: str | int = port()
+
+
+@dataclass(frozen=True)
+class Bus:
+    """How the servos are spoken to.
+
+    Attributes:
+        baud: bits per second, of every servo.
+        return_delay_s: what each servo waits before it answers (register 9).
+        latency_timer_ms: of the adapter; its driver's default of 16 ms costs that much per read.
+        write_read_gap_s: from the last byte of a write to the next read; below 0.2 ms servos miss the read.
+        pwm_limit: share of full duty that the servos may use (register 36).
+        watchdog_s: servos stop by themselves after this long without an instruction (register 98); 0 is off.
+        chain: lists of joints, each in the order of its cable, from the adapter outwards.
+    """
+
+    baud: int = choice(tuple(BAUD_CODES.values()), "baud rate that servos have", 1_000_000)
+    return_delay_s: float = number(0, 508e-6, "s", 0.0)
+    latency_timer_ms: int = whole(1, 255, 1)
+    write_read_gap_s: float = number(0, 0.1, "s", 0.0002)
+    pwm_limit: float = number(0, 1, "", PLATFORM_PWM_LIMIT)
+    watchdog_s: float = number(0, 2.54, "s", 0.2)
+    chain: tuple[tuple[str, ...], ...] = ()
+
+
+@dataclass(frozen=True)
+class Motor:
+    """One joint's servo and how it is mounted: joint angle = direction · (servo angle − zero offset).
+
+    Attributes:
+        joint: which joint it drives.
+        id: on the bus.
+        model: the servo model's name.
+        direction: 1, or −1 for a servo that is mounted the other way round.
+        zero_offset_rad: the servo's angle where the joint is at zero.
+        min_rad, max_rad: limits of commands, at the joint.
+    """
+
+    joint: str
+    id: int = whole(0, 252)
+    model: str = choice(tuple(SERVO_MODELS), "servo model")
+    zero_offset_rad: float = number(-MAX_OFFSET_RAD, MAX_OFFSET_RAD, "rad")
+    min_rad: float = number(-MAX_ANGLE_RAD, MAX_ANGLE_RAD, "rad")
+    max_rad: float = number(-MAX_ANGLE_RAD, MAX_ANGLE_RAD, "rad")
+    direction: int = choice((1, -1), "direction", 1)
+
+    @property
+    def servo(self) -> ServoModel:
+        return SERVO_MODELS[self.model]
+
+    @property
+    def kind(self) -> Kind:
+        return JOINTS[self.joint].kind
+
+    def to_joint(self, servo_rad: float, turns: int = 0) -> float:
+        """The joint's angle for a servo's, with `turns` as `turns_at` gave them when the bus was opened."""
+        return self.direction * (servo_rad - turns * TURN - self.zero_offset_rad)
+
+    def to_servo(self, joint_rad: float, turns: int = 0) -> float:
+        """The servo's angle for a joint's; the inverse of `to_joint`."""
+        return self.direction * joint_rad + self.zero_offset_rad + turns * TURN
+
+    def turns_at(self, servo_rad: float) -> int:
+        """Whole turns that the servo has counted beyond the zero offset, so that the joint is nearest to mid-range.
+
+        A servo in extended position mode counts on over turns, and starts anywhere within one after power-on.
+        """
+        middle = self.to_servo((self.min_rad + self.max_rad) / 2)
+        return round((servo_rad - middle) / TURN)
+
+    def clip(self, joint_rad: float) -> float:
+        """The nearest angle within the limits of commands."""
+        return min(max(joint_rad, self.min_rad), self.max_rad)
+
+
+@dataclass(frozen=True)
+class Imu:
+    """The flight controller in the torso.
+
+    Attributes:
+        mounting_rad: rotation vector from the sensor's frame to the body's.
+        gyro_bias_rad_s, acc_bias_m_s2: what it reads too much, in the body's frame.
+        acc_counts_per_g: raw accelerometer counts for 1 g, which differs by firmware; 0 while unknown.
+        gyro_counts_per_dps: raw gyro counts for 1 °/s, 16.4 for the range of 2000 °/s.
+    """
+
+    mounting_rad: tuple[float, ...] = vector(3, -TURN, TURN, "rad", (0.0, 0.0, 0.0))
+    gyro_bias_rad_s: tuple[float, ...] = vector(3, -2, 2, "rad/s", (0.0, 0.0, 0.0))
+    acc_bias_m_s2: tuple[float, ...] = vector(3, -5, 5, "m/s²", (0.0, 0.0, 0.0))
+    acc_counts_per_g: float = number(0, 32768, "", 0.0)
+    gyro_counts_per_dps: float = number(1, 1000, "", 16.4)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """The overhead camera and the tags that it looks for (family tagCircle21h7).
+
+    Attributes:
+        fov_diagonal_rad: angle from corner to corner of the picture.
+        origin_tag_id, body_tag_id: the tag on the floor, and the one on the torso; −1 while unknown.
+        origin_tag_size_m, body_tag_size_m: length of a tag's edge. A wrong one scales every distance.
+    """
+
+    fov_diagonal_rad: float = number(0.1, 3.0, "rad", math.radians(60))
+    origin_tag_id: int = whole(-1, 100_000, 0)
+    body_tag_id: int = whole(-1, 100_000, -1)
+    origin_tag_size_m: float = number(0.005, 2, "m", 0.10)
+    body_tag_size_m: float = number(0.005, 2, "m", 0.045)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The control loop.
+
+    Attributes:
+        dt_s: from one action to the next.
+    """
+
+    dt_s: float = number(0.002, 2, "s", 0.12)
+
+
+@dataclass(frozen=True)
+class ActionRange:
+    """What actions of −1…1 mean: joint target = centre + action · half range, in rad, by kind of joint."""
+
+    hip_centre_rad: float
+    hip_half_range_rad: float
+    knee_centre_rad: float
+    knee_half_range_rad: float
+
+    def centre(self, kind: Kind) -> float:
+        return self.hip_centre_rad if kind == "hip" else self.knee_centre_rad
+
+    def half_range(self, kind: Kind) -> float:
+        return self.hip_half_range_rad if kind == "hip" else self.knee_half_range_rad
+
+
+def _range(hip_half: float, knee: float, knee_half: float) -> ActionRange:
+    return ActionRange(0.0, math.radians(hip_half), math.radians(knee), math.radians(knee_half))
+
+
+#: The platform's ranges: its default (and the paper's), what its SAC scripts set, what its SARSA scripts set.
+ACTION_PRESETS: Mapping[str, ActionRange] = {
+    "platform": _range(45, -50, 20),
+    "sac": _range(30, -50, 20),
+    "sarsa": _range(30, -60, 45),
+}
+
+
+@dataclass(frozen=True)
+class Actions:
+    """The range of actions: a preset, and what this robot has different from it."""
+
+    preset: str = choice(tuple(ACTION_PRESETS), "preset", "platform")
+    hip_centre_rad: float | None = number(-MAX_ANGLE_RAD, MAX_ANGLE_RAD, "rad", None)
+    hip_half_range_rad: float | None = number(0, MAX_ANGLE_RAD, "rad", None)
+    knee_centre_rad: float | None = number(-MAX_ANGLE_RAD, MAX_ANGLE_RAD, "rad", None)
+    knee_half_range_rad: float | None = number(0, MAX_ANGLE_RAD, "rad", None)
+
+    @property
+    def range(self) -> ActionRange:
+        base = ACTION_PRESETS[self.preset]
+
+        def own(mine: float | None, preset: float) -> float:
+            return preset if mine is None else mine
+
+        return ActionRange(
+            own(self.hip_centre_rad, base.hip_centre_rad),
+            own(self.hip_half_range_rad, base.hip_half_range_rad),
+            own(self.knee_centre_rad, base.knee_centre_rad),
+            own(self.knee_half_range_rad, base.knee_half_range_rad),
+        )
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One `[[effect]]` that acts in simulation (formats, section 4).
+
+    Attributes:
+        effect: its name in the effect catalogue.
+        joints: the joints it belongs to, or "all" or "body".
+        parameters: by the catalogue's names, SI; a parameter may also be a list (a direction, a position).
+        enabled: whether it acts.
+    """
+
+    effect: str = text()
+    joints: str | tuple[str, ...] = "all"
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    enabled: bool = switch(True)
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a value came from.
+
+    Attributes:
+        how: one word or two: "nominal", "imported", "by hand", "measured", "fitted".
+        command: the command that wrote it.
+        recording: the recording it was measured in, relative to the robot's folder.
+        date: when.
+        low, high: how certain: the 95 % interval, in the value's unit.
+    """
+
+    how: str = text()
+    command: str | None = text(None)
+    recording: str | None = text(None)
+    date: datetime.datetime | None = None
+    low: float | None = number(-math.inf, math.inf, "", None)
+    high: float | None = number(-math.inf, math.inf, "", None)
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """Everything that `robot.toml` says and this software knows.
+
+    Attributes:
+        name: what its owner calls it.
+        kit: "standard" or "lite".
+        model: the MJCF that simulates it, relative to the folder.
+        motors: joint → motor, complete, in the order of the joints.
+        observation: name of a run table's column, such as `pos.hip_rr` or `gyro.x` → measured (low, high) of it.
+        effects: what acts in simulation beside the MJCF.
+        provenance: dotted path, or the front of one → where what stands there came from.
+        unknown: top-level tables that this software does not know.
+    """
+
+    name: str = text()
+    kit: str = choice(tuple(KITS), "kit")
+    model: str = text()
+    ports: Ports = Ports()
+    bus: Bus = Bus()
+    motors: Mapping[str, Motor] = field(default_factory=dict)
+    imu: Imu = Imu()
+    camera: Camera = Camera()
+    timing: Timing = Timing()
+    actions: Actions = Actions()
+    observation: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    effects: tuple[Effect, ...] = ()
+    provenance: Mapping[str, Provenance] = field(default_factory=dict)
+    unknown: tuple[str, ...] = ()
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """The servos' ids in the order of the joints."""
+        return tuple(motor.id for motor in self.motors.values())
+
+    def motor_with_id(self, id: int) -> Motor | None:
+        return next((motor for motor in self.motors.values() if motor.id == id), None)
+
+    def provenance_of(self, path: str) -> Provenance | None:
+        """Where the value at a dotted path came from: the entry for it, or for the longest front of it."""
+        parts = path.split(".")
+        for length in range(len(parts), 0, -1):
+            entry = self.provenance.get(".".join(parts[:length]))
+            if entry is not None:
+                return entry
+        return None
+
+
+_SECTIONS: Mapping[str, type[Any]] = {
+    "ports": Ports, "bus": Bus, "imu": Imu, "camera": Camera, "timing": Timing, "actions": Actions,
+}  # fmt: skip
+_KNOWN = {"schema", "name", "kit", "model", *_SECTIONS, "motors", "observation", "effect", "provenance", "platform"}
+
+
+def _suggest(name: str, names: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, names, n=1)
+    return f"did you mean {close[0]!r}?" if close else f"the joints are {', '.join(names)}"
+
+
+def _motors(table: Any, problems: list[Problem]) -> dict[str, Motor]:
+    motors: dict[str, Motor] = {}
+    if not isinstance(table, Mapping):
+        problems.append(
+            Problem(
+                "motors",
+                "is missing" if table is None else "is no table",
+                "each joint needs a table [motors.JOINT]; a file cut short has lost them",
+            )
+        )
+        return motors
+    for joint in table:
+        if joint not in JOINTS:
+            problems.append(Problem(f"motors.{joint}", "there is no such joint", _suggest(joint, JOINT_NAMES)))
+    for joint in JOINT_NAMES:
+        if joint not in table:
+            problems.append(Problem(f"motors.{joint}", "is missing", f"add a table [motors.{joint}]"))
+            continue
+        motor = read(Motor, table[joint], f"motors.{joint}", problems, joint=joint)
+        if motor is not None:
+            motors[joint] = motor
+    for motor in motors.values():
+        if motor.min_rad >= motor.max_rad:
+            problems.append(
+                Problem(
+                    f"motors.{motor.joint}.min_rad",
+                    f"{motor.min_rad:.6g} is not below max_rad, {motor.max_rad:.6g}",
+                    "swap them",
+                )
+            )
+    owners: dict[int, str] = {}
+    for motor in motors.values():
+        first = owners.setdefault(motor.id, motor.joint)
+        if first != motor.joint:
+            problems.append(
+                Problem(
+                    f"motors.{motor.joint}.id",
+                    f"{motor.id} is also the id of {first}",
+                    "two servos cannot share an id on one bus",
+                )
+            )
+    return motors
+
+
+def _chain(value: Any, problems: list[Problem]) -> tuple[tuple[str, ...], ...]:
+    if not (isinstance(value, list) and all(isinstance(cable, list) for cable in value)):
+        problems.append(Problem("bus.chain", "is no list of lists of joints"))
+        return ()
+    seen: set[str] = set()
+    for joint in (joint for cable in value for joint in cable):
+        if joint not in JOINTS:
+            problems.append(Problem("bus.chain", f"there is no joint {joint!r}", _suggest(str(joint), JOINT_NAMES)))
+        elif joint in seen:
+            problems.append(Problem("bus.chain", f"{joint} stands in it twice"))
+        else:
+            seen.add(joint)
+    return tuple(tuple(str(joint) for joint in cable) for cable in value)
+
+
+def _leaves(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in table.items():
+        full = f"{path}.{key}" if path else key
+        if isinstance(value, Mapping):
+            yield from _leaves(value, full)
+        else:
+            yield full, value
+
+
+def _observation(table: Any, problems: list[Problem]) -> dict[str, tuple[float, float]]:
+    bounds: dict[str, tuple[float, float]] = {}
+    if not isinstance(table, Mapping):
+        problems.append(Problem("observation", "is no table"))
+        return bounds
+    for column, value in _leaves(table):
+        signal, _, part = column.partition(".")
+        unit, largest = OBSERVED.get(signal, ("", math.inf))
+        known = part in JOINTS if signal in ("pos", "vel") else part in "xyz" and len(part) == 1
+        if signal not in OBSERVED or not known:
+            problems.append(
+                Problem(
+                    f"observation.{column}",
+                    "is no signal that is observed",
+                    "known are pos.JOINT, vel.JOINT, acc.x|y|z and gyro.x|y|z",
+                    "note",
+                )
+            )
+        elif not (
+            isinstance(value, list)
+            and len(value) == 2
+            and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+        ):
+            problems.append(Problem(f"observation.{column}", "needs two numbers, [low, high]"))
+        elif not -largest <= value[0] < value[1] <= largest:
+            problems.append(
+                Problem(
+                    f"observation.{column}",
+                    f"{value[0]:.6g} to {value[1]:.6g} {unit} cannot be",
+                    f"low must be below high, both within ±{largest:.4g} {unit}",
+                )
+            )
+        else:
+            bounds[column] = (float(value[0]), float(value[1]))
+    return bounds
+
+
+def _effects(entries: Any, problems: list[Problem]) -> tuple[Effect, ...]:
+    if not isinstance(entries, list):
+        problems.append(Problem("effect", "is no list of tables", "write each effect as a table [[effect]]"))
+        return ()
+    effects: list[Effect] = []
+    for n, entry in enumerate(entries):
+        path = f"effect[{n + 1}]"
+        joints = entry.get("joints", "all") if isinstance(entry, Mapping) else "all"
+        parameters = entry.get("parameters", {}) if isinstance(entry, Mapping) else {}
+        if isinstance(joints, str) and joints not in ("all", "body"):
+            problems.append(
+                Problem(
+                    f"{path}.joints",
+                    f'{joints!r} is neither "all" nor "body" nor a list of joints',
+                    f'write ["{joints}"]' if joints in JOINTS else None,
+                )
+            )
+        elif isinstance(joints, list):
+            for joint in joints:
+                if joint not in JOINTS:
+                    problems.append(
+                        Problem(f"{path}.joints", f"there is no joint {joint!r}", _suggest(str(joint), JOINT_NAMES))
+                    )
+            joints = tuple(joints)
+        elif not isinstance(joints, str):
+            problems.append(Problem(f"{path}.joints", "is neither text nor a list of joints"))
+        if not isinstance(parameters, Mapping):
+            problems.append(Problem(f"{path}.parameters", "is no table", "write { delay_s = 0.02 }"))
+            parameters = {}
+        effect = read(Effect, entry, path, problems, joints=joints, parameters=dict(parameters))
+        if effect is not None:
+            effects.append(effect)
+    return tuple(effects)
+
+
+def _provenance(table: Any, problems: list[Problem]) -> dict[str, Provenance]:
+    entries: dict[str, Provenance] = {}
+    if not isinstance(table, Mapping):
+        problems.append(Problem("provenance", "is no table"))
+        return entries
+    for path, value in table.items():
+        key = f'provenance."{path}"'
+        date = value.get("date") if isinstance(value, Mapping) else None
+        if isinstance(date, datetime.date) and not isinstance(date, datetime.datetime):
+            date = datetime.datetime(date.year, date.month, date.day)
+        elif date is not None and not isinstance(date, datetime.datetime):
+            problems.append(Problem(f"{key}.date", "is no date", "write it as 2026-01-31T12:00:00Z, without quotes"))
+            date = None
+        entry = read(Provenance, value, key, problems, date=date)
+        if entry is not None:
+            entries[path] = entry
+    return entries
+
+
+def read_document(data: bytes, where: str | Path) -> tomlkit.TOMLDocument:
+    """The TOML document in a file's bytes; raises BadInput with line and column where it is none."""
+    remedy = "mend it by hand"
+    try:
+        # TOML forbids NUL; tomlkit would let it pass in comments, and a zeroed tail is what a power cut leaves.
+        if b"\0" in data:
+            raise BadInput(
+                "holds zero bytes, as a power cut leaves them",
+                where=f"{where}, line {data[: data.index(0)].count(10) + 1}",
+                remedy=remedy,
+            )
+        return tomlkit.parse(data.decode("utf-8"))
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise BadInput("is no UTF-8 text", where=f"{where}, line {line}", remedy=remedy) from None
+    except ParseError as error:
+        what = re.sub(r" at line \d+ col \d+$", "", str(error))
+        raise BadInput(
+            f"is no TOML: {what}", where=f"{where}, line {error.line}, column {error.col + 1}", remedy=remedy
+        ) from None
+    except TOMLKitError as error:
+        raise BadInput(f"is no TOML: {error}", where=where, remedy=remedy) from None
+
+
+def parse_config(document: Mapping[str, Any]) -> tuple[RobotConfig | None, list[Problem]]:
+    """What a document says, and everything in it that cannot be or is probably not meant.
+
+    Args:
+        document: plain values of a TOML document (`unwrap()` of a tomlkit one).
+
+    Returns:
+        The configuration, None where an error stands among the problems; and the problems in the file's order of
+        sections.
+    """
+    problems: list[Problem] = []
+    schema = document.get("schema", "openant.robot/1")
+    if schema != "openant.robot/1":
+        problems.append(
+            Problem(
+                "schema", f"{schema!r} is not known", "this software reads openant.robot/1; update it, or mend the line"
+            )
+        )
+    parts: dict[str, Any] = {}
+    for name, kind in _SECTIONS.items():
+        given = {}
+        if name == "bus" and isinstance(document.get("bus"), Mapping) and "chain" in document["bus"]:
+            given["chain"] = _chain(document["bus"]["chain"], problems)
+        parts[name] = read(kind, document.get(name, {}), name, problems, **given)
+    unknown = tuple(key for key in document if key not in _KNOWN)
+    for key in unknown:
+        close = difflib.get_close_matches(key, sorted(_KNOWN), n=1, cutoff=0.8)
+        if close:
+            problems.append(Problem(key, f"is not known; is {close[0]!r} meant?", None, "note"))
+    config = read(
+        RobotConfig,
+        document,
+        "",
+        problems,
+        **parts,
+        motors=_motors(document.get("motors"), problems),
+        observation=_observation(document.get("observation", {}), problems),
+        effects=_effects(document.get("effect", []), problems),
+        provenance=_provenance(document.get("provenance", {}), problems),
+        unknown=unknown,
+    )
+    errors = any(problem.severity == "error" for problem in problems)
+    return (None if errors else config), problems

@@ -1,0 +1,474 @@
+"""A robot is a folder: finding its parts, reading `robot.toml`, and changing it without touching what is not ours."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.items import AoT, InlineTable, Table
+
+from openant_tools.errors import BadInput
+from openant_tools.files import write_bytes, write_text
+from openant_tools.robot.config import (
+    CONFIG_NAME,
+    Effect,
+    Problem,
+    Provenance,
+    RobotConfig,
+    parse_config,
+    read_document,
+)
+from openant_tools.robot.joints import JOINTS
+from openant_tools.robot.kit import ANGLE_LIMIT_RAD, Kit
+from openant_tools.robot.kit import kit as kit_by_name
+from openant_tools.robot.mjcf import nominal_mjcf
+
+__all__ = ["Located", "RobotFolder", "create_robot"]
+
+NOMINAL_MODEL = "nominal.xml"
+
+
+@dataclass(frozen=True)
+class Located:
+    """A problem and the line of `robot.toml` that it stands in, if it stands anywhere."""
+
+    problem: Problem
+    line: int | None
+    file: Path
+
+    @property
+    def where(self) -> str:
+        line = f", line {self.line}" if self.line else ""
+        return f"{self.file}{line}, {self.problem.key}"
+
+    def __str__(self) -> str:
+        text = f"{self.where}: {self.problem.what}"
+        return f"{text} → {self.problem.remedy}" if self.problem.remedy else text
+
+
+@dataclass(frozen=True)
+class RobotFolder:
+    """The parts of one robot's folder (formats, section 4).
+
+    Attributes:
+        path: the folder.
+    """
+
+    path: Path
+
+    @classmethod
+    def at(cls, path: str | Path) -> RobotFolder:
+        """The folder at a path, which may also name its `robot.toml`; raises BadInput where there is none."""
+        path = Path(path)
+        folder = cls(path.parent if path.suffix == ".toml" else path)
+        if not folder.config_file.is_file():
+            raise BadInput(
+                f"there is no {CONFIG_NAME} here",
+                where=folder.path,
+                remedy="make one with `openant config new --kit standard --robot DIR` or `openant config import`",
+            )
+        return folder
+
+    @property
+    def config_file(self) -> Path:
+        return self.path / CONFIG_NAME
+
+    @property
+    def recordings(self) -> Path:
+        return self.path / "recordings"
+
+    @property
+    def findings(self) -> Path:
+        return self.path / "findings"
+
+    @property
+    def runs(self) -> Path:
+        return self.path / "runs"
+
+    @property
+    def backups(self) -> Path:
+        return self.path / "backups"
+
+    @property
+    def journal(self) -> Path:
+        return self.path / "journal.jsonl"
+
+    @property
+    def passport(self) -> Path:
+        return self.path / "passport.html"
+
+    def model_path(self, config: RobotConfig | None = None) -> Path:
+        """The MJCF that simulates this robot."""
+        return self.path / (config or self.config()).model
+
+    def relative(self, path: str | Path) -> str:
+        """A path as the folder's files name it: relative to the folder where it lies inside, with forward slashes."""
+        absolute = Path(path).resolve()
+        root = self.path.resolve()
+        return absolute.relative_to(root).as_posix() if absolute.is_relative_to(root) else str(absolute)
+
+    def check(self, *, simulate: bool = True) -> tuple[RobotConfig | None, list[Located]]:
+        """Everything in the configuration that cannot be, or (notes) is probably not meant.
+
+        Args:
+            simulate: also load the model with MuJoCo and look for the robot's joints and actuators in it.
+
+        Returns:
+            The configuration (None where there are errors in it) and the problems by line.
+
+        Raises:
+            BadInput: the file is missing, cut, or no TOML.
+        """
+        data = self._bytes()
+        document = self._document(data).unwrap()
+        config, problems = parse_config(document)
+        model = document.get("model")
+        if isinstance(model, str):
+            problems += self._model_problems(self.path / model, simulate)
+        text = data.decode("utf-8")
+        located = [Located(problem, _line_of(text, problem.key), self.config_file) for problem in problems]
+        located.sort(key=lambda entry: entry.line or 0)
+        return config, located
+
+    def config(self) -> RobotConfig:
+        """What `robot.toml` says.
+
+        Raises:
+            BadInput: the file is missing, cut, or says something that cannot be; the first such place is named.
+        """
+        config, located = self.check(simulate=False)
+        errors = [entry for entry in located if entry.problem.severity == "error"]
+        if errors or config is None:
+            more = f" (and {len(errors) - 1} more: `openant config check` lists them)" if len(errors) > 1 else ""
+            raise BadInput(errors[0].problem.what + more, where=errors[0].where, remedy=errors[0].problem.remedy)
+        return config
+
+    def update(
+        self,
+        values: Mapping[str, Any] | None = None,
+        *,
+        provenance: Provenance | Mapping[str, Provenance] | None = None,
+        effects: Sequence[Effect] | None = None,
+    ) -> RobotConfig:
+        """Change values in `robot.toml`; comments, order, unknown keys and everything else stay byte for byte.
+
+        What stood there before is kept in `backups/` under its date. Nothing is written where nothing changes.
+
+        Args:
+            values: dotted path → value, such as {"motors.hip_rr.zero_offset_rad": 0.79}.
+            provenance: where these values came from: one for all of them, or path → provenance (whose paths need not
+                be among the values).
+            effects: the new list of `[[effect]]`, if it is to be replaced.
+
+        Returns:
+            The configuration as it now stands.
+
+        Raises:
+            BadInput: the file cannot be read, or would hold something that cannot be; it is left as it was.
+        """
+        before = self._bytes()
+        document = self._document(before)
+        said = document.unwrap()
+        values = dict(values or {})
+        for path, value in values.items():
+            _set(document, _keys(document, path), _plain(value))
+        if isinstance(provenance, Provenance):
+            provenance = dict.fromkeys(values, provenance)
+        for path, entry in (provenance or {}).items():
+            _set(document, ["provenance", path], _provenance_item(entry))
+        if effects is not None:
+            _set_effects(document, effects)
+        after = tomlkit.dumps(document).encode("utf-8")
+        says = tomlkit.parse(after.decode("utf-8")).unwrap()
+        config, problems = parse_config(says)
+        errors = [problem for problem in problems if problem.severity == "error"]
+        if errors or config is None:
+            raise BadInput(
+                f"{errors[0].what}; {CONFIG_NAME} was left as it is",
+                where=f"{self.config_file}, {errors[0].key}",
+                remedy=errors[0].remedy,
+            )
+        if says != said:
+            self._back_up(before)
+            # A link to a configuration kept elsewhere stays a link.
+            write_bytes(self.config_file.resolve(), after)
+        return config
+
+    def _bytes(self) -> bytes:
+        try:
+            return self.config_file.read_bytes()
+        except FileNotFoundError:
+            return RobotFolder.at(self.path)._bytes()
+
+    def _back_up(self, data: bytes) -> Path:
+        # To the microsecond, so that two changes in a second keep both their files, in order of name and time.
+        stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%S.%fZ")
+        path = self.backups / f"robot-{stamp}.toml"
+        write_bytes(path, data)
+        return path
+
+    @property
+    def newest_backup(self) -> Path | None:
+        return max(self.backups.glob("robot-*.toml"), default=None)
+
+    def _document(self, data: bytes) -> tomlkit.TOMLDocument:
+        try:
+            return read_document(data, self.config_file)
+        except BadInput as error:
+            backup = self.newest_backup
+            remedy = f"mend it by hand, or bring back {backup}" if backup else "mend it by hand"
+            raise BadInput(error.what, where=error.where, remedy=remedy) from None
+
+    def _model_problems(self, path: Path, simulate: bool) -> list[Problem]:
+        if not path.is_file():
+            return [Problem("model", f"there is no file {path}", "name the MJCF relative to the robot's folder")]
+        if not simulate:
+            return []
+        import mujoco
+
+        try:
+            model = mujoco.MjModel.from_xml_path(str(path))
+        except ValueError as error:
+            return [Problem("model", f"MuJoCo cannot load {path}: {' '.join(str(error).split())}")]
+        driven = {int(model.actuator_trnid[k, 0]) for k in range(model.nu)}
+        problems = []
+        for joint in JOINTS:
+            index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
+            if index < 0:
+                problems.append(Problem("model", f"{path} has no joint {joint}"))
+            elif index not in driven:
+                problems.append(Problem("model", f"no actuator of {path} drives {joint}"))
+        return problems
+
+
+def _line_of(text: str, key: str) -> int | None:
+    """The line of a dotted key in TOML text, as well as headers and plain keys tell; else that of its nearest table."""
+    if not key:
+        return None
+    match = re.fullmatch(r"effect\[(\d+)\](?:\.(.*))?", key)
+    if match:
+        headers = [n for n, line in enumerate(text.splitlines(), 1) if re.match(r"\s*\[\[\s*effect\s*\]\]", line)]
+        index = int(match[1]) - 1
+        return headers[index] if index < len(headers) else None
+    provenance = re.match(r'provenance\."(.*?)"', key)
+    parts = ["provenance", provenance[1]] if provenance else key.split(".")
+    best: tuple[int, int] | None = None
+    table: list[str] = []
+    for n, line in enumerate(text.splitlines(), 1):
+        header = re.match(r"\s*\[{1,2}\s*([^\[\]]+?)\s*\]{1,2}", line)
+        assignment = re.match(r"\s*([^=#\[\]]+?)\s*=", line)
+        if header:
+            table = _split_key(header[1])
+            here = table
+        elif assignment:
+            here = [*table, *_split_key(assignment[1])]
+        else:
+            continue
+        if here == parts[: len(here)] and (best is None or len(here) > best[0]):
+            best = (len(here), n)
+    return best[1] if best else None
+
+
+def _split_key(key: str) -> list[str]:
+    return [
+        double or single or bare for double, single, bare in re.findall(r'"([^"]*)"|\'([^\']*)\'|([A-Za-z0-9_-]+)', key)
+    ]
+
+
+def _plain(value: Any) -> Any:
+    """A value as TOML has it: NumPy scalars and arrays, tuples and mappings become plain."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, tuple | list):
+        return [_plain(entry) for entry in value]
+    return value
+
+
+def _keys(document: Mapping[str, Any], path: str) -> list[str]:
+    """The keys of a dotted path. Bounds of observations stand under the whole name of their signal, on one line each,
+    unless their owner has given them tables."""
+    keys = path.split(".")
+    if keys[0] == "observation" and not isinstance(document.get("observation", {}).get(keys[1]), Mapping):
+        return [keys[0], ".".join(keys[1:])]
+    return keys
+
+
+def _set(container: Any, keys: Sequence[str], value: Any) -> None:
+    *path, last = keys
+    for key in path:
+        if key not in container:
+            container[key] = tomlkit.table()
+        container = container[key]
+        if not isinstance(container, Mapping):
+            raise BadInput(f"{key} is no table, so that {'.'.join(keys)} cannot be set")
+    present = container.get(last)
+    if present is not None and _same(present, value):
+        return
+    container[last] = value
+
+
+def _same(present: Any, value: Any) -> bool:
+    """Whether a TOML item already says this value; 1 and 1.0 are one number, 1 and true are not."""
+    plain = present.unwrap() if hasattr(present, "unwrap") else present
+    wanted = value.unwrap() if hasattr(value, "unwrap") else value
+    if isinstance(plain, bool) != isinstance(wanted, bool):
+        return False
+    return bool(plain == wanted)
+
+
+def _provenance_item(entry: Provenance) -> InlineTable:
+    item = tomlkit.inline_table()
+    for key in ("how", "command", "recording", "date", "low", "high"):
+        value = getattr(entry, key)
+        if value is not None:
+            item.append(key, _plain(value))
+    return item
+
+
+def _effect_table(effect: Effect) -> Table:
+    table = tomlkit.table()
+    table.append("effect", effect.effect)
+    table.append("joints", _plain(effect.joints))
+    parameters = tomlkit.inline_table()
+    parameters.update(_plain(effect.parameters))
+    table.append("parameters", parameters)
+    table.append("enabled", effect.enabled)
+    return table
+
+
+def _set_effects(document: tomlkit.TOMLDocument, effects: Sequence[Effect]) -> None:
+    _, problems = parse_config(document.unwrap())
+    if any(problem.key.startswith("effect") and problem.severity == "error" for problem in problems):
+        raise BadInput("the effects that stand in it cannot be read", where=CONFIG_NAME, remedy="mend them first")
+    present = document.get("effect")
+    kept: dict[tuple[str, str | tuple[str, ...]], Table] = {}
+    if isinstance(present, AoT):
+        for table in present:
+            joints = table.get("joints", "all")
+            plain = joints if isinstance(joints, str) else tuple(str(joint) for joint in joints)
+            kept[(str(table["effect"]), str(plain) if isinstance(plain, str) else plain)] = table
+    tables = tomlkit.aot()
+    for effect in effects:
+        table = kept.get((effect.effect, effect.joints))
+        if table is None:
+            tables.append(_effect_table(effect))
+            continue
+        for name, value in effect.parameters.items():
+            _set(table, ["parameters", name], _plain(value))
+        for name in [name for name in table.get("parameters", {}) if name not in effect.parameters]:
+            del table["parameters"][name]
+        if bool(table.get("enabled", True)) != effect.enabled:
+            table["enabled"] = effect.enabled
+        tables.append(table)
+    if isinstance(present, AoT) and list(map(id, present)) == [id(kept.get((e.effect, e.joints))) for e in effects]:
+        return  # the tables were changed in place, where they stand
+    if not effects:
+        document.pop("effect", None)
+    else:
+        document["effect"] = tables
+
+
+def _template(name: str, kit: Kit, date: datetime.datetime) -> str:
+    """The text of a new `robot.toml`."""
+    motors: list[str] = []
+    for joint in JOINTS.values():
+        limit = ANGLE_LIMIT_RAD[joint.kind]
+        motors.append(
+            f"[motors.{joint.name}]  # {joint.words}\n"
+            f"id = {joint.id}\n"
+            f'model = "{kit.servo(joint.kind).name}"\n'
+            f"direction = 1\n"
+            f"zero_offset_rad = 0.0\n"
+            f"min_rad = {-limit!r}\n"
+            f"max_rad = {limit!r}\n"
+        )
+    stamp = date.strftime("%Y-%m-%dT%H:%M:%SZ")
+    nominal = f'{{ how = "nominal", command = "openant config new", date = {stamp} }}'
+    return f"""\
+# One Open Ant: what it is built from, how it is plugged in, and what was measured on it.
+# Edit it freely. The `openant` commands change single values and leave comments, order and keys of your own alone;
+# each change leaves the file before it in backups/. Units are SI: m, kg, s, rad. `openant config check` reads it over.
+
+schema = "openant.robot/1"
+name = {tomlkit.string(name).as_string()}
+kit = "{kit.name}"  # {kit.words}
+model = "{NOMINAL_MODEL}"  # the MJCF that simulates this robot; `openant sysid fit` puts a calibrated one here
+
+[ports]  # empty while unknown; names below /dev/serial/by-id/ survive replugging
+bus = ""  # the servos' USB adapter (U2D2)
+imu = ""  # the flight controller
+camera = ""  # number or device of the overhead camera
+
+[bus]
+baud = 1_000_000
+return_delay_s = 0.0  # the factory's 500 µs cost 4 ms a read of eight servos
+latency_timer_ms = 1  # of the adapter
+write_read_gap_s = 0.0002  # from the end of a write to the next read
+pwm_limit = 0.5  # share of full duty; it bounds torque and speed alike
+watchdog_s = 0.2  # the servos stop by themselves after this long without a word from us
+
+# joint angle = direction * (servo angle - zero_offset_rad). Positive turns a hip counter-clockwise seen from above and
+# lifts the tip of a leg; zero is the leg straight out. min_rad and max_rad bound commands.
+
+{chr(10).join(motors)}
+[imu]
+mounting_rad = [0.0, 0.0, 0.0]  # rotation vector from the sensor's frame to the body's
+gyro_bias_rad_s = [0.0, 0.0, 0.0]
+acc_bias_m_s2 = [0.0, 0.0, 0.0]
+
+[camera]
+fov_diagonal_rad = 1.0471975511965976  # 60 degrees
+origin_tag_id = 0
+origin_tag_size_m = 0.1  # edge of the tag on the floor; a wrong size scales every distance
+body_tag_id = -1  # the tag on the torso; -1 while unknown
+body_tag_size_m = 0.045
+
+[timing]
+dt_s = 0.12  # from one action to the next
+
+[actions]
+preset = "platform"  # range of actions: platform, sac or sarsa; hip_centre_rad, knee_half_range_rad … override it
+
+[observation]  # measured bounds, such as "pos.hip_rr" = [-0.8, 0.8] or "gyro.x" = [-3.1, 2.9]
+
+[provenance]  # where a value, or all values below a name, came from
+motors = {nominal}
+bus = {nominal}
+camera = {nominal}
+"""
+
+
+def create_robot(path: str | Path, kit: str = "standard", name: str | None = None) -> RobotFolder:
+    """Make a robot's folder with nominal values: `robot.toml`, `nominal.xml`, `recordings/` and `findings/`.
+
+    Args:
+        path: the folder; it may exist, but must not hold a robot already.
+        kit: "standard" or "lite".
+        name: what to call the robot; default the folder's name.
+
+    Raises:
+        BadInput: there is a robot already, or no such kit.
+    """
+    parts = kit_by_name(kit)
+    folder = RobotFolder(Path(path))
+    if folder.path.exists() and not folder.path.is_dir():
+        raise BadInput("is a file, but a robot is a folder", where=folder.path, remedy="name another one")
+    if folder.config_file.exists():
+        raise BadInput(
+            f"there is a {CONFIG_NAME} already",
+            where=folder.path,
+            remedy="choose another folder, or edit what stands there",
+        )
+    for part in (folder.recordings, folder.findings):
+        part.mkdir(parents=True, exist_ok=True)
+    write_text(folder.path / NOMINAL_MODEL, nominal_mjcf(parts.name))
+    date = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+    write_text(folder.config_file, _template(name or folder.path.resolve().name, parts, date))
+    return folder
