@@ -118,6 +118,9 @@ class Bus:
     #: requests that may be sent again by `read` and `write` (never by sync reads); each is counted
     retries: int = 2
 
+    #: when the first byte of the last request left, s
+    request_at: float = field(default=0.0, init=False)
+
     def __post_init__(self) -> None:
         self._quiet_from = 0.0
 
@@ -282,7 +285,7 @@ class Bus:
         stale = self.line.read()
         if stale:
             self._count_stale(stale)
-        started = self.clock.now()
+        started = self.request_at = self.clock.now()
         self.line.write(packet)
         self._quiet_from = started + self.wire_s(len(packet))
         return started

@@ -1,0 +1,614 @@
+"""The process that owns the hardware: bus and recorder in one fixed-rate loop, torque off however it ends.
+
+Run as `python -m openant_tools.comms.engine`, by `engine_process.EngineProcess`, with a socket pair to its parent: it
+takes `messages`, answers each, and tells events. When the parent dies the socket ends, and torque goes off. Should this
+process be killed, its guardian sends the same packet; should both die, each servo's Bus Watchdog stops its motion.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from types import FrameType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.comms import guardian, messages
+from openant_tools.comms import protocol2 as p2
+from openant_tools.comms.bus import Answer, Bus, Timing
+from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
+from openant_tools.comms.faults import Cause
+from openant_tools.comms.guards import Trip, Watch
+from openant_tools.comms.line import PortGone, SerialLine
+from openant_tools.comms.messages import EngineConfig
+from openant_tools.comms.motion import Motion, hold, play, ramp
+from openant_tools.comms.ports import WANTED_LATENCY_MS, Host, udev_rule
+from openant_tools.comms.ring import ERR_CODES, Ring
+from openant_tools.comms.servos import Block, Servo, Servos
+from openant_tools.errors import BadInput, HardwareFault, OpenAntError
+from openant_tools.recording.telemetry import Answer as RecordedAnswer
+from openant_tools.recording.telemetry import Cycle, ServoChannel
+from openant_tools.recording.writer import RecordingWriter
+
+__all__ = ["Engine", "main"]
+
+Array = NDArray[np.float64]
+
+#: Registers kept with every recording: what decides how a servo moves and answers.
+RECORDED_REGISTERS = (
+    "firmware_version", "return_delay_time", "drive_mode", "operating_mode", "homing_offset", "temperature_limit",
+    "pwm_limit", "velocity_limit", "position_d_gain", "position_i_gain", "position_p_gain", "feedforward_2nd_gain",
+    "feedforward_1st_gain", "profile_acceleration", "profile_velocity",
+)  # fmt: skip
+#: The unit of the Bus Watchdog, s.
+WATCHDOG_UNIT_S = 0.02
+#: How long the engine waits for a port that vanished to come back, between two tries.
+REOPEN_PERIOD_S = 0.5
+_ERR_CODE = {word: code for code, word in enumerate(ERR_CODES)}
+_UNANSWERED = {cause: RecordedAnswer(None, False, cause.value) for cause in Cause}
+
+
+class _ParentGone(Exception):
+    pass
+
+
+class Engine:
+    """The loop and all it owns. `run` returns when the parent says so, dies, or the process is told to end.
+
+    Args:
+        config: the hardware.
+        connection: to the parent.
+        ring: telemetry, one row a cycle.
+    """
+
+    def __init__(self, config: EngineConfig, connection: Connection, ring: Ring) -> None:
+        self.config = config
+        self._connection = connection
+        self._ring = ring
+        self._parent = os.getppid()
+        self._outbox: deque[Any] = deque(maxlen=4096)
+        self._ending = False
+        self._torque = False
+        self._motions: deque[Motion] = deque()
+        self._goal: Array | None = None
+        self._counts: list[int] | None = None
+        self._waiting: list[tuple[int, Motion]] = []
+        self._recorder: RecordingWriter | None = None
+        self._overruns = 0
+        self._worst_wake = 0.0
+        self._cycles = 0
+        self._guardian: subprocess.Popen[bytes] | None = None
+        self._lost = False
+
+    # ---- life ----------------------------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Connect, loop, and release whatever happens."""
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._on_signal)
+        # Ctrl-C at the terminal is for the parent, which then tells us; a loop half way through a cycle is no place.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            try:
+                self._connect()
+            except OpenAntError as error:
+                self._say(messages.Reply(0, error=(error.what, error.where, error.remedy)))
+                return
+            self._say(messages.Reply(0, value=self._description()))
+            self._loop()
+        except _ParentGone:
+            pass
+        finally:
+            self._release()
+            self._flush(patience_s=0.5)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self._ending = True
+
+    def _connect(self) -> None:
+        config = self.config
+        self.clock: Clock = RealClock()
+        control = VirtualControl(config.control) if config.control else None
+        self._line = SerialLine(config.port, config.baud)
+        if control is not None and control.ask("now")["stepped"]:
+            self.clock = SteppedClock(control, bus=self._line)
+        timing = Timing(write_read_gap_s=config.write_read_gap_s, latency_timer_s=self._latency_timer_s())
+        self._bus = Bus(self._line, self.clock, timing)
+        self._start_guardian()
+        servos = Servos(self._bus, config.servos)
+        found = servos.identify()
+        known = [replace(servo, firmware=found[servo.joint].firmware) for servo in config.servos]
+        self._servos = servos = Servos(self._bus, known)
+        self._report_leftovers()
+        delays = servos.read_all("return_delay_time")
+        longest = max(delays.values()) * known[0].model.registers["return_delay_time"].scale
+        self._bus.timing = replace(timing, return_delay_s=longest)
+        for joint, table in config.registers.items():
+            for register, counts in table.items():
+                servos.write_counts(register, joint, counts)
+        for write in servos.journal:
+            self._notice(f"{write.joint} (id {write.id}): {write.register} changed from {write.old} to {write.new}")
+        self._servos = self._on_this_turn()
+        self._watch = Watch(config.guards, self._servos.servos, config.limits_rad)
+        self._registers = self._read_registers()
+        self._period = 1.0 / config.rate_hz
+
+    def _latency_timer_s(self) -> float:
+        host, port = Host(), self.config.port
+        now = host.latency_timer_ms(port)
+        if now is not None and now > WANTED_LATENCY_MS and not host.set_latency_timer_ms(port):
+            self._notice(
+                f"the adapter's latency timer is {now} ms, each read waits so long; this sets it to 1 ms for good:\n"
+                + udev_rule()
+            )
+        now = host.latency_timer_ms(port)
+        return Timing.latency_timer_s if now is None else now * 1e-3
+
+    def _report_leftovers(self) -> None:
+        """What an earlier program left: torque on, tripped watchdogs, hardware errors."""
+        servos = self._servos
+        on = [joint for joint, value in servos.read_all("torque_enable").items() if value]
+        tripped = servos.tripped_watchdogs()
+        if on:
+            self._notice(f"torque was still on at {', '.join(on)}: it is off now")
+            servos.set_torque(False, on)
+        for joint in tripped:
+            servos.write_counts("bus_watchdog", joint, 0)
+        if tripped:
+            self._notice(
+                f"the Bus Watchdog of {', '.join(tripped)} had tripped, since the last program ended without a word, "
+                "and had locked the goals: cleared"
+            )
+        for joint, status in servos.read_all("hardware_error_status").items():
+            if status:
+                for error in servos.hardware_errors(joint):
+                    self._notice(f"{joint} (id {servos[joint].id}) reports {error.name}: {error.advice}")
+
+    def _on_this_turn(self) -> Servos:
+        """The servos with zeros moved by whole turns, so that each joint reads near the middle of its limits.
+
+        In extended position mode a servo counts over turns, and which one it starts on is chance.
+        """
+        positions = self._servos.read_all("present_position")
+        moved: list[Servo] = []
+        for servo in self._servos.servos:
+            low, high = self.config.limits_rad.get(servo.joint, (0.0, 0.0))
+            seen = positions[servo.joint] * servo.model.registers["present_position"].scale
+            middle = servo.to_servo((low + high) / 2)
+            turns = round((seen - middle) / (2 * np.pi))
+            moved.append(replace(servo, zero_rad=servo.zero_rad + turns * 2 * np.pi))
+        return Servos(self._bus, moved)
+
+    def _read_registers(self) -> dict[str, dict[str, int]]:
+        table: dict[str, dict[str, int]] = {joint: {} for joint in self._servos.joints}
+        for register in RECORDED_REGISTERS:
+            for joint, counts in self._servos.read_all(register).items():
+                table[joint][register] = counts
+        return table
+
+    def _description(self) -> dict[str, Any]:
+        return {
+            "joints": self._servos.joints,
+            "firmware": {servo.joint: servo.firmware for servo in self._servos.servos},
+            "registers": self._registers,
+            "position": self._measure(),
+            "stepped": self.clock.stepped,
+            "latency_timer_s": self._bus.timing.latency_timer_s,
+            "pid": os.getpid(),
+            "guardian_pid": self._guardian.pid if self._guardian else None,
+        }
+
+    def _start_guardian(self) -> None:
+        packet = p2.sync_write(64, 1, dict.fromkeys((servo.id for servo in self.config.servos), b"\0")).encode()
+        fd = self._line.fileno()
+        self._guardian = subprocess.Popen(
+            [sys.executable, "-I", "-S", guardian.__file__, str(fd), packet.hex()],
+            stdin=subprocess.PIPE, pass_fds=(fd,), start_new_session=True,
+        )  # fmt: skip
+
+    def _dismiss_guardian(self) -> None:
+        if self._guardian is not None and self._guardian.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._guardian.stdin.write(b"bye")
+                self._guardian.stdin.close()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._guardian.wait(1.0)
+            self._guardian = None
+
+    def _release(self) -> None:
+        """Torque off, the recording closed, the guardian sent home; none of them prevents the next."""
+        if hasattr(self, "_servos"):
+            self._torque_off()
+        self._close_recording()
+        self._dismiss_guardian()
+        if hasattr(self, "_line"):
+            self._line.close()
+
+    def _torque_off(self) -> None:
+        """Release every servo: first all at once, then each proven by its answer."""
+        if not self._lost:
+            try:
+                self._servos.torque_off_now()
+                still_on = [joint for joint, on in self._servos.read_all("torque_enable").items() if on]
+                self._servos.set_torque(False, still_on)
+            except PortGone:
+                self._port_lost()
+            except HardwareFault as error:
+                self._say(messages.Notice(f"torque off was sent, but not every servo confirms: {error}"))
+        self._torque = False
+        self._motions.clear()
+        self._goal = self._counts = None
+
+    # ---- the loop ------------------------------------------------------------------------------------------------
+
+    def _loop(self) -> None:
+        due, cycles = self.clock.now(), 1
+        while not self._ending:
+            if self.clock.stepped and not self._motions:
+                # A virtual robot's time stands still while there is nothing to do.
+                self._take_commands(block=True)
+                due = self.clock.now()
+                continue
+            self.clock.sleep_until(due)
+            wake = self.clock.now() - due
+            self._take_commands(block=False)
+            try:
+                self._cycle(wake, cycles)
+            except PortGone as error:
+                self._port_lost()
+                self._stopped(Trip(str(error.what), "look at the USB cable; the servos' watchdog stops them"))
+            self._flush()
+            late = int((self.clock.now() - due) / self._period)
+            self._overruns += late > 0
+            cycles = 1 + late
+            due += cycles * self._period
+
+    def _cycle(self, wake: float, cycles: int) -> None:
+        if self._lost:
+            self._try_reopen()
+            return
+        cmd_t: float | None = None
+        ended: Motion | None = None
+        if self._torque and self._motions:
+            motion = self._motions[0]
+            self._goal = motion.step(cycles)
+            self._counts = self._servos.goal_counts(self._goal.tolist())
+            if motion.ended:
+                ended = self._motions.popleft()
+        if self._torque and self._counts is not None:
+            cmd_t = self._servos.write_goals(self._counts)
+        answers = self._servos.read_blocks()
+        t = self._bus.request_at
+        self._cycles += 1
+        self._worst_wake = max(self._worst_wake, wake)
+        if self._recorder is not None:
+            self._record(t, cmd_t, wake, answers)
+        self._telemetry(t, cmd_t, wake, answers)
+        if self._torque:
+            trip = self._watch.check(t, answers)
+            if trip is not None:
+                self._stopped(self._explained(trip))
+        if ended is not None:
+            self._motion_ended(ended)
+
+    def _motion_ended(self, motion: Motion) -> None:
+        for entry in list(self._waiting):
+            if entry[1] is motion:
+                self._waiting.remove(entry)
+                self._say(messages.Reply(entry[0], value=self._measure()))
+        self._say(messages.Finished(motion.name))
+
+    def _explained(self, trip: Trip) -> Trip:
+        """An alert says only that register 70 has something: read it, once torque is off."""
+        if trip.joint is None or "alert" not in trip.what:
+            return trip
+        self._torque_off()
+        try:
+            errors = self._servos.hardware_errors(trip.joint)
+        except HardwareFault:
+            return trip
+        if not errors:
+            return trip
+        servo = self._servos[trip.joint]
+        names = ", ".join(error.name for error in errors)
+        return Trip(f"{servo.joint} (id {servo.id}) reports {names}", errors[0].advice, trip.joint)
+
+    def _stopped(self, trip: Trip) -> None:
+        self._torque_off()
+        for number, _ in self._waiting:
+            self._say(messages.Reply(number, error=(trip.what, None, trip.remedy)))
+        self._waiting.clear()
+        if self._recorder is not None:
+            self._recorder.event("stopped", what=trip.what, joint=trip.joint)
+        self._say(messages.Stopped(trip.what, trip.remedy, trip.joint))
+
+    def _port_lost(self) -> None:
+        self._lost = True
+        self._reopen_at = self.clock.now() + REOPEN_PERIOD_S
+        self._line.close()
+
+    def _try_reopen(self) -> None:
+        if self.clock.now() < self._reopen_at:
+            return
+        self._reopen_at = self.clock.now() + REOPEN_PERIOD_S
+        try:
+            self._dismiss_guardian()
+            self._line = SerialLine(self.config.port, self.config.baud)
+            self._bus.line = self._line
+            self._start_guardian()
+            self._lost = False
+            self._report_leftovers()
+            self._notice("the port is back")
+        except HardwareFault:
+            self._lost = True
+
+    # ---- what a cycle leaves behind ------------------------------------------------------------------------------
+
+    def _record(self, t: float, cmd_t: float | None, wake: float, answers: list[tuple[Answer, Block | None]]) -> None:
+        assert self._recorder is not None
+        recorded = [
+            RecordedAnswer(
+                {
+                    "pos": block.position, "vel": block.velocity, self._effort[k]: block.effort, "pwm": block.pwm,
+                    "volt": block.voltage, "temp": block.temperature, "tick": block.tick,
+                },
+                answer.ok, answer.word, answer.rtt or 0.0,
+            )
+            if block is not None
+            else _UNANSWERED[answer.cause or Cause.SHORT]
+            for k, (answer, block) in enumerate(answers)
+        ]  # fmt: skip
+        n = len(recorded)
+        goals: list[int | None] = [None] * n if self._counts is None else list(self._counts)
+        try:
+            self._recorder.cycle(Cycle(t, goals, cmd_t, wake, recorded, [self._torque] * n))
+        except OpenAntError as error:
+            # The disk is full: the robot must not go on moving for a recording that nobody will have.
+            self._recorder = None
+            self._stopped(Trip(error.what, error.remedy or "", None))
+
+    def _telemetry(
+        self, t: float, cmd_t: float | None, wake: float, answers: list[tuple[Answer, Block | None]]
+    ) -> None:
+        nan = float("nan")
+        row = [t, nan if cmd_t is None else cmd_t, wake, float(self._torque), nan, nan, nan, nan, nan, nan]
+        for k, (answer, block) in enumerate(answers):
+            servo = self._servos.servos[k]
+            command = nan if self._goal is None else float(self._goal[k])
+            if block is None:
+                row += [command, nan, nan, nan, nan, nan, nan, nan, nan, 0.0, _ERR_CODE[answer.word], nan]
+                continue
+            table, sign = servo.model.registers, servo.direction
+            effort = sign * servo.model.effort.to_si(block.effort)
+            row += [
+                command,
+                servo.to_joint(block.position * table["present_position"].scale),
+                sign * block.velocity * table["present_velocity"].scale,
+                effort if servo.model.has_current_sensor else nan,
+                nan if servo.model.has_current_sensor else effort,
+                sign * block.pwm * table["present_pwm"].scale,
+                block.voltage * table["present_input_voltage"].scale,
+                float(block.temperature),
+                float(block.tick),
+                float(answer.ok),
+                _ERR_CODE[answer.word],
+                nan if answer.rtt is None else answer.rtt,
+            ]
+        self._ring.put(row)
+
+    # ---- commands ------------------------------------------------------------------------------------------------
+
+    def _take_commands(self, *, block: bool) -> None:
+        """Do what the parent has asked for; raises _ParentGone where it is no more."""
+        if os.getppid() != self._parent:
+            raise _ParentGone
+        try:
+            while self._connection.poll(0.2 if block else 0.0):
+                number, command = self._connection.recv()
+                if command is None:
+                    self._ending = True
+                    return
+                try:
+                    answer = self._do(number, command)
+                except PortGone as error:
+                    self._port_lost()
+                    answer = messages.Reply(number, error=(error.what, error.where, error.remedy))
+                except OpenAntError as error:
+                    answer = messages.Reply(number, error=(error.what, error.where, error.remedy))
+                if answer is not None:
+                    self._say(answer)
+                if block:
+                    return
+        except (EOFError, ConnectionError):
+            raise _ParentGone from None
+
+    def _do(self, number: int, command: messages.Command) -> messages.Reply | None:
+        """One command; None where its reply comes later."""
+        if isinstance(command, messages.Stop):
+            self._stopped(Trip("stopped by hand", ""))
+            return messages.Reply(number)
+        if self._lost:
+            raise HardwareFault("the port is gone", where=self.config.port, remedy="look at the USB cable")
+        handlers: dict[type, Callable[[int, Any], messages.Reply | None]] = {
+            messages.Torque: self._do_torque,
+            messages.Ramp: self._do_move,
+            messages.Play: self._do_move,
+            messages.Hold: self._do_move,
+            messages.Goal: self._do_goal,
+            messages.Record: self._do_record,
+            messages.StopRecording: lambda number, _: messages.Reply(number, value=self._close_recording()),
+            messages.ReadRegister: self._do_read,
+            messages.WriteRegister: self._do_write,
+            messages.Statistics: lambda number, _: messages.Reply(number, value=self._statistics()),
+        }
+        return handlers[type(command)](number, command)
+
+    def _do_torque(self, number: int, command: messages.Torque) -> messages.Reply:
+        if not command.on:
+            self._torque_off()
+            return messages.Reply(number)
+        if not self._torque:
+            self._switch_on()
+        return messages.Reply(number, value=self._goal)
+
+    def _switch_on(self) -> None:
+        """Torque on where the robot stands: goals are set to what is measured before and after."""
+        servos = self._servos
+        positions = servos.read_all("present_position")
+        self._counts = [positions[joint] for joint in servos.joints]
+        try:
+            servos.write_goals(self._counts)
+            servos.set_torque(True)
+            servos.write_goals(self._counts)
+            able = [servo for servo in servos.servos if (servo.firmware or 0) >= 38]
+            for servo in able:
+                servos.write_counts(
+                    "bus_watchdog", servo.joint, max(1, round(self.config.watchdog_s / WATCHDOG_UNIT_S))
+                )
+        except HardwareFault:
+            self._torque_off()
+            raise
+        self._goal = np.array(servos.joint_rad(self._counts))
+        self._torque = True
+        self._watch.reset(self.clock.now())
+
+    def _do_move(self, number: int, command: messages.Ramp | messages.Play | messages.Hold) -> None:
+        if not self._torque or self._goal is None:
+            raise BadInput("torque is off", remedy="switch it on first")
+        rate = self.config.rate_hz
+        if isinstance(command, messages.Hold):
+            motions = [hold(self._goal, command.seconds, rate)]
+        elif isinstance(command, messages.Ramp):
+            self._within_limits(command.target[None, :])
+            motions = [ramp(self._goal, command.target, rate)]
+        else:
+            self._within_limits(command.commands)
+            motions = play(self._goal, command.commands, rate, command.name)
+        self._motions.extend(motions)
+        self._waiting.append((number, motions[-1]))
+
+    def _do_goal(self, number: int, command: messages.Goal) -> None:
+        if not self._torque:
+            raise BadInput("torque is off", remedy="switch it on first")
+        low, high = self._limit_arrays()
+        cycles = max(1, round(command.seconds * self.config.rate_hz))
+        motion = Motion("goal", np.repeat(np.clip(command.target, low, high)[None, :], cycles, axis=0))
+        self._motions.clear()
+        self._motions.append(motion)
+        self._waiting.append((number, motion))
+
+    def _limit_arrays(self) -> tuple[Array, Array]:
+        limits = [self.config.limits_rad.get(joint, (-np.inf, np.inf)) for joint in self._servos.joints]
+        return np.array([low for low, _ in limits]), np.array([high for _, high in limits])
+
+    def _within_limits(self, commands: Array) -> None:
+        low, high = self._limit_arrays()
+        if commands.ndim != 2 or commands.shape[1] != len(low) or not np.isfinite(commands).all():
+            raise BadInput(f"commands of shape {commands.shape} for {len(low)} joints")
+        outside = np.argwhere((commands < low - 1e-9) | (commands > high + 1e-9))
+        if len(outside):
+            row, k = outside[0]
+            raise BadInput(
+                f"a command of {commands[row, k]:.3f} rad for {self._servos.joints[k]} is outside its limits "
+                f"{low[k]:.3f} to {high[k]:.3f}"
+            )
+
+    def _do_record(self, number: int, command: messages.Record) -> messages.Reply:
+        if self._recorder is not None:
+            raise BadInput(f"{self._recorder.path} is being recorded", remedy="stop that recording first")
+        channels = [self._channel(servo) for servo in self._servos.servos]
+        self._effort = ["cur" if servo.model.has_current_sensor else "load" for servo in self._servos.servos]
+        extra = {
+            "baud": self.config.baud,
+            "latency_timer_ms": self._bus.timing.latency_timer_s * 1e3,
+            "return_delay_s": self._bus.timing.return_delay_s,
+        }
+        facts = replace(command.facts, joints=self._servos.joints, extra={**extra, **command.facts.extra})
+        self._registers = self._read_registers()
+        self._recorder = RecordingWriter(
+            command.path,
+            facts=facts,
+            channels=channels,
+            registers=self._registers,
+            config=command.config,
+            clock=self.clock.now,
+            overwrite=command.overwrite,
+        )
+        return messages.Reply(number, value=str(self._recorder.path))
+
+    def _channel(self, servo: Servo) -> ServoChannel:
+        table = servo.model.registers
+        names = {
+            "pos": "present_position", "vel": "present_velocity", "pwm": "present_pwm",
+            "volt": "present_input_voltage", "temp": "present_temperature", "tick": "realtime_tick",
+        }  # fmt: skip
+        scales = {name: table[register].scale for name, register in names.items()}
+        scales["cur" if servo.model.has_current_sensor else "load"] = servo.model.effort.scale
+        return ServoChannel(servo.joint, servo.model.name, servo.id, servo.direction, servo.zero_rad, scales)
+
+    def _close_recording(self) -> tuple[str, int] | None:
+        if self._recorder is None:
+            return None
+        recorder, self._recorder = self._recorder, None
+        recorder.close()
+        return str(recorder.path), recorder.cycles
+
+    def _do_read(self, number: int, command: messages.ReadRegister) -> messages.Reply:
+        return messages.Reply(number, value=self._servos.read_all(command.register))
+
+    def _do_write(self, number: int, command: messages.WriteRegister) -> messages.Reply:
+        seen = len(self._servos.journal)
+        self._servos.write_counts(command.register, command.joint, command.counts)
+        return messages.Reply(number, value=self._servos.journal[seen:])
+
+    def _statistics(self) -> dict[str, object]:
+        names = {servo.id: servo.joint for servo in self._servos.servos}
+        return self._bus.statistics.as_dict(names) | {
+            "cycles": self._cycles,
+            "overruns": self._overruns,
+            "worst_wake_s": self._worst_wake,
+        }
+
+    def _measure(self) -> Array:
+        """Joint angles (joints,) rad, as of now."""
+        positions = self._servos.read_all("present_position")
+        return np.array(self._servos.joint_rad([positions[joint] for joint in self._servos.joints]))
+
+    # ---- to the parent -------------------------------------------------------------------------------------------
+
+    def _notice(self, text: str) -> None:
+        self._say(messages.Notice(text))
+
+    def _say(self, message: messages.Reply | messages.Event) -> None:
+        self._outbox.append(message)
+        self._flush()
+
+    def _flush(self, patience_s: float = 0.0) -> None:
+        """Send what the parent can take now; a face that does not read must not stop the loop."""
+        try:
+            while self._outbox and select.select([], [self._connection], [], patience_s)[1]:
+                self._connection.send(self._outbox.popleft())
+        except OSError:
+            if patience_s == 0.0:
+                raise _ParentGone from None
+
+
+def main() -> None:
+    """Argument: file descriptors of the connection and of the ring. The config comes first over the connection."""
+    connection, ring_fd = Connection(int(sys.argv[1])), int(sys.argv[2])
+    config, width = connection.recv()
+    Engine(config, connection, Ring(width, ring_fd)).run()
+
+
+if __name__ == "__main__":
+    main()

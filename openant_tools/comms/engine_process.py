@@ -1,0 +1,187 @@
+"""The engine from outside: starts the process, asks it, hears its events, reads its telemetry.
+
+Terminal program, command line and environments are three faces of this one object. Leaving the `with` block, or dying,
+switches torque off.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Any
+
+from openant_tools.comms.messages import Command, EngineConfig, Event, Finished, Notice, Reply, Stop, Stopped
+from openant_tools.comms.ring import Ring, columns
+from openant_tools.errors import HardwareFault
+
+__all__ = ["EngineProcess"]
+
+#: Time for a Python process to start and for eight servos to be read through, on a slow machine.
+CONNECT_TIMEOUT_S = 60.0
+#: The engine sends torque off, closes the recording and goes.
+CLOSE_TIMEOUT_S = 15.0
+
+
+class EngineProcess:
+    """An engine in a process of its own; a context manager.
+
+    Attributes:
+        config: as given.
+        description: what the engine found when it connected: joints, firmware, registers, position.
+        columns: names of the telemetry's numbers.
+
+    Raises:
+        HardwareFault: it could not connect; the message is the engine's.
+    """
+
+    def __init__(self, config: EngineConfig) -> None:
+        self.config = config
+        self.columns = columns([servo.joint for servo in config.servos])
+        self._ring = Ring(len(self.columns))
+        self._seen = 0
+        self._events: deque[Event] = deque()
+        self._replies: dict[int, Reply] = {}
+        self._number = 0
+        ours, theirs = socket.socketpair()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "openant_tools.comms.engine", str(theirs.fileno()), str(self._ring.fd)],
+            pass_fds=(theirs.fileno(), self._ring.fd),
+            start_new_session=True,
+        )
+        theirs.close()
+        self._connection = Connection(ours.detach())
+        try:
+            self._connection.send((config, len(self.columns)))
+            self.description: dict[str, Any] = self._await(0, CONNECT_TIMEOUT_S)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def __enter__(self) -> EngineProcess:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # ---- commands ------------------------------------------------------------------------------------------------
+
+    def start(self, command: Command) -> int:
+        """Send a command without waiting; its number, for `done`."""
+        self._number += 1
+        try:
+            self._connection.send((self._number, command))
+        except OSError:
+            self._died()
+        return self._number
+
+    def done(self, number: int) -> bool:
+        """Whether the command has been answered (for a motion: whether it has ended). Raises its error."""
+        self._receive(0.0)
+        if number in self._replies:
+            self._value(self._replies[number])
+            return True
+        return False
+
+    def ask(self, command: Command, timeout_s: float | None = None) -> Any:
+        """Send a command and wait for its answer; for a motion that is its end.
+
+        Raises:
+            HardwareFault: the engine says no, was stopped meanwhile, or has died.
+        """
+        return self._await(self.start(command), timeout_s)
+
+    def stop(self) -> None:
+        """The stop key: torque off now."""
+        self.ask(Stop(), 5.0)
+
+    # ---- what comes back -----------------------------------------------------------------------------------------
+
+    def events(self) -> Iterator[Event]:
+        """What happened since the last call."""
+        if not self._connection.closed:
+            self._receive(0.0)
+        while self._events:
+            yield self._events.popleft()
+
+    def telemetry(self) -> Any:
+        """Rows (n, columns) since the last call, oldest first; see `columns`. What was missed is gone."""
+        rows, self._seen = self._ring.since(self._seen)
+        return rows
+
+    def _await(self, number: int, timeout_s: float | None) -> Any:
+        give_up = None if timeout_s is None else time.monotonic() + timeout_s
+        while number not in self._replies:
+            if give_up is not None and time.monotonic() > give_up:
+                raise HardwareFault(
+                    "the engine does not answer", where=self.config.port, remedy="stop it and try again"
+                )
+            self._receive(0.1)
+        return self._value(self._replies.pop(number))
+
+    def _value(self, reply: Reply) -> Any:
+        if reply.error is not None:
+            what, where, remedy = reply.error
+            raise HardwareFault(what, where=where or self.config.port, remedy=remedy)
+        return reply.value
+
+    def _receive(self, wait_s: float) -> None:
+        try:
+            while self._connection.poll(wait_s):
+                message = self._connection.recv()
+                if isinstance(message, Reply):
+                    self._replies[message.number] = message
+                elif isinstance(message, (Finished, Stopped, Notice)):
+                    self._events.append(message)
+                wait_s = 0.0
+        except (EOFError, OSError):
+            self._died()
+
+    def _died(self) -> None:
+        code = self._process.wait(CLOSE_TIMEOUT_S)
+        raise HardwareFault(
+            f"the engine has ended (exit status {code})",
+            where=self.config.port,
+            remedy="its guardian has switched torque off; connect again",
+        )
+
+    def close(self) -> None:
+        """Torque off, recording closed, process gone. May be called again."""
+        if self._connection.closed:
+            return
+        with contextlib.suppress(OSError):
+            self._connection.send((0, None))
+        try:
+            self._drain_until_gone()
+        finally:
+            self._connection.close()
+            self._ring.close()
+
+    def _drain_until_gone(self) -> None:
+        give_up = time.monotonic() + CLOSE_TIMEOUT_S
+        while self._process.poll() is None and time.monotonic() < give_up:
+            try:
+                self._receive(0.05)
+            except HardwareFault:
+                break
+        try:
+            self._process.wait(max(0.1, give_up - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            self._process.terminate()
+            try:
+                self._process.wait(2.0)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()

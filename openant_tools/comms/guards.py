@@ -1,0 +1,131 @@
+"""What stops a motion: joint angles, effort, heat, voltage, alerts and silence. Functions of data in and reason out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from openant_tools.comms.bus import Answer
+from openant_tools.comms.servos import Block, Servo
+
+__all__ = ["Guards", "Trip", "Watch"]
+
+
+@dataclass(frozen=True)
+class Guards:
+    """Limits that stop a motion; None switches one off.
+
+    Attributes:
+        angle_margin_rad: how far beyond its limits a joint may be measured: overshoot, not a wrong way.
+        current_share, load_share: of the servo's stall current, or of its full load, over `effort_s`.
+        temperature_margin_k: below the servo's own limit, at which it would shut down.
+        silent_s: a servo that does not answer for so long is lost.
+    """
+
+    angle_margin_rad: float | None = 0.2
+    current_share: float | None = 0.9
+    load_share: float | None = 0.95
+    effort_s: float = 0.5
+    temperature_margin_k: float | None = 5.0
+    voltage: bool = True
+    silent_s: float | None = 0.25
+
+
+@dataclass(frozen=True)
+class Trip:
+    """Why the motion was stopped."""
+
+    what: str
+    remedy: str
+    joint: str | None = None
+
+
+@dataclass
+class Watch:
+    """The guards over time, for one robot.
+
+    Attributes:
+        limits_rad: joint → (low, high), joint angle.
+    """
+
+    guards: Guards
+    servos: Sequence[Servo]
+    limits_rad: Mapping[str, tuple[float, float]]
+    _strained_since: dict[int, float] = field(default_factory=dict)
+    _heard: dict[int, float] = field(default_factory=dict)
+
+    def reset(self, t: float) -> None:
+        """Torque comes on at `t`: what was before does not count."""
+        self._strained_since.clear()
+        self._heard = {servo.id: t for servo in self.servos}
+
+    def check(self, t: float, answers: Sequence[tuple[Answer, Block | None]]) -> Trip | None:
+        """The first guard that trips on this cycle's answers at time `t`, if any."""
+        for servo, (answer, block) in zip(self.servos, answers, strict=True):
+            if block is None:
+                trip = self._silence(t, servo, answer)
+            else:
+                self._heard[servo.id] = t
+                trip = self._measured(t, servo, answer, block)
+            if trip is not None:
+                return trip
+        return None
+
+    def _silence(self, t: float, servo: Servo, answer: Answer) -> Trip | None:
+        silent = t - self._heard.setdefault(servo.id, t)
+        if self.guards.silent_s is None or silent < self.guards.silent_s:
+            return None
+        return Trip(
+            f"{servo.joint} (id {servo.id}) has not answered for {silent:.2f} s ({answer.word})",
+            "look at its cable and at the one before it in the chain",
+            servo.joint,
+        )
+
+    def _measured(self, t: float, servo: Servo, answer: Answer, block: Block) -> Trip | None:
+        guards, model, place = self.guards, servo.model, f"{servo.joint} (id {servo.id})"
+        if answer.alert:
+            return Trip(f"{place} raises its alert bit", "read its hardware error status", servo.joint)
+        if guards.angle_margin_rad is not None and servo.joint in self.limits_rad:
+            angle = servo.to_joint(model.registers["present_position"].to_si(block.position))
+            low, high = self.limits_rad[servo.joint]
+            if not low - guards.angle_margin_rad <= angle <= high + guards.angle_margin_rad:
+                return Trip(
+                    f"{place} is at {angle:.2f} rad, outside its limits {low:.2f} to {high:.2f}",
+                    "look for a wrong zero, a reversed joint, or something that pushes it",
+                    servo.joint,
+                )
+        strained = (
+            guards.current_share is not None
+            and abs(model.effort.to_si(block.effort)) > guards.current_share * model.stall_current_a
+            if model.has_current_sensor
+            else guards.load_share is not None and abs(model.effort.to_si(block.effort)) > guards.load_share
+        )
+        if strained:
+            since = self._strained_since.setdefault(servo.id, t)
+            if t - since >= guards.effort_s:
+                amount = model.effort.to_si(block.effort)
+                unit = " A" if model.has_current_sensor else " of full load"
+                return Trip(
+                    f"{place} pushes with {amount:.2f}{unit} for {t - since:.1f} s",
+                    "free the joint: is a leg blocked, or the load too much?",
+                    servo.joint,
+                )
+        else:
+            self._strained_since.pop(servo.id, None)
+        if guards.temperature_margin_k is not None:
+            limit = model.temperature_limit_c - guards.temperature_margin_k
+            if block.temperature >= limit:
+                return Trip(
+                    f"{place} is at {block.temperature} °C, {model.temperature_limit_c:.0f} °C is its limit",
+                    "let it cool for 20 minutes and take load off this joint",
+                    servo.joint,
+                )
+        if guards.voltage:
+            volts, (low, high) = block.voltage * 0.1, model.supply_range_v
+            if not low <= volts <= high + 0.5:
+                return Trip(
+                    f"{place} is supplied with {volts:.1f} V, it needs {low:.1f} to {high:.1f} V",
+                    "look at the power connector and the supply under load",
+                    servo.joint,
+                )
+        return None

@@ -1,0 +1,184 @@
+"""What the engine and its faces say to each other: one dataclass a message, pickled over a socket pair."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.comms.guards import Guards
+from openant_tools.comms.servos import Servo
+from openant_tools.recording.run import Facts
+
+__all__ = [
+    "Command",
+    "EngineConfig",
+    "Event",
+    "Finished",
+    "Goal",
+    "Hold",
+    "Notice",
+    "Play",
+    "Ramp",
+    "ReadRegister",
+    "Record",
+    "Reply",
+    "Statistics",
+    "Stop",
+    "StopRecording",
+    "Stopped",
+    "Torque",
+    "WriteRegister",
+]
+
+
+@dataclass(frozen=True)
+class EngineConfig:
+    """What the engine needs to own the hardware.
+
+    Attributes:
+        port: device path or `socket://` URL; a stable path survives re-plugging.
+        control: control socket of a virtual robot; its clock is used where it is stepped.
+        limits_rad: joint → (low, high); commands beyond are refused, measurements far beyond stop the motion.
+        registers: joint → register → counts that must be in force; EEPROM is written only where it differs.
+        watchdog_s: how long servos go on moving when nothing is heard of us any more.
+    """
+
+    port: str
+    servos: tuple[Servo, ...]
+    baud: int = 1_000_000
+    rate_hz: float = 100.0
+    control: str | None = None
+    limits_rad: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    registers: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    guards: Guards = field(default_factory=Guards)
+    watchdog_s: float = 0.2
+    write_read_gap_s: float = 0.2e-3
+
+
+# ---- to the engine: each is answered by a `Reply` ------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Torque:
+    """Torque of all servos on, at the position measured, or off."""
+
+    on: bool
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """Go to a pose (joints,) rad, slowly; `Finished` follows."""
+
+    target: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Play:
+    """Play commands (n, joints) rad at the loop's rate, after a ramp to the first; `Finished` follows."""
+
+    commands: NDArray[np.float64]
+    name: str = "motion"
+
+
+@dataclass(frozen=True)
+class Hold:
+    """Stay at the last command for `seconds`; `Finished` follows."""
+
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A new goal (joints,) rad, clipped to the limits, for `seconds`; the reply comes when they have passed.
+
+    It is sent as it is: ramp to where such steps begin.
+    """
+
+    target: NDArray[np.float64]
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Record:
+    """Begin a recording; the engine adds servos, registers and resolution to the facts."""
+
+    path: str
+    facts: Facts
+    config: str | None = None
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class StopRecording:
+    """Close the recording; the reply is its path and the number of cycles."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """The stop key: torque off at once, whatever is going on."""
+
+
+@dataclass(frozen=True)
+class ReadRegister:
+    """Counts of a register of every joint: the reply is joint → counts."""
+
+    register: str
+
+
+@dataclass(frozen=True)
+class WriteRegister:
+    """Set a register of one joint, in counts; see `Servos.write_counts`."""
+
+    joint: str
+    register: str
+    counts: int
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """The reply is `BusStatistics.as_dict`, with the loop's own figures."""
+
+
+Command = Torque | Ramp | Play | Hold | Goal | Record | StopRecording | Stop | ReadRegister | WriteRegister | Statistics
+
+
+# ---- from the engine ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Reply:
+    """The answer to command number `number`: a value, or (what, where, remedy) of an error."""
+
+    number: int
+    value: Any = None
+    error: tuple[str, str | None, str | None] | None = None
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A motion has ended; its last command is held."""
+
+    motion: str
+
+
+@dataclass(frozen=True)
+class Stopped:
+    """Torque was switched off by a guard, the stop key, or an error."""
+
+    what: str
+    remedy: str | None = None
+    joint: str | None = None
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something the user should know; nothing was stopped."""
+
+    text: str
+
+
+Event = Finished | Stopped | Notice
