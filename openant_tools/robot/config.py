@@ -25,7 +25,7 @@ from openant_tools.robot.servo import BAUD_CODES, SERVO_MODELS, ServoModel
 
 __all__ = [
     "ACTION_PRESETS", "CONFIG_NAME", "ActionRange", "Actions", "Bus", "Camera", "Effect", "Imu", "Motor", "Ports",
-    "Problem", "Provenance", "RobotConfig", "Timing", "parse_config", "read_document",
+    "Problem", "Provenance", "RobotConfig", "Timing", "covers", "parse_config", "read_document",
 ]  # fmt: skip
 
 CONFIG_NAME = "robot.toml"
@@ -274,7 +274,8 @@ class RobotConfig:
         motors: joint → motor, complete, in the order of the joints.
         observation: name of a run table's column, such as `pos.hip_rr` or `gyro.x` → measured (low, high) of it.
         effects: what acts in simulation beside the MJCF.
-        provenance: dotted path, or the front of one → where what stands there came from.
+        provenance: dotted path, or the front of one → where what stands there came from; * is any one key, as in
+            `motors.*.zero_offset_rad`.
         unknown: top-level tables that this software does not know.
     """
 
@@ -302,13 +303,17 @@ class RobotConfig:
         return next((motor for motor in self.motors.values() if motor.id == id), None)
 
     def provenance_of(self, path: str) -> Provenance | None:
-        """Where the value at a dotted path came from: the entry for it, or for the longest front of it."""
-        parts = path.split(".")
-        for length in range(len(parts), 0, -1):
-            entry = self.provenance.get(".".join(parts[:length]))
-            if entry is not None:
-                return entry
-        return None
+        """Where the value at a dotted path came from: the longest entry that covers it, the one without * first."""
+        entries = [entry for entry in self.provenance if covers(entry, path)]
+        return (
+            self.provenance[max(entries, key=lambda entry: (entry.count("."), -entry.count("*")))] if entries else None
+        )
+
+
+def covers(entry: str, path: str) -> bool:
+    """Whether a provenance entry is about a dotted path: the same, or a front of it, with * for any one key."""
+    entry_keys, keys = entry.split("."), path.split(".")
+    return len(entry_keys) <= len(keys) and all(own in ("*", key) for own, key in zip(entry_keys, keys, strict=False))
 
 
 _SECTIONS: Mapping[str, type[Any]] = {

@@ -20,6 +20,7 @@ from openant_tools.robot.config import (
     Problem,
     Provenance,
     RobotConfig,
+    covers,
     parse_config,
     read_document,
 )
@@ -161,8 +162,8 @@ class RobotFolder:
 
         Args:
             values: dotted path → value, such as {"motors.hip_rr.zero_offset_rad": 0.79}.
-            provenance: where these values came from: one for all of them, or path → provenance (whose paths need not
-                be among the values).
+            provenance: where these values came from: one for all of them, or path → provenance (whose paths may also
+                be fronts of paths, with * for any key). Older entries about the same values give way.
             effects: the new list of `[[effect]]`, if it is to be replaced.
 
         Returns:
@@ -180,7 +181,7 @@ class RobotFolder:
         if isinstance(provenance, Provenance):
             provenance = dict.fromkeys(values, provenance)
         for path, entry in (provenance or {}).items():
-            _set(document, ["provenance", path], _provenance_item(entry))
+            _set_provenance(document, path, entry)
         if effects is not None:
             _set_effects(document, effects)
         after = tomlkit.dumps(document).encode("utf-8")
@@ -321,6 +322,13 @@ def _same(present: Any, value: Any) -> bool:
     if isinstance(plain, bool) != isinstance(wanted, bool):
         return False
     return bool(plain == wanted)
+
+
+def _set_provenance(document: tomlkit.TOMLDocument, path: str, entry: Provenance) -> None:
+    present = document.get("provenance", {})
+    for stale in [key for key in present if key != path and covers(path, str(key))]:
+        del present[stale]
+    _set(document, ["provenance", path], _provenance_item(entry))
 
 
 def _provenance_item(entry: Provenance) -> InlineTable:

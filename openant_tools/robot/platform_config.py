@@ -7,6 +7,7 @@ stays in a copy of the file in the robot's folder, from which the export starts.
 
 from __future__ import annotations
 
+import datetime
 import json
 import math
 import re
@@ -16,15 +17,22 @@ from pathlib import Path
 from typing import Any
 
 from openant_tools.errors import BadInput
-from openant_tools.robot.config import MAX_ANGLE_RAD, MAX_OFFSET_RAD, RobotConfig
+from openant_tools.files import write_bytes
+from openant_tools.robot.config import MAX_ANGLE_RAD, MAX_OFFSET_RAD, Provenance, RobotConfig, read_document
+from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
 
-__all__ = ["PlatformConfig", "export_platform_config", "read_platform_config"]
+__all__ = [
+    "PlatformConfig", "export_notes", "export_platform_config", "import_platform_config", "imported_object",
+    "read_platform_config",
+]  # fmt: skip
 
 #: The platform's config maker rounds offsets to this grid, the angle between two splines of a servo's horn it knows.
 OFFSET_GRID_RAD = math.pi / 4
 #: Digits that survive degrees → rad → degrees.
 DEGREE_DIGITS = 12
+#: What the platform's driver speaks, whatever its configuration says.
+PLATFORM_BAUD = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -161,6 +169,72 @@ def _read_name(path: Path, values: dict[str, Any], notes: list[str]) -> None:
     stated = values.setdefault("camera.body_tag_id", tag)
     if stated != tag:
         notes.append(f"the file's name says body tag {tag}, camera_tag_ids.body says {stated}; the latter is taken")
+
+
+def import_platform_config(platform: PlatformConfig, path: str | Path, kit: str | None = None) -> RobotFolder:
+    """Put a platform's configuration into a robot's folder, which is made where there is none.
+
+    A copy of the file stays in the folder; `platform.config` in `robot.toml` names it.
+
+    Args:
+        platform: what was read.
+        path: the robot's folder.
+        kit: of a robot to be made; default "standard", which the file cannot tell.
+
+    Raises:
+        BadInput: the folder's robot is of another kit, or what it would hold cannot be.
+    """
+    target = RobotFolder(Path(path))
+    if target.config_file.is_file():
+        folder = target
+        present = folder.config().kit
+        if kit not in (None, present):
+            raise BadInput(
+                f"the robot there is of the {present} kit", where=folder.config_file, remedy="leave out --kit"
+            )
+    else:
+        folder = create_robot(path, kit or "standard", platform.name)
+    copy = folder.path / platform.path.name
+    if copy.resolve() != platform.path.resolve():
+        write_bytes(copy, platform.path.read_bytes())
+    source = Provenance(
+        how="imported",
+        command=f"openant config import {platform.path.name}",
+        date=datetime.datetime.now(datetime.UTC).replace(microsecond=0),
+    )
+    # What every joint got has one entry with *, instead of eight alike.
+    fields = {path.split(".")[2] for path in platform.values if path.startswith("motors.")}
+    for_all = {field for field in fields if all(f"motors.{joint}.{field}" in platform.values for joint in JOINTS)}
+    paths = [path for path in platform.values if not (path.startswith("motors.") and path.split(".")[2] in for_all)]
+    paths += [f"motors.*.{field}" for field in sorted(for_all)]
+    folder.update({**platform.values, "platform.config": copy.name}, provenance=dict.fromkeys(paths, source))
+    return folder
+
+
+def imported_object(folder: RobotFolder) -> dict[str, Any] | None:
+    """The object that was imported into a folder, None where none was, or where its copy is gone."""
+    document = read_document(folder.config_file.read_bytes(), folder.config_file).unwrap()
+    table = document.get("platform")
+    name = table.get("config") if isinstance(table, dict) else None
+    path = folder.path / name if isinstance(name, str) else None
+    return _load(path) if path is not None and path.is_file() else None
+
+
+def export_notes(config: RobotConfig, out: Path | None, *, on_grid: bool = False) -> list[str]:
+    """What the platform's software will take otherwise than it stands in `robot.toml`."""
+    notes = []
+    worst = max(config.motors.values(), key=lambda motor: off_grid(motor.zero_offset_rad))
+    if on_grid and off_grid(worst.zero_offset_rad) > 1e-4:
+        notes.append(
+            f"rounding to 45° moves the zero of {worst.joint} by {math.degrees(off_grid(worst.zero_offset_rad)):.2f}°, "
+            "the most of all joints"
+        )
+    if config.bus.baud != PLATFORM_BAUD:
+        notes.append(f"the platform's environment ignores motor_baudrate and speaks {PLATFORM_BAUD} baud")
+    tag = config.camera.body_tag_id
+    if out is not None and tag >= 0 and out.name != f"ant{tag}.json":
+        notes.append(f"the platform names its files after the tag on the torso, here ant{tag}.json")
+    return notes
 
 
 def off_grid(offset_rad: float) -> float:
