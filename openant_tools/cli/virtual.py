@@ -1,0 +1,57 @@
+"""`openant virtual`: start a virtual Open Ant that speaks the real protocols."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+__all__ = ["virtual"]
+
+
+@click.group()
+def virtual() -> None:
+    """A virtual Open Ant that speaks the real protocols."""
+
+
+@virtual.command()
+@click.option(
+    "--scenario",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="A TOML file that says what this robot is and what is wrong with it. Default: a healthy standard Ant on its "
+    "stand.",
+)
+@click.option(
+    "--ready-file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Write where to connect, as JSON, once everything is ready.",
+)
+@click.option(
+    "--clock",
+    type=click.Choice(["real", "stepped"]),
+    help="Real time, or time that moves only by the control socket. Default: what the scenario says, else real.",
+)
+@click.option("--tcp", is_flag=True, help="Put the bus on a TCP port (pyserial's socket://) instead of a terminal.")
+def start(scenario: Path | None, ready_file: Path | None, clock: str | None, tcp: bool) -> None:
+    """Run until interrupted; prints where to connect.
+
+    \b
+    A client opens the bus as any serial port, at 1,000,000 baud unless the scenario says otherwise:
+      openant virtual start --ready-file ant.json
+      openant comms scan --port $(jq -r .bus ant.json)
+    """
+    from openant_tools.virtual.start import serve
+
+    with serve(scenario, clock=clock, tcp=tcp) as server:
+        for name, value in server.addresses.items():
+            if value is not None:
+                click.echo(f"{name:8} {value}")
+        if ready_file is not None:
+            server.announce(ready_file)
+        try:
+            server.run()
+        except KeyboardInterrupt:
+            # Interrupting is how one ends it (formats, section 6): no failure.
+            click.echo("stopped", err=True)

@@ -1,0 +1,445 @@
+"""The servos' control loops, motors and gears, all joints at once: the firmware at 1 kHz, the windings, the supply.
+
+One call of `step` computes, from joint angles and speeds, the torque of every motor at its output shaft. Everything is
+an array over the n servos, since a scalar loop would be ten times slower; what few servos have (profiles, modes other
+than position, play in the gear) runs only where it occurs.
+
+Electrics: I = (d·V − ke·ω)/R with the bridge's duty d, τ = kt·I. A bridge that is on brakes at duty 0; torque off opens
+it. All servos hang on one supply with resistance Rs, so that V = V0 − Rs·(ΣI_standby + Σ d·I), solved exactly.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.robot.registers import PULSES_PER_TURN, PWM_FULL, RAD_S_PER_COUNT
+from openant_tools.virtual.body import Body
+from openant_tools.virtual.motor import MotorSettings
+from openant_tools.virtual.profile import Trajectory, start_trajectory
+from openant_tools.virtual.servo import (
+    CURRENT_MODE,
+    CURRENT_POSITION_MODE,
+    EXTENDED_MODE,
+    POSITION_MODE,
+    PWM_MODE,
+    VELOCITY_MODE,
+    Loop,
+    Sensed,
+)  # fmt: skip
+
+__all__ = ["Drive", "Drives"]
+
+Array = NDArray[np.float64]
+
+PULSES_PER_RAD = PULSES_PER_TURN / (2 * math.pi)
+AMPERE_PER_COUNT = 2.69e-3
+#: share of the critical damping of the gear's teeth
+GEAR_DAMPING = 0.25
+#: (angular frequency of the stiffest spring) × (time step) stays below this, well inside what symplectic Euler bears
+SPRING_STEP = 0.5
+_NOISE_BLOCK = 4096
+
+
+class Drives:
+    """Loops, motors and gears of n servos in front of a body.
+
+    Args:
+        motors: settings of each, in the order of the body's joints.
+        sign, mount_rad: shaft angle = sign · joint angle + mount, (n,).
+        seed: of encoder and current noise and of random delays.
+    """
+
+    def __init__(
+        self, body: Body, motors: Sequence[MotorSettings], sign: Array, mount_rad: Array, *, seed: int = 0
+    ) -> None:
+        n = len(motors)
+        self.body, self.motors, self.n = body, list(motors), n
+        self.dt = body.settings.timestep_s
+        self.time = 0.0
+        self.sign, self.mount = sign.astype(float), mount_rad.astype(float)
+        self._random = np.random.default_rng(seed)
+        # state of the loops
+        self.torque_on = np.zeros(n)
+        self.goal = np.zeros(n)
+        self.effective_goal = np.zeros(n)
+        self.direction = np.ones(n)
+        self.offset = np.zeros(n)
+        self.p_gain, self.i_gain, self.d_gain = np.zeros(n), np.zeros(n), np.zeros(n)
+        self.pwm_limit = np.full(n, float(PWM_FULL))
+        self._error, self._sum, self._pwm = np.zeros(n), np.zeros(n), np.zeros(n)
+        self.loops: list[Loop] = [Loop() for _ in range(n)]
+        self._special: list[int] = []
+        self._velocity_sum = np.zeros(n)
+        self._moves: dict[int, Trajectory] = {}
+        self._queue: list[tuple[float, int, int, tuple[float, float, float, bool]]] = []
+        self._count = 0
+        self._dropped_until = np.full(n, -1.0)
+        # what the sensors show
+        self.duty, self.current, self.shaft_velocity = np.zeros(n), np.zeros(n), np.zeros(n)
+        self.motor_torque = np.zeros(n)
+        self._filtered_velocity = np.zeros(n)
+        self.voltage = 12.0
+        # the supply
+        self.supply_v, self.supply_ohm, self.supply_a = 12.0, 0.0, 0.0
+        self.lowest_voltage = 12.0
+        #: s below each servo's reset voltage, without a break
+        self.starved_s = np.zeros(n)
+        self.powered = np.ones(n)
+        # heat, of winding and case
+        self.ambient = 25.0
+        self.winding, self.case = np.full(n, 25.0), np.full(n, 25.0)
+        self._derating = np.zeros(n)
+        self.configure()
+
+    # ---- settings ----
+
+    def configure(self) -> None:
+        """Take the motors' settings anew, after any of them has changed."""
+        m = self.motors
+
+        def column(name: str) -> Array:
+            return np.array([float(getattr(motor, name)) for motor in m])
+
+        self.kt, self.ke, self._r_cold = column("kt"), column("ke"), column("resistance")
+        self.resistance = self._r_cold.copy()
+        self.strength = column("strength")
+        self._armature = column("armature")
+        self._coulomb, self._viscous = column("coulomb_nm"), column("viscous")
+        self._static = np.maximum(column("static_nm"), self._coulomb)
+        self._stribeck_rad_s = column("stribeck_rad_s")
+        self._bias, self._load_friction = column("friction_bias_nm"), column("load_friction")
+        self._quadratic = column("viscous_quadratic")
+        self._cogging, self._periods = column("cogging_nm"), column("cogging_periods")
+        self._torque_limit = column("torque_limit_nm")
+        self._torque_limit[self._torque_limit == 0] = np.inf
+        self._dead_zone = column("dead_zone_rad") / 2 * PULSES_PER_RAD
+        lag = column("lag_s")
+        self._lag_share = np.where(lag > 0, 1 - np.exp(-self.dt / np.maximum(lag, 1e-9)), 1.0)
+        self._slew = column("slew_rad_s") * PULSES_PER_RAD * self.dt
+        self._slew[self._slew == 0] = np.inf
+        self._velocity_share = 1 - np.exp(-self.dt / np.maximum(column("velocity_filter_s"), 1e-9))
+        self._standby = column("standby_a")
+        self._reset_v = column("reset_v")
+        self._copper, self._magnet = column("copper_per_k"), column("magnet_per_k")
+        self._winding_j_k, self._case_j_k = column("winding_j_k"), column("case_j_k")
+        self._winding_case, self._case_air = column("winding_case_k_w"), column("case_air_k_w")
+        self._derating_per_k, self._derating_s = column("derating_per_k"), column("derating_s")
+        self._p_divisor, self._i_divisor, self._d_divisor = (
+            column("p_divisor"), column("i_divisor"), column("d_divisor"),
+        )  # fmt: skip
+        self._stiffness_scale = column("stiffness_scale")
+        # One period for all: the firmware of every X430 is of one family.
+        self._every = max(1, round(m[0].control_period_s / self.dt)) if m else 1
+        self._noise = column("encoder_noise_rad") * PULSES_PER_RAD
+        self._current_noise = column("current_noise_a")
+        self._noisy = bool(self._noise.any())
+        self._fill_noise()
+        self._varying_friction = bool(self._load_friction.any() or (self._static > self._coulomb).any())
+        self._extra_torque = bool(self._bias.any() or self._quadratic.any() or self._cogging.any())
+        self._limited = bool(np.isfinite(self._torque_limit).any())
+        self._filtered_goal = bool((self._lag_share < 1).any() or np.isfinite(self._slew).any())
+        self._shaft_gain = self.sign * PULSES_PER_RAD
+        self._shaft_zero = self.mount * PULSES_PER_RAD
+        self.elastic = any(motor.elastic for motor in m)
+        self._set_gear(column("backlash_rad"), column("gear_stiffness"))
+        self._warm(0.0)
+        for k, loop in enumerate(self.loops):
+            self._take(k, loop)
+
+    def _set_gear(self, backlash: Array, stiffness: Array) -> None:
+        body = self.body
+        if not self.elastic:
+            body.set_gear(self._coulomb, self._viscous, self._armature)
+            return
+        # Every rotor is ours then; a gear without play of its own is a stiff spring.
+        body.set_gear(np.zeros(self.n), np.zeros(self.n), np.zeros(self.n))
+        inertia = np.maximum(body.link_inertia(), 1e-6)
+        self._half_gap = backlash / 2
+        self._gear_k = np.minimum(stiffness, np.minimum(inertia, self._armature) * (SPRING_STEP / self.dt) ** 2)
+        self._gear_c = 2 * GEAR_DAMPING * np.sqrt(self._gear_k * inertia)
+        if not hasattr(self, "rotor"):
+            self.rotor, self.rotor_velocity = body.q.copy(), body.v.copy()
+
+    def _fill_noise(self) -> None:
+        self._noise_rows = self._random.standard_normal((_NOISE_BLOCK, self.n)) * self._noise
+        self._noise_row = 0
+
+    # ---- what the firmware does to its loop ----
+
+    def set_loop(self, k: int, loop: Loop) -> None:
+        was = self.loops[k]
+        if loop.torque and not was.torque:
+            self._error[k] = self._sum[k] = self._velocity_sum[k] = 0.0
+        self.loops[k] = loop
+        self._take(k, loop)
+
+    def _take(self, k: int, loop: Loop) -> None:
+        self.torque_on[k] = float(loop.torque)
+        self.direction[k], self.offset[k] = loop.direction, loop.offset
+        self.p_gain[k] = loop.p_gain / self._p_divisor[k] * self._stiffness_scale[k]
+        self.i_gain[k] = loop.i_gain / self._i_divisor[k]
+        self.d_gain[k] = loop.d_gain / self._d_divisor[k]
+        self.pwm_limit[k] = loop.pwm_limit
+        plain = loop.mode in (POSITION_MODE, EXTENDED_MODE)
+        feeds = loop.feedforward_velocity or loop.feedforward_acceleration
+        self._special = [i for i in self._special if i != k]
+        if not plain or feeds:
+            self._special.append(k)
+
+    def hold(self, k: int, pulses: float) -> None:
+        self._moves.pop(k, None)
+        self._queue = [entry for entry in self._queue if entry[2] != k]
+        heapq.heapify(self._queue)
+        self.goal[k] = self.effective_goal[k] = pulses
+
+    def set_goal(self, k: int, pulses: float, velocity: float, acceleration: float, time_based: bool) -> None:
+        """A goal that arrived now; it takes effect after the motor's delay, unless it is lost."""
+        motor = self.motors[k]
+        if motor.dropout_fraction > 0 and self._lost(k, motor):
+            return
+        late = motor.action_delay_s
+        if motor.jitter_s > 0:
+            late = max(0.0, late + motor.jitter_s * float(self._random.standard_normal()))
+        self._count += 1
+        heapq.heappush(self._queue, (self.time + late, self._count, k, (pulses, velocity, acceleration, time_based)))
+
+    def _lost(self, k: int, motor: MotorSettings) -> bool:
+        if self.time < self._dropped_until[k]:
+            return True
+        # Runs of random length up to the longest; on average their share of the time is the fraction.
+        if motor.dropout_s <= 0:
+            return bool(self._random.random() < motor.dropout_fraction)
+        mean_run = motor.dropout_s / 2
+        pause = mean_run * (1 - motor.dropout_fraction) / motor.dropout_fraction
+        since = self.time - self._dropped_until[k]
+        if self._dropped_until[k] < 0 or (since > 0 and self._random.random() < min(1.0, since / pause) * 0.5):
+            self._dropped_until[k] = self.time + self._random.uniform(0.0, motor.dropout_s)
+            return self._dropped_until[k] > self.time
+        return False
+
+    def _take_goals(self) -> None:
+        while self._queue and self._queue[0][0] <= self.time + 1e-9:
+            _, _, k, (pulses, velocity, acceleration, time_based) = heapq.heappop(self._queue)
+            moving = self._moves.pop(k, None)
+            speed = moving.velocity if moving else 0.0
+            trajectory = start_trajectory(
+                float(self.goal[k]), speed, pulses,
+                velocity_count=velocity, acceleration_count=acceleration, time_based=time_based,
+            )  # fmt: skip
+            if trajectory is None:
+                self.goal[k] = pulses
+            else:
+                self._moves[k] = trajectory
+
+    # ---- one step ----
+
+    def step(self, count: int) -> None:
+        """One time step: sense, control, torque, mechanics. `count` numbers the steps, for the loop's period."""
+        body = self.body
+        if self._queue:
+            self._take_goals()
+        if self._moves:
+            for k, move in list(self._moves.items()):
+                if not move.step(self.dt):
+                    del self._moves[k]
+                self.goal[k] = move.position
+        if self._filtered_goal:
+            change = (self.goal - self.effective_goal) * self._lag_share
+            self.effective_goal += np.minimum(np.maximum(change, -self._slew), self._slew)
+            goal = self.effective_goal
+        else:
+            goal = self.goal
+        shaft_velocity = self.sign * (self.rotor_velocity if self.elastic else body.v)
+        if count % self._every == 0:
+            self._control(goal)
+        d = self._pwm * self.torque_on
+        d *= 1.0 / PWM_FULL
+        d *= self.direction
+        conducting = self.torque_on
+        back = self.ke * shaft_velocity
+        over_r = d / self.resistance
+        draw, push = float(over_r @ d), float(over_r @ back)
+        volts = (self.supply_v - self.supply_ohm * (self.supply_a - push)) / (1 + self.supply_ohm * draw)
+        self.voltage = volts
+        if volts < self.lowest_voltage:
+            self.lowest_voltage = volts
+        current = (d * volts - back) / self.resistance * conducting
+        torque = self.kt_warm * current
+        torque *= self._pull
+        if self._limited:
+            torque = np.minimum(np.maximum(torque, -self._torque_limit), self._torque_limit)
+        self.duty, self.current, self.motor_torque, self.shaft_velocity = d, current, torque, shaft_velocity
+        self._filtered_velocity += (shaft_velocity - self._filtered_velocity) * self._velocity_share
+        joint_torque = torque * self.sign
+        if self._extra_torque:
+            joint_torque = joint_torque + self._extra()
+        if self.elastic:
+            self._step_rotors(joint_torque)
+        else:
+            if self._varying_friction:
+                body.frictionloss[:] = self._friction(body.v, joint_torque)
+            body.torque[:] = joint_torque
+        body.step()
+        self.time += self.dt
+
+    def _control(self, goal: Array) -> None:
+        pulses = self._shaft_gain * self.body.q
+        pulses += self._shaft_zero
+        if self._noisy:
+            if self._noise_row == _NOISE_BLOCK:
+                self._fill_noise()
+            pulses += self._noise_rows[self._noise_row]
+            self._noise_row += 1
+        np.rint(pulses, out=pulses)
+        pulses *= self.direction
+        pulses += self.offset
+        error = goal - pulses
+        if self._dead_zone.any():
+            error = np.sign(error) * np.maximum(np.abs(error) - self._dead_zone, 0.0)
+        pwm = self.p_gain * error
+        if self.i_gain.any():
+            # The sum never asks for more than the limit: the firmware has to stop it somewhere.
+            self._sum += error * self.torque_on
+            room = self.pwm_limit / np.maximum(self.i_gain, 1e-12)
+            self._sum = np.minimum(np.maximum(self._sum, -room), room)
+            pwm += self.i_gain * self._sum
+        if self.d_gain.any():
+            pwm += self.d_gain * (error - self._error)
+        self._error = error
+        for k in self._special:
+            self._control_specially(k, pwm)
+        self._pwm = np.trunc(np.minimum(np.maximum(pwm, -self.pwm_limit), self.pwm_limit))
+
+    def _control_specially(self, k: int, pwm: Array) -> None:
+        """Feed-forward, and the modes that are not position control."""
+        loop = self.loops[k]
+        move = self._moves.get(k)
+        if loop.mode in (POSITION_MODE, EXTENDED_MODE, CURRENT_POSITION_MODE) and move is not None:
+            # Unpublished: the velocity's unit. Pulses per control period are taken, as the D gain sees them.
+            pwm[k] += loop.feedforward_velocity / 4 * move.velocity * self._every * self.dt
+        if loop.mode == PWM_MODE:
+            pwm[k] = loop.goal_pwm
+        elif loop.mode == VELOCITY_MODE:
+            velocity = self.direction[k] * self._filtered_velocity[k] / RAD_S_PER_COUNT
+            error = loop.goal_velocity - velocity
+            self._velocity_sum[k] += error
+            pwm[k] = loop.velocity_p_gain / 128 * error + loop.velocity_i_gain / 65536 * self._velocity_sum[k]
+        elif loop.mode in (CURRENT_MODE, CURRENT_POSITION_MODE):
+            # The bridge gives what drives this current against back-EMF.
+            wanted = abs(loop.goal_current) * AMPERE_PER_COUNT
+            back = self.direction[k] * self.ke[k] * self.shaft_velocity[k]
+            volts = max(self.voltage, 1.0)
+            if loop.mode == CURRENT_MODE:
+                drive = math.copysign(wanted, loop.goal_current)
+                pwm[k] = (drive * self.resistance[k] + back) / volts * PWM_FULL
+            else:
+                low = (-wanted * self.resistance[k] + back) / volts * PWM_FULL
+                high = (wanted * self.resistance[k] + back) / volts * PWM_FULL
+                pwm[k] = min(max(pwm[k], low), high)
+
+    def _friction(self, velocity: Array, torque: Array) -> Array:
+        """(n,) N·m: f = c + (s − c)·exp(−(ω/ωs)²) + µ·|τ|."""
+        fall = np.exp(-np.square(velocity / self._stribeck_rad_s))
+        return self._coulomb + (self._static - self._coulomb) * fall + self._load_friction * np.abs(torque)
+
+    def _extra(self) -> Array:
+        v = self.rotor_velocity if self.elastic else self.body.v
+        # Friction larger one way than the other is symmetric friction and a constant torque: p for ω > 0 and n for
+        # ω < 0 are (p + n)/2 against the motion plus (n − p)/2 always.
+        extra = -self._bias - self._quadratic * v * np.abs(v)
+        if self._cogging.any():
+            angle = (self.rotor if self.elastic else self.body.q) * self.sign + self.mount
+            extra += self._cogging * np.sin(self._periods * angle)
+        return extra
+
+    def _step_rotors(self, torque: Array) -> None:
+        """Rotors behind gears with play and spring; friction acts on the rotor, by a step that may stop it."""
+        body, dt = self.body, self.dt
+        twist = self.rotor - body.q
+        squeeze = np.sign(twist) * np.maximum(np.abs(twist) - self._half_gap, 0.0)
+        touching = squeeze != 0
+        gear = self._gear_k * squeeze
+        gear += self._gear_c * (self.rotor_velocity - body.v) * touching
+        # Teeth push, they do not pull.
+        gear = np.where(gear * squeeze > 0, gear, 0.0)
+        body.torque[:] = gear
+        friction = self._friction(self.rotor_velocity, gear) if self._varying_friction else self._coulomb
+        velocity = self.rotor_velocity + dt * (torque - gear) / self._armature
+        velocity /= 1 + dt * self._viscous / self._armature
+        stop = dt * friction / self._armature
+        self.rotor_velocity = np.sign(velocity) * np.maximum(np.abs(velocity) - stop, 0.0)
+        self.rotor += dt * self.rotor_velocity
+
+    # ---- slow things ----
+
+    def heat(self, dt: float) -> None:
+        """Warm winding and case over dt (s): two nodes each, explicit, dt far below their time constants."""
+        loss = np.square(self.current) * self.resistance
+        idle = self._standby * self.voltage * self.powered
+        flow = (self.winding - self.case) / self._winding_case
+        self.winding += dt * (loss - flow) / self._winding_j_k
+        self.case += dt * (flow + idle - (self.case - self.ambient) / self._case_air) / self._case_j_k
+        self._warm(dt)
+
+    def _warm(self, dt: float) -> None:
+        rise = self.winding - 25.0
+        self.resistance = self._r_cold * (1 + self._copper * rise)
+        self.kt_warm = self.kt * (1 - self._magnet * rise)
+        share = np.where(self._derating_s > 0, 1 - np.exp(-dt / np.maximum(self._derating_s, 1e-9)), 1.0)
+        self._derating += (self._derating_per_k * (self.case - 25.0) - self._derating) * share
+        self._pull = self.strength * np.clip(1 - self._derating, 0.0, 1.0)
+
+    def watch_supply(self, dt: float) -> None:
+        """Note how long each servo has been below its reset voltage, by the lowest since the last call."""
+        self.supply_a = float(self._standby @ self.powered)
+        low = self.lowest_voltage < self._reset_v
+        self.starved_s = np.where(low, self.starved_s + dt, 0.0)
+        self.lowest_voltage = self.voltage
+
+    def sense(self, k: int, time: float) -> Sensed:
+        """What servo k's electronics measure at `time` (s), at most a step after the last one done."""
+        ahead = time - self.time
+        q, v = float(self.body.q[k]), float(self.body.v[k])
+        pulses = float(self._shaft_gain[k]) * (q + v * ahead) + float(self._shaft_zero[k])
+        if self._noisy:
+            pulses += float(self._noise_rows[self._noise_row - 1, k])
+        current = float(self.current[k]) + float(self._current_noise[k]) * float(self._random.standard_normal())
+        move = self._moves.get(k)
+        return Sensed(
+            pulses=pulses,
+            velocity=float(self._filtered_velocity[k]),
+            current=current,
+            duty=float(self.duty[k]),
+            voltage=self.voltage,
+            temperature=float(self.case[k]),
+            trajectory=float(self.goal[k]),
+            trajectory_velocity=move.velocity if move else 0.0,
+            profile_active=move is not None,
+            profile_shape=move.shape if move else 0,
+        )
+
+
+class Drive:
+    """One servo's view of the drives: the `Motor` of its firmware."""
+
+    def __init__(self, drives: Drives, k: int) -> None:
+        self._drives, self._k = drives, k
+        #: s, until when the body's last state is carried on in a straight line; the world sets it
+        self.now = 0.0
+
+    def sense(self) -> Sensed:
+        return self._drives.sense(self._k, max(self.now, self._drives.time))
+
+    def set_loop(self, loop: Loop) -> None:
+        self._drives.set_loop(self._k, loop)
+
+    def set_goal(self, pulses: float, *, velocity: float, acceleration: float, time_based: bool) -> None:
+        self._drives.set_goal(self._k, pulses, velocity, acceleration, time_based)
+
+    def hold(self, pulses: float) -> None:
+        self._drives.hold(self._k, pulses)

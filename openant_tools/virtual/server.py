@@ -1,0 +1,397 @@
+"""The virtual robot as a process: ports that clients open, a control socket, and one loop that keeps time.
+
+In real time the world is brought to "now" before each packet and every answer leaves when the wire would have
+delivered it. In stepped time nothing moves but by the control socket.
+
+The control socket (Unix stream, one JSON object a line, one line of answer each):
+
+| request | answer |
+|---|---|
+| `{"do": "now"}` | `{"t": s, "stepped": bool}` |
+| `{"do": "open"}` | counts of bytes start anew, for a client that has just opened its ports; `{"t": s}` |
+| `{"do": "advance", "to": s}` | runs the world to that time (stepped only); `{"t": s}` |
+| `{"do": "settle", "bus_written": n, "imu_written": m}` | waits for so many bytes in all and lets them act; |
+| | `{"t": s, "bus_sent": n, "imu_sent": m}`: when the last answer reached the host (or the wire fell silent), and |
+| | how many bytes were sent in all |
+| `{"do": "state"}` | the truth: angles, torques, temperatures, torque enables, supply, body |
+| `{"do": "fault", "cause": …, "where": …, "on": bool, …}` | switches a fault; `{"t": s}` |
+| `{"do": "plug", "joint": …}`, `{"do": "unplug", …}` | puts a servo on the bus or takes it off; `{"t": s}` |
+
+What fails answers `{"error": "…"}`. Counts of bytes run from the opening of this control connection or the last `open`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import json
+import os
+import selectors
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from openant_tools.errors import OpenAntError
+from openant_tools.files import write_text
+from openant_tools.virtual.ports import Port, PtyPort, TcpPort
+from openant_tools.virtual.world import World
+
+__all__ = ["Device", "Server"]
+
+#: s between two advances of the world while nobody talks.
+IDLE_S = 4e-3
+#: s before an answer is due in which the loop spins, since sleeping overshoots by 0.1 ms and more.
+SPIN_S = 2e-4
+#: A world that falls behind by more lets the time go: after a laptop's sleep it does not run to catch up.
+MAX_LAG_S = 1.0
+SETTLE_TIMEOUT_S = 5.0
+
+
+class Device(Protocol):
+    """What sits behind a port other than the bus: bytes in, bytes out, both with their time in s."""
+
+    @property
+    def connected(self) -> bool: ...
+
+    def receive(self, data: bytes, t: float) -> None: ...
+
+    def transmit(self, t: float) -> bytes: ...
+
+    def next_event(self, t: float) -> float: ...
+
+
+@dataclass
+class _Control:
+    """One client of the control socket."""
+
+    socket: socket.socket
+    buffer: bytearray = field(default_factory=bytearray)
+    received: dict[str, int] = field(default_factory=dict)
+    sent: dict[str, int] = field(default_factory=dict)
+
+
+class _Failed(Exception):
+    """A control request that cannot be done."""
+
+
+class Server:
+    """Serves one world.
+
+    Args:
+        world: the robot.
+        stepped: time moves only by the control socket.
+        imu: the flight controller, if any. camera: the source that clients open.
+        tcp: the bus on a TCP port instead of a pseudo-terminal.
+        folder: where the links and the socket stand; by default a temporary one, removed at the end.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        *,
+        stepped: bool = False,
+        imu: Device | None = None,
+        camera: str | None = None,
+        tcp: bool = False,
+        folder: Path | None = None,
+        fault: Callable[[dict[str, Any]], None] | None = None,
+    ) -> None:
+        self.world, self.stepped, self.camera = world, stepped, camera
+        self._imu, self._fault = imu, fault
+        self._own_folder = folder is None
+        self.folder = Path(tempfile.mkdtemp(prefix="openant-")) if folder is None else folder
+        self.ports: dict[str, Port] = {"bus": TcpPort() if tcp else PtyPort(self.folder / "bus")}
+        if imu is not None:
+            self.ports["imu"] = PtyPort(self.folder / "imu")
+        self.received = dict.fromkeys(("bus", "imu"), 0)
+        self.sent = dict.fromkeys(("bus", "imu"), 0)
+        self._held: list[tuple[float, str, bytes, int]] = []
+        self._outbox: list[tuple[float, int, str, bytes]] = []
+        self._count = 0
+        self._selector = selectors.DefaultSelector()
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._listener.bind(str(self.folder / "control"))
+        self._listener.listen()
+        self._listener.setblocking(False)
+        self._selector.register(self._listener, selectors.EVENT_READ, "listener")
+        self._controls: list[_Control] = []
+        self._watched: dict[int, str] = {}
+        self._start = time.monotonic() - world.now
+        self._last_delivery = 0.0
+        self._stalled_until = 0.0
+
+    # ---- life ----
+
+    @property
+    def addresses(self) -> dict[str, Any]:
+        """What the ready file says (formats, section 6)."""
+        bus = self.ports["bus"]
+        return {
+            "bus": bus.url if isinstance(bus, TcpPort) else str(self.folder / "bus"),
+            "imu": str(self.folder / "imu") if "imu" in self.ports else None,
+            "camera": self.camera,
+            "control": str(self.folder / "control"),
+            "pid": os.getpid(),
+        }
+
+    def announce(self, ready_file: Path) -> None:
+        write_text(ready_file, json.dumps(self.addresses) + "\n")
+
+    def close(self) -> None:
+        for port in self.ports.values():
+            port.close()
+        for control in self._controls:
+            control.socket.close()
+        self._listener.close()
+        self._selector.close()
+        if self._own_folder:
+            shutil.rmtree(self.folder, ignore_errors=True)
+        else:
+            (self.folder / "control").unlink(missing_ok=True)
+
+    def __enter__(self) -> Server:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def run(self, until: Callable[[], bool] = lambda: False) -> None:
+        """Serve until `until()` (looked at a few hundred times a second) or an interrupt."""
+        while not until():
+            self.turn()
+
+    # ---- the loop ----
+
+    @property
+    def now(self) -> float:
+        """s since power-on."""
+        return self.world.now if self.stepped else time.monotonic() - self._start
+
+    def turn(self) -> None:
+        """One turn: wait for bytes or the next thing due, and do it."""
+        self._watch()
+        timeout = 0.05 if self.stepped else self._pause()
+        for key, _ in self._selector.select(timeout):
+            self._ready(key.data)
+        if not self.stepped:
+            self._keep_time()
+
+    def _pause(self) -> float:
+        """s to sleep until something is due; spins through the last stretch before an answer."""
+        if not self._outbox:
+            return IDLE_S
+        left = self._outbox[0][0] - self.now
+        return 0.0 if left < SPIN_S else min(IDLE_S, left - SPIN_S)
+
+    def _keep_time(self) -> None:
+        now = self.now
+        if now - self.world.now > MAX_LAG_S:
+            self._start += now - self.world.now - IDLE_S
+            now = self.now
+        if now - self.world.now >= IDLE_S:
+            self.world.advance(now)
+        while self._outbox and self._outbox[0][0] <= self.now:
+            _, _, name, data = heapq.heappop(self._outbox)
+            self._send(name, data)
+        if self._imu is not None:
+            self._serve_imu(self.now)
+
+    def _watch(self) -> None:
+        """Keep the selector's list in step with ports that come and go."""
+        wanted = {file: name for name, port in self.ports.items() for file in port.files}
+        if wanted == self._watched:
+            return
+        for file in self._watched.keys() - wanted.keys():
+            with contextlib.suppress(KeyError, ValueError, OSError):
+                self._selector.unregister(file)
+        for file, name in wanted.items():
+            if file not in self._watched:
+                self._selector.register(file, selectors.EVENT_READ, name)
+        self._watched = wanted
+
+    def _ready(self, what: Any) -> None:
+        if what == "listener":
+            client, _ = self._listener.accept()
+            client.setblocking(False)
+            control = _Control(client)
+            self._restart_counts(control)
+            self._controls.append(control)
+            self._selector.register(client, selectors.EVENT_READ, control)
+        elif isinstance(what, _Control):
+            self._hear(what)
+        else:
+            self._read(what)
+
+    def _read(self, name: str) -> None:
+        """Take a client's bytes; in real time they act at once."""
+        port = self.ports[name]
+        data = port.read()
+        if not data:
+            return
+        self.received[name] += len(data)
+        baud = port.baud(self.world.line_baud)
+        self._held.append((self.now, name, data, baud))
+        if not self.stepped:
+            self._act()
+
+    def _act(self) -> float:
+        """Let held bytes act; when the last of their answers reaches the host, or the wire falls silent, s."""
+        last = 0.0
+        for t, name, data, baud in self._held:
+            if name == "imu":
+                assert self._imu is not None
+                self._imu.receive(data, t)
+                continue
+            replies = self.world.line.receive(data, t, baud)
+            for reply in replies:
+                self._post(reply.t, name, reply.data)
+                last = max(last, reply.t)
+            last = max(last, self.world.line.free_at)
+        self._held.clear()
+        return last
+
+    def _post(self, t: float, name: str, data: bytes) -> None:
+        self._count += 1
+        heapq.heappush(self._outbox, (t, self._count, name, data))
+
+    def _send(self, name: str, data: bytes) -> None:
+        self.sent[name] += self.ports[name].write(data)
+
+    def _serve_imu(self, t: float) -> None:
+        assert self._imu is not None
+        port = self.ports["imu"]
+        if self._imu.connected != bool(port.files):
+            (port.plug if self._imu.connected else port.unplug)()
+        data = self._imu.transmit(t)
+        if data:
+            self._send("imu", data)
+
+    # ---- stepped time ----
+
+    def advance(self, to: float) -> None:
+        """Stepped: run to a time, sending what falls due on the way."""
+        self._act()
+        while True:
+            due = self._outbox[0][0] if self._outbox else to
+            event = self._imu.next_event(self.world.now) if self._imu is not None else to
+            t = min(max(min(due, event), self.world.now), to)
+            self.world.advance(t)
+            self._flush(t)
+            if t >= to:
+                return
+
+    def _flush(self, t: float) -> None:
+        while self._outbox and self._outbox[0][0] <= t:
+            _, _, name, data = heapq.heappop(self._outbox)
+            self._send(name, data)
+        if self._imu is not None:
+            self._serve_imu(t)
+
+    # ---- the control socket ----
+
+    def _restart_counts(self, control: _Control) -> None:
+        control.received, control.sent = dict(self.received), dict(self.sent)
+
+    def _hear(self, control: _Control) -> None:
+        try:
+            data = control.socket.recv(65536)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._selector.unregister(control.socket)
+            control.socket.close()
+            self._controls.remove(control)
+            return
+        control.buffer += data
+        while (end := control.buffer.find(b"\n")) >= 0:
+            line = bytes(control.buffer[:end])
+            del control.buffer[: end + 1]
+            answer = self._answer(control, line)
+            with contextlib.suppress(OSError):
+                control.socket.setblocking(True)
+                control.socket.sendall(json.dumps(answer).encode() + b"\n")
+                control.socket.setblocking(False)
+
+    def _answer(self, control: _Control, line: bytes) -> dict[str, Any]:
+        try:
+            request = json.loads(line)
+            if not isinstance(request, dict):
+                raise _Failed("a request is a JSON object")
+            return self._do(control, request)
+        except (_Failed, OpenAntError) as error:
+            return {"error": str(error)}
+        except (ValueError, KeyError, TypeError) as error:
+            return {"error": f"not a request: {error}"}
+
+    def _do(self, control: _Control, request: dict[str, Any]) -> dict[str, Any]:
+        do = request.get("do")
+        if do == "now":
+            return {"t": self.now, "stepped": self.stepped}
+        if do == "open":
+            for name in self.ports:
+                self._drain(name)
+            self._restart_counts(control)
+            return {"t": self.now}
+        if do == "advance":
+            if not self.stepped:
+                raise _Failed("time runs by itself: the robot was not started with --clock stepped")
+            self.advance(float(request["to"]))
+            return {"t": self.now}
+        if do == "settle":
+            return self._settle(control, request)
+        if do == "state":
+            if not self.stepped:
+                self.world.advance(self.now)
+            return self.world.state()
+        if do == "fault":
+            if self._fault is None:
+                raise _Failed("this robot has no faults to switch")
+            self._fault(request)
+            return {"t": self.now}
+        if do in ("plug", "unplug"):
+            self._plug(str(request["joint"]), do == "plug")
+            return {"t": self.now}
+        raise _Failed(f"no such request: {do!r} (now, open, advance, settle, state, fault, plug, unplug)")
+
+    def _settle(self, control: _Control, request: dict[str, Any]) -> dict[str, Any]:
+        deadline = time.monotonic() + SETTLE_TIMEOUT_S
+        for name in self.ports:
+            wanted = int(request.get(f"{name}_written", 0))
+            while self.received[name] - control.received[name] < wanted:
+                self._await(name, deadline)
+        if self.stepped:
+            reached = max(self._act(), self.now)
+            self.advance(reached)
+        else:
+            while self._outbox:
+                time.sleep(max(0.0, self._outbox[0][0] - self.now))
+                self._keep_time()
+        sent = {f"{name}_sent": self.sent[name] - control.sent[name] for name in ("bus", "imu")}
+        return {"t": self.now, **sent}
+
+    def _await(self, name: str, deadline: float) -> None:
+        """Wait for more bytes at one port, the pseudo-terminal's delivery being asynchronous."""
+        files = self.ports[name].files
+        left = deadline - time.monotonic()
+        with selectors.DefaultSelector() as waiting:
+            for file in files:
+                waiting.register(file, selectors.EVENT_READ)
+            if not files or left <= 0 or not waiting.select(left):
+                raise _Failed(f"the bytes announced for {name} did not arrive")
+        self._read(name)
+
+    def _drain(self, name: str) -> None:
+        self._read(name)
+
+    def _plug(self, joint: str, plugged: bool) -> None:
+        if joint not in self.world.joints:
+            raise _Failed(f"no joint {joint!r}: there are {', '.join(self.world.joints)}")
+        k = self.world.joints.index(joint)
+        self.world.plug(k, plugged)

@@ -1,0 +1,257 @@
+"""Everything that happens between two bytes: servos, motors, mechanics, supply and heat, brought forward in time.
+
+Time is a plain number of seconds since the robot was switched on. Whoever holds the world (the server in real time, a
+test step by step) says until when; the world never looks at a clock.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from openant_tools.robot.joints import JOINTS
+from openant_tools.robot.kit import kit as kit_by_name
+from openant_tools.robot.servo import ServoModel, baud_code
+from openant_tools.virtual.body import Body, BodySettings
+from openant_tools.virtual.bus import BusSettings, Line
+from openant_tools.virtual.drives import Drive, Drives
+from openant_tools.virtual.motor import MotorSettings
+from openant_tools.virtual.servo import OVERLOAD_ERROR, ServoDevice
+
+__all__ = ["MOUNT_EIGHTHS", "ServoSetup", "SupplySettings", "World", "WorldSettings", "standard_servos"]
+
+#: s between two looks of firmware and supply at themselves.
+POLL_S = 2e-3
+HEAT_S = 2e-2
+#: Eighths of a turn from the servo's zero to the joint's: horns go on in steps of 45°, and half a turn keeps the whole
+#: range of every joint away from the encoder's seam.
+MOUNT_EIGHTHS = 4
+#: A servo calls it overload when nearly all of its stall current flows this long; unpublished.
+OVERLOAD_SHARE, OVERLOAD_S = 0.8, 2.0
+
+
+@dataclass
+class ServoSetup:
+    """One servo as it was bought, set up and built in.
+
+    Attributes:
+        joint: what it moves. model, firmware: what it is.
+        registers: name → counts that stand in its EEPROM or RAM at the start.
+        reversed: mounted so that the joint's positive direction is the servo's negative.
+        spline_offset: horn put on that many eighths of a turn away from where the guide says.
+        motor: motor, gear and sensor; None for the data sheet's.
+    """
+
+    joint: str
+    model: ServoModel
+    firmware: int = 46
+    registers: dict[str, int] = field(default_factory=dict)
+    reversed: bool = False
+    spline_offset: int = 0
+    mount_rad: float | None = None
+    motor: MotorSettings | None = None
+    clock_ppm: float = 0.0
+
+
+@dataclass
+class SupplySettings:
+    """One supply for all: V without load, and the resistance of supply, connector and cables in Ω."""
+
+    volts: float = 12.0
+    resistance_ohm: float = 0.0
+
+
+@dataclass
+class WorldSettings:
+    """All that the world is made of; `openant_tools.virtual.scenario` fills it from a file."""
+
+    servos: list[ServoSetup]
+    body: BodySettings = field(default_factory=BodySettings)
+    bus: BusSettings = field(default_factory=BusSettings)
+    supply: SupplySettings = field(default_factory=SupplySettings)
+    ambient_c: float = 25.0
+    seed: int = 0
+
+
+def standard_servos(kit: str = "standard", *, factory: bool = False) -> list[ServoSetup]:
+    """The eight servos of a kit: set up as the platform's guide says, or as they come from the factory."""
+    parts = kit_by_name(kit)
+    setups = []
+    for joint in JOINTS.values():
+        model = parts.servo(joint.kind)
+        registers = {} if factory else {"id": joint.id, "baud_rate": baud_code(1_000_000), "return_delay_time": 0}
+        setups.append(ServoSetup(joint.name, model, registers=registers))
+    return setups
+
+
+class World:
+    """The robot and everything around it.
+
+    Attributes:
+        servos: the devices, in the order of `settings.servos`. line: the wire that they hang on.
+        time: s since power-on.
+        events: called with the time at every poll, before firmware and supply look; faults hang on it.
+    """
+
+    def __init__(self, settings: WorldSettings) -> None:
+        self.settings = settings
+        joints = [setup.joint for setup in settings.servos]
+        self.joints = tuple(joints)
+        self.body = Body(settings.body, joints)
+        motors = [setup.motor or MotorSettings.of(setup.model) for setup in settings.servos]
+        sign = np.array([-1.0 if setup.reversed else 1.0 for setup in settings.servos])
+        mount = np.array(
+            [
+                (MOUNT_EIGHTHS + setup.spline_offset) * math.pi / 4 if setup.mount_rad is None else setup.mount_rad
+                for setup in settings.servos
+            ]
+        )
+        self.drives = Drives(self.body, motors, sign, mount, seed=settings.seed)
+        self.drives.ambient = settings.ambient_c
+        self.drives.winding[:] = self.drives.case[:] = settings.ambient_c
+        self.set_supply(settings.supply.volts, settings.supply.resistance_ohm)
+        self._views = [Drive(self.drives, k) for k in range(len(joints))]
+        self.servos = [self._build(setup, view) for setup, view in zip(settings.servos, self._views, strict=True)]
+        self.line = Line(self.servos, settings.bus, self.advance, seed=settings.seed + 1)
+        if not settings.bus.chains:
+            settings.bus.chains = _chains_by_leg(joints)
+        self.events: list[Callable[[float], None]] = []
+        self._steps = 0
+        self._poll_every = max(1, round(POLL_S / settings.body.timestep_s))
+        self._heat_every = max(1, round(HEAT_S / settings.body.timestep_s))
+        self._overloaded_s = np.zeros(len(joints))
+        self._stall_current = settings.supply.volts / self.drives.resistance
+        self.now = 0.0
+
+    def _build(self, setup: ServoSetup, view: Drive) -> ServoDevice:
+        servo = ServoDevice(setup.model, view, firmware=setup.firmware, clock_ppm=setup.clock_ppm)
+        ram = {}
+        for name, counts in setup.registers.items():
+            register = setup.model.register(name)
+            if register.area == "EEPROM":
+                servo.set(name, counts)
+            else:
+                ram[name] = counts
+        servo.boot(0.0, mute=False)
+        for name, counts in ram.items():
+            servo.set(name, counts)
+        servo.settle()
+        return servo
+
+    # ---- time ----
+
+    def advance(self, t: float) -> None:
+        """Bring everything to time t (s); a time already passed changes nothing."""
+        dt = self.settings.body.timestep_s
+        target = math.floor(t / dt + 1e-9)
+        drives = self.drives
+        while self._steps < target:
+            drives.step(self._steps)
+            self._steps += 1
+            if self._steps % self._poll_every == 0:
+                self._poll()
+            if self._steps % self._heat_every == 0:
+                drives.heat(self._heat_every * dt)
+        self.now = max(self.now, t)
+        for view in self._views:
+            view.now = self.now
+
+    def _poll(self) -> None:
+        now = self._steps * self.settings.body.timestep_s
+        self.now = max(self.now, now)
+        for view in self._views:
+            view.now = now
+        for event in self.events:
+            event(now)
+        drives = self.drives
+        drives.watch_supply(POLL_S)
+        for k, servo in enumerate(self.servos):
+            if drives.starved_s[k] > drives.motors[k].reset_s:
+                if servo.powered:
+                    servo.power_off()
+                    drives.powered[k] = 0.0
+            elif not servo.powered and k in self.line.plugged and drives.starved_s[k] == 0:
+                drives.powered[k] = 1.0
+                servo.power_on(now)
+            else:
+                servo.poll(now)
+        heavy = np.abs(drives.current) > OVERLOAD_SHARE * self._stall_current
+        self._overloaded_s = np.where(heavy, self._overloaded_s + POLL_S, 0.0)
+        if heavy.any():
+            for k in np.flatnonzero(self._overloaded_s > OVERLOAD_S):
+                self.servos[k].raise_hardware_error(OVERLOAD_ERROR)
+
+    def plug(self, k: int, plugged: bool) -> None:
+        """Put servo k on the cable, which powers it, or take it off."""
+        if plugged and k not in self.line.plugged:
+            self.line.plugged.add(k)
+            self.drives.powered[k] = 1.0
+            self.servos[k].power_on(self.now)
+        elif not plugged and k in self.line.plugged:
+            self.line.plugged.discard(k)
+            self.drives.powered[k] = 0.0
+            self.servos[k].power_off()
+
+    @property
+    def line_baud(self) -> int:
+        """The rate taken for a port that has none (TCP): that of most servos on the line."""
+        bauds = [self.servos[k].baud for k in self.line.plugged] or [57_600]
+        return max(set(bauds), key=bauds.count)
+
+    # ---- what faults change ----
+
+    def set_supply(self, volts: float, resistance_ohm: float) -> None:
+        self.drives.supply_v, self.drives.supply_ohm = volts, resistance_ohm
+
+    # ---- what is true ----
+
+    def state(self) -> dict[str, Any]:
+        """The truth behind the sensors, for tests and people: rad, rad/s, N·m, A, V, °C, m."""
+        drives, body = self.drives, self.body
+        torque = drives.sign * drives.motor_torque
+
+        def per_joint(values: Sequence[Any] | np.ndarray[Any, Any]) -> dict[str, Any]:
+            return {joint: _plain(value) for joint, value in zip(self.joints, values, strict=True)}
+
+        return {
+            "t": self.now,
+            "setup": self.settings.body.setup,
+            "angle": per_joint(body.q),
+            "velocity": per_joint(body.v),
+            "torque": per_joint(torque),
+            "current": per_joint(drives.current),
+            "duty": per_joint(drives.duty),
+            "temperature": per_joint(drives.case),
+            "winding_temperature": per_joint(drives.winding),
+            "torque_enable": per_joint([servo.torque for servo in self.servos]),
+            "powered": per_joint([servo.powered for servo in self.servos]),
+            "shut_down": per_joint([servo.shut_down for servo in self.servos]),
+            "hardware_error": per_joint([servo.memory[70] for servo in self.servos]),
+            "id": per_joint([servo.id for servo in self.servos]),
+            "baud": per_joint([servo.baud for servo in self.servos]),
+            "plugged": per_joint([k in self.line.plugged for k in range(len(self.servos))]),
+            "supply_v": drives.voltage,
+            "base": {
+                "position": body.position.tolist(),
+                "quaternion": body.quaternion.tolist(),
+                "gyro": body.gyro.tolist(),
+                "acceleration": body.accelerometer.tolist(),
+            },
+        }
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if hasattr(value, "item") else value
+
+
+def _chains_by_leg(joints: Sequence[str]) -> list[list[int]]:
+    """One cable a leg, hip first, as the robot is wired; what is no joint of ours hangs on its own cable."""
+    chains: dict[str, list[int]] = {}
+    for k, name in enumerate(joints):
+        leg = JOINTS[name].leg.name if name in JOINTS else name
+        chains.setdefault(leg, []).append(k)
+    return list(chains.values())
