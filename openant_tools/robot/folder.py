@@ -173,28 +173,18 @@ class RobotFolder:
             BadInput: the file cannot be read, or would hold something that cannot be; it is left as it was.
         """
         before = self._bytes()
-        document = self._document(before)
-        said = document.unwrap()
         values = dict(values or {})
-        for path, value in values.items():
-            _set(document, _keys(document, path), _plain(value))
         if isinstance(provenance, Provenance):
             provenance = dict.fromkeys(values, provenance)
-        for path, entry in (provenance or {}).items():
-            _set_provenance(document, path, entry)
-        if effects is not None:
-            _set_effects(document, effects)
-        after = tomlkit.dumps(document).encode("utf-8")
-        says = tomlkit.parse(after.decode("utf-8")).unwrap()
-        config, problems = parse_config(says)
-        errors = [problem for problem in problems if problem.severity == "error"]
-        if errors or config is None:
+        try:
+            after, config = _edited(self._document(before), self.config_file, values, provenance or {}, effects)
+        except BadInput as error:
             raise BadInput(
-                f"{errors[0].what}; {CONFIG_NAME} was left as it is",
-                where=f"{self.config_file}, {errors[0].key}",
-                remedy=errors[0].remedy,
-            )
-        if says != said:
+                f"{error.what}; the file was left as it is", where=error.where, remedy=error.remedy
+            ) from None
+        if "model" in values and not (self.path / config.model).is_file():
+            raise BadInput(f"there is no model {config.model} to name", where=self.path)
+        if after is not None:
             self._back_up(before)
             # A link to a configuration kept elsewhere stays a link.
             write_bytes(self.config_file.resolve(), after)
@@ -290,6 +280,34 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return [_plain(entry) for entry in value]
     return value
+
+
+def _edited(
+    document: tomlkit.TOMLDocument,
+    where: Path,
+    values: Mapping[str, Any],
+    provenance: Mapping[str, Provenance],
+    effects: Sequence[Effect] | None = None,
+) -> tuple[bytes | None, RobotConfig]:
+    """A document's bytes after a change, None where nothing changes, and what they then say.
+
+    Raises:
+        BadInput: they would say something that cannot be.
+    """
+    said = document.unwrap()
+    for path, value in values.items():
+        _set(document, _keys(document, path), _plain(value))
+    for path, entry in provenance.items():
+        _set_provenance(document, path, entry)
+    if effects is not None:
+        _set_effects(document, effects)
+    after = tomlkit.dumps(document)
+    says = tomlkit.parse(after).unwrap()
+    config, problems = parse_config(says)
+    errors = [problem for problem in problems if problem.severity == "error"]
+    if errors or config is None:
+        raise BadInput(errors[0].what, where=f"{where}, {errors[0].key}", remedy=errors[0].remedy)
+    return (after.encode("utf-8") if says != said else None), config
 
 
 def _keys(document: Mapping[str, Any], path: str) -> list[str]:
@@ -398,7 +416,7 @@ def _template(name: str, kit: Kit, date: datetime.datetime) -> str:
             f"max_rad = {limit!r}\n"
         )
     stamp = date.strftime("%Y-%m-%dT%H:%M:%SZ")
-    nominal = f'{{ how = "nominal", command = "openant config new", date = {stamp} }}'
+    nominal = f'{{how = "nominal", command = "openant config new", date = {stamp}}}'
     return f"""\
 # One Open Ant: what it is built from, how it is plugged in, and what was measured on it.
 # Edit it freely. The `openant` commands change single values and leave comments, order and keys of your own alone;
@@ -453,16 +471,25 @@ camera = {nominal}
 """
 
 
-def create_robot(path: str | Path, kit: str = "standard", name: str | None = None) -> RobotFolder:
-    """Make a robot's folder with nominal values: `robot.toml`, `nominal.xml`, `recordings/` and `findings/`.
+def create_robot(
+    path: str | Path,
+    kit: str = "standard",
+    name: str | None = None,
+    *,
+    values: Mapping[str, Any] | None = None,
+    provenance: Mapping[str, Provenance] | None = None,
+) -> RobotFolder:
+    """Make a robot's folder: `robot.toml`, `nominal.xml`, `recordings/` and `findings/`, with the kit's nominal values.
 
     Args:
         path: the folder; it may exist, but must not hold a robot already.
         kit: "standard" or "lite".
         name: what to call the robot; default the folder's name.
+        values: dotted path → value, where it is to differ from the nominal one.
+        provenance: dotted path → where these values came from.
 
     Raises:
-        BadInput: there is a robot already, or no such kit.
+        BadInput: there is a robot already, there is no such kit, or a value cannot be; nothing is written then.
     """
     parts = kit_by_name(kit)
     folder = RobotFolder(Path(path))
@@ -474,9 +501,12 @@ def create_robot(path: str | Path, kit: str = "standard", name: str | None = Non
             where=folder.path,
             remedy="choose another folder, or edit what stands there",
         )
+    date = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+    text = _template(name or folder.path.resolve().name, parts, date).encode("utf-8")
+    changed, _ = _edited(tomlkit.parse(text.decode("utf-8")), folder.config_file, values or {}, provenance or {})
     for part in (folder.recordings, folder.findings):
         part.mkdir(parents=True, exist_ok=True)
     write_text(folder.path / NOMINAL_MODEL, nominal_mjcf(parts.name))
-    date = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
-    write_text(folder.config_file, _template(name or folder.path.resolve().name, parts, date))
+    # Last, because it is what makes the folder a robot's.
+    write_bytes(folder.config_file, text if changed is None else changed)
     return folder

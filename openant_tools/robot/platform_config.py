@@ -174,7 +174,7 @@ def _read_name(path: Path, values: dict[str, Any], notes: list[str]) -> None:
 def import_platform_config(platform: PlatformConfig, path: str | Path, kit: str | None = None) -> RobotFolder:
     """Put a platform's configuration into a robot's folder, which is made where there is none.
 
-    A copy of the file stays in the folder; `platform.config` in `robot.toml` names it.
+    A copy of its object stays in the folder; `platform.config` in `robot.toml` names it.
 
     Args:
         platform: what was read.
@@ -184,30 +184,31 @@ def import_platform_config(platform: PlatformConfig, path: str | Path, kit: str 
     Raises:
         BadInput: the folder's robot is of another kit, or what it would hold cannot be.
     """
-    target = RobotFolder(Path(path))
-    if target.config_file.is_file():
-        folder = target
-        present = folder.config().kit
-        if kit not in (None, present):
-            raise BadInput(
-                f"the robot there is of the {present} kit", where=folder.config_file, remedy="leave out --kit"
-            )
-    else:
-        folder = create_robot(path, kit or "standard", platform.name)
-    copy = folder.path / platform.path.name
-    if copy.resolve() != platform.path.resolve():
-        write_bytes(copy, platform.path.read_bytes())
     source = Provenance(
         how="imported",
         command=f"openant config import {platform.path.name}",
         date=datetime.datetime.now(datetime.UTC).replace(microsecond=0),
     )
     # What every joint got has one entry with *, instead of eight alike.
-    fields = {path.split(".")[2] for path in platform.values if path.startswith("motors.")}
+    fields = {key.split(".")[2] for key in platform.values if key.startswith("motors.")}
     for_all = {field for field in fields if all(f"motors.{joint}.{field}" in platform.values for joint in JOINTS)}
-    paths = [path for path in platform.values if not (path.startswith("motors.") and path.split(".")[2] in for_all)]
-    paths += [f"motors.*.{field}" for field in sorted(for_all)]
-    folder.update({**platform.values, "platform.config": copy.name}, provenance=dict.fromkeys(paths, source))
+    keys = [key for key in platform.values if not (key.startswith("motors.") and key.split(".")[2] in for_all)]
+    provenance = dict.fromkeys([*keys, *(f"motors.*.{field}" for field in sorted(for_all))], source)
+
+    folder = RobotFolder(Path(path))
+    copy = folder.path / platform.path.name
+    values = {**platform.values, "platform.config": copy.name}
+    if folder.config_file.is_file():
+        present = folder.config().kit
+        if kit not in (None, present):
+            raise BadInput(
+                f"the robot there is of the {present} kit", where=folder.config_file, remedy="leave out --kit"
+            )
+        folder.update(values, provenance=provenance)
+    else:
+        create_robot(path, kit or "standard", platform.name, values=values, provenance=provenance)
+    if copy.resolve() != platform.path.resolve():
+        write_bytes(copy, json.dumps(platform.raw, indent=4, ensure_ascii=False).encode("utf-8"))
     return folder
 
 
