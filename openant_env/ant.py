@@ -23,15 +23,13 @@ from openant_env.actions import action_map
 from openant_env.metrics import AverageReward
 from openant_env.observations import ORDERS, layout
 from openant_env.rendering import Painter
-from openant_env.robots import SimulatedRobot, simulated_robot
+from openant_env.robots import DT_S, SimulatedRobot, simulated_robot
 from openant_env.tasks import BackAndForth, make_task
 from openant_tools.errors import BadInput
 from openant_tools.model.rollout import fill_setpoints
 
 __all__ = ["Ant"]
 
-#: s, the paper's step of SAC.
-DT_S = 0.12
 #: s that the robot stands before the first observation, so that it neither falls nor swings at reset.
 SETTLE_S = 2.0
 #: m, from which the robot is let down onto the floor before it settles (the published simulation's start).
@@ -42,7 +40,7 @@ OnFall = Literal["truncate", "terminate", "ignore"]
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
-class Ant(gymnasium.Env[Observation, NDArray[Any]]):
+class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
     """A walking Open Ant on a floor, without episodes.
 
     Actions: (8,) in −1…1, one a joint, mapped onto `action_range` and kept within the calibrated limits.
@@ -59,8 +57,9 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):
         kit: `"standard"` or `"lite"`, which nominal robot.
         task: `"back-and-forth"` or `"forward"`.
         task_options: for back-and-forth `radius_m`, `origin`, `scored` (`"paper"` or `"platform"`).
-        dt: s, the time of one step; a whole number of the model's timesteps.
-        action_range: `"paper"`, `"platform"`, `"platform-sarsa"` or `"limits"` (`openant_env.actions`).
+        dt: s, the time of one step; a whole number of the model's timesteps. None: as the robot's folder says, 0.12.
+        action_range: `"paper"`, `"platform"`, `"sac"`, `"sarsa"` or `"limits"` (`openant_env.actions`). None: as the
+            robot's folder says, which is the paper's unless changed.
         observation_order: `"platform"` or `"paper"` (`openant_env.observations`).
         effects: which of the robot's `[[effect]]` entries act: True (all that are enabled), False, or their names.
         on_fall: what lying on the back means: `"truncate"`, `"terminate"`, or `"ignore"`.
@@ -81,8 +80,8 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):
         kit: str | None = None,
         task: str = BackAndForth.name,
         task_options: Mapping[str, Any] | None = None,
-        dt: float = DT_S,
-        action_range: str = "paper",
+        dt: float | None = None,
+        action_range: str | None = None,
         observation_order: str = "platform",
         effects: bool | Sequence[str] = True,
         on_fall: OnFall = "truncate",
@@ -113,7 +112,7 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):
         # MuJoCo would start a simulation that has come apart afresh without a word.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.data = mujoco.MjData(self.model)
-        self.dt = float(dt)
+        self.dt = self.robot.dt_s if dt is None else float(dt)
         self._substeps = _whole_steps(self.dt, self.model.opt.timestep, self.robot.model_path)
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self.dt))}
         self.render_mode = render_mode
@@ -121,7 +120,9 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):
         self._painter: Painter | None = None
 
         joints = self.robot.joints
-        self.actions = action_map(action_range, joints, self.robot.low, self.robot.high)
+        self.actions = action_map(
+            self.robot.action_range if action_range is None else action_range, joints, self.robot.low, self.robot.high
+        )
         self.layout = layout(joints, observation_order)
         self.task = make_task(task, task_options)
         self.average_reward = AverageReward()
@@ -145,7 +146,7 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):
 
     @property
     def observation_names(self) -> tuple[str, ...]:
-        """What each number of an observation is, such as `position.hip_rr`."""
+        """What each number of an observation is, such as `pos.hip_rr`."""
         return self.layout.names
 
     @property
@@ -153,6 +154,20 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):
         """Low and high, each (24,), that observations keep to in practice: the robot's measured bounds where its
         folder has them, else nominal ones. Not a promise: use them to normalise, never to clip what you learn from."""
         return self.robot.bounds(self.layout)
+
+    def describe(self) -> dict[str, Any]:
+        """What a policy trained here depends on, as plain values: to be kept beside it and compared before it plays."""
+        return {
+            "observation_names": list(self.layout.names),
+            "action_names": list(self.robot.joints),
+            "action_range": {
+                "centre_rad": self.actions.centre.round(6).tolist(),
+                "half_rad": self.actions.half.round(6).tolist(),
+            },
+            "dt": self.dt,
+            "task": self.task.name,
+            "model_sha256": self.robot.model_sha256(),
+        }
 
     def _bind(self) -> None:
         """Look every name up once, and keep views into the simulation's memory, which never moves."""
@@ -167,9 +182,9 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):
         self._command = np.empty(len(joints))
 
         index = np.zeros(len(self.layout), np.intp)
-        index[self.layout.slices["position"]] = [_sensor(model, f"pos.{joint}", 1, where) for joint in joints]
-        index[self.layout.slices["velocity"]] = [_sensor(model, f"vel.{joint}", 1, where) for joint in joints]
-        for block, name in (("acceleration", "accelerometer"), ("angular_velocity", "gyro")):
+        index[self.layout.slices["pos"]] = [_sensor(model, f"pos.{joint}", 1, where) for joint in joints]
+        index[self.layout.slices["vel"]] = [_sensor(model, f"vel.{joint}", 1, where) for joint in joints]
+        for block, name in (("acc", "accelerometer"), ("gyro", "gyro")):
             index[self.layout.slices[block]] = _sensor(model, name, 3, where) + np.arange(3)
         self._sensor_index = index
         self._reading = np.empty(len(index))
@@ -315,7 +330,7 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):
 
     # --------------------------------------------------------------------------------------------------- pictures
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """The robot, the reward direction, and the circle it turns at, (height, width, 3); None without `rgb_array`.
 
         Raises:

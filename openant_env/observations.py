@@ -11,20 +11,20 @@ from dataclasses import dataclass
 
 __all__ = ["ORDERS", "Block", "Layout", "layout"]
 
-#: block → size, None where it is one number a joint.
+#: block, named as in run tables → size, None where it is one number a joint.
 BLOCKS: Mapping[str, int | None] = {
-    "position": None,
-    "velocity": None,
+    "pos": None,
+    "vel": None,
     "direction": 2,
-    "acceleration": 3,
-    "angular_velocity": 3,
+    "acc": 3,
+    "gyro": 3,
 }
 Block = str
 
 #: name → the blocks in order. `platform`: the published software. `paper`: the order of the paper's sentence.
 ORDERS: Mapping[str, tuple[Block, ...]] = {
-    "platform": ("position", "velocity", "direction", "acceleration", "angular_velocity"),
-    "paper": ("position", "velocity", "angular_velocity", "acceleration", "direction"),
+    "platform": ("pos", "vel", "direction", "acc", "gyro"),
+    "paper": ("pos", "vel", "gyro", "acc", "direction"),
 }
 
 
@@ -35,7 +35,7 @@ class Layout:
     Attributes:
         order: the name in `ORDERS`.
         slices: block → its place.
-        names: one name a number, such as `position.hip_rr` or `acceleration.z`.
+        names: one name a number, such as `pos.hip_rr` or `acc.z`: the columns of run tables, where there is one.
     """
 
     order: str

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import io
+import itertools
 import os
 import platform
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -12,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.files import write_bytes
 
-__all__ = ["NoOpenGL", "Painter"]
+__all__ = ["NoOpenGL", "Painter", "write_strip"]
 
 Image = NDArray[np.uint8]
 ARROW_RGBA = (0.0, 0.447, 0.698, 1.0)  # Okabe–Ito blue
@@ -108,7 +113,7 @@ class Painter:
             points = np.column_stack(
                 [x + radius * np.cos(angles), y + radius * np.sin(angles), np.full_like(angles, 2e-3)]
             )
-            for a, b in zip(points[:-1], points[1:], strict=True):
+            for a, b in itertools.pairwise(points):
                 self._connect(mujoco.mjtGeom.mjGEOM_CAPSULE, 0.004, a, b, CIRCLE_RGBA)
         if arrow is not None:
             start = np.array([look_at[0], look_at[1], look_at[2] + 0.12])
@@ -134,3 +139,28 @@ class Painter:
         """Give the OpenGL context back."""
         self._context.free()
         self._gl.free()
+
+
+def write_strip(pictures: Sequence[Image], file: Path, *, seconds_apart: float, columns: int = 4) -> None:
+    """Write pictures side by side, each with its time, as one PNG.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    columns = min(columns, len(pictures))
+    rows = -(-len(pictures) // columns)
+    height, width, _ = pictures[0].shape
+    figure = Figure(figsize=(2.4 * columns, 2.4 * rows * height / width), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.01, h_pad=0.01, wspace=0.0, hspace=0.0)
+    for k, axes in enumerate(figure.subplots(rows, columns, squeeze=False).flat):
+        axes.axis("off")
+        if k < len(pictures):
+            axes.imshow(pictures[k])
+            axes.text(
+                0.03, 0.95, f"{k * seconds_apart:.2f} s", transform=axes.transAxes, va="top", fontsize=9, color="0.15"
+            )
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=160)
+    write_bytes(file, picture.getvalue())

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,14 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_env.observations import Layout
+from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, load_plant
+from openant_tools.robot.config import ACTION_PRESETS, ActionRange, Effect
+from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import ANGLE_LIMIT_RAD
 from openant_tools.robot.mjcf import nominal_model_path
 
-__all__ = ["SimulatedRobot", "simulated_robot"]
+__all__ = ["DT_S", "SimulatedRobot", "simulated_robot"]
 
 Array = NDArray[np.float64]
+
+#: s, the paper's step of SAC.
+DT_S = 0.12
 
 # Nominal bounds of what the sensors read while an Open Ant walks, for robots whose folder has no measured ones.
 JOINT_SPEED_RAD_S = 8.0  # above the no-load speed of every kit's servos, 4.8 to 7.3 rad/s
@@ -32,18 +39,21 @@ class SimulatedRobot:
 
     Attributes:
         model_path: its MJCF.
-        joints: in the order of actions and observations.
         low, high: (joints,) rad, the limits of commands.
-        measured_bounds: observation name → (low, high), as far as they were measured.
+        action_range: what actions of −1…1 mean unless someone asks for another range.
+        dt_s: s, the length of a step unless someone asks for another.
+        measured_bounds: name of an observation → (low, high), as far as they were measured.
         folder: the robot's folder, None for the nominal one.
     """
 
     model_path: Path
-    joints: tuple[str, ...]
     low: Array
     high: Array
-    measured_bounds: dict[str, tuple[float, float]]
+    action_range: ActionRange
+    dt_s: float
+    measured_bounds: Mapping[str, tuple[float, float]]
     folder: Path | None
+    joints: tuple[str, ...] = tuple(JOINTS)
 
     def load(self) -> Plant:
         """Its model on the floor, with the sensors `pos.J` and `vel.J` added where the file has none.
@@ -53,30 +63,34 @@ class SimulatedRobot:
         """
         plant = load_plant(self.model_path, self.joints, Setup.FLOOR)
         present = {plant.model.sensor(i).name for i in range(plant.model.nsensor)}
-        missing = [joint for joint in self.joints if not {f"pos.{joint}", f"vel.{joint}"} <= present]
+        missing = [
+            name for kind in ("pos", "vel") for joint in self.joints if (name := f"{kind}.{joint}") not in present
+        ]
         if not missing:
             return plant
         # The platform's own models measure no joints; sensors behind all others change no address of the plant's.
         spec = mujoco.MjSpec.from_file(str(self.model_path))
-        for prefix, kind in (("pos", mujoco.mjtSensor.mjSENS_JOINTPOS), ("vel", mujoco.mjtSensor.mjSENS_JOINTVEL)):
-            for joint in self.joints:
-                if f"{prefix}.{joint}" not in present:
-                    spec.add_sensor(
-                        name=f"{prefix}.{joint}", type=kind, objtype=mujoco.mjtObj.mjOBJ_JOINT, objname=joint
-                    )
+        kinds = {"pos": mujoco.mjtSensor.mjSENS_JOINTPOS, "vel": mujoco.mjtSensor.mjSENS_JOINTVEL}
+        for name in missing:
+            kind, _, joint = name.partition(".")
+            spec.add_sensor(name=name, type=kinds[kind], objtype=mujoco.mjtObj.mjOBJ_JOINT, objname=joint)
         return replace(plant, model=spec.compile())
+
+    def model_sha256(self) -> str:
+        """Which model this is: the hash of its file."""
+        return hashlib.sha256(self.model_path.read_bytes()).hexdigest()
 
     def bounds(self, layout: Layout) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Low and high of each observation, each (len(layout),): measured where they were, else nominal."""
         nominal: dict[str, tuple[float, float]] = {}
         for joint, low, high in zip(self.joints, self.low, self.high, strict=True):
-            nominal[f"position.{joint}"] = (float(low), float(high))
-            nominal[f"velocity.{joint}"] = (-JOINT_SPEED_RAD_S, JOINT_SPEED_RAD_S)
+            nominal[f"pos.{joint}"] = (float(low), float(high))
+            nominal[f"vel.{joint}"] = (-JOINT_SPEED_RAD_S, JOINT_SPEED_RAD_S)
         for axis in ("along", "left"):
             nominal[f"direction.{axis}"] = (-1.0, 1.0)
         for axis in "xyz":
-            nominal[f"acceleration.{axis}"] = (-ACCELERATION_M_S2, ACCELERATION_M_S2)
-            nominal[f"angular_velocity.{axis}"] = (-ANGULAR_VELOCITY_RAD_S, ANGULAR_VELOCITY_RAD_S)
+            nominal[f"acc.{axis}"] = (-ACCELERATION_M_S2, ACCELERATION_M_S2)
+            nominal[f"gyro.{axis}"] = (-ANGULAR_VELOCITY_RAD_S, ANGULAR_VELOCITY_RAD_S)
         pairs = np.array([self.measured_bounds.get(name, nominal[name]) for name in layout.names], np.float32)
         return pairs[:, 0].copy(), pairs[:, 1].copy()
 
@@ -94,6 +108,49 @@ def simulated_robot(
     Raises:
         BadInput: no such folder or kit, or a robot that cannot be simulated as it is described.
     """
-    kinds = [joint.kind for joint in JOINTS.values()]
-    high = np.array([ANGLE_LIMIT_RAD[kind] for kind in kinds])
-    return SimulatedRobot(nominal_model_path(kit or "standard"), tuple(JOINTS), -high, high, {}, None)
+    if robot is None:
+        if not isinstance(effects, bool):
+            raise BadInput(
+                "the nominal robot has no effects to choose from", remedy="name a robot whose robot.toml has them"
+            )
+        high = np.array([ANGLE_LIMIT_RAD[joint.kind] for joint in JOINTS.values()])
+        model = nominal_model_path(kit or "standard")
+        return SimulatedRobot(model, -high, high, ACTION_PRESETS["platform"], DT_S, {}, None)
+
+    if kit is not None:
+        raise BadInput("a robot's folder says itself which kit it is", where=robot, remedy="leave kit out")
+    folder = RobotFolder.at(robot)
+    config = folder.config()
+    _refuse_effects([effect for effect in config.effects if effect.enabled], effects, folder)
+    motors = [config.motors[joint] for joint in JOINTS]
+    return SimulatedRobot(
+        model_path=folder.model_path(config),
+        low=np.array([motor.min_rad for motor in motors]),
+        high=np.array([motor.max_rad for motor in motors]),
+        action_range=config.actions.range,
+        dt_s=config.timing.dt_s,
+        measured_bounds=config.observation,
+        folder=folder.path,
+    )
+
+
+def _refuse_effects(present: Sequence[Effect], wanted: bool | Sequence[str], folder: RobotFolder) -> None:
+    """Entries of robot.toml are what the MJCF cannot carry; leaving them out takes someone's word."""
+    if wanted is False:
+        return
+    names = {effect.effect for effect in present}
+    if not isinstance(wanted, bool):
+        strangers = sorted(set(wanted) - names)
+        if strangers:
+            raise BadInput(
+                f"no enabled effect is called {strangers[0]}",
+                where=folder.config_file,
+                remedy=f"it has {', '.join(sorted(names)) or 'none'}",
+            )
+        names &= set(wanted)
+    if names:
+        raise BadInput(
+            f"the effect{'s' if len(names) > 1 else ''} {', '.join(sorted(names))} cannot act in this simulation yet",
+            where=folder.config_file,
+            remedy="simulate without: effects=False, `--no-effects`, or enabled = false in the file",
+        )

@@ -1,0 +1,262 @@
+"""A training run on disk: what was asked for, checkpoints, transitions and the learning curve.
+
+    run.json             what is trained, on what, with which settings and seed
+    checkpoint.pt        networks, optimisers, random states, counters and the simulation's state
+    transitions.f32      every transition, rows of float32 in the order of the replay buffer, appended
+    learning_curve.csv   step, seconds, average_reward_m_s, appended
+    learning_curve.png   the same as a picture
+
+A checkpoint replaces the last one in one stroke, after the transitions and the curve that belong to it are on the disk;
+it says how long both files were. Whatever a killed process had appended beyond is cut off on resuming, so that a
+resumed run goes on as if it had never been stopped.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from openant_tools.errors import BadInput
+from openant_tools.files import write_bytes, write_text
+
+__all__ = ["SCHEMA", "CurvePoint", "Run", "read_curve"]
+
+SCHEMA = "openant.train/1"
+CURVE_COLUMNS = ("step", "seconds", "average_reward_m_s")
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """One row of a learning curve.
+
+    Attributes:
+        step: environment steps so far.
+        seconds: s, robot time so far.
+        average_reward_m_s: m/s, over the last 120 s.
+    """
+
+    step: int
+    seconds: float
+    average_reward_m_s: float
+
+
+class Run:
+    """The folder of one training run.
+
+    Args:
+        folder: made where it is missing.
+        facts: what `run.json` says; a folder that holds a run goes on only if its facts are the same.
+
+    Raises:
+        BadInput: the folder holds another run, or files that are none.
+        OSError: it cannot be written.
+    """
+
+    def __init__(self, folder: Path, facts: Mapping[str, Any]) -> None:
+        self.folder = folder
+        # As it will be read back: tuples as lists, keys as texts.
+        self.facts: dict[str, Any] = json.loads(json.dumps({"schema": SCHEMA, **facts}))
+        path = folder / "run.json"
+        if path.is_file():
+            _check_same(path, read_facts(folder), self.facts)
+        else:
+            write_text(path, json.dumps(self.facts, indent=2, ensure_ascii=False) + "\n")
+        self._saved_rows = 0
+        self._curve: io.TextIOWrapper | None = None
+
+    def resume(self) -> dict[str, Any] | None:
+        """The last checkpoint, with the curve and the transitions cut back to it; None where there is none yet."""
+        path = self.folder / "checkpoint.pt"
+        checkpoint = load_checkpoint(self.folder) if path.is_file() else None
+        curve_bytes = 0 if checkpoint is None else int(checkpoint["curve_bytes"])
+        self._saved_rows = 0 if checkpoint is None else int(checkpoint["transitions"])
+        self._cut(self.folder / "learning_curve.csv", curve_bytes)
+        if checkpoint is not None:
+            self._cut(self.folder / "transitions.f32", self._saved_rows * int(checkpoint["transition_bytes"]))
+        else:
+            (self.folder / "transitions.f32").unlink(missing_ok=True)
+        curve = (self.folder / "learning_curve.csv").open("a", encoding="utf-8", newline="")
+        self._curve = curve
+        if curve_bytes == 0:
+            curve.write(",".join(CURVE_COLUMNS) + "\n")
+            curve.flush()
+        return checkpoint
+
+    def _cut(self, path: Path, size: int) -> None:
+        if size == 0:
+            path.unlink(missing_ok=True)
+            return
+        there = path.stat().st_size if path.is_file() else 0
+        if there < size:
+            raise BadInput(
+                f"it has {there} bytes of the {size} that its checkpoint speaks of",
+                where=path,
+                remedy="train into another folder; this one has lost data",
+            )
+        os.truncate(path, size)
+
+    def transitions(self, width: int, newest: int) -> NDArray[np.float32]:
+        """The last `newest` saved transitions, (rows, width), oldest first."""
+        rows = min(self._saved_rows, newest)
+        if rows == 0:
+            return np.empty((0, width), np.float32)
+        skip = (self._saved_rows - rows) * width * 4
+        return np.fromfile(self.folder / "transitions.f32", np.float32, rows * width, offset=skip).reshape(rows, width)
+
+    def save(self, state: Mapping[str, Any], new_transitions: NDArray[np.float32]) -> None:
+        """Put a checkpoint on the disk, so that a crash at any instant finds this one or the one before it whole.
+
+        Args:
+            state: tensors, numbers, texts, lists and dictionaries.
+            new_transitions: (rows, width), those added since the last checkpoint.
+        """
+        with (self.folder / "transitions.f32").open("ab") as stream:
+            stream.write(np.ascontiguousarray(new_transitions).tobytes())
+            stream.flush()
+            os.fsync(stream.fileno())
+        self._saved_rows += len(new_transitions)
+        assert self._curve is not None
+        self._curve.flush()
+        os.fsync(self._curve.fileno())
+        whole = {
+            **state,
+            "schema": SCHEMA,
+            "transitions": self._saved_rows,
+            "transition_bytes": new_transitions.shape[1] * 4,
+            "curve_bytes": self._curve.tell(),
+        }
+        buffer = io.BytesIO()
+        torch.save(_plain(whole), buffer)
+        write_bytes(self.folder / "checkpoint.pt", buffer.getvalue())
+
+    def add_curve_point(self, point: CurvePoint) -> None:
+        assert self._curve is not None
+        self._curve.write(f"{point.step},{point.seconds:.3f},{point.average_reward_m_s:.6f}\n")
+        self._curve.flush()
+
+    def close(self) -> None:
+        if self._curve is not None:
+            self._curve.close()
+            self._curve = None
+
+
+def read_facts(folder: Path) -> dict[str, Any]:
+    """What `run.json` says.
+
+    Raises:
+        BadInput: the folder holds no training run.
+    """
+    path = folder / "run.json"
+    if not path.is_file():
+        raise BadInput(
+            "there is no training run here (no run.json)", where=folder, remedy="name the --out of `openant train`"
+        )
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, UnicodeDecodeError) as error:
+        raise BadInput(f"it is no JSON: {error}", where=path, remedy="train into another folder") from error
+    if not isinstance(facts, dict) or facts.get("schema") != SCHEMA:
+        raise BadInput(f"its schema is not {SCHEMA}", where=path, remedy="train into another folder")
+    return facts
+
+
+def load_checkpoint(folder: Path) -> dict[str, Any]:
+    """The checkpoint of a run; nothing in the file is executed.
+
+    Raises:
+        BadInput: there is none, or it cannot be read.
+    """
+    path = folder / "checkpoint.pt"
+    if not path.is_file():
+        raise BadInput("there is no checkpoint yet", where=folder, remedy="train a little longer (`openant train sac`)")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises a dozen kinds for a file that is cut, foreign or not a zip at all
+        raise BadInput(
+            "the checkpoint cannot be read; the file is damaged or none of ours",
+            where=path,
+            remedy="train into another folder, or put a copy of it back",
+        ) from error
+    if not isinstance(checkpoint, dict) or checkpoint.get("schema") != SCHEMA:
+        raise BadInput(f"the checkpoint's schema is not {SCHEMA}", where=path, remedy="train into another folder")
+    return checkpoint
+
+
+def read_curve(folder: Path) -> list[CurvePoint]:
+    """The learning curve of a run.
+
+    Raises:
+        BadInput: there is none, or a row of it is not what it should be.
+    """
+    path = folder / "learning_curve.csv"
+    if not path.is_file():
+        raise BadInput("there is no learning curve here", where=folder, remedy="name the --out of `openant train`")
+    points: list[CurvePoint] = []
+    with path.open(encoding="utf-8", newline="") as stream:
+        for row in csv.DictReader(stream):
+            try:
+                point = CurvePoint(int(row["step"]), float(row["seconds"]), float(row["average_reward_m_s"]))
+            except (KeyError, TypeError, ValueError):
+                if stream.read(1) == "":
+                    break  # the last line of a run that was killed while writing it
+                raise BadInput(
+                    f"row {len(points) + 2} is not {', '.join(CURVE_COLUMNS)}", where=path, remedy="repair the row"
+                ) from None
+            if math.isfinite(point.average_reward_m_s):
+                points.append(point)
+    return points
+
+
+def _check_same(path: Path, there: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
+    """A run goes on only as what it was begun as; versions of libraries may differ."""
+    differing = sorted(
+        f"{key} ({_short(old.get(key))}, not {_short(new.get(key))})"
+        for old, new in [(_flat(there), _flat(asked))]
+        for key in old.keys() | new.keys()
+        if not key.startswith("versions") and old.get(key) != new.get(key)
+    )
+    if differing:
+        raise BadInput(
+            f"this folder holds another run: it differs in {', '.join(differing[:4])}",
+            where=path.parent,
+            remedy="name another --out, or repeat the command that began it",
+        )
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 60 else text[:57] + "…"
+
+
+def _flat(facts: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in facts.items():
+        if isinstance(value, Mapping):
+            flat.update(_flat(value, f"{prefix}{key}."))
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def _plain(value: Any) -> Any:
+    """The same with arrays as tensors and NumPy's numbers as Python's, so that it loads without running any code."""
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(value.copy())
+    if isinstance(value, np.generic):
+        return value.item()
+    return value

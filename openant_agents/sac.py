@@ -1,0 +1,564 @@
+"""Soft actor-critic as the Open Ant paper uses it, in one file to be read from top to bottom.
+
+What the paper adds to the common form (Haarnoja et al. 2018, automatic entropy; CleanRL's structure): LayerNorm before
+every ReLU, rewards scaled by 100, learning that starts after 2,000 random steps, and a return that does not depend on
+the length of a step (De Asis and Sutton 2024, arXiv 2406.14951):
+
+    target = scale · r · Δt + γ_s^Δt · (min Q'(s', a') − α log π(a'|s')),    a' ~ π(s'),
+
+with γ_s = 0.92 per second, which at Δt = 0.12 s is the paper's 0.99 a step. The paper cites the idea without a formula;
+this form, reward times Δt included, is that of the platform's published agent. Each transition carries its own Δt.
+
+The task has no episodes. A termination cuts the bootstrap, a truncation (someone had to help the robot) does not.
+
+Updates are plain torch on one thread: the matrices are too small for two. What makes them quick: fused Adam, one call
+for all target weights, no gradients for the critics' weights while the actor learns, log π computed once for actor and
+entropy, and transitions kept as rows of one array, so that a batch is one gather.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from openant_agents.runs import CurvePoint, Run, load_checkpoint, read_facts
+from openant_env.metrics import AverageReward
+from openant_tools.errors import BadInput
+
+__all__ = ["Actor", "Critics", "Progress", "Replay", "Sac", "Settings", "load_policy", "train"]
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The paper's parameters of SAC (its table of parameters, and CleanRL's defaults where it names none).
+
+    Attributes:
+        gamma_per_s: discount of a second; of a step of Δt seconds γ_s^Δt.
+        tau: share of the critics that goes into the targets with every update.
+        batch: transitions in an update.
+        buffer: transitions kept.
+        learning_start: steps with random actions before the first update.
+        reward_scale: factor on rewards, which are metres.
+        actor_step, critic_step, entropy_step: step sizes of Adam.
+        policy_every: critic updates between visits to the actor, which is then updated as many times.
+        hidden: width of both hidden layers.
+        layer_norm: whether layers are normalised before each ReLU.
+    """
+
+    gamma_per_s: float = 0.92
+    tau: float = 0.005
+    batch: int = 256
+    buffer: int = 1_000_000
+    learning_start: int = 2_000
+    reward_scale: float = 100.0
+    actor_step: float = 3e-4
+    critic_step: float = 1e-3
+    entropy_step: float = 1e-3
+    policy_every: int = 2
+    hidden: int = 256
+    layer_norm: bool = True
+
+    def as_dict(self) -> dict[str, float | int | bool]:
+        return asdict(self)
+
+
+# --------------------------------------------------------------------------------------------------------- networks
+
+LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
+
+
+def _network(inputs: int, outputs: int, settings: Settings) -> nn.Sequential:
+    """Two hidden layers, each normalised before its ReLU."""
+    layers: list[nn.Module] = []
+    for size in (inputs, settings.hidden):
+        layers.append(nn.Linear(size, settings.hidden))
+        if settings.layer_norm:
+            layers.append(nn.LayerNorm(settings.hidden))
+        layers.append(nn.ReLU())
+    return nn.Sequential(*layers, nn.Linear(settings.hidden, outputs))
+
+
+class Actor(nn.Module):
+    """A tanh-squashed Gaussian policy: mean and standard deviation of each action from an observation."""
+
+    def __init__(self, observations: int, actions: int, settings: Settings) -> None:
+        super().__init__()
+        self.network = _network(observations, 2 * actions, settings)
+
+    def forward(self, observation: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Sample by reparametrisation.
+
+        Args:
+            observation: (batch, observations).
+            noise: (batch, actions), standard normal.
+
+        Returns:
+            Actions in −1…1, (batch, actions), and their log π, (batch,).
+        """
+        mean, log_std = self._gaussian(observation)
+        u = mean + log_std.exp() * noise
+        log_gaussian = -0.5 * noise.square() - log_std - 0.5 * math.log(2.0 * math.pi)
+        # log(1 − tanh²u) = 2 (log 2 − u − softplus(−2u)), which does not cancel where tanh saturates.
+        log_slope = 2.0 * (math.log(2.0) - u - F.softplus(-2.0 * u))
+        return torch.tanh(u), (log_gaussian - log_slope).sum(-1)
+
+    def mode(self, observation: Tensor) -> Tensor:
+        """The action in the middle of the distribution, (batch, actions)."""
+        return torch.tanh(self._gaussian(observation)[0])
+
+    def _gaussian(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        mean, spread = self.network(observation).chunk(2, dim=-1)
+        log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (torch.tanh(spread) + 1.0)
+        return mean, log_std
+
+
+class Critics(nn.Module):
+    """Two action-value functions of their own; the smaller estimate counts."""
+
+    def __init__(self, observations: int, actions: int, settings: Settings) -> None:
+        super().__init__()
+        self.first = _network(observations + actions, 1, settings)
+        self.second = _network(observations + actions, 1, settings)
+
+    def forward(self, observation_action: Tensor) -> tuple[Tensor, Tensor]:
+        """Both values, each (batch,), of rows that hold an observation followed by an action."""
+        return self.first(observation_action).squeeze(-1), self.second(observation_action).squeeze(-1)
+
+
+# ----------------------------------------------------------------------------------------------------------- replay
+
+
+class Replay:
+    """Transitions as rows of one array: observation, action, reward, Δt, terminated, next observation.
+
+    The array is a ring of `capacity` rows; its memory is claimed by the operating system only as rows are written.
+    """
+
+    def __init__(self, observations: int, actions: int, capacity: int) -> None:
+        self.observations, self.actions, self.capacity = observations, actions, capacity
+        self.width = 2 * observations + actions + 3
+        self.rows = np.empty((capacity, self.width), np.float32)
+        self.added = 0  # ever; row k stands at k modulo capacity
+        self._tensor = torch.from_numpy(self.rows)
+
+    def __len__(self) -> int:
+        return min(self.added, self.capacity)
+
+    def add(
+        self, observation: Array, action: Array, reward: float, dt: float, terminated: bool, next_observation: Array
+    ) -> None:
+        row = self.rows[self.added % self.capacity]
+        o, a = self.observations, self.actions
+        row[:o] = observation
+        row[o : o + a] = action
+        row[o + a] = reward
+        row[o + a + 1] = dt
+        row[o + a + 2] = terminated
+        row[o + a + 3 :] = next_observation
+        self.added += 1
+
+    def sample(self, size: int, random: np.random.Generator) -> Tensor:
+        """(size, width), drawn with replacement."""
+        return self._tensor.index_select(0, torch.from_numpy(random.integers(0, len(self), size)))
+
+    def between(self, start: int, stop: int) -> Array:
+        """The rows added as number `start` up to `stop`, oldest first; only the last `capacity` can be had."""
+        return self.rows[np.arange(start, stop) % self.capacity]
+
+    def restore(self, rows: Array, added: int) -> None:
+        """Fill with the last rows of `added` ever added, so that each stands where it stood."""
+        self.rows[np.arange(added - len(rows), added) % self.capacity] = rows
+        self.added = added
+
+
+# ------------------------------------------------------------------------------------------------------------ agent
+
+
+def _adam(parameters: Any, step: float) -> torch.optim.Adam:
+    try:
+        return torch.optim.Adam(parameters, lr=step, fused=True)
+    except RuntimeError:  # torch before 2.4 has the fused form on graphics cards only
+        return torch.optim.Adam(parameters, lr=step)
+
+
+class Sac:
+    """Actor, critics, their targets and the entropy's weight, with the update that ties them.
+
+    Args:
+        observations, actions: how many numbers each has.
+        settings: parameters of the algorithm.
+        seed: of initial weights, random actions, exploration noise and batches.
+        device: where networks live.
+    """
+
+    def __init__(
+        self, observations: int, actions: int, settings: Settings, *, seed: int, device: str | torch.device = "cpu"
+    ) -> None:
+        self.settings = settings
+        self.device = torch.device(device)
+        self.random = np.random.default_rng(seed)
+        self.noise = torch.Generator(self.device)
+        self.noise.manual_seed(seed)
+        with torch.random.fork_rng(devices=[]):
+            # torch's layers draw their weights from its global generator, which is left as it was found.
+            torch.manual_seed(seed)
+            self.actor = Actor(observations, actions, settings).to(self.device)
+            self.critics = Critics(observations, actions, settings).to(self.device)
+            self.targets = Critics(observations, actions, settings).to(self.device)
+        self.targets.load_state_dict(self.critics.state_dict())
+        self.targets.requires_grad_(False)
+        self.log_alpha = torch.zeros((), device=self.device, requires_grad=True)
+        self.target_entropy = -float(actions)
+        self._actor_weights = list(self.actor.parameters())
+        self._critic_weights: list[Tensor] = list(self.critics.parameters())
+        self._target_weights: list[Tensor] = list(self.targets.parameters())
+        self.actor_optimiser = _adam(self._actor_weights, settings.actor_step)
+        self.critic_optimiser = _adam(self._critic_weights, settings.critic_step)
+        self.entropy_optimiser = _adam([self.log_alpha], settings.entropy_step)
+        self.replay = Replay(observations, actions, settings.buffer)
+        self.updates = 0
+
+    def random_action(self) -> Array:
+        """(actions,), uniform in −1…1."""
+        return self.random.uniform(-1.0, 1.0, self.replay.actions).astype(np.float32)
+
+    @torch.inference_mode()
+    def act(self, observation: Array, *, explore: bool = True) -> Array:
+        """(actions,): a sample of the policy, or its mode."""
+        seen = torch.from_numpy(observation).to(self.device).unsqueeze(0)
+        if explore:
+            mean, log_std = self.actor._gaussian(seen)
+            action = torch.tanh(mean + log_std.exp() * self._normal(1))
+        else:
+            action = self.actor.mode(seen)
+        result: Array = action.squeeze(0).cpu().numpy()
+        return result
+
+    def update(self) -> None:
+        """One update of the critics and their targets; every `policy_every` times as many of actor and entropy."""
+        settings, replay = self.settings, self.replay
+        o, a = replay.observations, replay.actions
+        batch = replay.sample(settings.batch, self.random).to(self.device)
+        observation_action = batch[:, : o + a]
+        observation, next_observation = batch[:, :o], batch[:, o + a + 3 :]
+        reward, dt, terminated = batch[:, o + a], batch[:, o + a + 1], batch[:, o + a + 2]
+
+        with torch.no_grad():
+            next_action, next_log_pi = self.actor(next_observation, self._normal(settings.batch))
+            value = torch.minimum(*self.targets(torch.cat((next_observation, next_action), dim=1)))
+            value = value - self.log_alpha.exp() * next_log_pi
+            discount = torch.pow(settings.gamma_per_s, dt) * (1.0 - terminated)
+            target = settings.reward_scale * reward * dt + discount * value
+        first, second = self.critics(observation_action)
+        critic_loss = F.mse_loss(first, target) + F.mse_loss(second, target)
+        self.critic_optimiser.zero_grad()
+        critic_loss.backward()
+        self.critic_optimiser.step()
+        self.updates += 1
+
+        if self.updates % settings.policy_every == 0:
+            for _ in range(settings.policy_every):
+                self._update_actor(observation)
+
+        with torch.no_grad():
+            torch._foreach_lerp_(self._target_weights, self._critic_weights, settings.tau)
+
+    def _update_actor(self, observation: Tensor) -> None:
+        action, log_pi = self.actor(observation, self._normal(self.settings.batch))
+        value = torch.minimum(*self.critics(torch.cat((observation, action), dim=1)))
+        actor_loss = (self.log_alpha.detach().exp() * log_pi - value).mean()
+        self.actor_optimiser.zero_grad()
+        # Only the actor's weights: the critics' would cost a third more and be thrown away.
+        actor_loss.backward(inputs=self._actor_weights)
+        self.actor_optimiser.step()
+
+        entropy_loss = -self.log_alpha.exp() * (log_pi.detach().mean() + self.target_entropy)
+        self.entropy_optimiser.zero_grad()
+        entropy_loss.backward()  # type: ignore[no-untyped-call]
+        self.entropy_optimiser.step()
+
+    def _normal(self, rows: int) -> Tensor:
+        return torch.randn(rows, self.replay.actions, generator=self.noise, device=self.device)
+
+    # ------------------------------------------------------------------------------------------------- going on
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything but the replay's rows, as tensors and plain values."""
+        return {
+            "actor": self.actor.state_dict(),
+            "critics": self.critics.state_dict(),
+            "targets": self.targets.state_dict(),
+            "log_alpha": self.log_alpha.detach(),
+            "actor_optimiser": self.actor_optimiser.state_dict(),
+            "critic_optimiser": self.critic_optimiser.state_dict(),
+            "entropy_optimiser": self.entropy_optimiser.state_dict(),
+            "noise": self.noise.get_state(),
+            "random": self.random.bit_generator.state,
+            "updates": self.updates,
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on where `get_state` was called; the replay is restored apart from this."""
+        self.actor.load_state_dict(state["actor"])
+        self.critics.load_state_dict(state["critics"])
+        self.targets.load_state_dict(state["targets"])
+        with torch.no_grad():
+            self.log_alpha.copy_(state["log_alpha"])
+        self.actor_optimiser.load_state_dict(state["actor_optimiser"])
+        self.critic_optimiser.load_state_dict(state["critic_optimiser"])
+        self.entropy_optimiser.load_state_dict(state["entropy_optimiser"])
+        self.noise.set_state(state["noise"].cpu())
+        self.random.bit_generator.state = state["random"]
+        self.updates = int(state["updates"])
+
+
+# ---------------------------------------------------------------------------------------------------------- training
+
+#: s of wall-clock time between checkpoints: a crash loses at most this much.
+CHECKPOINT_EVERY_S = 30.0
+#: steps between points of the learning curve
+CURVE_EVERY = 100
+#: s of wall-clock time between calls of the progress report
+REPORT_EVERY_S = 0.25
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a training run is.
+
+    Attributes:
+        step, steps: environment steps done, and wanted.
+        robot_seconds: s, the time that the robot has walked.
+        average_reward_m_s: m/s, over the last 120 s of it.
+        learning: whether updates have begun.
+        helped: why and how often the robot had to be set up again.
+    """
+
+    step: int
+    steps: int
+    robot_seconds: float
+    average_reward_m_s: float
+    learning: bool
+    helped: Mapping[str, int]
+
+
+def train(
+    env: gymnasium.Env[Any, Any],
+    *,
+    folder: Path,
+    steps: int,
+    seed: int,
+    settings: Settings | None = None,
+    env_facts: Mapping[str, Any] | None = None,
+    device: str = "cpu",
+    report: Callable[[Progress], None] | None = None,
+) -> Progress:
+    """Train on one environment, or go on with the run that the folder holds.
+
+    Args:
+        env: observations a vector, actions a vector in −1…1. Where it has `get_state` and `set_state`, a resumed run is
+            equal to one that was never stopped, bit for bit; else a resumed run begins with a reset.
+        folder: for everything the run leaves behind (`openant_agents.runs`).
+        steps: until the run is this long, steps of earlier calls included.
+        seed: of the agent and of the first reset.
+        settings: the paper's by default.
+        env_facts: how to make the environment again, for `run.json`.
+        device: where torch computes; acting and learning on `"cpu"` take one thread.
+        report: called a few times a second.
+
+    Raises:
+        BadInput: the folder holds another run, the environment does not suit, or a number that is none came up.
+        KeyboardInterrupt: asked for by SIGINT or SIGTERM; the run is saved and goes on with the same call.
+    """
+    settings = settings or Settings()
+    observations, actions = _sizes(env)
+    describe = getattr(env.unwrapped, "describe", None)
+    described = dict(describe()) if describe is not None else {}
+    run = Run(
+        folder,
+        {
+            "agent": "sac", "seed": seed, "settings": settings.as_dict(), "env": dict(env_facts or {}),
+            "trained_on": described, "observations": observations, "actions": actions,
+            "versions": {"torch": torch.__version__, "numpy": np.__version__, "gymnasium": gymnasium.__version__},
+        },
+    )  # fmt: skip
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with _stop_on_signal() as stop:
+            return _train(
+                env, run, Sac(observations, actions, settings, seed=seed, device=device), steps, seed, report, stop
+            )
+    finally:
+        torch.set_num_threads(threads)
+        run.close()
+
+
+def _train(
+    env: gymnasium.Env[Any, Any],
+    run: Run,
+    agent: Sac,
+    steps: int,
+    seed: int,
+    report: Callable[[Progress], None] | None,
+    stop: threading.Event,
+) -> Progress:
+    settings, replay = agent.settings, agent.replay
+    average = AverageReward()
+    helped: Counter[str] = Counter()
+    step, seconds = 0, 0.0
+    observation, _ = env.reset(seed=seed)
+    checkpoint = run.resume()
+    if checkpoint is not None:
+        step, seconds = int(checkpoint["step"]), float(checkpoint["seconds"])
+        agent.set_state(checkpoint["agent"])
+        replay.restore(run.transitions(replay.width, replay.capacity), int(checkpoint["transitions"]))
+        average.set_state(checkpoint["average"])
+        helped.update(checkpoint["helped"])
+        if checkpoint["env"] is not None:
+            env.unwrapped.set_state(checkpoint["env"])
+            observation = checkpoint["observation"].numpy()
+
+    saved = replay.added
+    last_save = last_report = time.monotonic()
+
+    def save() -> None:
+        nonlocal saved, last_save
+        get_state = getattr(env.unwrapped, "get_state", None)
+        state = {
+            "step": step, "seconds": seconds, "agent": agent.get_state(), "average": average.get_state(),
+            "helped": dict(helped), "observation": observation,
+            "env": None if get_state is None else get_state(),
+        }  # fmt: skip
+        run.save(state, replay.between(saved, replay.added))
+        saved, last_save = replay.added, time.monotonic()
+
+    def progress() -> Progress:
+        learning = step > settings.learning_start
+        return Progress(step, steps, seconds, average.value, learning, dict(helped))
+
+    while step < steps and not stop.is_set():
+        random = step < settings.learning_start
+        action = agent.random_action() if random else agent.act(observation)
+        next_observation, reward, terminated, truncated, info = env.step(action)
+        reward = float(reward)
+        if not math.isfinite(reward + float(next_observation.sum())):
+            raise BadInput(
+                f"step {step} gave a reward or an observation that is no number",
+                where=run.folder,
+                remedy="look at the environment; the last checkpoint is sound",
+            )
+        dt = float(info.get("dt", 1.0))
+        replay.add(observation, action, reward, dt, terminated, next_observation)
+        average.add(reward, dt)
+        observation = next_observation
+        step += 1
+        seconds += dt
+        if terminated or truncated:
+            helped[str(info.get("reason", "the episode ended"))] += 1
+            observation, _ = env.reset()
+        if step > settings.learning_start:
+            agent.update()
+        if step % CURVE_EVERY == 0:
+            run.add_curve_point(CurvePoint(step, seconds, average.value))
+        now = time.monotonic()
+        # Rows of a full ring are overwritten by and by: save them before that, however little time has passed.
+        if now - last_save > CHECKPOINT_EVERY_S or replay.added - saved >= replay.capacity:
+            save()
+        if report is not None and now - last_report > REPORT_EVERY_S:
+            last_report = now
+            report(progress())
+    save()
+    if report is not None:
+        report(progress())
+    if stop.is_set() and step < steps:
+        raise KeyboardInterrupt
+    return progress()
+
+
+def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
+    """The agent of a run, ready to act in an environment, and the step it was saved at.
+
+    Raises:
+        BadInput: no such run, or one whose observations or actions are not the environment's.
+    """
+    facts = read_facts(folder)
+    observations, actions = _sizes(env)
+    if (facts["observations"], facts["actions"]) != (observations, actions):
+        raise BadInput(
+            f"its policy takes {facts['observations']} observations and gives {facts['actions']} actions, "
+            f"this robot has {observations} and {actions}",
+            where=folder,
+            remedy="play it on a robot like the one it was trained on",
+        )
+    describe = getattr(env.unwrapped, "describe", None)
+    here = describe() if describe is not None else {}
+    for what in ("observation_names", "action_names", "action_range"):
+        if what in here and facts["trained_on"].get(what) != here[what]:
+            raise BadInput(
+                f"its policy was trained with other {what.replace('_', ' ')} than this environment has",
+                where=folder,
+                remedy="make the environment as run.json says",
+            )
+    checkpoint = load_checkpoint(folder)
+    agent = Sac(observations, actions, Settings(**{**facts["settings"], "buffer": 1}), seed=int(facts["seed"]))
+    try:
+        agent.set_state(checkpoint["agent"])
+    except (KeyError, RuntimeError, ValueError) as error:
+        raise BadInput(
+            "the checkpoint does not fit the networks that run.json describes",
+            where=folder,
+            remedy="train into another folder",
+        ) from error
+    return agent, int(checkpoint["step"])
+
+
+def _sizes(env: gymnasium.Env[Any, Any]) -> tuple[int, int]:
+    observation, action = env.observation_space, env.action_space
+    box = gymnasium.spaces.Box
+    if not (isinstance(observation, box) and len(observation.shape) == 1):
+        raise BadInput(f"observations are {observation}, not a vector", remedy="wrap it in FlattenObservation")
+    if not (
+        isinstance(action, box) and len(action.shape) == 1 and (action.low == -1).all() and (action.high == 1).all()
+    ):
+        raise BadInput(f"actions are {action}, not a vector in −1…1", remedy="wrap it in RescaleAction")
+    return observation.shape[0], action.shape[0]
+
+
+@contextmanager
+def _stop_on_signal() -> Iterator[threading.Event]:
+    """Turn the first SIGINT or SIGTERM into a wish, so that no update is cut in half; the second interrupts at once."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+
+    def handle(signum: int, frame: FrameType | None) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,97 @@
+"""`openant eval`: play a trained agent and measure it."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import click
+
+from openant_tools.cli.options import json_option
+from openant_tools.errors import BadInput
+
+#: pictures in a strip, one a step, and s of walking before the first
+STRIP_FRAMES = 8
+STRIP_FROM_S = 6.0
+
+
+@click.command()
+@click.argument("run", type=click.Path(path_type=Path, file_okay=False), metavar="DIR")
+@click.option("--seconds", type=float, default=120.0, show_default=True, help="Robot time.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option(
+    "--robot", type=click.Path(path_type=Path), metavar="DIR",
+    help="Play it on another robot than it was trained on.",
+)  # fmt: skip
+@click.option("--explore", is_flag=True, help="Sample actions as in training, instead of taking the likeliest.")
+@click.option(
+    "--strip", type=click.Path(path_type=Path, dir_okay=False), metavar="PNG",
+    help="Also write a strip of pictures of the walking robot.",
+)  # fmt: skip
+@json_option
+def eval_(
+    run: Path, seconds: float, seed: int, robot: Path | None, explore: bool, strip: Path | None, json_file: Path | None
+) -> None:
+    """Play the agent of a training run and measure its average reward per second.
+
+    \b
+    Example:
+      openant eval my-ant/runs/sac-1 --seconds 120 --json eval.json --strip walk.png
+    """
+    from openant_tools.cli.train import need_torch
+
+    need_torch()
+    import gymnasium
+    from rich.console import Console
+    from rich.progress import Progress
+
+    import openant_env  # noqa: F401  (registers the environment)
+    from openant_agents.evaluate import evaluate
+    from openant_agents.runs import read_facts
+    from openant_agents.sac import load_policy
+    from openant_env.rendering import NoOpenGL, write_strip
+    from openant_tools.files import write_text
+
+    facts = read_facts(run)
+    options = dict(facts["env"]["options"])
+    if robot is not None:
+        options.pop("kit", None)
+        options["robot"] = os.path.abspath(robot)
+    elif not os.path.exists(options.get("robot", os.curdir)):
+        raise BadInput(
+            f"the robot it was trained on is no longer at {options['robot']}", where=run, remedy="name it with --robot"
+        )
+    env = gymnasium.make(facts["env"]["id"], render_mode="rgb_array", **options)
+    try:
+        agent, step = load_policy(run, env)
+        if strip is not None:
+            try:
+                env.reset(seed=seed)
+                env.render()
+            except NoOpenGL as error:
+                click.echo(f"openant: no strip: {error}", err=True)
+                strip = None
+        with Progress(console=Console(stderr=True)) as bar:
+            task = bar.add_task("walking", total=seconds)
+            result, pictures = evaluate(
+                env,
+                lambda observation: agent.act(observation, explore=explore),
+                seconds=seconds,
+                seed=seed,
+                report=lambda done, average: bar.update(task, completed=done, description=f"{100 * average:.1f} cm/s"),
+                frames=0 if strip is None else STRIP_FRAMES,
+                frames_from_s=min(STRIP_FROM_S, 0.5 * seconds),
+            )
+    finally:
+        env.close()
+    if strip is not None:
+        write_strip(pictures, strip, seconds_apart=result.seconds / result.steps)
+        click.echo(f"strip: {strip}")
+    helped = "".join(f", set up again {count}× ({reason})" for reason, count in result.helped.items())
+    click.echo(
+        f"{100 * result.average_reward_m_s:.1f} cm/s over {result.seconds:.0f} s: {result.progress_m:.2f} m of progress "
+        f"on a way of {result.path_m:.2f} m, {result.turns} turns{helped} (policy of step {step})"
+    )
+    if json_file is not None:
+        write_text(json_file, json.dumps({**result.as_dict(), "run": str(run), "step": step}, indent=2) + "\n")
