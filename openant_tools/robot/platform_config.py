@@ -196,7 +196,7 @@ def import_platform_config(platform: PlatformConfig, path: str | Path, kit: str 
     provenance = dict.fromkeys([*keys, *(f"motors.*.{field}" for field in sorted(for_all))], source)
 
     folder = RobotFolder(Path(path))
-    copy = folder.path / platform.path.name
+    copy = folder.path / f"{platform.name}.json"
     values = {**platform.values, "platform.config": copy.name}
     if folder.config_file.is_file():
         present = folder.config().kit
