@@ -262,6 +262,10 @@ class Bus:
             speed=f"{self.line.baud} baud",
         )
 
+    def require_all(self, answered: Mapping[int, bool]) -> None:
+        """Raise NoAnswer unless every one of these ids answered, in the order asked."""
+        self.require([Answer(id, b"" if ok else None, 0, None if ok else Cause.TIMEOUT) for id, ok in answered.items()])
+
     def close(self) -> None:
         self.line.close()
 

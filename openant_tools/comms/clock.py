@@ -116,6 +116,8 @@ class SteppedClock:
     def __init__(self, control: VirtualControl, *, bus: Line | None = None, imu: Line | None = None) -> None:
         self._control = control
         self._lines: dict[str, Line] = {}
+        #: bytes (written, received) before the counts of the robot began
+        self._base: dict[str, tuple[int, int]] = {}
         self._sent: dict[str, int] = {"bus": 0, "imu": 0}
         self._settled: dict[str, int] = {}
         answer = control.ask("now")
@@ -124,15 +126,16 @@ class SteppedClock:
                 "this virtual robot runs in real time", where=control.path, remedy='[clock] mode = "stepped"'
             )
         self._t = float(answer["t"])
-        if bus is not None:
-            self.attach("bus", bus)
-        if imu is not None:
-            self.attach("imu", imu)
+        self.attach(bus=bus, imu=imu)
 
-    def attach(self, name: str, line: Line) -> None:
-        """Take `line` as the robot's "bus" or "imu"."""
-        self._lines[name] = line
-        self._settled[name] = line.written
+    def attach(self, *, bus: Line | None = None, imu: Line | None = None) -> None:
+        """Take these lines, just opened, as the robot's; those attached before stay, and must be idle."""
+        given = {"bus": bus, "imu": imu}
+        self._lines |= {name: line for name, line in given.items() if line is not None}
+        self._t = float(self._control.ask("open")["t"])
+        for name, line in self._lines.items():
+            self._base[name] = line.written, line.received
+            self._sent[name], self._settled[name] = line.received, line.written
 
     def now(self) -> float:
         return self._t
@@ -159,7 +162,8 @@ class SteppedClock:
 
     def _settle(self) -> None:
         self._settled = {name: line.written for name, line in self._lines.items()}
-        answer = self._control.ask("settle", **{f"{name}_written": count for name, count in self._settled.items()})
+        written = {f"{name}_written": count - self._base[name][0] for name, count in self._settled.items()}
+        answer = self._control.ask("settle", **written)
         self._t = max(self._t, float(answer["t"]))
-        for name in self._sent:
-            self._sent[name] = int(answer.get(f"{name}_sent", self._sent[name]))
+        for name in self._lines:
+            self._sent[name] = int(answer[f"{name}_sent"]) + self._base[name][1]

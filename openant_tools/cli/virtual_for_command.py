@@ -1,0 +1,87 @@
+"""`--virtual [SCENARIO | READY_FILE]` on commands that touch hardware: a virtual robot for this command, or a running
+one."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import click
+
+from openant_tools.errors import BadInput, HardwareFault
+
+__all__ = ["VIRTUAL_DEFAULT", "virtual_option", "virtual_robot"]
+
+#: what `--virtual` without a value stands for
+VIRTUAL_DEFAULT = "default"
+START_TIMEOUT_S = 60.0
+
+virtual_option = click.option(
+    "--virtual",
+    "virtual_source",
+    is_flag=False,
+    flag_value=VIRTUAL_DEFAULT,
+    metavar="[SCENARIO|READY_FILE]",
+    help="Use a virtual robot: started for this command (from a scenario .toml, or a healthy one), or running (its "
+    "ready file).",
+)
+
+
+@contextlib.contextmanager
+def virtual_robot(source: str, *, clock: str | None = None) -> Iterator[Mapping[str, str | None]]:
+    """What a ready file says of the virtual robot meant by `--virtual`; one that was started ends with the block.
+
+    Args:
+        source: the option's value.
+        clock: "real" or "stepped" for a robot started here; None for what its scenario says.
+    """
+    if source != VIRTUAL_DEFAULT and not source.endswith(".toml"):
+        yield _read(Path(source))
+        return
+    if source != VIRTUAL_DEFAULT and not Path(source).is_file():
+        raise BadInput("there is no such scenario", where=source)
+    with tempfile.TemporaryDirectory(prefix="openant-virtual-") as folder:
+        ready = Path(folder) / "ready.json"
+        command = [sys.executable, "-m", "openant_tools.cli", "virtual", "start", "--ready-file", str(ready)]
+        command += [] if source == VIRTUAL_DEFAULT else ["--scenario", source]
+        command += [] if clock is None else ["--clock", clock]
+        with open(Path(folder) / "log", "w+") as log:
+            # A session of its own: Ctrl-C is for the command, which then ends the robot after torque is off.
+            process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+            try:
+                _await(process, ready, log.name)
+                yield _read(ready)
+            finally:
+                process.terminate()
+                try:
+                    process.wait(5.0)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+
+
+def _await(process: subprocess.Popen[bytes], ready: Path, log: str) -> None:
+    give_up = time.monotonic() + START_TIMEOUT_S
+    while not ready.is_file():
+        if process.poll() is not None:
+            words = Path(log).read_text().strip().splitlines()
+            raise HardwareFault(words[-1] if words else f"the virtual robot ended with status {process.returncode}")
+        if time.monotonic() > give_up:
+            raise HardwareFault(f"the virtual robot is not ready after {START_TIMEOUT_S:.0f} s")
+        time.sleep(0.02)
+
+
+def _read(path: Path) -> Mapping[str, str | None]:
+    try:
+        content = json.loads(path.read_text())
+        return {"bus": str(content["bus"]), "imu": content.get("imu"), "control": content.get("control")}
+    except FileNotFoundError:
+        raise BadInput("there is no such ready file", where=path, remedy="start a virtual robot first") from None
+    except (ValueError, KeyError, TypeError):
+        raise BadInput("this is no ready file of a virtual robot", where=path) from None

@@ -1,0 +1,107 @@
+"""From what a user names (a port, a robot's folder, a virtual robot) to what the engine needs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from openant_tools.comms.bus import Bus, Timing
+from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
+from openant_tools.comms.line import SerialLine
+from openant_tools.comms.messages import EngineConfig
+from openant_tools.comms.ports import Host
+from openant_tools.comms.servos import Servo
+from openant_tools.errors import HardwareFault
+from openant_tools.robot.config import RobotConfig
+from openant_tools.robot.joints import JOINTS
+from openant_tools.robot.kit import ANGLE_LIMIT_RAD, PLATFORM_PWM_LIMIT_COUNTS
+from openant_tools.robot.registers import PWM_FULL
+from openant_tools.robot.servo import servo_model
+
+__all__ = ["config_of_robot", "config_of_unknown_robot", "find_bus", "open_bus"]
+
+#: Servo angle at joint zero where no robot.toml says otherwise: horns mounted with the range in the encoder's middle.
+DEFAULT_ZERO_RAD = math.pi
+
+
+def find_bus(port: str | None, robot: RobotConfig | None = None, host: Host | None = None) -> str:
+    """The bus to use: the port named, else robot.toml's, else the one adapter that is plugged in.
+
+    Raises:
+        HardwareFault: there is none, or several.
+    """
+    if port:
+        return port
+    if robot is not None and robot.ports.bus:
+        return str(robot.ports.bus)
+    buses = [found for found in (host or Host()).ports() if found.kind == "bus"]
+    if len(buses) == 1:
+        return buses[0].stable_path
+    if not buses:
+        raise HardwareFault(
+            "no U2D2 is plugged in", remedy="plug it in, name another adapter with --port, or use --virtual"
+        )
+    names = ", ".join(found.stable_path for found in buses)
+    raise HardwareFault(f"several buses are plugged in: {names}", remedy="name one with --port")
+
+
+def open_bus(port: str, baud: int, control: str | None = None) -> Bus:
+    """A bus for tools that ask a few questions and own nothing: scan, calibration of loose motors."""
+    remote = VirtualControl(control) if control else None
+    line = SerialLine(port, baud)
+    clock: Clock = RealClock()
+    if remote is not None and remote.ask("now")["stepped"]:
+        clock = SteppedClock(remote, bus=line)
+    latency = Host().latency_timer_ms(port)
+    return Bus(line, clock, Timing(latency_timer_s=Timing.latency_timer_s if latency is None else latency * 1e-3))
+
+
+def config_of_robot(robot: RobotConfig, port: str | None = None, **more: object) -> EngineConfig:
+    """The engine's config for a robot that has a robot.toml; `more` goes to `EngineConfig`."""
+    servos = tuple(
+        Servo(motor.joint, motor.id, motor.servo, motor.direction, motor.zero_offset_rad)
+        for motor in robot.motors.values()
+    )
+    pwm_limit = round(robot.bus.pwm_limit * PWM_FULL)
+    return EngineConfig(
+        port=find_bus(port, robot),
+        servos=servos,
+        baud=robot.bus.baud,
+        limits_rad={motor.joint: (motor.min_rad, motor.max_rad) for motor in robot.motors.values()},
+        registers={servo.joint: {"pwm_limit": pwm_limit} for servo in servos},
+        watchdog_s=robot.bus.watchdog_s,
+        write_read_gap_s=robot.bus.write_read_gap_s,
+        **more,  # type: ignore[arg-type]
+    )
+
+
+def config_of_unknown_robot(port: str, control: str | None = None, **more: object) -> EngineConfig:
+    """The engine's config for an Ant that nobody has described: the guide's ids, models as they answer, kit limits.
+
+    Raises:
+        HardwareFault: not all eight answer at 1 Mbaud.
+    """
+    bus = open_bus(port, 1_000_000, control)
+    try:
+        bus.names = {joint.id: joint.name for joint in JOINTS.values()}
+        found = {joint.name: bus.ping(joint.id) for joint in JOINTS.values()}
+        bus.require_all({JOINTS[name].id: seen is not None for name, seen in found.items()})
+        servos = tuple(
+            Servo(name, seen.id, servo_model(seen.model_number), 1, DEFAULT_ZERO_RAD)
+            for name, seen in found.items()
+            if seen is not None
+        )
+    finally:
+        bus.close()
+    return EngineConfig(
+        port=port,
+        servos=servos,
+        control=control,
+        limits_rad=_kit_limits(),
+        registers={servo.joint: {"pwm_limit": PLATFORM_PWM_LIMIT_COUNTS} for servo in servos},
+        **more,  # type: ignore[arg-type]
+    )
+
+
+def _kit_limits() -> Mapping[str, tuple[float, float]]:
+    return {name: (-ANGLE_LIMIT_RAD[joint.kind], ANGLE_LIMIT_RAD[joint.kind]) for name, joint in JOINTS.items()}
