@@ -1,0 +1,307 @@
+"""What a report is made of: one class a kind of part, each of which writes itself as HTML, Markdown and JSON."""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+from openant_tools.report import plots
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MatplotlibFigure
+
+__all__ = [
+    "Code", "Details", "Figure", "KeyFigure", "KeyFigures", "Mark", "Part", "Picture", "SavePicture", "Table", "Text",
+    "Tone",
+]  # fmt: skip
+
+#: What a value says: all is well, look here, this is bad, or nothing.
+Tone = Literal["", "good", "warn", "bad"]
+
+#: Stores a picture beside a Markdown report and returns the path to write: (name, PNG bytes) → relative path.
+SavePicture = Callable[[str, bytes], str]
+
+#: bytes of SVG; beyond it a picture of pixels is smaller and scrolls better
+_LARGEST_SVG = 700_000
+
+
+class Part(Protocol):
+    """One part of a report."""
+
+    def html(self, key: str) -> str:
+        """As HTML; `key` is unique in the report, for ids."""
+
+    def markdown(self, key: str, save: SavePicture) -> str:
+        """As Markdown, pictures stored by `save`."""
+
+    def json(self) -> dict[str, Any]:
+        """As data."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A word or number in a table that says by its colour, and by a sign for those who see none, how it stands."""
+
+    text: str
+    tone: Tone = ""
+
+
+@dataclass(frozen=True)
+class Text:
+    """Paragraphs, parted by empty lines; lines that start with `- ` are a list; `code`, **bold** and [links](url)."""
+
+    text: str
+
+    def html(self, key: str) -> str:
+        out = []
+        for block in re.split(r"\n\s*\n", self.text.strip()):
+            lines = block.splitlines()
+            first = next((k for k, line in enumerate(lines) if line.lstrip().startswith("- ")), len(lines))
+            if first:
+                out.append(f"<p>{_inline(' '.join(lines[:first]))}</p>")
+            if first < len(lines):
+                items = re.split(r"(?m)^\s*- ", "\n".join(lines[first:]))[1:]
+                out.append("<ul>" + "".join(f"<li>{_inline(' '.join(item.split()))}</li>" for item in items) + "</ul>")
+        return "\n".join(out)
+
+    def markdown(self, key: str, save: SavePicture) -> str:
+        return self.text.strip()
+
+    def json(self) -> dict[str, Any]:
+        return {"kind": "text", "text": self.text.strip()}
+
+
+@dataclass(frozen=True)
+class Code:
+    """Commands or file content, to be copied."""
+
+    text: str
+
+    def html(self, key: str) -> str:
+        return f"<pre><code>{escape(self.text.strip())}</code></pre>"
+
+    def markdown(self, key: str, save: SavePicture) -> str:
+        return f"```\n{self.text.strip()}\n```"
+
+    def json(self) -> dict[str, Any]:
+        return {"kind": "code", "text": self.text.strip()}
+
+
+@dataclass(frozen=True)
+class KeyFigure:
+    """One number that a reader should take away.
+
+    Attributes:
+        label: what it is.
+        value: with its unit, as it should be read.
+        note: what it is compared with, or what it decides.
+        tone: how it stands.
+    """
+
+    label: str
+    value: str
+    note: str = ""
+    tone: Tone = ""
+
+
+@dataclass(frozen=True)
+class KeyFigures:
+    """A row of key figures."""
+
+    figures: Sequence[KeyFigure]
+
+    def html(self, key: str) -> str:
+        boxes = []
+        for figure in self.figures:
+            note = f"<span class=note>{_inline(figure.note)}</span>" if figure.note else ""
+            value = f"<b>{escape(figure.value)}</b>"
+            boxes.append(f'<div class="key {figure.tone}"><span>{escape(figure.label)}</span>{value}{note}</div>')
+        return f"<div class=keys>{''.join(boxes)}</div>"
+
+    def markdown(self, key: str, save: SavePicture) -> str:
+        return "\n".join(
+            f"- {figure.label}: **{figure.value}**" + (f" ({figure.note})" if figure.note else "")
+            for figure in self.figures
+        )
+
+    def json(self) -> dict[str, Any]:
+        return {"kind": "key_figures", "figures": [vars(figure) for figure in self.figures]}
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; a column whose cells are all numbers is set to the right.
+
+    Attributes:
+        columns: headings, with the unit where there is one.
+        rows: cells: text, a number (printed with four significant digits; write text for more), a `Mark` or None.
+        caption: what it shows.
+    """
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[object]]
+    caption: str = ""
+
+    def html(self, key: str) -> str:
+        right = [self._is_numeric(column) for column in range(len(self.columns))]
+        sides = [" class=num" if flag else "" for flag in right]
+        head = "".join(f"<th{side}>{_inline(name)}</th>" for side, name in zip(sides, self.columns, strict=True))
+        body = []
+        for row in self.rows:
+            cells = []
+            for side, cell in zip(sides, row, strict=True):
+                if isinstance(cell, Mark):
+                    cells.append(f'<td{side}><span class="mark {cell.tone}">{_inline(cell.text)}</span></td>')
+                else:
+                    cells.append(f"<td{side}>{_inline(_shown(cell))}</td>")
+            body.append(f"<tr>{''.join(cells)}</tr>")
+        caption = f"<caption>{_inline(self.caption)}</caption>" if self.caption else ""
+        table = f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
+        return f"<div class=scroll>{table}</div>"
+
+    def markdown(self, key: str, save: SavePicture) -> str:
+        lines = [
+            "| " + " | ".join(map(_cell, self.columns)) + " |",
+            "|" + "|".join("---:" if self._is_numeric(k) else "---" for k in range(len(self.columns))) + "|",
+        ]
+        lines += ["| " + " | ".join(_cell(_shown(cell)) for cell in row) + " |" for row in self.rows]
+        return "\n".join(([self.caption, ""] if self.caption else []) + lines)
+
+    def json(self) -> dict[str, Any]:
+        rows = [[_data(cell) for cell in row] for row in self.rows]
+        return {"kind": "table", "caption": self.caption, "columns": list(self.columns), "rows": rows}
+
+    def _is_numeric(self, column: int) -> bool:
+        cells = [_shown(row[column]).strip("±+−-–<>≤≥ %") for row in self.rows]
+        numbers = [cell for cell in cells if cell]
+        return bool(numbers) and all(cell[0].isdigit() for cell in numbers)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A plot.
+
+    Attributes:
+        figure: a matplotlib figure, as `openant_tools.report.plots.figure` makes them.
+        caption: what it shows and what to look for.
+        alt: what a reader who cannot see it should know; default: the caption.
+    """
+
+    figure: MatplotlibFigure
+    caption: str
+    alt: str = ""
+
+    def html(self, key: str) -> str:
+        alt = escape(self.alt or self.caption, quote=True)
+        svg = plots.as_svg(self.figure, key)
+        if len(svg) <= _LARGEST_SVG:
+            picture = svg.replace("<svg ", f'<svg role="img" aria-label="{alt}" ', 1)
+        else:
+            picture = f'<img class=paper alt="{alt}" src="{_data_url(plots.as_png(self.figure))}">'
+        return f"<figure>{picture}<figcaption>{_inline(self.caption)}</figcaption></figure>"
+
+    def markdown(self, key: str, save: SavePicture) -> str:
+        path = save(f"{key}.png", plots.as_png(self.figure))
+        return f"![{(self.alt or self.caption).replace(']', ')')}]({path})\n\n*{self.caption}*"
+
+    def json(self) -> dict[str, Any]:
+        return {"kind": "figure", "caption": self.caption}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A photograph or a rendering: a PNG or JPEG file, or the bytes of one."""
+
+    data: bytes | Path
+    caption: str
+    alt: str = ""
+
+    def html(self, key: str) -> str:
+        alt = escape(self.alt or self.caption, quote=True)
+        picture = f'<img alt="{alt}" src="{_data_url(self._bytes())}">'
+        return f"<figure>{picture}<figcaption>{_inline(self.caption)}</figcaption></figure>"
+
+    def markdown(self, key: str, save: SavePicture) -> str:
+        data = self._bytes()
+        path = save(f"{key}.{'jpg' if _is_jpeg(data) else 'png'}", data)
+        return f"![{(self.alt or self.caption).replace(']', ')')}]({path})\n\n*{self.caption}*"
+
+    def json(self) -> dict[str, Any]:
+        return {"kind": "picture", "caption": self.caption}
+
+    def _bytes(self) -> bytes:
+        return self.data if isinstance(self.data, bytes) else self.data.read_bytes()
+
+
+@dataclass(frozen=True)
+class Details:
+    """Parts that stay folded until a reader asks for them."""
+
+    summary: str
+    parts: Sequence[Part]
+
+    def html(self, key: str) -> str:
+        inside = "\n".join(part.html(f"{key}-{k}") for k, part in enumerate(self.parts))
+        return f"<details><summary>{_inline(self.summary)}</summary>{inside}</details>"
+
+    def markdown(self, key: str, save: SavePicture) -> str:
+        inside = (part.markdown(f"{key}-{k}", save) for k, part in enumerate(self.parts))
+        return "\n\n".join([f"**{self.summary}**", *inside])
+
+    def json(self) -> dict[str, Any]:
+        return {"kind": "details", "summary": self.summary, "parts": [part.json() for part in self.parts]}
+
+
+def _inline(text: str) -> str:
+    """Escaped text with `code`, **bold** and [links](url); code is left as it is inside."""
+    out = []
+    for k, piece in enumerate(re.split(r"`([^`]+)`", text)):
+        safe = escape(piece)
+        if k % 2:
+            out.append(f"<code>{safe}</code>")
+            continue
+        safe = re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", safe)
+        out.append(re.sub(r"\[([^\]]+)\]\(((?:https?://|#|\.{0,2}/)?[^\s):]+[^\s)]*)\)", r'<a href="\2">\1</a>', safe))
+    return "".join(out)
+
+
+def _shown(cell: object) -> str:
+    if cell is None:
+        return "–"
+    if isinstance(cell, Mark):
+        return cell.text
+    if isinstance(cell, bool):
+        return "yes" if cell else "no"
+    if isinstance(cell, float) or hasattr(cell, "dtype"):
+        value = float(cell)  # type: ignore[arg-type]
+        return f"{value:.4g}".replace("-", "−") if math.isfinite(value) else "–"
+    return str(cell)
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
+def _data(cell: object) -> object:
+    if isinstance(cell, Mark):
+        return {"text": cell.text, "tone": cell.tone}
+    if hasattr(cell, "item"):
+        cell = cell.item()
+    if isinstance(cell, float) and not math.isfinite(cell):
+        return None
+    return cell if isinstance(cell, bool | int | float | str | None) else str(cell)
+
+
+def _is_jpeg(data: bytes) -> bool:
+    return data[:2] == b"\xff\xd8"
+
+
+def _data_url(data: bytes) -> str:
+    kind = "jpeg" if _is_jpeg(data) else "png"
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
