@@ -326,8 +326,8 @@ class Bus:
         # A refusal is shorter than an answer and stuffing makes it longer: the length field tells, once it is there.
         heads = [p2.HEADER + bytes((id,)) for id in ids]
         known, at_known, plain, expected = 0, 0, True, size * len(ids)
-        in_time = True
-        wait, read, now = self.clock.wait_readable, self.line.read, self.clock.now
+        in_time, before = True, self.line.received
+        wait, read, arrivals = self.clock.wait_readable, self.line.read, self.clock.arrivals
         while len(buffer) < expected:
             if not wait(self.line, deadline):
                 if not in_time or self.timing.grace_s <= 0:
@@ -335,19 +335,20 @@ class Bus:
                 in_time, deadline = False, deadline + self.timing.grace_s
                 continue
             buffer += read()
-            at = now()
-            edges.append((len(buffer), at, in_time))
+            for total, at in arrivals(self.line):
+                # In real time a portion that was read late may have arrived in time: only waiting in vain tells.
+                edges.append((total - before, at, in_time and (at <= deadline or not self.clock.stepped)))
             while known < len(ids) and len(buffer) >= at_known + 7 and buffer.startswith(heads[known], at_known):
                 actual = 7 + (buffer[at_known + 5] | buffer[at_known + 6] << 8)
                 if actual != size:
                     plain, expected = False, expected + actual - size
                 known, at_known = known + 1, at_known + actual
             if len(buffer) < expected and in_time:
-                deadline = min(deadline, max(at, started + self.wire_s(len(packet))) + quiet)
+                deadline = min(deadline, max(edges[-1][1], started + self.wire_s(len(packet))) + quiet)
         if buffer:
             self._quiet_from = self.clock.now() - self.timing.write_read_gap_s
         answers: list[Answer] = []
-        if plain and known == len(ids) and len(buffer) == expected and in_time:
+        if plain and known == len(ids) and len(buffer) == expected and edges[-1][2]:
             # The usual case: every head where it should be; checksums and stuffing are left to look at.
             for k, id in enumerate(ids):
                 part = bytes(buffer[k * size : (k + 1) * size])
@@ -407,9 +408,10 @@ class Bus:
         deadline = started + whole
         expected, buffer = 8 + len(ids) * (count + 4), bytearray()
         edges: list[tuple[int, float, bool]] = []
+        before = self.line.received
         while len(buffer) < expected and self.clock.wait_readable(self.line, deadline):
             buffer += self.line.read()
-            edges.append((len(buffer), self.clock.now(), True))
+            edges += [(total - before, at, True) for total, at in self.clock.arrivals(self.line)]
             deadline = min(deadline, max(edges[-1][1] + quiet, started + self.wire_s(len(packet)) + quiet))
         if buffer:
             self._quiet_from = self.clock.now() - self.timing.write_read_gap_s

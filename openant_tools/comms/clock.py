@@ -43,6 +43,10 @@ class Clock(Protocol):
         even after the deadline: then it was this process that was late, not they."""
         ...
 
+    def arrivals(self, line: Line) -> list[tuple[int, float]]:
+        """(bytes received in all, when) of each portion that the last `line.read()` brought."""
+        ...
+
 
 class RealClock:
     """The host's monotonic clock, the same one for all processes."""
@@ -62,6 +66,9 @@ class RealClock:
     def wait_readable(self, line: Line, deadline: float) -> bool:
         ready, _, _ = select.select([line], [], [], max(0.0, deadline - time.monotonic()))
         return bool(ready)
+
+    def arrivals(self, line: Line) -> list[tuple[int, float]]:
+        return [(line.received, time.monotonic())]
 
 
 class VirtualControl:
@@ -120,6 +127,7 @@ class SteppedClock:
         self._base: dict[str, tuple[int, int]] = {}
         self._sent: dict[str, int] = {"bus": 0, "imu": 0}
         self._settled: dict[str, int] = {}
+        self._marks: dict[str, list[tuple[int, float]]] = {}
         answer = control.ask("now")
         if not answer["stepped"]:
             raise HardwareFault(
@@ -136,6 +144,7 @@ class SteppedClock:
         for name, line in self._lines.items():
             self._base[name] = line.written, line.received
             self._sent[name], self._settled[name] = line.received, line.written
+            self._marks[name] = []
 
     def now(self) -> float:
         return self._t
@@ -147,18 +156,32 @@ class SteppedClock:
             self._t = float(self._control.ask("advance", to=t)["t"])
 
     def wait_readable(self, line: Line, deadline: float) -> bool:
-        name = next(name for name, known in self._lines.items() if known is line)
+        name = self._name(line)
         if line.received >= self._sent[name]:
             self._settle()
         if line.received >= self._sent[name]:
             self.sleep_until(deadline)
             self._settle()
-        if line.received >= self._sent[name] or self._t > deadline:
+        if line.received >= self._sent[name]:
+            return False
+        first = next((t for count, t in self._marks[name] if count > line.received), self._t)
+        if first > deadline:
             return False
         ready, _, _ = select.select([line], [], [], CONTROL_TIMEOUT_S)
         if not ready:
             raise HardwareFault("the virtual robot's bytes do not arrive", where=line.path)
         return True
+
+    def arrivals(self, line: Line) -> list[tuple[int, float]]:
+        name = self._name(line)
+        here = [mark for mark in self._marks[name] if mark[0] <= line.received]
+        self._marks[name] = self._marks[name][len(here) :]
+        if not here or here[-1][0] < line.received:
+            here.append((line.received, self._t))
+        return here
+
+    def _name(self, line: Line) -> str:
+        return next(name for name, known in self._lines.items() if known is line)
 
     def _settle(self) -> None:
         self._settled = {name: line.written for name, line in self._lines.items()}
@@ -166,4 +189,6 @@ class SteppedClock:
         answer = self._control.ask("settle", **written)
         self._t = max(self._t, float(answer["t"]))
         for name in self._lines:
-            self._sent[name] = int(answer[f"{name}_sent"]) + self._base[name][1]
+            base = self._base[name][1]
+            self._sent[name] = int(answer[f"{name}_sent"]) + base
+            self._marks[name] += [(int(count) + base, float(t)) for count, t in answer.get(f"{name}_arrivals", ())]

@@ -12,7 +12,10 @@ The control socket (Unix stream, one JSON object a line, one line of answer each
 | `{"do": "advance", "to": s}` | runs the world to that time (stepped only); `{"t": s}` |
 | `{"do": "settle", "bus_written": n, "imu_written": m}` | waits for so many bytes in all and lets them act; |
 | | `{"t": s, "bus_sent": n, "imu_sent": m}`: when the last answer reached the host (or the wire fell silent), and |
-| | how many bytes were sent in all |
+| | how many bytes were sent in all; `"bus_arrivals": [[n, t], …]` (and `imu_…`): when each portion since the last |
+| | answer reached the host |
+| `{"do": "wait", "port": "bus", "to": s, "bus_written": n, "imu_written": m}` | as `settle`, but time runs only until |
+| | the next bytes leave for that port, or to `to` (stepped only) |
 | `{"do": "state"}` | the truth: angles, torques, temperatures, torque enables, supply, body |
 | `{"do": "fault", "cause": …, "where": …, "on": bool, …}` | switches a fault; `{"t": s}` |
 | `{"do": "plug", "joint": …}`, `{"do": "unplug", …}` | puts a servo on the bus or takes it off; `{"t": s}` |
@@ -73,6 +76,8 @@ class _Control:
     buffer: bytearray = field(default_factory=bytearray)
     received: dict[str, int] = field(default_factory=dict)
     sent: dict[str, int] = field(default_factory=dict)
+    #: port → (bytes sent in all, when), since this client's last settle
+    arrivals: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
 
 
 class _Failed(Exception):
@@ -99,10 +104,12 @@ class Server:
         camera: str | None = None,
         tcp: bool = False,
         folder: Path | None = None,
-        fault: Callable[[dict[str, Any]], None] | None = None,
     ) -> None:
         self.world, self.stepped, self.camera = world, stepped, camera
-        self._imu, self._fault = imu, fault
+        self._imu = imu
+        #: switches a fault by a control request; set by whoever builds the robot
+        self.fault: Callable[[dict[str, Any]], None] | None = None
+        self._unplugged: set[str] = set()
         self._own_folder = folder is None
         self.folder = Path(tempfile.mkdtemp(prefix="openant-")) if folder is None else folder
         self.ports: dict[str, Port] = {"bus": TcpPort() if tcp else PtyPort(self.folder / "bus")}
@@ -122,8 +129,7 @@ class Server:
         self._controls: list[_Control] = []
         self._watched: dict[int, str] = {}
         self._start = time.monotonic() - world.now
-        self._last_delivery = 0.0
-        self._stalled_until = 0.0
+        self._imu_served = world.now
 
     # ---- life ----
 
@@ -183,10 +189,13 @@ class Server:
 
     def _pause(self) -> float:
         """s to sleep until something is due; spins through the last stretch before an answer."""
+        left = IDLE_S
+        if self._imu is not None:
+            left = min(left, max(0.0, self._imu.next_event(self.world.now) - self.now))
         if not self._outbox:
-            return IDLE_S
-        left = self._outbox[0][0] - self.now
-        return 0.0 if left < SPIN_S else min(IDLE_S, left - SPIN_S)
+            return left
+        due = self._outbox[0][0] - self.now
+        return 0.0 if due < SPIN_S else min(left, due - SPIN_S)
 
     def _keep_time(self) -> None:
         now = self.now
@@ -198,7 +207,8 @@ class Server:
         while self._outbox and self._outbox[0][0] <= self.now:
             _, _, name, data = heapq.heappop(self._outbox)
             self._send(name, data)
-        if self._imu is not None:
+        if self._imu is not None and self.now >= self._imu.next_event(self._imu_served):
+            self.world.advance(self.now)
             self._serve_imu(self.now)
 
     def _watch(self) -> None:
@@ -261,22 +271,27 @@ class Server:
 
     def _send(self, name: str, data: bytes) -> None:
         self.sent[name] += self.ports[name].write(data)
+        if self.stepped:
+            for control in self._controls:
+                control.arrivals.setdefault(name, []).append((self.sent[name], self.now))
 
     def _serve_imu(self, t: float) -> None:
         assert self._imu is not None
+        self._imu_served = t
         port = self.ports["imu"]
-        if self._imu.connected != bool(port.files):
-            (port.plug if self._imu.connected else port.unplug)()
+        there = self._imu.connected and "imu" not in self._unplugged
+        if there != bool(port.files):
+            (port.plug if there else port.unplug)()
         data = self._imu.transmit(t)
         if data:
             self._send("imu", data)
 
     # ---- stepped time ----
 
-    def advance(self, to: float) -> None:
-        """Stepped: run to a time, sending what falls due on the way."""
+    def advance(self, to: float, until: Callable[[], bool] = lambda: False) -> None:
+        """Stepped: run to a time, or until something holds, sending what falls due on the way."""
         self._act()
-        while True:
+        while not until():
             due = self._outbox[0][0] if self._outbox else to
             event = self._imu.next_event(self.world.now) if self._imu is not None else to
             t = min(max(min(due, event), self.world.now), to)
@@ -296,6 +311,7 @@ class Server:
 
     def _restart_counts(self, control: _Control) -> None:
         control.received, control.sent = dict(self.received), dict(self.sent)
+        control.arrivals.clear()
 
     def _hear(self, control: _Control) -> None:
         try:
@@ -336,7 +352,7 @@ class Server:
             return {"t": self.now, "stepped": self.stepped}
         if do == "open":
             for name in self.ports:
-                self._drain(name)
+                self._read(name)
             self._restart_counts(control)
             return {"t": self.now}
         if do == "advance":
@@ -346,26 +362,46 @@ class Server:
             return {"t": self.now}
         if do == "settle":
             return self._settle(control, request)
+        if do == "wait":
+            return self._wait(control, request)
         if do == "state":
             if not self.stepped:
                 self.world.advance(self.now)
             return self.world.state()
         if do == "fault":
-            if self._fault is None:
+            if self.fault is None:
                 raise _Failed("this robot has no faults to switch")
-            self._fault(request)
+            self.fault(request)
             return {"t": self.now}
         if do in ("plug", "unplug"):
             self._plug(str(request["joint"]), do == "plug")
             return {"t": self.now}
-        raise _Failed(f"no such request: {do!r} (now, open, advance, settle, state, fault, plug, unplug)")
+        raise _Failed(f"no such request: {do!r} (now, open, advance, settle, wait, state, fault, plug, unplug)")
 
-    def _settle(self, control: _Control, request: dict[str, Any]) -> dict[str, Any]:
+    def _arrive(self, control: _Control, request: dict[str, Any]) -> None:
+        """Wait until all bytes are here that a client says it wrote."""
         deadline = time.monotonic() + SETTLE_TIMEOUT_S
         for name in self.ports:
             wanted = int(request.get(f"{name}_written", 0))
             while self.received[name] - control.received[name] < wanted:
                 self._await(name, deadline)
+
+    def _counts(self, control: _Control) -> dict[str, Any]:
+        return {"t": self.now, **{f"{name}_sent": self.sent[name] - control.sent[name] for name in ("bus", "imu")}}
+
+    def _wait(self, control: _Control, request: dict[str, Any]) -> dict[str, Any]:
+        if not self.stepped:
+            raise _Failed("time runs by itself: the robot was not started with --clock stepped")
+        name = str(request["port"])
+        if name not in self.ports:
+            raise _Failed(f"no port {name!r}")
+        self._arrive(control, request)
+        before = self.sent[name]
+        self.advance(float(request["to"]), until=lambda: self.sent[name] > before)
+        return self._counts(control)
+
+    def _settle(self, control: _Control, request: dict[str, Any]) -> dict[str, Any]:
+        self._arrive(control, request)
         if self.stepped:
             reached = max(self._act(), self.now)
             self.advance(reached)
@@ -374,7 +410,12 @@ class Server:
                 time.sleep(max(0.0, self._outbox[0][0] - self.now))
                 self._keep_time()
         sent = {f"{name}_sent": self.sent[name] - control.sent[name] for name in ("bus", "imu")}
-        return {"t": self.now, **sent}
+        arrivals = {
+            f"{name}_arrivals": [(count - control.sent[name], t) for count, t in marks]
+            for name, marks in control.arrivals.items()
+        }
+        control.arrivals.clear()
+        return {"t": self.now, **sent, **arrivals}
 
     def _await(self, name: str, deadline: float) -> None:
         """Wait for more bytes at one port, the pseudo-terminal's delivery being asynchronous."""
@@ -387,8 +428,11 @@ class Server:
                 raise _Failed(f"the bytes announced for {name} did not arrive")
         self._read(name)
 
-    def _drain(self, name: str) -> None:
-        self._read(name)
+    def set_plugged(self, device: str, plugged: bool) -> None:
+        """Pull a USB device ("bus" or "imu") out of the host, or put it back."""
+        (self._unplugged.discard if plugged else self._unplugged.add)(device)
+        if device in self.ports:
+            (self.ports[device].plug if plugged else self.ports[device].unplug)()
 
     def _plug(self, joint: str, plugged: bool) -> None:
         if joint not in self.world.joints:
