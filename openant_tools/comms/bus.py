@@ -235,6 +235,19 @@ class Bus:
         ids = [id for id, _, _ in items]
         return self._exchange(p2.bulk_read(items), ids, max(count for _, _, count in items))
 
+    def measure_latency_timer(self, id: int, tries: int = 12) -> float:
+        """What the adapter holds short answers back, s: for lines whose timer the host cannot read.
+
+        The timer runs freely, so that an answer waits for anything between nothing and its whole period: twice the
+        median of what a ping takes beyond wire and return delay.
+        """
+        waits = []
+        for _ in range(tries):
+            answer = self._exchange(p2.ping(id), [id], 3)[0]
+            if answer.rtt is not None:
+                waits.append(answer.rtt - self.wire_s(10 + STATUS_OVERHEAD + 3) - self.timing.return_delay_s)
+        return max(1e-3, 2 * sorted(waits)[len(waits) // 2]) if waits else self.timing.latency_timer_s
+
     # ---- what must be there --------------------------------------------------------------------------------------
 
     def require(self, answers: Iterable[Answer]) -> list[Answer]:

@@ -54,6 +54,8 @@ RECORDED_REGISTERS = (
 WATCHDOG_UNIT_S = 0.02
 #: How long the engine waits for a port that vanished to come back, between two tries.
 REOPEN_PERIOD_S = 0.5
+#: Operating modes (register 11).
+POSITION, EXTENDED_POSITION = 3, 4
 _ERR_CODE = {word: code for code, word in enumerate(ERR_CODES)}
 _UNANSWERED = {cause: RecordedAnswer(None, False, cause.value) for cause in Cause}
 
@@ -122,7 +124,10 @@ class Engine:
         self._line = SerialLine(config.port, config.baud)
         if control is not None and control.ask("now")["stepped"]:
             self.clock = SteppedClock(control, bus=self._line)
-        timing = Timing(write_read_gap_s=config.write_read_gap_s, latency_timer_s=self._latency_timer_s())
+        self._latency_timer_s = self._set_latency_timer()
+        timing = Timing(
+            write_read_gap_s=config.write_read_gap_s, latency_timer_s=self._latency_timer_s or Timing.latency_timer_s
+        )
         self._bus = Bus(self._line, self.clock, timing)
         self._start_guardian()
         servos = Servos(self._bus, config.servos)
@@ -133,9 +138,13 @@ class Engine:
         delays = servos.read_all("return_delay_time")
         longest = max(delays.values()) * known[0].model.registers["return_delay_time"].scale
         self._bus.timing = replace(timing, return_delay_s=longest)
+        if self._latency_timer_s is None:
+            measured = self._bus.measure_latency_timer(known[0].id)
+            self._bus.timing = replace(self._bus.timing, latency_timer_s=round(measured, 3))
         for joint, table in config.registers.items():
             for register, counts in table.items():
                 servos.write_counts(register, joint, counts)
+        self._ensure_position_mode()
         for write in servos.journal:
             self._notice(f"{write.joint} (id {write.id}): {write.register} changed from {write.old} to {write.new}")
         self._servos = self._on_this_turn()
@@ -143,7 +152,8 @@ class Engine:
         self._registers = self._read_registers()
         self._period = 1.0 / config.rate_hz
 
-    def _latency_timer_s(self) -> float:
+    def _set_latency_timer(self) -> float | None:
+        """The adapter's timer, s, set to 1 ms where that is allowed; None where the host cannot tell."""
         host, port = Host(), self.config.port
         now = host.latency_timer_ms(port)
         if now is not None and now > WANTED_LATENCY_MS and not host.set_latency_timer_ms(port):
@@ -152,7 +162,17 @@ class Engine:
                 + udev_rule()
             )
         now = host.latency_timer_ms(port)
-        return Timing.latency_timer_s if now is None else now * 1e-3
+        return None if now is None else now * 1e-3
+
+    def _ensure_position_mode(self) -> None:
+        """Position mode where the joint's range lies within the encoder's turn, else extended position mode."""
+        for joint, mode in self._servos.read_all("operating_mode").items():
+            servo = self._servos[joint]
+            low, high = self.config.limits_rad.get(joint, (0.0, 0.0))
+            ends = servo.to_servo(low) % (2 * np.pi), servo.to_servo(high) % (2 * np.pi)
+            across_the_seam = (ends[1] - ends[0]) * servo.direction < 0
+            if mode != EXTENDED_POSITION and (mode != POSITION or across_the_seam):
+                self._servos.write_counts("operating_mode", joint, EXTENDED_POSITION)
 
     def _report_leftovers(self) -> None:
         """What an earlier program left: torque on, tripped watchdogs, hardware errors."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ __all__ = ["Recorded", "record_protocol", "repeat_paths"]
 
 #: The legs swing after the ramp to the start; the recording begins when they are still.
 SETTLE_S = 0.5
+_VOLTS = "present_input_voltage"  # 0.1 V a count
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ def record_protocol(
                 setup=setup,
                 protocol=protocol.name,
                 repeat_of=out.stem if k else None,
-                supply_v=None,
+                supply_v=round(statistics.fmean(engine.ask(messages.ReadRegister(_VOLTS)).values()) * 0.1, 2),
                 extra={"protocol_seed": seed, "rate_hz": config.rate_hz},
             )
             engine.ask(messages.Record(str(path), facts, robot_toml))

@@ -1,0 +1,294 @@
+"""The bus driver against the virtual wire, byte for byte and fault for fault: what a builder meets."""
+
+from __future__ import annotations
+
+import pytest
+from wire import IDS, ant
+
+from openant_tools.comms.bus import Timing
+from openant_tools.comms.faults import BrokenAnswer, Cause, NoAnswer, Refused
+from openant_tools.comms.line import PortGone
+from openant_tools.comms.servos import Servo, Servos
+from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.robot.joints import JOINTS
+from openant_tools.robot.kit import kit
+
+
+def robot(**options: object) -> tuple[Servos, object]:
+    bus, line = ant(**options)  # type: ignore[arg-type]
+    servos = [Servo(joint.name, joint.id, kit("standard").servo(joint.kind), 1, 3.14159) for joint in JOINTS.values()]
+    return Servos(bus, servos), line
+
+
+def test_everyone_is_found() -> None:
+    bus, _ = ant()
+    assert [servo.id for servo in bus.broadcast_ping()] == IDS
+    found = bus.ping(11)
+    assert found is not None
+    assert (found.model_number, found.firmware) == (1020, 46)
+    assert bus.ping(12) is None
+
+
+def test_a_block_of_all_servos_takes_the_wire_time_and_no_more() -> None:
+    bus, line = ant()
+    before = line.now()
+    answers = bus.sync_read(120, 27, IDS)
+    assert all(answer.ok and len(answer.data or b"") == 27 for answer in answers)
+    # 3.26 ms on the wire (dynamixel facts C6), and up to one latency timer.
+    assert 3.2e-3 < line.now() - before < 4.5e-3
+
+
+def test_fast_sync_read_gives_the_same_with_fewer_bytes() -> None:
+    bus, line = ant()
+    plain = bus.sync_read(132, 4, IDS)
+    before = line.received
+    bus.fast = set(IDS)
+    fast = bus.sync_read(132, 4, IDS)
+    assert [answer.data for answer in fast] == [answer.data for answer in plain]
+    assert line.received - before == 8 + 8 * (4 + 4)
+
+
+def test_fast_read_falls_back_and_keeps_what_was_verified() -> None:
+    bus, line = ant()
+    bus.fast = set(IDS)
+    line.wire.settings.lost[4] = 1.0
+    answers = bus.sync_read(132, 4, IDS)
+    assert [answer.ok for answer in answers] == [True] * 4 + [False] + [False] * 3
+    assert bus.statistics.fast_read_fallbacks == 1
+    assert not bus.fast
+    line.wire.settings.lost.clear()
+    assert all(answer.ok for answer in bus.sync_read(132, 4, IDS))
+
+
+def test_one_silent_servo_does_not_hide_those_behind_it() -> None:
+    bus, line = ant()
+    line.wire.settings.waits_for_silent = False
+    line.wire.settings.lost[3] = 1.0
+    answers = bus.sync_read(132, 4, IDS)
+    assert [answer.cause for answer in answers] == [None] * 3 + [Cause.TIMEOUT] + [None] * 4
+    with pytest.raises(NoAnswer, match="1 of 8 servos did not answer: knee_fr"):
+        bus.require(answers)
+
+
+def test_the_cable_before_the_silent_servo_is_named() -> None:
+    bus, line = ant()
+    line.wire.settings.lost |= dict.fromkeys(range(3, 8), 1.0)
+    with pytest.raises(NoAnswer) as error:
+        bus.require(bus.sync_read(132, 4, IDS))
+    assert str(error.value) == (
+        "wire: the first 3 of 8 servos answered, then silence from knee_fr (id 21) → look at the cable between "
+        "hip_fr (id 20) and knee_fr (id 21), then at knee_fr (id 21) itself"
+    )
+
+
+def test_nothing_at_all_points_at_supply_and_baud_rate() -> None:
+    bus, line = ant()
+    line.set_baud(57_600)
+    with pytest.raises(NoAnswer, match=r"nothing answered at 57600 baud: none of 8 servos .* supply on"):
+        bus.require(bus.sync_read(132, 4, IDS))
+    with pytest.raises(NoAnswer, match=r"hip_rr \(id 10\) does not answer at 57600 baud"):
+        bus.read(10, 132, 4)
+    assert bus.statistics.of(10).retries == bus.retries
+
+
+def test_broken_bytes_are_a_cause_of_their_own_and_never_a_value() -> None:
+    bus, line = ant()
+    line.wire.settings.byte_error = 0.01
+    causes = set()
+    for _ in range(300):
+        for answer in bus.sync_read(132, 4, IDS):
+            causes.add(answer.cause)
+            assert not answer.ok or answer.data == (2048).to_bytes(4, "little")
+    assert {None, Cause.CRC} <= causes
+    lost = sum(sum(servo.lost.values()) for servo in bus.statistics.servos.values())
+    assert 0 < lost < 300 * 8
+
+
+def test_every_retry_is_counted() -> None:
+    bus, line = ant()
+    line.wire.settings.lost[0] = 0.5
+    for _ in range(50):
+        try:
+            bus.read(10, 132, 4)
+        except NoAnswer:
+            pass
+    servo = bus.statistics.of(10)
+    assert servo.retries > 0
+    assert servo.asked == servo.answered + sum(servo.lost.values())
+
+
+def test_a_late_answer_is_late_not_lost() -> None:
+    bus, line = ant(Timing(return_delay_s=0.0, latency_timer_s=1e-3, margin_s=0.1e-3))
+    line.wire.servos[0].set("return_delay_time", 254)
+    line.wire.settings.response_s = 2.5e-3
+    [answer] = bus.sync_read(132, 4, [10])
+    assert answer.cause is Cause.LATE
+    assert answer.data is not None
+    assert answer.rtt is not None
+    assert answer.rtt > 2.5e-3
+
+
+def test_the_write_to_read_gap_is_kept() -> None:
+    bus, line = ant()
+    for _ in range(50):
+        left = bus.sync_write(116, 4, dict.fromkeys(IDS, bytes(4)))
+        assert all(answer.ok for answer in bus.sync_read(132, 4, IDS))
+        assert bus.request_at >= left + 0.2e-3 - 1e-9
+    bus, _ = ant(Timing(return_delay_s=0.0, latency_timer_s=1e-3, write_read_gap_s=0.0))
+    heard = []
+    for _ in range(50):
+        bus.sync_write(116, 4, dict.fromkeys(IDS, bytes(4)))
+        heard.append(all(answer.ok for answer in bus.sync_read(132, 4, IDS)))
+    assert sum(heard) < 10
+
+
+def test_values_that_need_stuffing_arrive() -> None:
+    bus, line = ant()
+    # Bytes FF FF FD FF: a position just past minus 32 turns.
+    line.wire.servos[0].motor.sensed.pulses = -131073.0  # type: ignore[attr-defined]
+    data = bus.read(10, 132, 4)
+    answers = bus.sync_read(132, 4, IDS)
+    assert answers[0].data == data
+    assert all(answer.ok for answer in answers)
+
+
+def test_unplugging_is_told_as_such() -> None:
+    bus, line = ant()
+    line.unplugged = True
+    with pytest.raises(PortGone, match=r"the port is gone .* USB cable"):
+        bus.sync_read(132, 4, IDS)
+
+
+def test_colliding_answers_of_fresh_servos() -> None:
+    bus, line = ant()
+    for servo in line.wire.servos:
+        servo.set("id", 1)
+    with pytest.raises(BrokenAnswer, match="share an id, as factory-fresh ones do: connect one at a time"):
+        bus.broadcast_ping()
+
+
+def test_all_other_instructions() -> None:
+    bus, line = ant()
+    bus.reg_write(10, 65, b"\x01")
+    assert bus.read(10, 65, 1) == b"\x00"
+    bus.action(10)
+    assert bus.read(10, 65, 1) == b"\x01"
+    bus.bulk_write([(10, 65, b"\x00"), (11, 84, (500).to_bytes(2, "little"))])
+    answers = bus.bulk_read([(10, 65, 1), (11, 84, 2)])
+    assert [answer.data for answer in answers] == [b"\x00", b"\xf4\x01"]
+    bus.backup(11)
+    bus.clear_multi_turn(11)
+    bus.reboot(11)
+    assert bus.ping(11) is None
+    line.sleep_until(line.now() + 1.0)
+    assert bus.ping(11) is not None
+    bus.factory_reset(11, 0x02)
+    line.sleep_until(line.now() + 1.0)
+    assert bus.ping(11) is not None
+
+
+# ---- registers by joint and name ---------------------------------------------------------------------------------
+
+
+def test_registers_speak_si() -> None:
+    servos, _ = robot()
+    assert servos.read("present_position", "hip_rr") == pytest.approx(3.14159, abs=1e-3)
+    assert servos.read("present_input_voltage", "knee_fl") == pytest.approx(12.0)
+    servos.write("profile_velocity", "hip_rr", 1.0)
+    assert servos.read("profile_velocity", "hip_rr") == pytest.approx(1.0, abs=0.012)
+
+
+def test_unknown_registers_and_joints_are_named() -> None:
+    servos, _ = robot()
+    with pytest.raises(BadInput, match="did you mean 'position_p_gain'"):
+        servos.read("position_p_gian", "hip_rr")
+    with pytest.raises(BadInput, match="no joint 'hip_xx'"):
+        servos.read("id", "hip_xx")
+    with pytest.raises(BadInput, match="position_p_gain cannot be 20000"):
+        servos.write_counts("position_p_gain", "hip_rr", 20000)
+
+
+def test_eeprom_is_written_only_where_it_differs_and_stands_in_the_journal() -> None:
+    servos, _ = robot()
+    servos.write_counts("pwm_limit", "knee_fl", 442)
+    servos.write_counts("pwm_limit", "knee_fl", 442)
+    [write] = servos.journal
+    assert (write.joint, write.register, write.old, write.new) == ("knee_fl", "pwm_limit", 885, 442)
+
+
+def test_a_refusal_names_register_and_rule() -> None:
+    servos, _ = robot()
+    servos.set_torque(True)
+    with pytest.raises(Refused, match=r"hip_rr \(id 10\): refuses pwm_limit = 442: .*EEPROM is locked"):
+        servos.write_counts("pwm_limit", "hip_rr", 442)
+
+
+def test_an_alert_is_decoded_and_does_not_hide_the_answer() -> None:
+    servos, line = robot()
+    device = line.wire.servos[1]  # type: ignore[attr-defined]
+    device.set("hardware_error_status", 0x04)
+    answers = servos.read_blocks()
+    assert answers[1][0].ok
+    assert answers[1][0].word == "alert"
+    assert answers[1][1] is not None
+    [error] = servos.hardware_errors("knee_rr")
+    assert error.name == "overheating"
+    assert "cool" in error.advice
+
+
+def test_torque_after_a_shutdown_says_why() -> None:
+    servos, line = robot()
+    device = line.wire.servos[1]  # type: ignore[attr-defined]
+    device.set("hardware_error_status", 0x04)
+    device.shut_down = True
+    with pytest.raises(Refused, match=r"torque stays off after overheating → .*cool"):
+        servos.set_torque(True)
+
+
+def test_a_tripped_watchdog_is_found() -> None:
+    servos, line = robot()
+    servos.set_torque(True)
+    servos.set_watchdogs(10)
+    line.sleep_until(line.now() + 1.0)  # type: ignore[attr-defined]
+    assert servos.tripped_watchdogs() == list(JOINTS)
+    with pytest.raises(Refused, match="Bus Watchdog has tripped"):
+        servos.write_counts("goal_position", "hip_rr", 2000)
+    servos.set_watchdogs(0)
+    servos.write_counts("goal_position", "hip_rr", 2000)
+
+
+def test_a_servo_of_another_model_is_told() -> None:
+    bus, _ = ant()
+    servos = Servos(bus, [Servo("hip_rr", 10, kit("standard").servo("knee"))])
+    with pytest.raises(HardwareFault, match="is a XC430-W240-T, not a XM430-W350-T"):
+        servos.identify()
+
+
+def test_identify_knows_who_can_be_read_fast() -> None:
+    servos, _ = robot()
+    servos.identify()
+    assert servos.bus.fast == set(IDS)
+    servos, _ = robot(firmware=42)
+    servos.identify()
+    assert not servos.bus.fast
+
+
+def test_goals_and_angles_are_inverse() -> None:
+    servos, _ = robot()
+    angles = [0.1, -0.2, 0.3, -0.4, 0.5, -0.6, 0.7, -0.8]
+    assert servos.joint_rad(servos.goal_counts(angles)) == pytest.approx(angles, abs=p2_step())
+    servos.set_torque(True)
+    servos.write_goals(servos.goal_counts(angles))
+    counts = [block.position for _, block in servos.read_blocks() if block]
+    assert servos.joint_rad(counts) == pytest.approx(angles, abs=p2_step())
+
+
+def p2_step() -> float:
+    return 2 * 3.14159265 / 4096 / 2 + 1e-9
+
+
+def test_emergency_packet_releases_everyone() -> None:
+    servos, line = robot()
+    servos.set_torque(True)
+    servos.torque_off_now()
+    assert not any(device.torque for device in line.wire.servos)  # type: ignore[attr-defined]
