@@ -129,7 +129,7 @@ def test_a_late_answer_is_late_not_lost() -> None:
 
 
 def test_the_write_to_read_gap_is_kept() -> None:
-    bus, line = ant()
+    bus, _ = ant()
     for _ in range(50):
         left = bus.sync_write(116, 4, dict.fromkeys(IDS, bytes(4)))
         assert all(answer.ok for answer in bus.sync_read(132, 4, IDS))

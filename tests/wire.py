@@ -87,7 +87,7 @@ class WireLine:
     def sleep_until(self, t: float) -> None:
         self._t = max(self._t, t)
         for servo in self.wire.servos:
-            servo.poll(self._t)
+            servo.watch_bus(self._t)
 
     def wait_readable(self, line: object, deadline: float) -> bool:
         if self._coming and self._coming[0][0] <= max(deadline, self._t):
