@@ -49,11 +49,13 @@ class BusSettings:
         write_read_gap_s: how long after an unanswered write an instruction may be missed.
         byte_error: probability that a byte is broken, either way.
         lost: position → probability that a packet does not reach this servo, or its answer the host.
+        broken: position → probability that an answer arrives with a broken byte.
         cut: positions before which the cable is broken now: nothing from there outwards hears or answers.
         response_s: from the end of a packet to the answer, besides the return delay.
         waits_for_silent: in a sync or bulk read a servo waits for the answer before its own; unpublished for
             silent ones. True: those behind a silent servo stay silent. False: they answer after a pause.
-        stalled: the host's adapter hands nothing over, either way, until this ends.
+        silent_pause_s: that pause.
+        stalled_until: the host hands nothing over, either way, before this time (s).
     """
 
     chains: Sequence[Sequence[int]] = ()
@@ -61,7 +63,9 @@ class BusSettings:
     write_read_gap_s: float = 2e-4
     byte_error: float = 0.0
     lost: dict[int, float] = field(default_factory=dict)
+    broken: dict[int, float] = field(default_factory=dict)
     cut: set[int] = field(default_factory=set)
+    stalled_until: float = -math.inf
     response_s: float = 0.0
     waits_for_silent: bool = True
     silent_pause_s: float = 1e-3
@@ -132,7 +136,7 @@ class Line:
     def receive(self, data: bytes, t: float, baud: int) -> list[Reply]:
         """Bytes that the host wrote at `t` (s) with its port at `baud`; what comes back of it, by rising time."""
         byte_s = BITS_PER_BYTE / baud
-        start = max(t, self._host_end)
+        start = max(t, self._host_end, self.settings.stalled_until)
         if baud != self._baud:
             self._parser, self._baud = Parser(), baud
         elif self._parser.pending and start - self._host_end > INTER_BYTE_S:
@@ -186,6 +190,15 @@ class Line:
     def _lost(self, position: int) -> bool:
         share = self.settings.lost.get(position, 0.0)
         return share > 0 and bool(self._random.random() < share)
+
+    def _scratched(self, position: int, data: bytes) -> bytes:
+        """An answer as it leaves a bad contact: maybe with one byte broken."""
+        share = self.settings.broken.get(position, 0.0)
+        if not share or self._random.random() >= share:
+            return data
+        scratched = bytearray(data)
+        scratched[int(self._random.integers(len(data)))] ^= int(self._random.integers(1, 256))
+        return bytes(scratched)
 
     def _execute(self, packet: Instruction, began: float, ended: float, byte_s: float) -> list[_Burst]:
         """Let the servos act on a packet whose last byte passes at `ended`; what they put on the wire."""
@@ -251,7 +264,9 @@ class Line:
                     break
                 t += self.settings.silent_pause_s
                 continue
-            spoken = [_Burst(t + self.servos[k].return_delay_s, status.encode()) for k, status in turn]
+            spoken = [
+                _Burst(t + self.servos[k].return_delay_s, self._scratched(k, status.encode())) for k, status in turn
+            ]
             bursts += spoken
             t = max(burst.end(byte_s) for burst in spoken) + self.settings.response_s
         return bursts
@@ -271,7 +286,7 @@ class Line:
             turn = answers.get(id)
             if not turn:
                 break
-            spoken = [_Burst(t + self.servos[k].return_delay_s, piece) for k, _ in turn]
+            spoken = [_Burst(t + self.servos[k].return_delay_s, self._scratched(k, piece)) for k, _ in turn]
             bursts += spoken
             t = max(burst.end(byte_s) for burst in spoken)
         return bursts
@@ -300,7 +315,8 @@ class Line:
             while stop < len(data) and float(heard[stop][0]) <= tick and stop - k < ADAPTER_BUFFER:
                 stop += 1
             full = stop - k == ADAPTER_BUFFER
-            replies.append(Reply(float(heard[stop - 1][0]) if full else tick, data[k:stop]))
+            at = float(heard[stop - 1][0]) if full else tick
+            replies.append(Reply(max(at, self.settings.stalled_until), data[k:stop]))
             k = stop
         return replies
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -72,6 +73,7 @@ class Drives:
         self.p_gain, self.i_gain, self.d_gain = np.zeros(n), np.zeros(n), np.zeros(n)
         self.pwm_limit = np.full(n, float(PWM_FULL))
         self._error, self._sum, self._pwm = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._has_i = self._has_d = False
         self.loops: list[Loop] = [Loop() for _ in range(n)]
         self._special: list[int] = []
         self._velocity_sum = np.zeros(n)
@@ -87,6 +89,8 @@ class Drives:
         # the supply
         self.supply_v, self.supply_ohm, self.supply_a = 12.0, 0.0, 0.0
         self.lowest_voltage = 12.0
+        #: 1 where the supply reaches a servo, 0 behind an open connector
+        self.path: Array | None = None
         #: s below each servo's reset voltage, without a break
         self.starved_s = np.zeros(n)
         self.powered = np.ones(n)
@@ -115,9 +119,11 @@ class Drives:
         self._bias, self._load_friction = column("friction_bias_nm"), column("load_friction")
         self._quadratic = column("viscous_quadratic")
         self._cogging, self._periods = column("cogging_nm"), column("cogging_periods")
+        self._has_cogging = bool(self._cogging.any())
         self._torque_limit = column("torque_limit_nm")
         self._torque_limit[self._torque_limit == 0] = np.inf
         self._dead_zone = column("dead_zone_rad") / 2 * PULSES_PER_RAD
+        self._has_dead_zone = bool(self._dead_zone.any())
         lag = column("lag_s")
         self._lag_share = np.where(lag > 0, 1 - np.exp(-self.dt / np.maximum(lag, 1e-9)), 1.0)
         self._slew = column("slew_rad_s") * PULSES_PER_RAD * self.dt
@@ -145,6 +151,10 @@ class Drives:
         self._filtered_goal = bool((self._lag_share < 1).any() or np.isfinite(self._slew).any())
         self._shaft_gain = self.sign * PULSES_PER_RAD
         self._shaft_zero = self.mount * PULSES_PER_RAD
+        self._sensor_delay = column("sensor_delay_s")
+        # Positions and velocities of the recent past, the newest last, where any answer is old.
+        keep = round(float(self._sensor_delay.max(initial=0.0)) / self.dt) + 1
+        self._past: deque[tuple[Array, Array]] | None = deque(maxlen=keep) if keep > 1 else None
         self.elastic = any(motor.elastic for motor in m)
         self._set_gear(column("backlash_rad"), column("gear_stiffness"))
         self._warm(0.0)
@@ -185,6 +195,7 @@ class Drives:
         self.i_gain[k] = loop.i_gain / self._i_divisor[k]
         self.d_gain[k] = loop.d_gain / self._d_divisor[k]
         self.pwm_limit[k] = loop.pwm_limit
+        self._has_i, self._has_d = bool(self.i_gain.any()), bool(self.d_gain.any())
         plain = loop.mode in (POSITION_MODE, EXTENDED_MODE)
         feeds = loop.feedforward_velocity or loop.feedforward_acceleration
         self._special = [i for i in self._special if i != k]
@@ -219,7 +230,7 @@ class Drives:
         since = self.time - self._dropped_until[k]
         if self._dropped_until[k] < 0 or (since > 0 and self._random.random() < min(1.0, since / pause) * 0.5):
             self._dropped_until[k] = self.time + self._random.uniform(0.0, motor.dropout_s)
-            return self._dropped_until[k] > self.time
+            return bool(self._dropped_until[k] > self.time)
         return False
 
     def _take_goals(self) -> None:
@@ -268,7 +279,8 @@ class Drives:
         self.voltage = volts
         if volts < self.lowest_voltage:
             self.lowest_voltage = volts
-        current = (d * volts - back) / self.resistance * conducting
+        driven = d * volts if self.path is None else d * volts * self.path
+        current = (driven - back) / self.resistance * conducting
         torque = self.kt_warm * current
         torque *= self._pull
         if self._limited:
@@ -284,6 +296,8 @@ class Drives:
             if self._varying_friction:
                 body.frictionloss[:] = self._friction(body.v, joint_torque)
             body.torque[:] = joint_torque
+        if self._past is not None:
+            self._past.append((body.q.copy(), self._filtered_velocity.copy()))
         body.step()
         self.time += self.dt
 
@@ -299,16 +313,16 @@ class Drives:
         pulses *= self.direction
         pulses += self.offset
         error = goal - pulses
-        if self._dead_zone.any():
+        if self._has_dead_zone:
             error = np.sign(error) * np.maximum(np.abs(error) - self._dead_zone, 0.0)
         pwm = self.p_gain * error
-        if self.i_gain.any():
+        if self._has_i:
             # The sum never asks for more than the limit: the firmware has to stop it somewhere.
             self._sum += error * self.torque_on
             room = self.pwm_limit / np.maximum(self.i_gain, 1e-12)
             self._sum = np.minimum(np.maximum(self._sum, -room), room)
             pwm += self.i_gain * self._sum
-        if self.d_gain.any():
+        if self._has_d:
             pwm += self.d_gain * (error - self._error)
         self._error = error
         for k in self._special:
@@ -352,7 +366,7 @@ class Drives:
         # Friction larger one way than the other is symmetric friction and a constant torque: p for ω > 0 and n for
         # ω < 0 are (p + n)/2 against the motion plus (n − p)/2 always.
         extra = -self._bias - self._quadratic * v * np.abs(v)
-        if self._cogging.any():
+        if self._has_cogging:
             angle = (self.rotor if self.elastic else self.body.q) * self.sign + self.mount
             extra += self._cogging * np.sin(self._periods * angle)
         return extra
@@ -394,10 +408,18 @@ class Drives:
         self._derating += (self._derating_per_k * (self.case - 25.0) - self._derating) * share
         self._pull = self.strength * np.clip(1 - self._derating, 0.0, 1.0)
 
+    def set_path(self, path: Array) -> None:
+        """Which servos the supply reaches, (n,) of 0 and 1."""
+        self.path = None if path.all() else path
+
+    def voltage_at(self, k: int) -> float:
+        """V at servo k."""
+        return self.voltage if self.path is None else self.voltage * float(self.path[k])
+
     def watch_supply(self, dt: float) -> None:
         """Note how long each servo has been below its reset voltage, by the lowest since the last call."""
         self.supply_a = float(self._standby @ self.powered)
-        low = self.lowest_voltage < self._reset_v
+        low = self.lowest_voltage * (1.0 if self.path is None else self.path) < self._reset_v
         self.starved_s = np.where(low, self.starved_s + dt, 0.0)
         self.lowest_voltage = self.voltage
 
@@ -405,6 +427,12 @@ class Drives:
         """What servo k's electronics measure at `time` (s), at most a step after the last one done."""
         ahead = time - self.time
         q, v = float(self.body.q[k]), float(self.body.v[k])
+        velocity = float(self._filtered_velocity[k])
+        if self._past and self._sensor_delay[k] > 0:
+            old = max(0, len(self._past) - round(float(self._sensor_delay[k]) / self.dt))
+            if old < len(self._past):
+                q, velocity = float(self._past[old][0][k]), float(self._past[old][1][k])
+                v = velocity * float(self.sign[k])
         pulses = float(self._shaft_gain[k]) * (q + v * ahead) + float(self._shaft_zero[k])
         if self._noisy:
             pulses += float(self._noise_rows[self._noise_row - 1, k])
@@ -412,10 +440,10 @@ class Drives:
         move = self._moves.get(k)
         return Sensed(
             pulses=pulses,
-            velocity=float(self._filtered_velocity[k]),
+            velocity=velocity,
             current=current,
             duty=float(self.duty[k]),
-            voltage=self.voltage,
+            voltage=self.voltage_at(k),
             temperature=float(self.case[k]),
             trajectory=float(self.goal[k]),
             trajectory_velocity=move.velocity if move else 0.0,

@@ -5,11 +5,10 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import platform
 import pty
 import socket
 import struct
-import sys
-import termios
 import tty
 from pathlib import Path
 from typing import Protocol
@@ -19,6 +18,7 @@ __all__ = ["Port", "PtyPort", "TcpPort"]
 #: Linux: struct termios2 = 4 flags, line, 19 control characters, input and output speed (bits/s as numbers).
 _TCGETS2 = 0x802C542A
 _TERMIOS2 = struct.Struct("<4IB19s2I")
+_HAS_TERMIOS2 = platform.system() == "Linux"
 _CHUNK = 65536
 
 
@@ -109,13 +109,11 @@ class PtyPort:
         """The rate that the client has set on its end, bits/s."""
         if self._master is None:
             return default
-        if sys.platform == "linux":
-            answer = fcntl.ioctl(self._master, _TCGETS2, b"\0" * _TERMIOS2.size)
-            speed = int(_TERMIOS2.unpack(answer)[-1])
-            return speed or default
-        # Elsewhere a pseudo-terminal cannot be set to the rates of servos (macOS): any rate counts as right.
-        speed_code = termios.tcgetattr(self._master)[5]
-        return default if speed_code in (termios.B9600, termios.B38400, termios.B115200) else int(speed_code)
+        if not _HAS_TERMIOS2:
+            # Elsewhere a pseudo-terminal cannot be set to the rates of servos (macOS): any rate counts as right.
+            return default
+        answer = fcntl.ioctl(self._master, _TCGETS2, b"\0" * _TERMIOS2.size)
+        return int(_TERMIOS2.unpack(answer)[-1]) or default
 
 
 class TcpPort:

@@ -418,19 +418,21 @@ class ServoDevice:
         """Whether it hears instructions at all (at its baud rate)."""
         return self.powered and now >= self._mute_until and self.memory[13] == 2
 
-    def poll(self, now: float) -> None:
-        """What the firmware does on its own: watchdog and protection. Called every few milliseconds."""
-        if not self.powered:
-            return
-        if self.torque and "bus_watchdog" in self.registers:
+    def watch_bus(self, now: float) -> None:
+        """The Bus Watchdog: counts while torque is on. Called every few milliseconds."""
+        if self.memory[98] and self.memory[64] and "bus_watchdog" in self.registers:
             watchdog = self.get("bus_watchdog")
             if watchdog > 0 and now - self._heard_at > watchdog * WATCHDOG_UNIT_S:
                 self._trip_watchdog()
-        sensed = self.motor.sense()
-        decivolts = round(sensed.voltage * 10)
-        if not self.get("min_voltage_limit") <= decivolts <= self.get("max_voltage_limit"):
+
+    def protect(self, voltage: float, temperature: float) -> None:
+        """Compare supply (V) and temperature (°C) with their limits."""
+        memory = self.memory
+        decivolts = round(voltage * 10)
+        low, high = memory[34] | memory[35] << 8, memory[32] | memory[33] << 8
+        if not low <= decivolts <= high:
             self.raise_hardware_error(VOLTAGE_ERROR)
-        if int(sensed.temperature) > self.memory[31]:
+        if int(temperature) > memory[31]:
             self.raise_hardware_error(HEAT_ERROR)
 
     def raise_hardware_error(self, bit: int) -> None:

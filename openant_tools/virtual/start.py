@@ -2,12 +2,54 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
-from openant_tools.virtual.server import Server
-from openant_tools.virtual.world import World, WorldSettings, standard_servos
+import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["serve"]
+from openant_tools.virtual.body import Body
+from openant_tools.virtual.eeprom import EepromFile
+from openant_tools.virtual.faults import Faults
+from openant_tools.virtual.flight_controller import FlightController, FlightControllerSettings
+from openant_tools.virtual.scenario import Scenario, load_scenario
+from openant_tools.virtual.server import Server
+from openant_tools.virtual.world import World
+
+__all__ = ["BodyTruth", "build", "serve"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class BodyTruth:
+    """What the flight controller's sensors feel: the torso of this body."""
+
+    body: Body
+
+    @property
+    def quaternion(self) -> Array:
+        return self.body.quaternion
+
+    @property
+    def rate(self) -> Array:
+        return self.body.gyro
+
+    @property
+    def specific_force(self) -> Array:
+        return self.body.accelerometer
+
+
+def build(scenario: Scenario | None = None) -> World:
+    """The world of a scenario, its servos plugged as it says; for use without ports."""
+    scenario = scenario or Scenario()
+    world = World(scenario.world)
+    if scenario.plugged is not None:
+        for k, joint in enumerate(world.joints):
+            world.plug(k, joint in scenario.plugged)
+    if scenario.eeprom is not None:
+        EepromFile(scenario.eeprom).attach(world)
+    return world
 
 
 def serve(scenario: Path | None = None, *, clock: str | None = None, tcp: bool = False) -> Server:
@@ -18,5 +60,13 @@ def serve(scenario: Path | None = None, *, clock: str | None = None, tcp: bool =
         clock: "real" or "stepped"; None for what the scenario says.
         tcp: put the bus on a TCP port.
     """
-    world = World(WorldSettings(standard_servos()))
-    return Server(world, stepped=clock == "stepped", tcp=tcp)
+    script = load_scenario(scenario) if scenario is not None else Scenario()
+    world = build(script)
+    settings = FlightControllerSettings(**script.world.imu)
+    imu = FlightController(settings, lambda: BodyTruth(world.body), np.random.default_rng(script.world.seed + 2))
+    # The robot has been on for a while: its flight controller is past its boot.
+    stepped = script.stepped if clock is None else clock == "stepped"
+    server = Server(world, stepped=stepped, imu=imu, tcp=tcp)
+    faults = Faults(world, script.faults, unplug=server.set_plugged, imu=imu)
+    server.fault = faults.request
+    return server

@@ -25,7 +25,7 @@ from openant_tools.virtual.servo import OVERLOAD_ERROR, ServoDevice
 __all__ = ["MOUNT_EIGHTHS", "ServoSetup", "SupplySettings", "World", "WorldSettings", "standard_servos"]
 
 #: s between two looks of firmware and supply at themselves.
-POLL_S = 2e-3
+POLL_S = 5e-3
 HEAT_S = 2e-2
 #: Eighths of a turn from the servo's zero to the joint's: horns go on in steps of 45°, and half a turn keeps the whole
 #: range of every joint away from the encoder's seam.
@@ -43,6 +43,7 @@ class ServoSetup:
         registers: name → counts that stand in its EEPROM or RAM at the start.
         reversed: mounted so that the joint's positive direction is the servo's negative.
         spline_offset: horn put on that many eighths of a turn away from where the guide says.
+        mount_rad: shaft angle at the joint's zero, in place of the guide's; zero_error_rad: what is added to it.
         motor: motor, gear and sensor; None for the data sheet's.
     """
 
@@ -53,6 +54,7 @@ class ServoSetup:
     reversed: bool = False
     spline_offset: int = 0
     mount_rad: float | None = None
+    zero_error_rad: float = 0.0
     motor: MotorSettings | None = None
     clock_ppm: float = 0.0
 
@@ -75,6 +77,8 @@ class WorldSettings:
     supply: SupplySettings = field(default_factory=SupplySettings)
     ambient_c: float = 25.0
     seed: int = 0
+    #: what differs from the defaults of `FlightControllerSettings`
+    imu: dict[str, Any] = field(default_factory=dict)
 
 
 def standard_servos(kit: str = "standard", *, factory: bool = False) -> list[ServoSetup]:
@@ -103,14 +107,16 @@ class World:
         self.joints = tuple(joints)
         self.body = Body(settings.body, joints)
         motors = [setup.motor or MotorSettings.of(setup.model) for setup in settings.servos]
-        sign = np.array([-1.0 if setup.reversed else 1.0 for setup in settings.servos])
+        signs = np.array([-1.0 if setup.reversed else 1.0 for setup in settings.servos])
         mount = np.array(
             [
-                (MOUNT_EIGHTHS + setup.spline_offset) * math.pi / 4 if setup.mount_rad is None else setup.mount_rad
-                for setup in settings.servos
+                (MOUNT_EIGHTHS * math.pi / 4 if setup.mount_rad is None else setup.mount_rad)
+                + setup.spline_offset * math.pi / 4
+                + sign * setup.zero_error_rad
+                for setup, sign in zip(settings.servos, signs, strict=True)
             ]
         )
-        self.drives = Drives(self.body, motors, sign, mount, seed=settings.seed)
+        self.drives = Drives(self.body, motors, signs, mount, seed=settings.seed)
         self.drives.ambient = settings.ambient_c
         self.drives.winding[:] = self.drives.case[:] = settings.ambient_c
         self.set_supply(settings.supply.volts, settings.supply.resistance_ohm)
@@ -177,12 +183,13 @@ class World:
             elif not servo.powered and k in self.line.plugged and drives.starved_s[k] == 0:
                 drives.powered[k] = 1.0
                 servo.power_on(now)
-            else:
-                servo.poll(now)
+            elif servo.powered:
+                servo.watch_bus(now)
+                servo.protect(drives.voltage_at(k), float(drives.case[k]))
         heavy = np.abs(drives.current) > OVERLOAD_SHARE * self._stall_current
         self._overloaded_s = np.where(heavy, self._overloaded_s + POLL_S, 0.0)
         if heavy.any():
-            for k in np.flatnonzero(self._overloaded_s > OVERLOAD_S):
+            for k in map(int, np.flatnonzero(self._overloaded_s > OVERLOAD_S)):
                 self.servos[k].raise_hardware_error(OVERLOAD_ERROR)
 
     def plug(self, k: int, plugged: bool) -> None:
