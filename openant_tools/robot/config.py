@@ -371,18 +371,24 @@ def _motors(table: Any, problems: list[Problem]) -> dict[str, Motor]:
     return motors
 
 
+def _joint_names(value: list[Any], path: str, problems: list[Problem]) -> tuple[str, ...]:
+    """The joints in a list; what is none, or stands in it twice, is a problem."""
+    joints: list[str] = []
+    for joint in value:
+        if not isinstance(joint, str) or joint not in JOINTS:
+            problems.append(Problem(path, f"there is no joint {joint!r}", _suggest(str(joint), JOINT_NAMES)))
+        elif joint in joints:
+            problems.append(Problem(path, f"{joint} stands in it twice"))
+        else:
+            joints.append(joint)
+    return tuple(joints)
+
+
 def _chain(value: Any, problems: list[Problem]) -> tuple[tuple[str, ...], ...]:
     if not (isinstance(value, list) and all(isinstance(cable, list) for cable in value)):
         problems.append(Problem("bus.chain", "is no list of lists of joints"))
         return ()
-    seen: set[str] = set()
-    for joint in (joint for cable in value for joint in cable):
-        if joint not in JOINTS:
-            problems.append(Problem("bus.chain", f"there is no joint {joint!r}", _suggest(str(joint), JOINT_NAMES)))
-        elif joint in seen:
-            problems.append(Problem("bus.chain", f"{joint} stands in it twice"))
-        else:
-            seen.add(joint)
+    _joint_names([joint for cable in value for joint in cable], "bus.chain", problems)
     return tuple(tuple(str(joint) for joint in cable) for cable in value)
 
 
@@ -439,25 +445,16 @@ def _effects(entries: Any, problems: list[Problem]) -> tuple[Effect, ...]:
     effects: list[Effect] = []
     for n, entry in enumerate(entries):
         path = f"effect[{n + 1}]"
-        joints = entry.get("joints", "all") if isinstance(entry, Mapping) else "all"
-        parameters = entry.get("parameters", {}) if isinstance(entry, Mapping) else {}
-        if isinstance(joints, str) and joints not in ("all", "body"):
+        table = entry if isinstance(entry, Mapping) else {}
+        joints = table.get("joints", "all")
+        if isinstance(joints, list):
+            joints = _joint_names(joints, f"{path}.joints", problems)
+        elif joints not in ("all", "body"):
+            remedy = f'write ["{joints}"]' if isinstance(joints, str) and joints in JOINTS else None
             problems.append(
-                Problem(
-                    f"{path}.joints",
-                    f'{joints!r} is neither "all" nor "body" nor a list of joints',
-                    f'write ["{joints}"]' if joints in JOINTS else None,
-                )
+                Problem(f"{path}.joints", f'{joints!r} is neither "all" nor "body" nor a list of joints', remedy)
             )
-        elif isinstance(joints, list):
-            for joint in joints:
-                if joint not in JOINTS:
-                    problems.append(
-                        Problem(f"{path}.joints", f"there is no joint {joint!r}", _suggest(str(joint), JOINT_NAMES))
-                    )
-            joints = tuple(joints)
-        elif not isinstance(joints, str):
-            problems.append(Problem(f"{path}.joints", "is neither text nor a list of joints"))
+        parameters = table.get("parameters", {})
         if not isinstance(parameters, Mapping):
             problems.append(Problem(f"{path}.parameters", "is no table", "write { delay_s = 0.02 }"))
             parameters = {}

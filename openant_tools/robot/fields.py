@@ -34,9 +34,10 @@ class Problem:
     remedy: str | None = None
     severity: Literal["error", "note"] = "error"
 
-    def __str__(self) -> str:
-        line = f"{self.key}: {self.what}" if self.key else self.what
-        return f"{line} → {self.remedy}" if self.remedy else line
+    @property
+    def place(self) -> str:
+        """The key for people: one line, whatever its owner put between quotes."""
+        return self.key if self.key.isprintable() else repr(self.key)
 
 
 class Unfit(Exception):

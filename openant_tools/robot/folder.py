@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -45,7 +46,7 @@ class Located:
     @property
     def where(self) -> str:
         line = f", line {self.line}" if self.line else ""
-        return f"{self.file}{line}, {self.problem.key}"
+        return f"{self.file}{line}, {self.problem.place}"
 
     def __str__(self) -> str:
         text = f"{self.where}: {self.problem.what}"
@@ -133,7 +134,7 @@ class RobotFolder:
             problems += self._model_problems(self.path / model, simulate)
         text = data.decode("utf-8")
         located = [Located(problem, _line_of(text, problem.key), self.config_file) for problem in problems]
-        located.sort(key=lambda entry: entry.line or 0)
+        located.sort(key=lambda entry: entry.line or math.inf)
         return config, located
 
     def config(self) -> RobotConfig:
@@ -145,8 +146,10 @@ class RobotFolder:
         config, located = self.check(simulate=False)
         errors = [entry for entry in located if entry.problem.severity == "error"]
         if errors or config is None:
-            more = f" (and {len(errors) - 1} more: `openant config check` lists them)" if len(errors) > 1 else ""
-            raise BadInput(errors[0].problem.what + more, where=errors[0].where, remedy=errors[0].problem.remedy)
+            first, rest = errors[0], len(errors) - 1
+            more = f"`openant config check` lists {rest} more" if rest else None
+            remedy = "; ".join(part for part in (first.problem.remedy, more) if part)
+            raise BadInput(first.problem.what, where=first.where, remedy=remedy or None)
         return config
 
     def update(
@@ -306,7 +309,7 @@ def _edited(
     config, problems = parse_config(says)
     errors = [problem for problem in problems if problem.severity == "error"]
     if errors or config is None:
-        raise BadInput(errors[0].what, where=f"{where}, {errors[0].key}", remedy=errors[0].remedy)
+        raise BadInput(errors[0].what, where=f"{where}, {errors[0].place}", remedy=errors[0].remedy)
     return (after.encode("utf-8") if says != said else None), config
 
 
