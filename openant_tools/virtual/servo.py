@@ -538,8 +538,10 @@ class ServoDevice:
             return b""
         if code in (Inst.SYNC_READ, Inst.BULK_READ, Inst.FAST_SYNC_READ, Inst.FAST_BULK_READ):
             fast = code in (Inst.FAST_SYNC_READ, Inst.FAST_BULK_READ)
-            if not broadcast or (fast and self.firmware < FAST_READ_FIRMWARE):
+            if not broadcast:
                 raise _Refused(Error.INSTRUCTION)
+            if fast and self.firmware < FAST_READ_FIRMWARE:
+                return None
             for id, address, count in read_requests(instruction):
                 if id == self.id:
                     return self.read(address, count, now=now)
