@@ -1,0 +1,463 @@
+"""Where the robot is: its body tag in the frame of the arena's origin tag, from one picture.
+
+Frames: a tag's x is its up-direction, y its left, z out of the paper; the arena's frame is the origin tag's. Body axes
+are x forward, y left, z up; how the body tag sits in them is the mount (`position` of its centre, `yaw`).
+
+The estimate. Corner noise of a small tag leaks into its tilt, and through the lever arm between tag and body centre
+into position. So the pose is the most likely one given the four corners *and* a prior on tilt: level to within
+`TILT_PRIOR_RAD`, or as the IMU says where the caller passes it. The prior also decides between the two poses that a
+flat square always allows. The reported errors are those of this estimate (Gauss–Newton covariance, corner noise
+`CORNER_PX`); they do not know a wrong lens or a wrongly declared edge length.
+
+The origin tag does not move, so its corners are averaged over many pictures (median, far ones left out) before its pose
+is computed once; it may then be covered. If it is seen elsewhere for a while, the camera was bumped: poses stop until
+the new place is certain.
+
+The body tag is found in this very picture or the robot is **lost**, with the reason. No pose is ever held.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.comms.intrinsics import Intrinsics
+from openant_tools.comms.tag_family import load_family
+from openant_tools.errors import BadInput
+
+__all__ = ["BodyLost", "BodyPose", "BodyTracker", "Sighting", "TagDetector", "TagSetup", "tag_pose"]
+
+Array = NDArray[np.float64]
+Gray = NDArray[np.uint8]
+
+#: Random corner error of a tag that is in focus, one standard deviation (benchmarks/tag_pose.py measures 0.02 … 0.1).
+CORNER_PX = 0.1
+#: A walking Open Ant tilts by a few degrees.
+TILT_PRIOR_RAD = math.radians(8.0)
+#: The flight controller's attitude while the body is shaken.
+IMU_TILT_RAD = math.radians(2.0)
+#: A square that fits its corners worse than this is not that square.
+MAX_RESIDUAL_PX = 2.0
+ORIGIN_MEMORY = 60
+ORIGIN_MIN = 5
+#: The origin tag seen this far from where it was, this many pictures running: something was moved.
+ORIGIN_MOVED_PX = 2.0
+ORIGIN_MOVED_PICTURES = 10
+
+# Tag axes (up, left, out) in the frame that IPPE_SQUARE wants (right, up, out).
+_IPPE_FROM_TAG = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class TagSetup:
+    """Which tags there are and where the body's is mounted.
+
+    Attributes:
+        origin_size, body_size: edge length in m (`tag_family` says which square that is).
+        body_position: centre of the body tag in the body, m. body_yaw: its up-direction against the body's x, rad.
+        min_margin, max_hamming: what the detector must be sure of; upstream accepts a margin of 2.
+        edge: share of the picture's width and height, on each side, that counts as its edge.
+        decimate: quads are searched at this fraction of the resolution; corners are refined at full resolution.
+    """
+
+    family: str = "tagCircle21h7"
+    origin_id: int = 0
+    body_id: int = 12
+    origin_size: float = 0.10
+    body_size: float = 0.045
+    body_position: tuple[float, float, float] = (0.0, 0.0, 0.085)
+    body_yaw: float = 0.0
+    min_margin: float = 5.0
+    max_hamming: int = 0
+    edge: float = 0.10
+    decimate: float = 2.0
+
+    def __post_init__(self) -> None:
+        known = len(load_family(self.family).codes)
+        for name, tag in (("origin", self.origin_id), ("body", self.body_id)):
+            if not 0 <= tag < known:
+                raise BadInput(f"{self.family} has no tag {tag} ({name})", remedy=f"its ids are 0 to {known - 1}")
+        if self.origin_id == self.body_id:
+            raise BadInput(f"origin and body cannot both be tag {self.body_id}", remedy="give the body another tag")
+        for name, size in (("origin", self.origin_size), ("body", self.body_size)):
+            if not 0.005 <= size <= 1.0:
+                raise BadInput(f"the {name} tag's edge length is {size} m", remedy="measure it; most are 0.03 to 0.2 m")
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A tag in a picture: corners (4, 2) in OpenCV's pixels, top left first, then clockwise as the tag is read."""
+
+    id: int
+    corners: Array
+    margin: float
+    hamming: int
+
+    @property
+    def size_px(self) -> float:
+        """Mean length of the four edges."""
+        return float(np.mean(np.linalg.norm(self.corners - np.roll(self.corners, 1, axis=0), axis=1)))
+
+
+class TagDetector:
+    """pyapriltags' detector for one family. Not for use by two threads at once."""
+
+    def __init__(self, family: str, *, decimate: float = 2.0, threads: int = 1) -> None:
+        from pyapriltags import Detector
+
+        load_family(family)
+        # Without edge refinement corners are off by a tenth to a fifth of a pixel, five times what they are with it.
+        self._detector = Detector(families=family, nthreads=threads, quad_decimate=decimate, refine_edges=1)
+
+    def detect(self, gray: Gray) -> list[Sighting]:
+        """All tags in a grey picture (h, w)."""
+        found = self._detector.detect(np.ascontiguousarray(gray))
+        # The library counts from the picture's corner, OpenCV from the first pixel's centre.
+        return [
+            Sighting(int(d.tag_id), np.asarray(d.corners[::-1], float) - 0.5, float(d.decision_margin), int(d.hamming))
+            for d in found
+        ]
+
+
+@dataclass(frozen=True)
+class BodyPose:
+    """The body in the arena.
+
+    Attributes:
+        t: when the picture was taken, s.
+        position: of the body's origin, m. rotation: 3 × 3, arena from body.
+        yaw: heading of the body's x axis, rad, counter-clockwise.
+        position_error, yaw_error: one standard deviation of the random part, m and rad.
+        near_edge: the tag is in the outer part of the picture, where the next step may lose it.
+        residual_px: root mean square distance of the corners from where the pose puts them.
+        size_px, margin: of the tag in the picture; small values foretell a loss.
+        detection_s: computing time.
+    """
+
+    t: float
+    position: Array
+    rotation: Array
+    yaw: float
+    position_error: Array
+    yaw_error: float
+    near_edge: bool
+    residual_px: float
+    size_px: float
+    margin: float
+    detection_s: float
+
+    @property
+    def heading(self) -> Array:
+        """The body's x axis in the floor, a unit vector (2,)."""
+        return np.array([math.cos(self.yaw), math.sin(self.yaw)])
+
+
+@dataclass(frozen=True)
+class BodyLost:
+    """No pose from this picture, and why."""
+
+    t: float
+    reason: str
+
+
+class BodyTracker:
+    """Follows the body tag from picture to picture.
+
+    Args:
+        setup: the tags.
+        intrinsics: the lens; scaled to the pictures' size where that differs.
+
+    Attributes:
+        origin_moves: how often the origin tag was found elsewhere than before.
+    """
+
+    def __init__(self, setup: TagSetup, intrinsics: Intrinsics, *, threads: int = 1) -> None:
+        self.setup = setup
+        self.origin_moves = 0
+        self._intrinsics = intrinsics
+        self._detector = TagDetector(setup.family, decimate=setup.decimate, threads=threads)
+        self._seen: deque[Array] = deque(maxlen=ORIGIN_MEMORY)
+        self._elsewhere: list[Array] = []
+        self._origin: tuple[Array, Array] | None = None
+        self._origin_t: float | None = None
+        self._seen_at_solution = 0
+
+    @property
+    def origin_age(self) -> float | None:
+        """Time stamp of the last picture that showed the origin tag where it is believed to be."""
+        return self._origin_t
+
+    @property
+    def origin(self) -> tuple[Array, Array] | None:
+        """Rotation (3, 3) and translation (3,) m, camera from arena; None until it is certain."""
+        return self._origin
+
+    def track(
+        self, picture: NDArray[np.uint8], t: float, tilt: tuple[float, float] | None = None
+    ) -> BodyPose | BodyLost:
+        """The body in one picture, grey (h, w) or colour (h, w, 3), taken at `t`.
+
+        Args:
+            tilt: roll and pitch of the body in rad from the IMU at `t`, where there is one.
+
+        Raises:
+            BadInput: the picture has another shape than the lens was calibrated for.
+        """
+        began = time.perf_counter()
+        setup = self.setup
+        gray = picture if picture.ndim == 2 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
+        lens = self._intrinsics.scaled(gray.shape[1], gray.shape[0])
+        sightings = self._detector.detect(gray)
+        self._note_origin(best(sightings, setup.origin_id, setup), lens, t)
+        seen = best(sightings, setup.body_id, setup)
+        if self._elsewhere:
+            return BodyLost(t, "the origin tag or the camera has moved")
+        if self._origin is None:
+            return BodyLost(t, f"origin tag {setup.origin_id} not seen yet")
+        if seen is None:
+            return BodyLost(t, self._why_not(sightings))
+        return self._pose(seen, lens, t, tilt, began)
+
+    def _why_not(self, sightings: list[Sighting]) -> str:
+        tag = self.setup.body_id
+        doubtful = [s for s in sightings if s.id == tag]
+        if doubtful:
+            s = max(doubtful, key=lambda s: s.margin)
+            how = f"margin {s.margin:.1f}, {s.hamming} wrong bits"
+            return f"body tag {tag} is doubtful ({how}): too small, too dark or blurred"
+        others = sorted({s.id for s in sightings if s.margin >= self.setup.min_margin and s.hamming == 0})
+        others = [i for i in others if i != self.setup.origin_id]
+        return f"body tag {tag} not seen" + (f" (but tag {', '.join(map(str, others))})" if others else "")
+
+    # --- the arena -------------------------------------------------------------------------------------------------
+
+    def _note_origin(self, seen: Sighting | None, lens: Intrinsics, t: float) -> None:
+        if seen is None:
+            return
+        if self._seen:
+            middle = np.median(self._seen, axis=0)
+            if np.abs(seen.corners - middle).max() > ORIGIN_MOVED_PX:
+                self._elsewhere.append(seen.corners)
+                if len(self._elsewhere) >= ORIGIN_MOVED_PICTURES:
+                    self._seen = deque(self._elsewhere[-ORIGIN_MIN:], maxlen=ORIGIN_MEMORY)
+                    self._elsewhere = []
+                    self._origin = None
+                    self.origin_moves += 1
+                    self._solve_origin(lens)
+                return
+        self._elsewhere = []
+        self._seen.append(seen.corners)
+        self._origin_t = t
+        # The average settles: solved anew only while it still gains.
+        if self._origin is None or len(self._seen) < ORIGIN_MEMORY:
+            self._solve_origin(lens)
+
+    def _solve_origin(self, lens: Intrinsics) -> None:
+        if len(self._seen) < ORIGIN_MIN:
+            return
+        corners = np.asarray(self._seen)
+        middle = np.median(corners, axis=0)
+        near = np.abs(corners - middle).max(axis=(1, 2)) < ORIGIN_MOVED_PX / 2
+        mean = corners[near].mean(axis=0) if near.any() else middle
+        poses = tag_pose(mean, self.setup.origin_size, lens)
+        if poses:
+            self._origin = poses[0]
+
+    # --- the body --------------------------------------------------------------------------------------------------
+
+    def _pose(
+        self, seen: Sighting, lens: Intrinsics, t: float, tilt: tuple[float, float] | None, began: float
+    ) -> BodyPose | BodyLost:
+        assert self._origin is not None
+        setup = self.setup
+        c, s = math.cos(setup.body_yaw), math.sin(setup.body_yaw)
+        body_from_tag = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        r_arena, t_arena = self._origin
+        up = r_arena[:, 2]
+        prior = _Prior(_up_in_tag(tilt, body_from_tag), up, TILT_PRIOR_RAD if tilt is None else IMU_TILT_RAD)
+        solutions = [
+            refine(rotation, position, seen.corners, setup.body_size, lens, prior)
+            for rotation, position in tag_pose(seen.corners, setup.body_size, lens)
+        ]
+        if not solutions:
+            return BodyLost(t, f"the corners of body tag {setup.body_id} make no square")
+        fit = min(solutions, key=lambda solution: solution.cost)
+        if fit.residual_px > MAX_RESIDUAL_PX:
+            return BodyLost(t, f"the corners of body tag {setup.body_id} make no square ({fit.residual_px:.1f} px off)")
+
+        def body(rotation: Array, position: Array) -> tuple[Array, Array]:
+            arena_from_tag = r_arena.T @ rotation
+            arena_from_body = arena_from_tag @ body_from_tag.T
+            return arena_from_body, r_arena.T @ (position - t_arena) - arena_from_body @ np.asarray(setup.body_position)
+
+        rotation, position = body(fit.rotation, fit.position)
+        if rotation[2, 2] <= 0.0:
+            return BodyLost(t, f"body tag {setup.body_id} is seen from below: the body lies on its back")
+        yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+        jacobian = np.empty((4, 6))
+        step = 1e-6
+        for k in range(6):
+            d = np.zeros(6)
+            d[k] = step
+            r, p = body(_exp(d[:3]) @ fit.rotation, fit.position + d[3:])
+            turn = math.remainder(math.atan2(r[1, 0], r[0, 0]) - yaw, 2 * math.pi)
+            jacobian[:, k] = np.append((p - position) / step, turn / step)
+        errors = np.sqrt(np.diag(jacobian @ fit.covariance @ jacobian.T))
+        centre = seen.corners.mean(axis=0) / [lens.width, lens.height]
+        return BodyPose(
+            t=t,
+            position=position,
+            rotation=rotation,
+            yaw=yaw,
+            position_error=errors[:3],
+            yaw_error=float(errors[3]),
+            near_edge=bool(np.any((centre < setup.edge) | (centre > 1.0 - setup.edge))),
+            residual_px=fit.residual_px,
+            size_px=seen.size_px,
+            margin=seen.margin,
+            detection_s=time.perf_counter() - began,
+        )
+
+
+def best(sightings: list[Sighting], tag: int, setup: TagSetup) -> Sighting | None:
+    """The surest sighting of a tag that passes the gates."""
+    good = [s for s in sightings if s.id == tag and s.margin >= setup.min_margin and s.hamming <= setup.max_hamming]
+    return max(good, key=lambda s: s.margin, default=None)
+
+
+# --- poses -------------------------------------------------------------------------------------------------------
+
+
+def tag_points(size: float) -> Array:
+    """Corners (4, 3) in the tag's frame, in the order of `Sighting.corners`, m."""
+    h = size / 2.0
+    return np.array([[h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0], [-h, h, 0.0]])
+
+
+def tag_pose(corners: Array, size: float, lens: Intrinsics) -> list[tuple[Array, Array]]:
+    """The one or two poses (rotation 3 × 3, position 3; camera from tag) of a square, best first (IPPE).
+
+    Args:
+        corners: (4, 2), as in `Sighting`.
+        size: edge length, m.
+    """
+    rays = lens.rays(corners)
+    points = tag_points(size) @ _IPPE_FROM_TAG.T
+    count, rotations, positions, _ = cv2.solvePnPGeneric(
+        points, rays.reshape(-1, 1, 2), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+    )
+    poses = []
+    for k in range(int(count)):
+        rotation = np.asarray(cv2.Rodrigues(rotations[k])[0], float) @ _IPPE_FROM_TAG
+        position = np.asarray(positions[k], float).ravel()
+        if position[2] > 0 and np.all(np.isfinite(rotation)):
+            poses.append((rotation, position))
+    return poses
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """The direction `up_tag` (in the tag) should be `up_camera` (in the camera), to within `sigma` rad each way."""
+
+    up_tag: Array
+    up_camera: Array
+    sigma: float
+
+
+@dataclass(frozen=True)
+class _Fit:
+    rotation: Array
+    position: Array
+    covariance: Array
+    cost: float
+    residual_px: float
+
+
+def refine(rotation: Array, position: Array, corners: Array, size: float, lens: Intrinsics, prior: _Prior) -> _Fit:
+    """The most likely pose near a first one: Gauss–Newton on corners and tilt, with its covariance (6 × 6).
+
+    Parameters are a small rotation in the camera's axes and the position. Residuals are corner distances over
+    `CORNER_PX`, and the two components of the tilt over the prior's sigma.
+    """
+    points = tag_points(size)
+    focal = np.array([lens.fx, lens.fy])
+    rays = lens.rays(corners)
+    # Any two axes across the prior's direction span the tilt.
+    across = np.linalg.svd(prior.up_camera[None, :])[2][1:]
+
+    def residuals(r: Array, p: Array) -> Array:
+        seen = points @ r.T + p
+        pixels = ((seen[:, :2] / seen[:, 2:] - rays) * focal).ravel()
+        lean = across @ (r @ prior.up_tag - prior.up_camera)
+        return np.concatenate([pixels / CORNER_PX, lean / prior.sigma])
+
+    now = residuals(rotation, position)
+    damping = 1e-3
+    for _ in range(30):
+        jacobian = _jacobian(rotation, position, points, focal, across, prior)
+        normal = jacobian.T @ jacobian
+        step = np.asarray(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -jacobian.T @ now), float)
+        trial = (_exp(step[:3]) @ rotation, position + step[3:])
+        then = residuals(*trial)
+        if then @ then < now @ now:
+            gained = now @ now - then @ then
+            rotation, position, now = trial[0], trial[1], then
+            damping = max(damping / 5, 1e-9)
+            if gained < 1e-6:
+                break
+        else:
+            damping *= 10
+            if damping > 1e6:
+                break
+    information = _information(rotation, position, points, focal, across, prior)
+    covariance = np.asarray(np.linalg.pinv(information), float)
+    residual = float(np.sqrt(np.mean((now[:8] * CORNER_PX) ** 2) * 2))
+    return _Fit(rotation, position, covariance, float(now @ now), residual)
+
+
+def _information(r: Array, p: Array, points: Array, focal: Array, across: Array, prior: _Prior) -> Array:
+    jacobian = _jacobian(r, p, points, focal, across, prior)
+    return np.asarray(jacobian.T @ jacobian)
+
+
+def _jacobian(r: Array, p: Array, points: Array, focal: Array, across: Array, prior: _Prior) -> Array:
+    """Derivatives (10, 6) of the residuals of `refine`."""
+    turned = points @ r.T
+    seen = turned + p
+    z = seen[:, 2]
+    rows = np.zeros((4, 2, 3))
+    rows[:, 0, 0] = focal[0] / z
+    rows[:, 1, 1] = focal[1] / z
+    rows[:, 0, 2] = -focal[0] * seen[:, 0] / z**2
+    rows[:, 1, 2] = -focal[1] * seen[:, 1] / z**2
+    out = np.empty((10, 6))
+    out[:8, 3:] = rows.reshape(8, 3) / CORNER_PX
+    for k in range(4):
+        out[2 * k : 2 * k + 2, :3] = -rows[k] @ _cross(turned[k]) / CORNER_PX
+    out[8:, :3] = -across @ _cross(r @ prior.up_tag) / prior.sigma
+    out[8:, 3:] = 0.0
+    return out
+
+
+def _up_in_tag(tilt: tuple[float, float] | None, body_from_tag: Array) -> Array:
+    """The vertical in the tag's frame, for a body with this roll and pitch (level without)."""
+    if tilt is None:
+        return np.array([0.0, 0.0, 1.0])
+    roll, pitch = tilt
+    up = [-math.sin(pitch), math.cos(pitch) * math.sin(roll), math.cos(pitch) * math.cos(roll)]
+    return np.asarray(body_from_tag.T @ up)
+
+
+def _cross(v: Array) -> Array:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def _exp(w: Array) -> Array:
+    """Rotation matrix of a rotation vector."""
+    return np.asarray(cv2.Rodrigues(np.asarray(w, float))[0], float)
