@@ -24,6 +24,8 @@ __all__ = ["Answer", "Bus", "Found", "Timing"]
 BITS_PER_BYTE = 10
 #: A status carries this many bytes besides its data.
 STATUS_OVERHEAD = 11
+#: The FTDI driver's own setting of its latency timer; any longer one is somebody's mistake.
+LONGEST_LATENCY_S = 16e-3
 #: Fast Sync Read came with this firmware (ROBOTIS e-manual).
 FAST_READ_FIRMWARE = 45
 _MARK = p2.HEADER[:3]
@@ -43,7 +45,7 @@ class Timing:
     """
 
     return_delay_s: float = 500e-6
-    latency_timer_s: float = 16e-3
+    latency_timer_s: float = LONGEST_LATENCY_S
     margin_s: float = 3e-3
     grace_s: float = 3e-3
     write_read_gap_s: float = 0.2e-3
@@ -126,10 +128,14 @@ class Bus:
 
     # ---- one instruction each ------------------------------------------------------------------------------------
 
-    def ping(self, id: int) -> Found | None:
-        """The servo with this ID, or None where none answers."""
-        answer = self._exchange(p2.ping(id), [id], 3)[0]
-        return _found(answer) if answer.ok else None
+    def ping(self, id: int, *, insist: bool = False) -> Found | None:
+        """The servo with this ID, or None where none answers; asked `retries` times more where we `insist`."""
+        for attempt in range(1 + self.retries * insist):
+            self.statistics.of(id).retries += attempt > 0
+            answer = self._exchange(p2.ping(id), [id], 3)[0]
+            if answer.ok:
+                return _found(answer)
+        return None
 
     def broadcast_ping(self, *, first_s: float = 0.2, quiet_s: float = 0.1) -> list[Found]:
         """Everyone at this baud rate, by ID.
@@ -235,14 +241,16 @@ class Bus:
         ids = [id for id, _, _ in items]
         return self._exchange(p2.bulk_read(items), ids, max(count for _, _, count in items))
 
-    def measure_latency_timer(self, id: int, tries: int = 12) -> float:
+    def measure_latency_timer(self, id: int, tries: int = 13) -> float:
         """What the adapter holds short answers back, s: for lines whose timer the host cannot read.
 
         The timer runs freely, so that an answer waits for anything between nothing and its whole period: twice the
         median of what a ping takes beyond wire and return delay.
         """
         waits = []
-        for _ in range(tries):
+        for k in range(tries):
+            # Asked at once after an answer, every ping would meet the timer at the same phase.
+            self.clock.sleep_until(self.clock.now() + (0.618 * k) % 1.0 * LONGEST_LATENCY_S)
             answer = self._exchange(p2.ping(id), [id], 3)[0]
             if answer.rtt is not None:
                 waits.append(answer.rtt - self.wire_s(10 + STATUS_OVERHEAD + 3) - self.timing.return_delay_s)

@@ -345,12 +345,12 @@ class Engine:
 
     def _stopped(self, trip: Trip) -> None:
         self._torque_off()
-        for number, _ in self._waiting:
-            self._say(messages.Reply(number, error=(trip.what, None, trip.remedy)))
-        self._waiting.clear()
         if self._recorder is not None:
             self._recorder.event("stopped", what=trip.what, joint=trip.joint)
         self._say(messages.Stopped(trip.what, trip.remedy, trip.joint))
+        for number, _ in self._waiting:
+            self._say(messages.Reply(number, error=(trip.what, None, trip.remedy)))
+        self._waiting.clear()
 
     def _port_lost(self) -> None:
         self._lost = True

@@ -49,6 +49,7 @@ class EngineProcess:
         self._events: deque[Event] = deque()
         self._replies: dict[int, Reply] = {}
         self._number = 0
+        self._ended = False
         ours, theirs = socket.socketpair()
         self._process = subprocess.Popen(
             [sys.executable, "-m", "openant_tools.comms.engine", str(theirs.fileno()), str(self._ring.fd)],
@@ -93,6 +94,8 @@ class EngineProcess:
         if number in self._replies:
             self._value(self._replies[number])
             return True
+        if self._ended:
+            self._died()
         return False
 
     def ask(self, command: Command, timeout_s: float | None = None) -> Any:
@@ -111,7 +114,7 @@ class EngineProcess:
 
     def events(self) -> Iterator[Event]:
         """What happened since the last call."""
-        if not self._connection.closed:
+        if not self._connection.closed and not self._ended:
             self._receive(0.0)
         while self._events:
             yield self._events.popleft()
@@ -128,6 +131,8 @@ class EngineProcess:
                 raise HardwareFault(
                     "the engine does not answer", where=self.config.port, remedy="stop it and try again"
                 )
+            if self._ended:
+                self._died()
             self._receive(0.1)
         return self._value(self._replies.pop(number))
 
@@ -147,7 +152,7 @@ class EngineProcess:
                     self._events.append(message)
                 wait_s = 0.0
         except (EOFError, OSError):
-            self._died()
+            self._ended = True
 
     def _died(self) -> None:
         code = self._process.wait(CLOSE_TIMEOUT_S)
@@ -172,9 +177,8 @@ class EngineProcess:
     def _drain_until_gone(self) -> None:
         give_up = time.monotonic() + CLOSE_TIMEOUT_S
         while self._process.poll() is None and time.monotonic() < give_up:
-            try:
-                self._receive(0.05)
-            except HardwareFault:
+            self._receive(0.05)
+            if self._ended:
                 break
         try:
             self._process.wait(max(0.1, give_up - time.monotonic()))

@@ -120,7 +120,7 @@ class Servos:
         found: dict[str, Found] = {}
         answers: list[Answer] = []
         for servo in self.servos:
-            seen = self.bus.ping(servo.id) or self.bus.ping(servo.id)
+            seen = self.bus.ping(servo.id, insist=True)
             answers.append(Answer(servo.id, b"" if seen else None, 0, None if seen else Cause.TIMEOUT))
             if seen:
                 found[servo.joint] = seen

@@ -84,7 +84,7 @@ def config_of_unknown_robot(port: str, control: str | None = None, **more: objec
     bus = open_bus(port, 1_000_000, control)
     try:
         bus.names = {joint.id: joint.name for joint in JOINTS.values()}
-        found = {joint.name: bus.ping(joint.id) for joint in JOINTS.values()}
+        found = {joint.name: bus.ping(joint.id, insist=True) for joint in JOINTS.values()}
         bus.require_all({JOINTS[name].id: seen is not None for name, seen in found.items()})
         servos = tuple(
             Servo(name, seen.id, servo_model(seen.model_number), 1, DEFAULT_ZERO_RAD)

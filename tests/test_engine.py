@@ -1,0 +1,274 @@
+"""The engine on a virtual robot in a process of its own: motions, guards, and every way to die with torque on."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_robot
+from openant_tools.comms import messages
+from openant_tools.comms.clock import VirtualControl
+from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.guards import Guards
+from openant_tools.comms.messages import EngineConfig
+from openant_tools.comms.setup import config_of_unknown_robot
+from openant_tools.errors import HardwareFault
+from openant_tools.recording.reader import read_recording
+from openant_tools.recording.run import Facts
+from openant_tools.robot.joints import JOINT_NAMES
+from openant_tools.robot.kit import home_angles
+
+HOME = np.array(home_angles())
+#: Patience of a test on a loaded machine; the engine itself promises 0.5 s (benchmarks/fault_campaign.py measures it).
+PATIENCE_S = 20.0
+
+
+@pytest.fixture(scope="module")
+def live() -> Iterator[dict[str, str]]:
+    """A virtual Ant in real time."""
+    with virtual_robot(VIRTUAL_DEFAULT, clock="real") as robot:
+        yield dict(robot)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def stepped() -> Iterator[dict[str, str]]:
+    """A virtual Ant whose time moves with the engine's."""
+    with virtual_robot(VIRTUAL_DEFAULT, clock="stepped") as robot:
+        yield dict(robot)  # type: ignore[arg-type]
+
+
+def config(robot: dict[str, str], **changes: object) -> EngineConfig:
+    return replace(config_of_unknown_robot(robot["bus"], robot["control"]), **changes)  # type: ignore[arg-type]
+
+
+def state(robot: dict[str, str]) -> dict[str, object]:
+    control = VirtualControl(robot["control"])
+    try:
+        return control.ask("state")
+    finally:
+        control.close()
+
+
+def torques(robot: dict[str, str]) -> list[bool]:
+    return list(state(robot)["torque_enable"].values())  # type: ignore[attr-defined]
+
+
+def answers(robot: dict[str, str]) -> bool:
+    try:
+        return bool(config(robot))
+    except HardwareFault:
+        return False
+
+
+def wait_until(what: Callable[[], bool]) -> None:
+    give_up = time.monotonic() + PATIENCE_S
+    while not what():
+        assert time.monotonic() < give_up, "it never happened"
+        time.sleep(0.02)
+
+
+# ---- motions -----------------------------------------------------------------------------------------------------
+
+
+def test_torque_comes_on_where_the_robot_stands_and_moves_do_not_jump(stepped: dict[str, str]) -> None:
+    with EngineProcess(config(stepped)) as engine:
+        before = engine.description["position"]
+        start = engine.ask(messages.Torque(True))
+        assert np.abs(start - before).max() < 0.01
+        engine.ask(messages.Ramp(HOME))
+        rows = engine.telemetry()
+        commands = rows[:, [engine.columns.index(f"cmd.{joint}") for joint in JOINT_NAMES]]
+        steps = np.abs(np.diff(commands, axis=0)).max()
+        assert steps < 1.0 / 100 * 1.02  # 1 rad/s
+        end = engine.ask(messages.Hold(0.5))
+        assert np.abs(end - HOME).max() < 0.05
+    assert not any(torques(stepped))
+
+
+def test_recordings_hold_what_was_commanded_and_measured(stepped: dict[str, str], tmp_path: Path) -> None:
+    wave = HOME + 0.2 * np.sin(np.arange(100) / 100 * 2 * np.pi)[:, None]
+    with EngineProcess(config(stepped)) as engine:
+        engine.ask(messages.Torque(True))
+        engine.ask(messages.Ramp(HOME))
+        engine.ask(messages.Record(str(tmp_path / "run"), Facts(JOINT_NAMES, setup="stand")))
+        engine.ask(messages.Play(wave, "wave"))
+        path, cycles = engine.ask(messages.StopRecording())
+    run = read_recording(path).run
+    assert len(run.t) == cycles == 100
+    command = run.signal("cmd")
+    assert np.abs(command - wave).max() < 2 * np.pi / 4096
+    assert run.signal("ok").all()
+    assert np.nanmax(np.abs(run.signal("pos") - command)) < 0.2
+    assert np.all(run.t - run.column("cmd_t") >= 0.2e-3 - 1e-9)
+    assert np.diff(run.t) == pytest.approx(0.01, abs=1e-3)
+    assert run.facts.extra["baud"] == 1_000_000
+    assert run.facts.extra["latency_timer_ms"] == 1.0
+    assert run.facts.registers["knee_fl"]["pwm_limit"] == 442
+
+
+def test_what_cannot_be_is_refused_and_nothing_moves(stepped: dict[str, str]) -> None:
+    with EngineProcess(config(stepped)) as engine:
+        with pytest.raises(HardwareFault, match="torque is off"):
+            engine.ask(messages.Ramp(HOME))
+        engine.ask(messages.Torque(True))
+        with pytest.raises(HardwareFault, match=r"2\.000 rad for hip_rr is outside its limits -0\.785 to 0\.785"):
+            engine.ask(messages.Ramp(np.full(8, 2.0)))
+        with pytest.raises(HardwareFault, match="EEPROM is locked"):
+            engine.ask(messages.WriteRegister("hip_rr", "pwm_limit", 400))
+        # Goals of a policy are clipped, as the platform clips them.
+        end = engine.ask(messages.Goal(np.full(8, 2.0), 1.0))
+        assert (end[::2] < 0.9).all()
+
+
+def test_a_second_connect_finds_the_port_taken(live: dict[str, str]) -> None:
+    settings = config(live)
+    with EngineProcess(settings) as engine, pytest.raises(HardwareFault, match=rf"held by .*process {engine.pid}"):
+        EngineProcess(settings)
+
+
+# ---- guards ------------------------------------------------------------------------------------------------------
+
+
+def test_the_stop_key_releases_at_once(live: dict[str, str]) -> None:
+    with EngineProcess(config(live)) as engine:
+        engine.ask(messages.Torque(True))
+        moving = engine.start(messages.Play(np.repeat(HOME[None, :], 3000, axis=0)))
+        time.sleep(0.3)
+        engine.stop()
+        assert not any(torques(live))
+        with pytest.raises(HardwareFault, match="stopped by hand"):
+            engine.done(moving)
+
+
+def test_a_joint_out_of_bounds_stops_the_motion(stepped: dict[str, str]) -> None:
+    settings = config(stepped, guards=Guards(angle_margin_rad=-0.5))
+    with EngineProcess(settings) as engine:
+        engine.ask(messages.Torque(True))
+        with pytest.raises(HardwareFault, match=r"is at .* rad, outside its limits .* → look for a wrong zero"):
+            engine.ask(messages.Ramp(np.full(8, 0.6)))
+        [stopped] = [event for event in engine.events() if isinstance(event, messages.Stopped)]
+        assert stopped.joint in JOINT_NAMES
+    assert not any(torques(stepped))
+
+
+def test_a_silent_servo_stops_the_motion(live: dict[str, str]) -> None:
+    with EngineProcess(config(live)) as engine:
+        engine.ask(messages.Torque(True))
+        moving = engine.start(messages.Play(np.repeat(HOME[None, :], 3000, axis=0)))
+        control = VirtualControl(live["control"])
+        control.ask("unplug", joint="knee_fl")
+        try:
+            with pytest.raises(HardwareFault, match=r"has not answered for .* → look at its cable"):
+                wait_until(lambda: engine.done(moving))
+        finally:
+            control.ask("plug", joint="knee_fl")
+            control.close()
+    wait_until(lambda: answers(live))  # a servo that gets its power back is mute for a while
+    wait_until(lambda: not any(on for k, on in enumerate(torques(live)) if JOINT_NAMES[k] != "knee_fl"))
+
+
+# ---- dying with torque on ----------------------------------------------------------------------------------------
+
+PARENT = textwrap.dedent(
+    """
+    import json, sys, time, pickle
+    import numpy as np
+    from openant_tools.comms import messages
+    from openant_tools.comms.engine_process import EngineProcess
+    from openant_tools.recording.run import Facts
+    config, home, out = pickle.loads(bytes.fromhex(sys.argv[1]))
+    engine = EngineProcess(config)
+    engine.ask(messages.Torque(True))
+    engine.ask(messages.Record(out, Facts(tuple(s.joint for s in config.servos))))
+    t = np.arange(60 * 100) / 100
+    engine.start(messages.Play(home + 0.2 * np.sin(2 * np.pi * t)[:, None]))
+    print(json.dumps({"engine": engine.pid, "guardian": engine.description["guardian_pid"]}), flush=True)
+    time.sleep(120)
+    """
+)
+
+
+@pytest.fixture
+def moving(live: dict[str, str], tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], dict[str, int], Path]]:
+    """A program that moves the legs: its process, the ids of engine and guardian, and its recording."""
+    import pickle
+
+    out = tmp_path / "run.mcap"
+    payload = pickle.dumps((config(live), HOME, str(out))).hex()
+    parent = subprocess.Popen([sys.executable, "-c", PARENT, payload], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pids = json.loads(parent.stdout.readline())
+    wait_until(lambda: all(torques(live)))
+    time.sleep(1.5)  # a second of recording reaches the disk
+    yield parent, pids, out
+    parent.kill()
+    parent.wait()
+    wait_until(lambda: not alive(pids["engine"]) and not alive(pids["guardian"]))
+
+
+def alive(pid: int) -> bool:
+    try:
+        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except FileNotFoundError:
+        return False
+
+
+def test_killing_the_parent_releases_the_robot_and_keeps_the_recording(
+    live: dict[str, str], moving: tuple[subprocess.Popen[str], dict[str, int], Path]
+) -> None:
+    parent, pids, out = moving
+    parent.kill()
+    wait_until(lambda: not any(torques(live)))
+    wait_until(lambda: not alive(pids["engine"]))
+    assert len(read_recording(out).run.t) > 30
+
+
+def test_killing_the_engine_leaves_it_to_the_guardian(
+    live: dict[str, str], moving: tuple[subprocess.Popen[str], dict[str, int], Path]
+) -> None:
+    _, pids, out = moving
+    os.kill(pids["engine"], signal.SIGKILL)
+    wait_until(lambda: not any(torques(live)))
+    assert len(read_recording(out).run.t) > 30
+
+
+def test_killing_both_leaves_it_to_the_servos_watchdog_and_the_next_connect_says_so(
+    live: dict[str, str], moving: tuple[subprocess.Popen[str], dict[str, int], Path]
+) -> None:
+    parent, pids, _ = moving
+    os.kill(pids["guardian"], signal.SIGKILL)
+    os.kill(pids["engine"], signal.SIGKILL)
+    parent.kill()
+    wait_until(lambda: not alive(pids["engine"]) and not alive(pids["guardian"]))
+    time.sleep(0.5)
+    assert all(torques(live))  # as in the real servo: the motion has stopped, torque is still on
+    before = state(live)["angle"]
+    time.sleep(0.3)
+    assert state(live)["angle"] == pytest.approx(before, abs=0.01)
+    with EngineProcess(config(live)) as engine:
+        notices = [event.text for event in engine.events() if isinstance(event, messages.Notice)]
+        assert any("torque was still on" in text for text in notices)
+        assert any("Bus Watchdog" in text and "cleared" in text for text in notices)
+        engine.ask(messages.Torque(True))
+        engine.ask(messages.Ramp(HOME))
+
+
+def test_sigterm_ends_in_good_order(
+    live: dict[str, str], moving: tuple[subprocess.Popen[str], dict[str, int], Path]
+) -> None:
+    _, pids, out = moving
+    os.kill(pids["engine"], signal.SIGTERM)
+    wait_until(lambda: not alive(pids["engine"]))
+    assert not any(torques(live))
+    assert len(read_recording(out).run.t) > 30
