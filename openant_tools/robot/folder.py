@@ -46,7 +46,7 @@ class Located:
     @property
     def where(self) -> str:
         line = f", line {self.line}" if self.line else ""
-        return f"{self.file}{line}, {self.problem.place}"
+        return ", ".join(part for part in (f"{self.file}{line}", self.problem.place) if part)
 
     def __str__(self) -> str:
         text = f"{self.where}: {self.problem.what}"
@@ -133,6 +133,9 @@ class RobotFolder:
         if isinstance(model, str):
             problems += self._model_problems(self.path / model, simulate)
         text = data.decode("utf-8")
+        if not text.endswith("\n"):
+            what = "the last line has no end: is the file cut short?"
+            problems.append(Problem("", what, "compare it with the newest file in backups/", "note"))
         located = [Located(problem, _line_of(text, problem.key), self.config_file) for problem in problems]
         located.sort(key=lambda entry: entry.line or math.inf)
         return config, located
