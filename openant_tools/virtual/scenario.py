@@ -112,7 +112,7 @@ def parse_scenario(table: Mapping[str, Any], name: str = "scenario") -> Scenario
     servos = standard_servos(kit, factory=factory)
     for servo in servos:
         if "baud" in bus:
-            servo.registers["baud_rate"] = baud_code(int(bus["baud"]))
+            servo.registers["baud_rate"] = _at(f"{name}, [bus]", baud_code, int(bus["baud"]))
         if "return_delay_s" in bus:
             servo.registers["return_delay_time"] = round(float(bus["return_delay_s"]) / 2e-6)
     world = WorldSettings(servos, seed=seed)
@@ -159,14 +159,14 @@ def _section(table: Mapping[str, Any], section: str, name: str) -> dict[str, Any
         if key not in known:
             raise BadInput(f"unknown key {key!r}", where=where, remedy=nearest(key, known))
         if known[key] == _NUMBER:
-            _checked_number(key, value, where)
+            _checked_number(key, value, where, signed=key in ("heading_rad", "ambient_c"))
     return values
 
 
-def _checked_number(key: str, value: Any, where: str) -> None:
+def _checked_number(key: str, value: Any, where: str, *, signed: bool = False) -> None:
     good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    if not good or (value < 0 and key not in ("heading_rad", "ambient_c", "mount_rad", "clock_ppm")):
-        raise BadInput(f"{key} = {value!r}", where=where, remedy="a number, not below zero")
+    if not good or (value < 0 and not signed):
+        raise BadInput(f"{key} = {value!r}", where=where, remedy="a number" if signed else "a number, not below zero")
 
 
 def _choice(values: Mapping[str, Any], key: str, choices: Sequence[str], default: str, where: str) -> str:
@@ -210,7 +210,7 @@ def _fields(values: Any, kind: type, where: str) -> dict[str, Any]:
             if type(default) is not type(value):
                 raise BadInput(f"{key} = {value!r}", where=where)
         elif isinstance(default, float) or default is dataclasses.MISSING:
-            _checked_number("mount_rad", value, where)
+            _checked_number(key, value, where, signed=True)
             value = float(value)
         elif not isinstance(value, type(default)):
             raise BadInput(f"{key} = {value!r}", where=where, remedy=f"like {default!r}")
@@ -254,7 +254,7 @@ def _read_servo(entry: Mapping[str, Any], servo: ServoSetup, where: str) -> None
                 raise BadInput(f"{key} = {value!r}", where=where, remedy="true or false")
             servo.reversed = value
         elif key in ("mount_rad", "clock_ppm"):
-            _checked_number(key, value, where)
+            _checked_number(key, value, where, signed=True)
             setattr(servo, key, float(value))
         elif not isinstance(value, int) or isinstance(value, bool):
             raise BadInput(f"{key} = {value!r}", where=where, remedy="a whole number, as the register counts")
@@ -289,7 +289,7 @@ def _read_robot(robot: Mapping[str, Any], world: WorldSettings, where: str) -> N
         for joint, angle in pose.items():
             if joint not in joints:
                 raise BadInput(f"pose: no joint {joint!r}", where=where, remedy=nearest(joint, joints))
-            _checked_number("mount_rad", angle, f"{where} pose")
+            _checked_number(joint, angle, f"{where} pose", signed=True)
         world.body.pose_rad = {joint: float(angle) for joint, angle in pose.items()}
     elif pose != "straight":
         raise BadInput(f"pose = {pose!r}", where=where, remedy=_SECTIONS["robot"]["pose"])
