@@ -204,7 +204,7 @@ class ServoDevice:
         self._reg_write: tuple[int, bytes] | None = None
         self._base = 0
         self._mute_until = 0.0
-        self._booted_at = 0.0
+        self.booted_at = 0.0
         self._heard_at = 0.0
         self._pending = _Pending()
         self._baud = 0
@@ -261,7 +261,7 @@ class ServoDevice:
         self._reg_write = None
         self._pending = _Pending()
         self._baud = BAUD_CODES[self.memory[8]]
-        self._booted_at = self._heard_at = now
+        self.booted_at = self._heard_at = now
         self._mute_until = now + self.reboot_s if mute else now
         self.set("goal_pwm", self.get("pwm_limit"))
         if "goal_current" in self.registers:
@@ -404,7 +404,7 @@ class ServoDevice:
             effort = _counts(direction * sensed.current / _CURRENT_UNIT, 15)
         else:
             effort = max(-1000, min(1000, round(direction * sensed.duty * 1000)))
-        tick = int((now - self._booted_at) * 1000 * (1 + self.clock_ppm * 1e-6)) % TICK_WRAP
+        tick = int((now - self.booted_at) * 1000 * (1 + self.clock_ppm * 1e-6)) % TICK_WRAP
         _DYNAMIC.pack_into(
             self.memory, _DYNAMIC_AT, tick, moving, status, round(direction * sensed.duty * PWM_FULL), effort, velocity,
             _counts(present, 31), _counts(sensed.trajectory_velocity / _PULSES_S_PER_COUNT, 31),

@@ -16,7 +16,7 @@ from openant_tools.virtual.scenario import Scenario, load_scenario
 from openant_tools.virtual.server import Server
 from openant_tools.virtual.world import World
 
-__all__ = ["BodyTruth", "build", "serve"]
+__all__ = ["BodyTruth", "assemble", "build", "serve"]
 
 Array = NDArray[np.float64]
 
@@ -52,21 +52,23 @@ def build(scenario: Scenario | None = None) -> World:
     return world
 
 
-def serve(scenario: Path | None = None, *, clock: str | None = None, tcp: bool = False) -> Server:
-    """A server for a scenario file, its ports open.
+def assemble(script: Scenario, *, clock: str | None = None, tcp: bool = False) -> Server:
+    """A server for a scenario, its ports open.
 
     Args:
-        scenario: the file; None for a healthy standard Ant on its stand.
         clock: "real" or "stepped"; None for what the scenario says.
         tcp: put the bus on a TCP port.
     """
-    script = load_scenario(scenario) if scenario is not None else Scenario()
     world = build(script)
     settings = FlightControllerSettings(**script.world.imu)
     imu = FlightController(settings, lambda: BodyTruth(world.body), np.random.default_rng(script.world.seed + 2))
-    # The robot has been on for a while: its flight controller is past its boot.
     stepped = script.stepped if clock is None else clock == "stepped"
     server = Server(world, stepped=stepped, imu=imu, tcp=tcp)
     faults = Faults(world, script.faults, unplug=server.set_plugged, imu=imu)
     server.fault = faults.request
     return server
+
+
+def serve(scenario: Path | None = None, *, clock: str | None = None, tcp: bool = False) -> Server:
+    """`assemble` for a scenario file; None for a healthy standard Ant on its stand. Raises BadInput."""
+    return assemble(load_scenario(scenario) if scenario is not None else Scenario(), clock=clock, tcp=tcp)
