@@ -1,4 +1,4 @@
-"""The virtual robot as its clients meet it: a line in process, a pseudo-terminal for the vendor's SDK, a control socket."""
+"""The virtual robot as its clients meet it: a line in process, a port for the vendor's SDK, a control socket."""
 
 from __future__ import annotations
 
@@ -483,7 +483,7 @@ def test_the_sdk_scans_pings_reads_and_writes(port):
     assert SDK.ping(port, 99)[1] == sdk.COMM_RX_TIMEOUT
     assert patiently(lambda: SDK.write1ByteTxRx(port, 10, 65, 1), lambda a: a[0] == 0) == (0, 0)
     assert patiently(lambda: SDK.read1ByteTxRx(port, 10, 65), lambda a: a[1] == 0) == (1, 0, 0)
-    value, result, error = patiently(lambda: SDK.read2ByteTxRx(port, 10, 150), lambda a: a[1] == 0)
+    _, _, error = patiently(lambda: SDK.read2ByteTxRx(port, 10, 150), lambda a: a[1] == 0)
     assert error == sdk.ERRNUM_ACCESS
 
 
@@ -550,9 +550,7 @@ def test_unplugging_takes_the_port_away_and_plugging_brings_it_back(robot):
     with serial.Serial(path, BAUD, timeout=0.5) as line:
         assert "error" not in remote.ask("fault", cause="usb_unplug")
         with pytest.raises((OSError, serial.SerialException)):
-            for _ in range(20):
-                line.write(p2.ping(10).encode())
-                line.read(14)
+            line.read(14)
     assert not Path(path).exists()
     remote.ask("fault", cause="usb_unplug", on=False)
     with serial.Serial(path, BAUD, timeout=1.0) as line:
@@ -577,11 +575,11 @@ def test_stepped_time_moves_only_when_told():
             assert answer["bus_sent"] == 8 * 15
             assert 0.0014 < answer["t"] < 0.003
             assert len(line.read(120)) == 120
-            assert remote.ask("advance", to=60.0) == {"t": 60.0}
+            assert remote.ask("advance", to=40.0) == {"t": 40.0}
             line.write(p2.read(10, 120, 2).encode())
             remote.ask("settle", bus_written=len(packet) + 14)
             status = p2.Parser().feed(line.read(13))[0]
-            assert int.from_bytes(status.params, "little") == 60_000 % 32_768
+            assert int.from_bytes(status.params, "little") == 40_000 % 32_768
 
 
 def test_waiting_runs_only_until_bytes_leave():
