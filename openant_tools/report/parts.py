@@ -30,6 +30,9 @@ SavePicture = Callable[[str, bytes], str]
 #: bytes of SVG; beyond it a picture of pixels is smaller and scrolls better
 _LARGEST_SVG = 700_000
 
+#: [words](address): on the web, in this page or beside it; no other scheme, so that text never becomes a script
+_LINK = re.compile(r"\[([^\]]+)\]\((https?://[^\s)]+|[^\s:)]+)\)")
+
 
 class Part(Protocol):
     """One part of a report."""
@@ -267,7 +270,7 @@ def _inline(text: str) -> str:
             out.append(f"<code>{safe}</code>")
             continue
         safe = re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", safe)
-        out.append(re.sub(r"\[([^\]]+)\]\(((?:https?://|#|\.{0,2}/)?[^\s):]+[^\s)]*)\)", r'<a href="\2">\1</a>', safe))
+        out.append(_LINK.sub(r'<a href="\2">\1</a>', safe))
     return "".join(out)
 
 
