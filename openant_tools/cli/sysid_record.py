@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from openant_tools.cli.options import robot_option
 from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option, virtual_robot
 
-__all__ = ["record"]
+if TYPE_CHECKING:
+    from openant_tools.robot.folder import RobotFolder
+
+__all__ = ["record", "robot_of"]
 
 
 @click.command()
@@ -62,7 +67,7 @@ def record(
     for path in repeat_paths(out, repeats):
         if path.exists():
             raise BadInput("there is a recording already", where=path, remedy="record under another name")
-    folder = _folder(robot, needed=virtual_source is None)
+    folder = robot_of(robot, needed=virtual_source is None)
     console = Console(stderr=True)
     with contextlib.ExitStack() as stack:
         control = None
@@ -100,16 +105,14 @@ def record(
         click.echo(f"{recorded.path}  {recorded.cycles} cycles")
 
 
-def _folder(robot: Path | None, *, needed: bool):  # type: ignore[no-untyped-def]
-    """The robot's folder; None for a virtual robot without one."""
-    import os
-
+def robot_of(robot: Path | None, *, needed: bool) -> RobotFolder | None:
+    """The robot's folder by `--robot`, $OPENANT_ROBOT or the working directory; None where none is meant nor needed."""
+    from openant_tools.robot.config import CONFIG_NAME
     from openant_tools.robot.folder import RobotFolder
 
     path = robot or Path(os.environ.get("OPENANT_ROBOT", "."))
-    if robot is None and not needed and "OPENANT_ROBOT" not in os.environ:
-        return None
-    return RobotFolder.at(path)
+    meant = robot is not None or "OPENANT_ROBOT" in os.environ or (path / CONFIG_NAME).is_file()
+    return RobotFolder.at(path) if meant or needed else None
 
 
 def _ask(yes: bool) -> None:

@@ -46,7 +46,7 @@ class Timing:
 
     return_delay_s: float = 500e-6
     latency_timer_s: float = LONGEST_LATENCY_S
-    margin_s: float = 3e-3
+    margin_s: float = 4e-3
     grace_s: float = 3e-3
     write_read_gap_s: float = 0.2e-3
 
@@ -381,6 +381,8 @@ class Bus:
             answers = self._sort_out(bytes(buffer), ids, edges, started)
         for answer in answers:
             self.statistics.count(answer.id, answer.cause, answer.rtt, answer.alert)
+        if answers[-1].rtt is not None:
+            self.statistics.arrivals.append((started + answers[-1].rtt, answers[-1].rtt))
         return answers
 
     def _sort_out(

@@ -18,7 +18,7 @@ from typing import Literal
 
 from openant_tools.errors import HardwareFault
 
-__all__ = ["FLIGHT_CONTROLLER", "U2D2", "Host", "Port", "explain_open_error", "udev_rule"]
+__all__ = ["FLIGHT_CONTROLLER", "U2D2", "Holder", "Host", "Port", "explain_open_error", "udev_rule"]
 
 #: USB VID:PID of ROBOTIS' U2D2 (FTDI FT232H) and of STM32 flight controllers (virtual COM port).
 U2D2 = ("0403", "6014")
@@ -78,7 +78,7 @@ class Host:
 
     def ports(self) -> list[Port]:
         """Every USB serial port, buses first, then by path."""
-        found = [self._port(tty) for tty in self._ttys()]
+        found = [self._port(tty) for tty in self._ttys()] if (self.sys / "class").is_dir() else list(_by_pyserial())
         order = {"bus": 0, "imu": 1, "unknown": 2}
         return sorted(found, key=lambda port: (order[port.kind], port.path))
 
@@ -109,6 +109,18 @@ class Host:
                 if link.is_symlink() and Path(os.readlink(link)).name == name:
                     return str(link)
         return None
+
+    def adapters_without_driver(self) -> list[str]:
+        """U2D2s on the USB that have become no serial port: their serial numbers (or places)."""
+        folder, lonely = self.sys / "bus" / "usb" / "devices", list[str]()
+        claimed = {port.serial_number for port in self.ports()}
+        if folder.is_dir():
+            for device in sorted(folder.iterdir()):
+                if (_text(device / "idVendor"), _text(device / "idProduct")) == U2D2:
+                    number = _text(device / "serial")
+                    if number not in claimed:
+                        lonely.append(number or device.name)
+        return lonely
 
     # ---- the latency timer ---------------------------------------------------------------------------------------
 
@@ -181,9 +193,11 @@ def explain_open_error(path: str, error: Exception, host: Host | None = None) ->
     code = getattr(error, "errno", None)
     if "://" in path:
         return HardwareFault(f"nobody answers there ({error})", where=path, remedy="start the virtual robot first")
-    if code == errno.ENOENT or not os.path.exists(path):
+    if code == errno.ENOENT or not os.path.lexists(path):
         known = [port.stable_path for port in host.ports() if port.kind == "bus"]
         remedy = f"the bus that is plugged in is {known[0]}" if known else "plug the adapter in: `openant comms ports`"
+        if not known and host.adapters_without_driver():
+            remedy = "the adapter is plugged in, but its driver is missing: `sudo modprobe ftdi_sio`"
         return HardwareFault("there is no such port", where=path, remedy=remedy)
     if code in (errno.EACCES, errno.EPERM):
         group = host.missing_group(path)
@@ -198,6 +212,21 @@ def explain_open_error(path: str, error: Exception, host: Host | None = None) ->
     if sys.platform == "darwin" and "/tty." in path:
         return HardwareFault(str(error), where=path, remedy=f"use {path.replace('/tty.', '/cu.')}")
     return HardwareFault(f"it does not open ({error})", where=path, remedy="is this a serial port?")
+
+
+def _by_pyserial() -> Iterator[Port]:
+    """macOS and Windows: what pyserial knows of USB serial ports. `cu.` and not `tty.`, which waits for a carrier."""
+    from serial.tools import list_ports
+
+    for found in list_ports.comports():
+        if found.vid is not None:
+            yield Port(
+                path=found.device.replace("/dev/tty.", "/dev/cu."),
+                vendor_id=f"{found.vid:04x}",
+                product_id=f"{found.pid:04x}",
+                serial_number=found.serial_number or "",
+                product=found.product or "",
+            )
 
 
 def _bytes(path: Path) -> bytes:

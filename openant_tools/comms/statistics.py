@@ -1,17 +1,60 @@
-"""What the bus did so far, per servo: losses by cause, retries, and how long answers took."""
+"""What the bus did so far, per servo: losses by cause, retries, how long answers took, and the latency timer's comb."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import cmath
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from openant_tools.comms.faults import Cause
 
-__all__ = ["LATENCY_BIN_S", "BusStatistics", "ServoStatistics"]
+__all__ = ["LATENCY_BIN_S", "BusStatistics", "Comb", "ServoStatistics", "find_comb"]
 
 #: width of a histogram's bin; the last bin holds everything above
 LATENCY_BIN_S = 0.25e-3
 LATENCY_BINS = 160
+
+#: A host that has never been told otherwise waits so long; Windows drivers ship with the same.
+DEFAULT_TIMER_S = 16e-3
+#: How alike the phases of arrivals must be (1: all the same), and for how long answers must have waited.
+COMB_STRENGTH, COMB_WAIT_S = 0.7, 3e-3
+COMB_MINIMUM = 50
+
+
+@dataclass(frozen=True)
+class Comb:
+    """Answers arrive at the ticks of an adapter's latency timer.
+
+    Attributes:
+        period_s: of the timer.
+        strength: length of the mean phase vector of the arrivals, 0…1.
+        wait_s: median of what answers take beyond `wire_s`.
+    """
+
+    period_s: float
+    strength: float
+    wait_s: float
+
+
+def find_comb(
+    arrivals: Sequence[float], rtt: Sequence[float], wire_s: float = 0.0, period_s: float = DEFAULT_TIMER_S
+) -> Comb | None:
+    """Whether answers come in the beat of a latency timer instead of when they are sent.
+
+    Args:
+        arrivals: times (s) at which answers were there, one a cycle.
+        rtt: s from each request's first byte to that answer.
+        wire_s: what the exchange takes on the wire at least.
+        period_s: of the timer looked for.
+    """
+    if len(arrivals) < COMB_MINIMUM:
+        return None
+    turns = [cmath.exp(2j * math.pi * (t / period_s)) for t in arrivals]
+    strength = abs(sum(turns)) / len(turns)
+    wait = sorted(rtt)[len(rtt) // 2] - wire_s
+    return Comb(period_s, strength, wait) if strength > COMB_STRENGTH and wait > COMB_WAIT_S else None
 
 
 @dataclass
@@ -55,6 +98,13 @@ class BusStatistics:
     servos: dict[int, ServoStatistics] = field(default_factory=dict)
     noise_bytes: int = 0
     fast_read_fallbacks: int = 0
+    #: (when, rtt) of the last answer of each of the last requests, s
+    arrivals: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=1000))
+
+    @property
+    def comb(self) -> Comb | None:
+        """The beat of an untouched latency timer, where it shows."""
+        return find_comb([when for when, _ in self.arrivals], [rtt for _, rtt in self.arrivals])
 
     def of(self, id: int) -> ServoStatistics:
         found = self.servos.get(id)
@@ -76,7 +126,9 @@ class BusStatistics:
 
     def as_dict(self, names: Mapping[int, str] | None = None, ids: Iterable[int] | None = None) -> dict[str, object]:
         """For JSON: per servo loss, causes, retries and latency quantiles."""
+        comb = self.comb
         return {
+            "comb_period_s": comb.period_s if comb else None,
             "noise_bytes": self.noise_bytes,
             "fast_read_fallbacks": self.fast_read_fallbacks,
             "servos": [
@@ -86,7 +138,7 @@ class BusStatistics:
                     "asked": servo.asked,
                     "answered": servo.answered,
                     "loss": servo.loss,
-                    "lost": {cause.value: count for cause, count in sorted(servo.lost.items())},
+                    "lost": {cause.value: count for cause, count in sorted(servo.lost.items()) if count},
                     "retries": servo.retries,
                     "alerts": servo.alerts,
                     "latency_p50_s": servo.latency_quantile(0.5),

@@ -1,0 +1,264 @@
+"""`openant comms`: the bus. Which ports there are, who answers, how fast it goes, what it loses."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from openant_tools.cli.options import json_option, robot_option
+from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option, virtual_robot
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from openant_tools.comms.messages import EngineConfig
+
+__all__ = ["comms"]
+
+port_option = click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one plugged in.")
+
+
+@click.group()
+def comms() -> None:
+    """The bus: ports, who answers, how fast it goes, what it loses.
+
+    \b
+      openant comms ports                     adapters that are plugged in, and their latency timers
+      openant comms scan --port /dev/ttyUSB0  every servo at every baud rate, in two seconds
+      openant comms watch                     live: angles, losses by cause, round trips
+    """
+
+
+@comms.command()
+@json_option
+def ports(json_file: Path | None) -> None:
+    """List serial ports by what is plugged in; sends nothing to any of them."""
+    from openant_tools.comms.ports import WANTED_LATENCY_MS, Host, udev_rule
+
+    host = Host()
+    found = host.ports()
+    slow = False
+    for port in found:
+        timer = "" if port.latency_timer_ms is None else f"  latency timer {port.latency_timer_ms} ms"
+        slow = slow or (port.latency_timer_ms or 0) > WANTED_LATENCY_MS
+        words = {"bus": "servo bus", "imu": "flight controller", "unknown": port.product or "unknown"}[port.kind]
+        click.echo(f"{port.stable_path}  {words}  {port.vendor_id}:{port.product_id}{timer}")
+        for holder in host.holders(port.path):
+            click.echo(f"  held by {holder.command} (process {holder.pid})")
+        group = host.missing_group(port.path)
+        if group:
+            click.echo(f"  you may not open it: run `sudo usermod -aG {group} $USER` and log in again")
+    for lonely in host.adapters_without_driver():
+        click.echo(f"adapter {lonely} has no driver: run `sudo modprobe ftdi_sio`")
+    if not found:
+        click.echo("no USB serial port is plugged in", err=True)
+    if slow:
+        click.echo("\nEach read waits for the latency timer. This sets it to 1 ms for good:\n" + udev_rule())
+    if json_file:
+        _write_json(json_file, [vars(port) | {"kind": port.kind} for port in found])
+
+
+@comms.command()
+@click.option("--port", "paths", multiple=True, metavar="PATH", help="A bus; may be repeated. Default: every U2D2.")
+@virtual_option
+@click.option("--baud", "bauds", multiple=True, type=int, help="Only this rate; may be repeated. Default: all eight.")
+@json_option
+def scan(paths: Sequence[str], virtual_source: str | None, bauds: Sequence[int], json_file: Path | None) -> None:
+    """List every servo: port, baud rate, id, model, firmware. Exit code 1 where something answers garbled."""
+    from rich.console import Console
+
+    from openant_tools.comms.ports import Host
+    from openant_tools.comms.scan import BAUDS
+    from openant_tools.comms.scan import scan as scan_bus
+    from openant_tools.comms.setup import open_bus
+    from openant_tools.errors import HardwareFault
+
+    console = Console(stderr=True)
+    rows: list[dict[str, Any]] = []
+    bad = False
+    with contextlib.ExitStack() as stack:
+        control = None
+        if virtual_source is not None:
+            clock = "stepped" if virtual_source == VIRTUAL_DEFAULT else None
+            robot = stack.enter_context(virtual_robot(virtual_source, clock=clock))
+            paths, control = (*paths, str(robot["bus"])), robot["control"]
+        buses = list(paths) or [port.stable_path for port in Host().ports() if port.kind == "bus"]
+        if not buses:
+            raise HardwareFault("no U2D2 is plugged in", remedy="plug it in, or name another adapter with --port")
+        for path in buses:
+            bus = open_bus(path, 1_000_000, control)
+            try:
+                with console.status(f"{path}: asking at every baud rate"):
+                    result = scan_bus(bus, bauds or BAUDS)
+            finally:
+                bus.close()
+            for servo in result.servos:
+                note = "  two servos share this id?" if servo.clash else ""
+                note += "  reports a hardware error" if servo.alert else ""
+                click.echo(
+                    f"{path}  {servo.baud:>7} baud  id {servo.id:>3}  {servo.model}  firmware {servo.firmware}{note}"
+                )
+                bad = bad or servo.clash
+                rows.append(
+                    {
+                        "id": servo.id, "baud": servo.baud, "model_number": servo.model_number,
+                        "firmware": servo.firmware, "model": servo.model, "port": path, "clash": servo.clash,
+                        "alert": servo.alert,
+                    }
+                )  # fmt: skip
+            for words in result.garbled.values():
+                bad = True
+                click.echo(words)
+    if json_file:
+        _write_json(json_file, rows)
+    if not rows and not bad:
+        raise HardwareFault(
+            "nothing answered at any baud rate",
+            where=", ".join(buses),
+            remedy="is the supply on, and the first cable in? A servo with a blinking LED is in shutdown: reboot it",
+        )
+    if bad:
+        raise SystemExit(1)
+
+
+@comms.command()
+@port_option
+@virtual_option
+@robot_option
+@click.option("--seconds", default=3.0, show_default=True, help="How long to measure the rate.")
+@json_option
+def bench(
+    port: str | None, virtual_source: str | None, robot: Path | None, seconds: float, json_file: Path | None
+) -> None:
+    """Measure the rate this bus reaches and the quiet time it needs after a write. Torque is off, nothing moves."""
+    from rich.console import Console
+
+    from openant_tools.comms.bench import measure_gap, measure_rate
+    from openant_tools.comms.servos import Servos
+    from openant_tools.comms.setup import open_bus
+
+    console = Console(stderr=True)
+    with _engine_config(port, virtual_source, robot) as config:
+        bus = open_bus(config.port, config.baud, config.control)
+        try:
+            servos = Servos(bus, config.servos)
+            servos.identify()
+            delays = servos.read_all("return_delay_time")
+            bus.timing = replace(bus.timing, return_delay_s=max(delays.values()) * 2e-6)
+            timer = bus.measure_latency_timer(servos.ids[0])
+            with console.status("rate"):
+                rate = measure_rate(bus, servos.ids, seconds)
+            with console.status("gap after a write"):
+                trials, gap = measure_gap(bus, servos.ids)
+        finally:
+            bus.close()
+    click.echo(f"{rate.hz:.0f} cycles/s of write {len(servos.ids)} goals, read {len(servos.ids)} blocks of 27 bytes")
+    click.echo(f"  {rate.share:.0%} of the {rate.limit_hz:.0f} Hz that the wire allows; {rate.lost:.2%} lost")
+    click.echo(f"  latency timer about {timer * 1e3:.0f} ms; return delay {max(delays.values()) * 2} µs at most")
+    click.echo("quiet time after a write → failed reads")
+    for trial in trials:
+        click.echo(f"  {trial.gap_s * 1e3:4.1f} ms   {trial.failed:2d} of {trial.tries}")
+    click.echo(f"smallest loss-free gap: {'none of these' if gap is None else f'{gap * 1e3:.1f} ms'}")
+    if json_file:
+        content = {
+            "rate": rate.as_dict(), "gaps": [vars(trial) for trial in trials], "gap_s": gap,
+            "latency_timer_s": timer, "return_delay_s": max(delays.values()) * 2e-6,
+        }  # fmt: skip
+        _write_json(json_file, content)
+
+
+@comms.command()
+@port_option
+@virtual_option
+@robot_option
+@click.option("--seconds", type=float, metavar="S", help="Stop after so long. Default: until Ctrl-C.")
+@json_option
+def watch(
+    port: str | None, virtual_source: str | None, robot: Path | None, seconds: float | None, json_file: Path | None
+) -> None:
+    """Show the bus live: angles, supply, heat, and per servo what is lost and how long answers take. Torque is off."""
+    from rich.console import Console
+    from rich.live import Live
+
+    from openant_tools.comms import messages
+    from openant_tools.comms.engine_process import EngineProcess
+
+    console = Console()
+    statistics: dict[str, Any] = {}
+    with _engine_config(port, virtual_source, robot, clock="real") as config, EngineProcess(config) as engine:
+        end = None if seconds is None else time.monotonic() + seconds
+        with contextlib.suppress(KeyboardInterrupt), Live(console=console, auto_refresh=False) as live:
+            while end is None or time.monotonic() < end:
+                time.sleep(0.2)
+                rows = engine.telemetry()
+                statistics = engine.ask(messages.Statistics())
+                if len(rows):
+                    live.update(_table(engine.columns, rows[-1], statistics), refresh=True)
+    if json_file:
+        _write_json(json_file, statistics)
+
+
+def _table(columns: Sequence[str], row: Sequence[float], statistics: Mapping[str, Any]) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    values = dict(zip(columns, row, strict=True))
+    comb = statistics["comb_period_s"]
+    title = f"{statistics['cycles']} cycles, worst wake-up {statistics['worst_wake_s'] * 1e3:.1f} ms late"
+    if comb:
+        title += f"; answers come in the beat of a {comb * 1e3:.0f} ms latency timer: see `openant comms ports`"
+    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("joint", "id", "rad", "V", "°C", "effort", "p50 ms", "p99 ms", "lost", "retries", "by cause"):
+        table.add_column(name, justify="left" if name in ("joint", "by cause") else "right", no_wrap=True)
+    for servo in statistics["servos"]:
+        joint = servo["joint"]
+        current, load = values[f"cur.{joint}"], values[f"load.{joint}"]
+        causes = ", ".join(f"{cause} {count}" for cause, count in servo["lost"].items())
+        table.add_row(
+            joint,
+            str(servo["id"]),
+            f"{values[f'pos.{joint}']:.3f}",
+            f"{values[f'volt.{joint}']:.1f}",
+            f"{values[f'temp.{joint}']:.0f}",
+            f"{current:.2f} A" if current == current else f"{load:.0%}",
+            *(f"{servo[key] * 1e3:.2f}" if servo[key] else "" for key in ("latency_p50_s", "latency_p99_s")),
+            f"{servo['loss']:.2%}",
+            str(servo["retries"]),
+            causes,
+        )
+    return table
+
+
+@contextlib.contextmanager
+def _engine_config(
+    port: str | None, virtual_source: str | None, robot: Path | None, *, clock: str | None = None
+) -> Any:
+    """The robot meant by the options, as the engine wants it."""
+    from openant_tools.cli.sysid_record import robot_of
+    from openant_tools.comms.setup import config_of_robot, config_of_unknown_robot, find_bus
+
+    folder = robot_of(robot, needed=False)
+    with contextlib.ExitStack() as stack:
+        control = None
+        if virtual_source is not None:
+            found = stack.enter_context(virtual_robot(virtual_source, clock=clock))
+            port, control = port or found["bus"], found["control"]
+        config: EngineConfig
+        if folder is not None:
+            config = config_of_robot(folder.config(), port, control=control)
+        else:
+            config = config_of_unknown_robot(find_bus(port), control)
+        yield config
+
+
+def _write_json(path: Path, content: object) -> None:
+    from openant_tools.files import write_text
+
+    write_text(path, json.dumps(content, indent=2) + "\n")
