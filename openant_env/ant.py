@@ -32,6 +32,8 @@ __all__ = ["Ant"]
 
 #: s that the robot stands before the first observation, so that it neither falls nor swings at reset.
 SETTLE_S = 2.0
+#: m/s and rad/s; a robot that moves faster than this after that time does not stand.
+RESTLESS = 0.5
 #: m, from which the robot is let down onto the floor before it settles (the published simulation's start).
 START_HEIGHT_M = 0.2
 
@@ -140,7 +142,6 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         self._bind()
         self._settled = self._settle()
         self._seconds = 0.0
-        self._observation = np.zeros(size, np.float32)
 
     # ------------------------------------------------------------------------------------------------ what it is
 
@@ -187,7 +188,7 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         for block, name in (("acc", "accelerometer"), ("gyro", "gyro")):
             index[self.layout.slices[block]] = _sensor(model, name, 3, where) + np.arange(3)
         self._sensor_index = index
-        self._reading = np.empty(len(index))
+        self._observation = np.zeros(len(index))
         self._direction_at = self.layout.slices["direction"].start
 
     def _settle(self) -> NDArray[np.float64]:
@@ -199,7 +200,8 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         data.qpos[self._plant.qpos] = rest
         fill_setpoints(self._plant, data, rest)
         mujoco.mj_step(model, data, nstep=max(1, round(SETTLE_S / model.opt.timestep)))
-        if not np.isfinite(data.qpos).all() or self._torso_rotation[8] < 0.0:
+        at_rest = np.abs(data.qvel).max() < RESTLESS  # false for NaN
+        if not at_rest or self._torso_rotation[8] < 0.0:
             raise BadInput(
                 "the robot does not come to stand in this model",
                 where=self.robot.model_path,
@@ -250,9 +252,8 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         self.task.reset(torso_x, torso_y, self.np_random, chosen.get("direction_rad"))
         self.average_reward.clear()
         self._seconds = 0.0
-        hx, hy = self._heading()
-        self._observation = self._observe(hx, hy)
-        return self._observation.copy(), self._info(torso_x, torso_y, hx, hy)
+        hx, hy = _unit(self._torso_rotation[0], self._torso_rotation[3])
+        return self._observe(hx, hy), self._info(torso_x, torso_y, hx, hy)
 
     def step(self, action: NDArray[Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Command the joints for `dt` seconds.
@@ -276,7 +277,7 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         command += actions.centre
         if actions.clipped:
             np.minimum(np.maximum(command, actions.low, out=command), actions.high, out=command)
-        if not math.isfinite(command.sum()):
+        if not math.isfinite(command.dot(command)):
             raise BadInput(
                 f"an action is not finite: {np.asarray(action)}", remedy="look for NaN in the agent's networks"
             )
@@ -284,38 +285,34 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         mujoco.mj_step(self.model, self.data, nstep=self._substeps)
         self._seconds += self.dt
 
-        x, y, _ = self._torso_position.tolist()
-        hx, hy = self._heading()
-        if not math.isfinite(self._sensordata.sum() + x + y):
+        x, y, z = self._torso_position.tolist()
+        readings = self._sensordata
+        if not math.isfinite(readings.dot(readings) + x + y + z):
             # The last sound observation stands in for what can no longer be measured; a learner must not see NaN.
             info = self._info(math.nan, math.nan, math.nan, math.nan)
-            return self._observation.copy(), 0.0, False, True, {**info, "reason": "the physics has come apart"}
+            info["reason"] = "the physics has come apart"
+            return self._observation.astype(np.float32), 0.0, False, True, info
+        forward_x, _, _, forward_y, _, _, _, _, up_z = self._torso_rotation.tolist()
+        hx, hy = _unit(forward_x, forward_y)
         reward = self.task.reward(x, y)
         self.average_reward.add(reward, self.dt)
-        self._observation = self._observe(hx, hy)
         info = self._info(x, y, hx, hy)
         terminated = truncated = False
-        if self._torso_rotation[8] < 0.0 and self._on_fall != "ignore":
+        if up_z < 0.0 and self._on_fall != "ignore":
             terminated, truncated = self._on_fall == "terminate", self._on_fall == "truncate"
             info["reason"] = "the robot lies on its back"
         elif self._seconds >= self._time_limit_s - 0.5 * self.dt:
             truncated = True
             info["reason"] = "time limit"
-        return self._observation.copy(), reward, terminated, truncated, info
-
-    def _heading(self) -> tuple[float, float]:
-        """The torso's x axis in the plane, a unit vector; east where it points straight up."""
-        forward_x, _, _, forward_y = self._torso_rotation[:4].tolist()
-        length = math.hypot(forward_x, forward_y)
-        return (forward_x / length, forward_y / length) if length > 1e-9 else (1.0, 0.0)
+        return self._observe(hx, hy), reward, terminated, truncated, info
 
     def _observe(self, hx: float, hy: float) -> Observation:
-        reading = self._reading
+        observation = self._observation
         # mode="clip" lets numpy write into `out` without a buffer between; every index is in range.
-        self._sensordata.take(self._sensor_index, out=reading, mode="clip")
+        self._sensordata.take(self._sensor_index, out=observation, mode="clip")
         at = self._direction_at
-        reading[at], reading[at + 1] = self.task.observed_direction(hx, hy)
-        return reading.astype(np.float32)
+        observation[at], observation[at + 1] = self.task.observed_direction(hx, hy)
+        return observation.astype(np.float32)
 
     def _info(self, x: float, y: float, hx: float, hy: float) -> dict[str, Any]:
         task = self.task
@@ -386,7 +383,7 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         self.task.set_state(state["task"])
         self.average_reward.set_state(state["average_reward"])
         self._seconds = float(state["seconds"])
-        self._observation = np.asarray(state["observation"], np.float32)
+        self._observation[:] = np.asarray(state["observation"])
         self.np_random.bit_generator.state = state["random"]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -396,6 +393,12 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         self.__init__(**pickled["arguments"])  # type: ignore[misc]
         self.spec = pickled["spec"]
         self.set_state(pickled["state"])
+
+
+def _unit(x: float, y: float) -> tuple[float, float]:
+    """The vector made 1 long; east where it has no length, as the heading of a robot that points straight up."""
+    length = math.hypot(x, y)
+    return (x / length, y / length) if length > 1e-9 else (1.0, 0.0)
 
 
 def _whole_steps(dt: float, timestep: float, where: Path) -> int:

@@ -90,7 +90,7 @@ def eval_(
         click.echo(f"strip: {strip}")
     helped = "".join(f", set up again {count}× ({reason})" for reason, count in result.helped.items())
     click.echo(
-        f"{100 * result.average_reward_m_s:.1f} cm/s over {result.seconds:.0f} s: {result.progress_m:.2f} m of progress "
+        f"{100 * result.average_reward_m_s:.1f} cm/s over {result.seconds:.0f} s: {result.progress_m:.2f} m progress "
         f"on a way of {result.path_m:.2f} m, {result.turns} turns{helped} (policy of step {step})"
     )
     if json_file is not None:

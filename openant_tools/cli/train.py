@@ -65,6 +65,10 @@ def train() -> None:
     "--learning-start", type=click.IntRange(min=1), default=2_000, show_default=True,
     help="Steps with random actions before learning.",
 )  # fmt: skip
+@click.option(
+    "--entropy-start", type=click.FloatRange(min=0.0, min_open=True), default=1.0, show_default=True, metavar="ALPHA",
+    help="Weight of the entropy at first; 0.1 explores less and walks sooner.",
+)  # fmt: skip
 @click.option("--device", default="cpu", show_default=True, help="Where torch computes, such as cpu or cuda.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
               help="Write the result as JSON.")  # fmt: skip
@@ -80,6 +84,7 @@ def sac(
     action_range: str | None,
     effects: bool,
     learning_start: int,
+    entropy_start: float,
     device: str,
     json_file: Path | None,
 ) -> None:
@@ -109,7 +114,7 @@ def sac(
 
     name = "openant/Ant-v0"
     env = gymnasium.make(name, **options)
-    settings = Settings(learning_start=learning_start)
+    settings = Settings(learning_start=learning_start, entropy_start=entropy_start)
     try:
         with _Bar(steps) as bar:
             result = train_sac(
