@@ -573,6 +573,10 @@ def test_stepped_time_moves_only_when_told():
             line.write(packet)
             answer = remote.ask("settle", bus_written=len(packet))
             assert answer["bus_sent"] == 8 * 15
+            counts, times = zip(*answer["bus_arrivals"], strict=True)
+            assert counts[-1] == 8 * 15
+            assert sorted(times) == list(times)
+            assert times[-1] == pytest.approx(answer["t"])
             assert 0.0014 < answer["t"] < 0.003
             assert len(line.read(120)) == 120
             assert remote.ask("advance", to=40.0) == {"t": 40.0}
@@ -671,7 +675,14 @@ def test_motors_of_a_box_are_set_up_one_at_a_time():
                 answer = remote.ask("settle", bus_written=written)
                 assert len(line.read(11)) == 11, joint
                 remote.ask("advance", to=answer["t"] + 0.1)
-        assert remote.ask("state")["id"]["knee_rr"] == 11
+        state = remote.ask("state")
+        assert state["id"]["knee_rr"] == 11
+        assert state["id"]["hip_fr"] == 1
+        remote.ask("assemble", setup="stand")
+        remote.ask("advance", to=state["t"] + 1.0)
+        state = remote.ask("state")
+        assert (state["setup"], state["id"]["knee_rr"], all(state["plugged"].values())) == ("stand", 11, True)
+        assert state["base"]["position"][2] == pytest.approx(0.4)
 
 
 def test_eeprom_is_remembered_from_one_start_to_the_next(tmp_path):

@@ -19,6 +19,7 @@ The control socket (Unix stream, one JSON object a line, one line of answer each
 | `{"do": "state"}` | the truth: angles, torques, temperatures, torque enables, supply, body |
 | `{"do": "fault", "cause": …, "where": …, "on": bool, …}` | switches a fault; `{"t": s}` |
 | `{"do": "plug", "joint": …}`, `{"do": "unplug", …}` | puts a servo on the bus or takes it off; `{"t": s}` |
+| `{"do": "assemble", "setup": "stand"}` | builds the robot from the motors in the box, or puts it on "floor" or stand |
 
 What fails answers `{"error": "…"}`. Counts of bytes run from the opening of this control connection or the last `open`.
 """
@@ -28,6 +29,7 @@ from __future__ import annotations
 import contextlib
 import heapq
 import json
+import math
 import os
 import selectors
 import shutil
@@ -82,6 +84,13 @@ class _Control:
 
 class _Failed(Exception):
     """A control request that cannot be done."""
+
+
+def _number(request: dict[str, Any], key: str, default: float | None = None) -> float:
+    value = request.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise _Failed(f"not a request: {key} = {value!r} is no number")
+    return float(value)
 
 
 class Server:
@@ -205,8 +214,8 @@ class Server:
         if now - self.world.now >= IDLE_S:
             self.world.advance(now)
         while self._outbox and self._outbox[0][0] <= self.now:
-            _, _, name, data = heapq.heappop(self._outbox)
-            self._send(name, data)
+            due, _, name, data = heapq.heappop(self._outbox)
+            self._send(name, data, due)
         if self._imu is not None and self.now >= self._imu.next_event(self._imu_served):
             self.world.advance(self.now)
             self._serve_imu(self.now)
@@ -269,11 +278,11 @@ class Server:
         self._count += 1
         heapq.heappush(self._outbox, (t, self._count, name, data))
 
-    def _send(self, name: str, data: bytes) -> None:
+    def _send(self, name: str, data: bytes, t: float) -> None:
         self.sent[name] += self.ports[name].write(data)
         if self.stepped:
             for control in self._controls:
-                control.arrivals.setdefault(name, []).append((self.sent[name], self.now))
+                control.arrivals[name].append((self.sent[name] - control.sent[name], t))
 
     def _serve_imu(self, t: float) -> None:
         assert self._imu is not None
@@ -284,7 +293,7 @@ class Server:
             (port.plug if there else port.unplug)()
         data = self._imu.transmit(t)
         if data:
-            self._send("imu", data)
+            self._send("imu", data, t)
 
     # ---- stepped time ----
 
@@ -302,8 +311,8 @@ class Server:
 
     def _flush(self, t: float) -> None:
         while self._outbox and self._outbox[0][0] <= t:
-            _, _, name, data = heapq.heappop(self._outbox)
-            self._send(name, data)
+            due, _, name, data = heapq.heappop(self._outbox)
+            self._send(name, data, due)
         if self._imu is not None:
             self._serve_imu(t)
 
@@ -311,7 +320,7 @@ class Server:
 
     def _restart_counts(self, control: _Control) -> None:
         control.received, control.sent = dict(self.received), dict(self.sent)
-        control.arrivals.clear()
+        control.arrivals = {name: [] for name in self.sent}
 
     def _hear(self, control: _Control) -> None:
         try:
@@ -338,13 +347,14 @@ class Server:
     def _answer(self, control: _Control, line: bytes) -> dict[str, Any]:
         try:
             request = json.loads(line)
+        except ValueError as error:
+            return {"error": f"not a request: {error}"}
+        try:
             if not isinstance(request, dict):
                 raise _Failed("a request is a JSON object")
             return self._do(control, request)
         except (_Failed, OpenAntError) as error:
             return {"error": str(error)}
-        except (ValueError, KeyError, TypeError) as error:
-            return {"error": f"not a request: {error}"}
 
     def _do(self, control: _Control, request: dict[str, Any]) -> dict[str, Any]:
         do = request.get("do")
@@ -358,7 +368,7 @@ class Server:
         if do == "advance":
             if not self.stepped:
                 raise _Failed("time runs by itself: the robot was not started with --clock stepped")
-            self.advance(float(request["to"]))
+            self.advance(_number(request, "to"))
             return {"t": self.now}
         if do == "settle":
             return self._settle(control, request)
@@ -373,31 +383,44 @@ class Server:
                 raise _Failed("this robot has no faults to switch")
             self.fault(request)
             return {"t": self.now}
-        if do in ("plug", "unplug"):
-            self._plug(str(request["joint"]), do == "plug")
+        if do == "assemble":
+            setup = request.get("setup", "stand")
+            if setup not in ("stand", "floor", "loose"):
+                raise _Failed(f"no setup {setup!r} (stand, floor, loose)")
+            self.world.assemble(setup)
             return {"t": self.now}
-        raise _Failed(f"no such request: {do!r} (now, open, advance, settle, wait, state, fault, plug, unplug)")
+        if do in ("plug", "unplug"):
+            self._plug(str(request.get("joint")), do == "plug")
+            return {"t": self.now}
+        raise _Failed(
+            f"no such request: {do!r} (now, open, advance, settle, wait, state, fault, plug, unplug, assemble)"
+        )
 
     def _arrive(self, control: _Control, request: dict[str, Any]) -> None:
         """Wait until all bytes are here that a client says it wrote."""
         deadline = time.monotonic() + SETTLE_TIMEOUT_S
         for name in self.ports:
-            wanted = int(request.get(f"{name}_written", 0))
+            wanted = int(_number(request, f"{name}_written", 0))
             while self.received[name] - control.received[name] < wanted:
                 self._await(name, deadline)
 
     def _counts(self, control: _Control) -> dict[str, Any]:
-        return {"t": self.now, **{f"{name}_sent": self.sent[name] - control.sent[name] for name in ("bus", "imu")}}
+        answer: dict[str, Any] = {"t": self.now}
+        for name in ("bus", "imu"):
+            answer[f"{name}_sent"] = self.sent[name] - control.sent[name]
+            answer[f"{name}_arrivals"] = control.arrivals[name]
+            control.arrivals[name] = []
+        return answer
 
     def _wait(self, control: _Control, request: dict[str, Any]) -> dict[str, Any]:
         if not self.stepped:
             raise _Failed("time runs by itself: the robot was not started with --clock stepped")
-        name = str(request["port"])
+        name = str(request.get("port"))
         if name not in self.ports:
             raise _Failed(f"no port {name!r}")
         self._arrive(control, request)
         before = self.sent[name]
-        self.advance(float(request["to"]), until=lambda: self.sent[name] > before)
+        self.advance(_number(request, "to"), until=lambda: self.sent[name] > before)
         return self._counts(control)
 
     def _settle(self, control: _Control, request: dict[str, Any]) -> dict[str, Any]:
@@ -409,13 +432,7 @@ class Server:
             while self._outbox:
                 time.sleep(max(0.0, self._outbox[0][0] - self.now))
                 self._keep_time()
-        sent = {f"{name}_sent": self.sent[name] - control.sent[name] for name in ("bus", "imu")}
-        arrivals = {
-            f"{name}_arrivals": [(count - control.sent[name], t) for count, t in marks]
-            for name, marks in control.arrivals.items()
-        }
-        control.arrivals.clear()
-        return {"t": self.now, **sent, **arrivals}
+        return self._counts(control)
 
     def _await(self, name: str, deadline: float) -> None:
         """Wait for more bytes at one port, the pseudo-terminal's delivery being asynchronous."""

@@ -105,7 +105,23 @@ class World:
         self.settings = settings
         joints = [setup.joint for setup in settings.servos]
         self.joints = tuple(joints)
-        self.body = Body(settings.body, joints)
+        self._build_body()
+        self._views = [Drive(self.drives, k) for k in range(len(joints))]
+        self.servos = [self._build(setup, view) for setup, view in zip(settings.servos, self._views, strict=True)]
+        self.line = Line(self.servos, settings.bus, self.advance, seed=settings.seed + 1)
+        if not settings.bus.chains:
+            settings.bus.chains = _chains_by_leg(joints)
+        self.events: list[Callable[[float], None]] = []
+        self._steps = 0
+        self._poll_every = max(1, round(POLL_S / settings.body.timestep_s))
+        self._heat_every = max(1, round(HEAT_S / settings.body.timestep_s))
+        self._overloaded_s = np.zeros(len(joints))
+        self.now = 0.0
+
+    def _build_body(self) -> None:
+        """Mechanics, motors and gears as the settings have them."""
+        settings = self.settings
+        self.body = Body(settings.body, self.joints)
         motors = [setup.motor or MotorSettings.of(setup.model) for setup in settings.servos]
         signs = np.array([-1.0 if setup.reversed else 1.0 for setup in settings.servos])
         mount = np.array(
@@ -120,18 +136,26 @@ class World:
         self.drives.ambient = settings.ambient_c
         self.drives.winding[:] = self.drives.case[:] = settings.ambient_c
         self.set_supply(settings.supply.volts, settings.supply.resistance_ohm)
-        self._views = [Drive(self.drives, k) for k in range(len(joints))]
-        self.servos = [self._build(setup, view) for setup, view in zip(settings.servos, self._views, strict=True)]
-        self.line = Line(self.servos, settings.bus, self.advance, seed=settings.seed + 1)
-        if not settings.bus.chains:
-            settings.bus.chains = _chains_by_leg(joints)
-        self.events: list[Callable[[float], None]] = []
-        self._steps = 0
-        self._poll_every = max(1, round(POLL_S / settings.body.timestep_s))
-        self._heat_every = max(1, round(HEAT_S / settings.body.timestep_s))
-        self._overloaded_s = np.zeros(len(joints))
         self._stall_current = settings.supply.volts / self.drives.resistance
-        self.now = 0.0
+
+    def assemble(self, setup: str) -> None:
+        """Take the motors out of the box and build the robot, or put it elsewhere; every servo starts anew.
+
+        What the servos have in their EEPROM stays; the robot stands or lies as at a start.
+        """
+        self.settings.body.setup = setup
+        was = self.drives
+        self._build_body()
+        self.drives.time = was.time
+        self.drives.winding, self.drives.case = was.winding, was.case
+        self.drives.supply_v, self.drives.supply_ohm = was.supply_v, was.supply_ohm
+        self._views = [Drive(self.drives, k) for k in range(len(self.joints))]
+        self.line.plugged = set(range(len(self.servos)))
+        for servo, view in zip(self.servos, self._views, strict=True):
+            view.now = self.now
+            servo.motor = view
+            servo.power_off()
+            servo.power_on(self.now)
 
     def _build(self, setup: ServoSetup, view: Drive) -> ServoDevice:
         servo = ServoDevice(setup.model, view, firmware=setup.firmware, clock_ppm=setup.clock_ppm)
