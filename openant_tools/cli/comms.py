@@ -214,8 +214,8 @@ def _table(columns: Sequence[str], row: Sequence[float], statistics: Mapping[str
     title = f"{statistics['cycles']} cycles, worst wake-up {statistics['worst_wake_s'] * 1e3:.1f} ms late"
     if comb:
         title += f"; answers come in the beat of a {comb * 1e3:.0f} ms latency timer: see `openant comms ports`"
-    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("joint", "id", "rad", "V", "°C", "effort", "p50 ms", "p99 ms", "lost", "retries", "by cause"):
+    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for name in ("joint", "rad", "V", "°C", "effort", "p50 ms", "p99 ms", "lost", "by cause"):
         table.add_column(name, justify="left" if name in ("joint", "by cause") else "right", no_wrap=True)
     for servo in statistics["servos"]:
         joint = servo["joint"]
@@ -223,15 +223,13 @@ def _table(columns: Sequence[str], row: Sequence[float], statistics: Mapping[str
         causes = ", ".join(f"{cause} {count}" for cause, count in servo["lost"].items())
         table.add_row(
             joint,
-            str(servo["id"]),
             f"{values[f'pos.{joint}']:.3f}",
             f"{values[f'volt.{joint}']:.1f}",
             f"{values[f'temp.{joint}']:.0f}",
             f"{current:.2f} A" if current == current else f"{load:.0%}",
             *(f"{servo[key] * 1e3:.2f}" if servo[key] else "" for key in ("latency_p50_s", "latency_p99_s")),
             f"{servo['loss']:.2%}",
-            str(servo["retries"]),
-            causes,
+            causes + (f", retries {servo['retries']}" if servo["retries"] else ""),
         )
     return table
 

@@ -122,7 +122,7 @@ class Chirp:
     """A sine whose frequency rises from `low_hz` to `high_hz` exponentially; its speed is bounded by the space's.
 
     x(t) = a(t) sin(2π f₀ (kᵗ − 1)/ln k + φ), k = (f₁/f₀)^(1/T), a(t) = min(share · half range, speed / (2π f(t))).
-    Each joint has a phase φ of its own.
+    Each joint has a phase φ and, within ±15 %, frequencies of its own, so that no two move alike.
     """
 
     seconds: float
@@ -131,12 +131,13 @@ class Chirp:
     share: float = 0.8
 
     def offsets(self, t: Array, space: CommandSpace, chance: np.random.Generator) -> Array:
+        joints = np.arange(len(space.joints))
+        pace = 1.0 + 0.3 * ((GOLDEN * (joints + 1)) % 1.0 - 0.5)
         rate = np.log(self.high_hz / self.low_hz) / self.seconds
-        frequency = self.low_hz * np.exp(rate * t)
-        angle = 2 * np.pi * (frequency - self.low_hz) / rate
-        amplitude = np.minimum(self.share * space.half, (space.speed / (2 * np.pi * frequency))[:, None])
-        shift = 2 * np.pi * GOLDEN * np.arange(len(space.joints))
-        out: Array = amplitude * np.sin(angle[:, None] + shift) * _fade(t, self.seconds)[:, None]
+        frequency = self.low_hz * np.exp(rate * t)[:, None] * pace
+        angle = 2 * np.pi * (frequency - self.low_hz * pace) / rate + 2 * np.pi * GOLDEN * joints
+        amplitude = np.minimum(self.share * space.half, space.speed / (2 * np.pi * frequency))
+        out: Array = amplitude * np.sin(angle) * _fade(t, self.seconds)[:, None]
         return out
 
 
