@@ -268,6 +268,29 @@ def chunk_ends(path: Path) -> list[tuple[int, int]]:
     return ends
 
 
+@settings(max_examples=100, deadline=None)
+@given(share=st.floats(0.0, 0.999), payload=st.binary(min_size=1, max_size=40))
+def test_garbage_anywhere_never_becomes_a_row(
+    whole: Path, tmp_path_factory: pytest.TempPathFactory, share: float, payload: bytes
+) -> None:
+    data = bytearray(whole.read_bytes())
+    at = int(share * len(data))
+    data[at : at + len(payload)] = payload[: len(data) - at]
+    path = tmp_path_factory.mktemp("garbage") / "r.mcap"
+    path.write_bytes(data)
+    original = read_run(whole)
+    try:
+        run = read_run(path)
+    except BadInput as refused:
+        line = str(refused)
+        assert line.startswith(str(path))
+        return
+    rows = np.searchsorted(original.t, run.t)
+    np.testing.assert_array_equal(original.t[rows], run.t)
+    for name in ("cmd.hip_rr", "pos.knee_rr", "err.knee_rr", "rtt.hip_rr"):
+        np.testing.assert_array_equal(original.columns[name][rows], run.columns[name])
+
+
 def test_a_torn_page_in_the_middle_loses_its_chunk_only(whole: Path, tmp_path: Path) -> None:
     data = bytearray(whole.read_bytes())
     ends = [end for end, _ in chunk_ends(whole)]

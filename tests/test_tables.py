@@ -139,6 +139,12 @@ def test_flags_may_be_words(tmp_path: Path) -> None:
     assert read_run(path).columns["torque.j"].tolist() == [1.0, 0.0]
 
 
+def test_an_index_and_a_comma_at_each_end_do_no_harm(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    path.write_text(",t,cmd.j,pos.j,\n0,0.0,1,1,\n1,0.1,1,1,\n")
+    assert set(read_run(path).columns) == {"cmd.j", "pos.j"}
+
+
 def test_a_log_of_the_bus_needs_no_positions(tmp_path: Path) -> None:
     path = tmp_path / "bus.csv"
     path.write_text("t,ok.j,rtt.j\n0,1,0.001\n1,0,\n")
@@ -253,6 +259,8 @@ def test_facts_that_cannot_be(tmp_path: Path, text: str, what: str) -> None:
         ("t,cmd.j,position.j\n0,0,0\n1,0,0\n", "there is no pos column"),
         ("t,cmd.j,pos.j\n0,0,\n1,0,\n", "pos has no valid sample"),
         ("t,pos.j,pos.j\n0,0,0\n", "column pos.j is there twice"),
+        ('t,"cmd.j\n0,0\n1,0\n', "close the quotes of the header"),
+        ("t,cmd.j,pos.j\n0,0,1_0\n", "'1_0' is not a number"),
         ("t,cmd.j,pos.j,gyro.w\n0,0,0,0\n", "no such column: gyro.w"),
         ("t,cmd.j,pos.j\n0,0,0\n1,0\n", "a row has 2 values where the header names 3"),
         ("t,cmd.j,pos.j\n0,0,0\n1,0,fast\n", "column pos.j, row 2: 'fast' is not a number"),
@@ -301,6 +309,44 @@ def test_text_in_a_number_column_of_a_parquet_file(tmp_path: Path) -> None:
         pa.table({"t": [0.0, 1.0], "cmd.j": [0.0, 0.0], "pos.j": ["0.1", "0.2 rad"]}), tmp_path / "r.parquet"
     )
     assert "column pos.j, row 2: '0.2 rad' is not a number" in refusal(tmp_path / "r.parquet")
+
+
+mutations = st.lists(
+    st.tuples(
+        st.sampled_from(["change", "drop", "insert", "cut"]), st.floats(0.0, 0.999), st.binary(min_size=1, max_size=9)
+    ),
+    min_size=1,
+    max_size=4,
+)
+
+
+@settings(max_examples=80, deadline=None)
+@given(mutations=mutations)
+@pytest.mark.parametrize("suffix", [".csv", ".parquet", ".json"])
+def test_a_damaged_table_is_read_or_refused_in_one_line(
+    tmp_path_factory: pytest.TempPathFactory, suffix: str, mutations: list[tuple[str, float, bytes]]
+) -> None:
+    folder = tmp_path_factory.mktemp("run")
+    table = written(folder, ".csv" if suffix == ".json" else suffix)
+    damaged = table.with_suffix(suffix)
+    data = bytearray(damaged.read_bytes())
+    for kind, share, payload in mutations:
+        at = int(share * len(data))
+        if kind == "change":
+            data[at : at + len(payload)] = payload
+        elif kind == "drop":
+            del data[at : at + len(payload)]
+        elif kind == "insert":
+            data[at:at] = payload
+        else:
+            del data[at:]
+    damaged.write_bytes(data)
+    try:
+        read_run(table)
+    except BadInput as refused:
+        line = str(refused)
+        assert line.startswith(str(folder))
+        assert line.isprintable()
 
 
 def test_a_full_disk_leaves_what_stood_there_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -108,11 +108,16 @@ def export(runs: tuple[Path, ...], kind: str, out: Path) -> None:
 @click.option("--out", type=RUN, required=True, metavar="RUN", help="The recording to make (NAME.mcap).")
 def import_(table: Path, out: Path) -> None:
     """Make a native recording of TABLE, so that viewers (Foxglove, Rerun, PlotJuggler) open it."""
+    from rich.console import Console
+    from rich.progress import Progress
+
     from openant_tools.recording.convert import import_run
     from openant_tools.recording.tables import read_run
 
     run = read_run(table, need=())
-    path = import_run(run, out)
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(f"importing {run.name}", total=1.0)
+        path = import_run(run, out, progress=lambda share: bar.update(task, completed=share))
     click.echo(f"{path}: {len(run.t)} rows of {', '.join(run.joints)}")
 
 

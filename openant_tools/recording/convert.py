@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,11 @@ _FLAGS = ("ok", "torque")
 _NOT_REGISTERS = ("cmd", "torque", "ok", "err", "rtt")
 
 
-def import_run(run: Run, path: str | Path) -> Path:
+def import_run(run: Run, path: str | Path, *, progress: Callable[[float], None] | None = None) -> Path:
     """Write `run` as a native recording, its values in SI as they are; returns the file's path.
 
-    The file appears when it is whole. Reading it gives the same rows and columns again.
+    The file appears when it is whole. Reading it gives the same rows and columns again. `progress` is called with the
+    share done, 0…1.
 
     Raises:
         BadInput: there is such a file already.
@@ -56,7 +58,7 @@ def import_run(run: Run, path: str | Path) -> Path:
         with RecordingWriter(
             unfinished, facts=run.facts_at(path.parent), channels=channels, telemetry=telemetry, overwrite=True
         ) as writer:
-            _write_rows(run, list(extra), telemetry, writer)
+            _write_rows(run, list(extra), telemetry, writer, progress or (lambda share: None))
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -68,7 +70,9 @@ def _of_a_joint(name: str, run: Run) -> bool:
     return signal in JOINT_SIGNALS and joint in run.joints
 
 
-def _write_rows(run: Run, extra: list[str], telemetry: Telemetry, writer: RecordingWriter) -> None:
+def _write_rows(
+    run: Run, extra: list[str], telemetry: Telemetry, writer: RecordingWriter, progress: Callable[[float], None]
+) -> None:
     signals = {
         joint: [
             (signal, run.columns[f"{signal}.{joint}"]) for signal in JOINT_SIGNALS if f"{signal}.{joint}" in run.columns
@@ -81,6 +85,8 @@ def _write_rows(run: Run, extra: list[str], telemetry: Telemetry, writer: Record
     has_imu = any(name in run.columns for name in IMU_FIELDS.values())
     has_pose = any(name in run.columns for name in POSE_FIELDS.values())
     for row, t in enumerate(run.t.tolist()):
+        if row % 1000 == 0:
+            progress(row / len(run.t))
         joints = {
             joint: {_FIELDS.get(signal, signal): value for signal, value in _valid(columns, row)}
             for joint, columns in signals.items()

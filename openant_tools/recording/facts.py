@@ -85,7 +85,11 @@ def _plain(value: Any) -> Any:
 
 
 def _joints(value: Any, where: str) -> tuple[str, ...]:
-    if not isinstance(value, list) or not value or not all(isinstance(name, str) and name for name in value):
+    if (
+        not isinstance(value, list)
+        or not value
+        or not all(isinstance(name, str) and name and name.isprintable() for name in value)
+    ):
         raise BadInput("`joints` is not a list of names", where=where, remedy='write "joints": ["hip_rr", "knee_rr"]')
     twice = sorted({name for name in value if value.count(name) > 1})
     if twice:

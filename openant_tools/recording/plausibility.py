@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.recording.run import BODY_COLUMNS, JOINT_SIGNALS, Array, Run
 
-__all__ = ["LIMITS", "Limit", "check_columns", "check_run", "need_signals"]
+__all__ = ["LIMITS", "Limit", "check_columns", "check_names", "check_run", "need_signals"]
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,22 @@ LIMITS: Mapping[str, Limit] = {
 _SLOWEST_ROW = 10.0
 
 
+def check_names(names: Sequence[str], where: str) -> None:
+    """Raise where a column has no name, one that cannot be printed, or one that another has."""
+    for name in names:
+        if not name or not name.isprintable():
+            raise BadInput(
+                f"a column is named {name[:40]!r}", where=where, remedy="name it, and close the quotes of the header"
+            )
+        if list(names).count(name) > 1:
+            raise BadInput(f"column {name} is there twice", where=where, remedy="keep one of them")
+
+
 def check_columns(names: Sequence[str], joints: Sequence[str], where: str) -> None:
-    """Raise where a column is named twice, speaks of a joint that is not among `joints`, or where a joint has none.
+    """Raise where a column speaks of a joint that is not among `joints`, or where a joint has none.
 
     Columns of signals that the format does not know are welcome.
     """
-    twice = sorted({name for name in names if list(names).count(name) > 1})
-    if twice:
-        raise BadInput(f"column {twice[0]} is there twice", where=where, remedy="keep one of them")
     body = {name.partition(".")[0] for name in BODY_COLUMNS if "." in name}
     for name in names:
         signal, dot, joint = name.partition(".")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.files import atomic_writer
 from openant_tools.recording.facts import facts_from_json, facts_to_json
-from openant_tools.recording.plausibility import check_columns, check_run, check_time, need_signals
+from openant_tools.recording.plausibility import check_columns, check_names, check_run, check_time, need_signals
 from openant_tools.recording.run import BODY_COLUMNS, JOINT_SIGNALS, Facts, Run
 
 __all__ = ["find_run", "read_run", "read_table", "write_table"]
@@ -91,7 +91,7 @@ def write_table(run: Run, path: str | Path) -> None:
     table = pa.table(arrays)
     with atomic_writer(path) as stream, atomic_writer(path.with_suffix(".json")) as facts_stream:
         if path.suffix == ".parquet":
-            pq.write_table(table, stream, compression="zstd")
+            pq.write_table(table, stream, compression="zstd", write_page_checksum=True)
         else:
             _write_csv(table, stream)
         facts_stream.write(facts_to_json(run.facts_at(path.parent)).encode())
@@ -151,8 +151,9 @@ def _joints_of(names: Sequence[str], path: Path) -> tuple[str, ...]:
 
 def _read_parquet(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        table = pq.read_table(path, partitioning=None)
-    except (pa.ArrowException, OSError) as error:
+        table = pq.read_table(path, partitioning=None, page_checksum_verification=True)
+        names = table.column_names
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         if isinstance(error, OSError) and error.errno is not None:
             raise
         raise BadInput(
@@ -160,10 +161,8 @@ def _read_parquet(path: Path) -> dict[str, NDArray[Any]]:
             where=path,
             remedy="copy or export it again; a parquet file cut short has lost its index and cannot be repaired",
         ) from error
-    twice = {name for name in table.column_names if table.column_names.count(name) > 1}
-    if twice:
-        raise BadInput(f"column {sorted(twice)[0]} is there twice", where=path, remedy="keep one of them")
-    return {name: _numbers(name, table[name].combine_chunks(), path) for name in table.column_names}
+    check_names(names, str(path))
+    return {name: _numbers(name, table[name].combine_chunks(), path) for name in names}
 
 
 def _read_csv(path: Path) -> dict[str, NDArray[Any]]:
@@ -178,9 +177,9 @@ def _read_csv(path: Path) -> dict[str, NDArray[Any]]:
             where=f"{path}, line 1",
             remedy="save it with commas between values and points in numbers",
         )
-    twice = {name for name in names if names.count(name) > 1}
-    if twice:
-        raise BadInput(f"column {sorted(twice)[0]} is there twice", where=path, remedy="keep one of them")
+    check_names([name for name in names if name], f"{path}, line 1")
+    # A column without a name is an index, or a comma at the end of every line: it holds nothing of ours.
+    names = [name or f"unnamed {k}" for k, name in enumerate(names)]
     bad: list[pa_csv.InvalidRow] = []
 
     def remember(row: pa_csv.InvalidRow) -> str:
@@ -206,7 +205,8 @@ def _read_csv(path: Path) -> dict[str, NDArray[Any]]:
             where=where,
             remedy="the file was cut or edited: complete that row or delete it",
         )
-    return {name: _numbers(name, table[name].combine_chunks(), path) for name in names}
+    named = [name for name, head in zip(names, header, strict=True) if head.strip()]
+    return {name: _numbers(name, table[name].combine_chunks(), path) for name in named}
 
 
 def _numbers(name: str, column: pa.Array, path: Path) -> NDArray[Any]:
@@ -262,8 +262,8 @@ def _parsed(name: str, column: pa.Array, path: Path, ours: bool) -> NDArray[Any]
 
 def _is_number(word: str | None) -> bool:
     try:
-        float(word or "0")
-    except ValueError:
+        pa.scalar(word, pa.string()).cast(pa.float64())
+    except pa.ArrowInvalid:
         return False
     return True
 
