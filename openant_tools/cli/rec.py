@@ -115,7 +115,8 @@ def import_(table: Path, out: Path) -> None:
     from openant_tools.recording.tables import read_run
 
     run = read_run(table, need=())
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(f"importing {run.name}", total=1.0)
         path = import_run(run, out, progress=lambda share: bar.update(task, completed=share))
     click.echo(f"{path}: {len(run.t)} rows of {', '.join(run.joints)}")
