@@ -28,7 +28,7 @@ def rec() -> None:
     """
 
 
-@rec.command()
+@rec.command(short_help="Show what a run holds: signals, rate, gaps, loss, facts.")
 @click.argument("run", type=RUN)
 @json_option
 def info(run: Path, json_file: Path | None) -> None:
@@ -65,7 +65,7 @@ def info(run: Path, json_file: Path | None) -> None:
         click.echo(line)
 
 
-@rec.command()
+@rec.command(short_help="Make a torn recording whole.")
 @click.argument("run", type=RUN)
 @click.option("--out", type=RUN, default=None, metavar="FILE", help="Where to; default: in place, the old one kept.")
 def repair(run: Path, out: Path | None) -> None:
@@ -82,7 +82,7 @@ def repair(run: Path, out: Path | None) -> None:
             click.echo(f"the torn file is kept as {done.original}")
 
 
-@rec.command()
+@rec.command(short_help="Write a run as a table (parquet, csv).")
 @click.argument("runs", type=RUN, nargs=-1, required=True, metavar="RUN...")
 @click.option("--to", "kind", type=click.Choice(["parquet", "csv"]), default="parquet", show_default=True)
 @click.option(
@@ -103,7 +103,7 @@ def export(runs: tuple[Path, ...], kind: str, out: Path) -> None:
         click.echo(f"{path}: {len(run.t)} rows, {len(run.columns)} columns; facts in {path.with_suffix('.json').name}")
 
 
-@rec.command(name="import")
+@rec.command(name="import", short_help="Make a recording of a table, for viewers.")
 @click.argument("table", type=RUN)
 @click.option("--out", type=RUN, required=True, metavar="RUN", help="The recording to make (NAME.mcap).")
 def import_(table: Path, out: Path) -> None:
