@@ -30,6 +30,7 @@ __all__ = ["record", "robot_of"]
 @click.option("--seconds", type=float, metavar="S", help="How long to play. Default: the protocol's own time.")
 @click.option("--repeat", "repeats", type=click.IntRange(1), default=1, show_default=True, help="Play it so often.")
 @click.option("--setup", type=click.Choice(["stand", "floor"]), default="stand", show_default=True)
+@click.option("--imu/--no-imu", default=None, help="Record the IMU too. Default: on the floor.")
 @click.option("--yes", is_flag=True, help="The robot may move: do not ask. Needed where no terminal is attached.")
 def record(
     name: str,
@@ -42,6 +43,7 @@ def record(
     seconds: float | None,
     repeats: int,
     setup: str,
+    imu: bool | None,
     yes: bool,
 ) -> None:
     """Play an excitation on the robot and record it.
@@ -56,7 +58,7 @@ def record(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from openant_tools.comms.setup import config_of_robot, config_of_unknown_robot
+    from openant_tools.comms.setup import config_of_robot, config_of_unknown_robot, imu_of_robot
     from openant_tools.errors import BadInput
     from openant_tools.recording.writer import recording_path
     from openant_tools.sysid.protocols import protocol
@@ -70,17 +72,20 @@ def record(
     folder = robot_of(robot, needed=virtual_source is None)
     console = Console(stderr=True)
     with contextlib.ExitStack() as stack:
-        control = None
+        control = imu_port = None
         if virtual_source is not None:
             # One that is ours alone need not wait for real time.
             clock = "stepped" if virtual_source == VIRTUAL_DEFAULT else None
             found = stack.enter_context(virtual_robot(virtual_source, clock=clock))
-            port, control = port or found["bus"], found["control"]
-        if folder is not None:
-            config = config_of_robot(folder.config(), port, control=control, rate_hz=rate_hz)
+            port, control, imu_port = port or found["bus"], found["control"], found["imu"]
+        described = None if folder is None else folder.config()
+        wanted = setup == "floor" if imu is None else imu
+        more = {"rate_hz": rate_hz, "imu": imu_of_robot(described, imu_port) if wanted else None}
+        if described is not None:
+            config = config_of_robot(described, port, control=control, **more)
         else:
             assert port is not None
-            config = config_of_unknown_robot(port, control, rate_hz=rate_hz)
+            config = config_of_unknown_robot(port, control, **more)
         console.print(
             f"{played.name}: {played.words}; {played.seconds:.0f} s"
             + (f", {repeats} times" if repeats > 1 else "")
@@ -99,6 +104,7 @@ def record(
             setup=setup,
             robot_toml=None if folder is None else folder.config_file.read_text(),
             progress=lambda words, share: bar.update(task, description=words, completed=share),
+            journal=None if folder is None else folder.journal,
             notice=lambda text: bar.console.print(text, highlight=False),
         )
     for recorded in done:

@@ -151,17 +151,17 @@ class SteppedClock:
 
     def sleep_until(self, t: float) -> None:
         if any(line.written != self._settled[name] for name, line in self._lines.items()):
-            self._settle()
+            self._ask("settle")
         if t > self._t:
             self._t = float(self._control.ask("advance", to=t)["t"])
 
     def wait_readable(self, line: Line, deadline: float) -> bool:
         name = self._name(line)
-        if line.received >= self._sent[name]:
-            self._settle()
-        if line.received >= self._sent[name]:
-            self.sleep_until(deadline)
-            self._settle()
+        if line.received >= self._sent[name] and name == "bus":
+            # A servo answers at once or never: let all that it has to say arrive by one question.
+            self._ask("settle")
+        if line.received >= self._sent[name] and deadline > self._t:
+            self._ask("wait", port=name, to=deadline)
         if line.received >= self._sent[name]:
             return False
         first = next((t for count, t in self._marks[name] if count > line.received), self._t)
@@ -183,10 +183,11 @@ class SteppedClock:
     def _name(self, line: Line) -> str:
         return next(name for name, known in self._lines.items() if known is line)
 
-    def _settle(self) -> None:
+    def _ask(self, do: str, **fields: Any) -> None:
+        """Let what was written act, and take in how far time and bytes have come."""
         self._settled = {name: line.written for name, line in self._lines.items()}
         written = {f"{name}_written": count - self._base[name][0] for name, count in self._settled.items()}
-        answer = self._control.ask("settle", **written)
+        answer = self._control.ask(do, **written, **fields)
         self._t = max(self._t, float(answer["t"]))
         for name in self._lines:
             base = self._base[name][1]

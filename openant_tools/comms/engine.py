@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from openant_tools.comms import guardian, messages
 from openant_tools.comms import protocol2 as p2
+from openant_tools.comms.body_imu import BodyImu
 from openant_tools.comms.bus import Answer, Bus, Timing
 from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
 from openant_tools.comms.faults import Cause
@@ -54,6 +55,8 @@ RECORDED_REGISTERS = (
 WATCHDOG_UNIT_S = 0.02
 #: How long the engine waits for a port that vanished to come back, between two tries.
 REOPEN_PERIOD_S = 0.5
+#: The IMU's port is left alone for so long before a cycle begins.
+IMU_SLACK_S = 0.3e-3
 #: Operating modes (register 11).
 POSITION, EXTENDED_POSITION = 3, 4
 _ERR_CODE = {word: code for code, word in enumerate(ERR_CODES)}
@@ -91,6 +94,7 @@ class Engine:
         self._cycles = 0
         self._guardian: subprocess.Popen[bytes] | None = None
         self._lost = False
+        self._imu: BodyImu | None = None
 
     # ---- life ----------------------------------------------------------------------------------------------------
 
@@ -145,12 +149,20 @@ class Engine:
             for register, counts in table.items():
                 servos.write_counts(register, joint, counts)
         self._ensure_position_mode()
+        self._eeprom_writes = list(servos.journal)
         for write in servos.journal:
             self._notice(f"{write.joint} (id {write.id}): {write.register} changed from {write.old} to {write.new}")
         self._servos = self._on_this_turn()
         self._watch = Watch(config.guards, self._servos.servos, config.limits_rad)
         self._registers = self._read_registers()
         self._period = 1.0 / config.rate_hz
+        if config.imu is not None:
+            try:
+                self._imu = BodyImu(config.imu, self.clock)
+                for note in self._imu.notes:
+                    self._notice(f"IMU: {note}")
+            except HardwareFault as error:
+                self._notice(f"going on without the IMU: {error}")
 
     def _set_latency_timer(self) -> float | None:
         """The adapter's timer, s, set to 1 ms where that is allowed; None where the host cannot tell."""
@@ -223,6 +235,7 @@ class Engine:
             "registers": self._registers,
             "position": self._measure(),
             "stepped": self.clock.stepped,
+            "eeprom_writes": self._eeprom_writes,
             "latency_timer_s": self._bus.timing.latency_timer_s,
             "pid": os.getpid(),
             "guardian_pid": self._guardian.pid if self._guardian else None,
@@ -251,6 +264,8 @@ class Engine:
             self._torque_off()
         self._close_recording()
         self._dismiss_guardian()
+        if self._imu is not None:
+            self._imu.close()
         if hasattr(self, "_line"):
             self._line.close()
 
@@ -279,7 +294,7 @@ class Engine:
                 self._take_commands(block=True)
                 due = self.clock.now()
                 continue
-            self.clock.sleep_until(due)
+            self._pass_time(due)
             wake = self.clock.now() - due
             self._take_commands(block=False)
             try:
@@ -292,6 +307,17 @@ class Engine:
             self._overruns += late > 0
             cycles = 1 + late
             due += cycles * self._period
+
+    def _pass_time(self, due: float) -> None:
+        """Wait for the next cycle; the IMU's samples come meanwhile."""
+        if self._imu is not None:
+            for sample in self._imu.until(due - IMU_SLACK_S):
+                if self._recorder is not None:
+                    self._recorder.imu(*sample)
+            news = self._imu.news()
+            if news is not None:
+                self._notice(news)
+        self.clock.sleep_until(due)
 
     def _cycle(self, wake: float, cycles: int) -> None:
         if self._lost:
@@ -365,6 +391,8 @@ class Engine:
             self._dismiss_guardian()
             self._line = SerialLine(self.config.port, self.config.baud)
             self._bus.line = self._line
+            if isinstance(self.clock, SteppedClock):
+                self.clock.attach(bus=self._line)
             self._start_guardian()
             self._lost = False
             self._report_leftovers()
@@ -401,7 +429,8 @@ class Engine:
         self, t: float, cmd_t: float | None, wake: float, answers: list[tuple[Answer, Block | None]]
     ) -> None:
         nan = float("nan")
-        row = [t, nan if cmd_t is None else cmd_t, wake, float(self._torque), nan, nan, nan, nan, nan, nan]
+        body = (nan,) * 6 if self._imu is None else self._imu.newest(t)
+        row = [t, nan if cmd_t is None else cmd_t, wake, float(self._torque), *body]
         for k, (answer, block) in enumerate(answers):
             servo = self._servos.servos[k]
             command = nan if self._goal is None else float(self._goal[k])

@@ -20,6 +20,7 @@ __all__ = [
     "Finished",
     "Goal",
     "Hold",
+    "ImuConfig",
     "Notice",
     "Play",
     "Ramp",
@@ -33,6 +34,21 @@ __all__ = [
     "Torque",
     "WriteRegister",
 ]
+
+
+@dataclass(frozen=True)
+class ImuConfig:
+    """Where the flight controller is, and how it sits in the body.
+
+    Attributes:
+        mounting_rad: rotation vector from the sensor's frame to the body's.
+        gyro_bias_rad_s, acc_bias_m_s2: what it reads too much, in the body's frame.
+    """
+
+    port: str
+    mounting_rad: tuple[float, ...] = (0.0, 0.0, 0.0)
+    gyro_bias_rad_s: tuple[float, ...] = (0.0, 0.0, 0.0)
+    acc_bias_m_s2: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -57,6 +73,7 @@ class EngineConfig:
     guards: Guards = field(default_factory=Guards)
     watchdog_s: float = 0.2
     write_read_gap_s: float = 0.2e-3
+    imu: ImuConfig | None = None
 
 
 # ---- to the engine: each is answered by a `Reply` ------------------------------------------------------------------

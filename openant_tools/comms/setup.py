@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from openant_tools.comms.bus import Bus, Timing
 from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
 from openant_tools.comms.line import SerialLine
-from openant_tools.comms.messages import EngineConfig
+from openant_tools.comms.messages import EngineConfig, ImuConfig
 from openant_tools.comms.ports import Host
 from openant_tools.comms.servos import Servo
 from openant_tools.errors import HardwareFault
@@ -18,7 +18,7 @@ from openant_tools.robot.kit import ANGLE_LIMIT_RAD, PLATFORM_PWM_LIMIT_COUNTS
 from openant_tools.robot.registers import PWM_FULL
 from openant_tools.robot.servo import servo_model
 
-__all__ = ["config_of_robot", "config_of_unknown_robot", "find_bus", "open_bus"]
+__all__ = ["config_of_robot", "config_of_unknown_robot", "find_bus", "imu_of_robot", "open_bus"]
 
 #: Servo angle at joint zero where no robot.toml says otherwise: horns mounted with the range in the encoder's middle.
 DEFAULT_ZERO_RAD = math.pi
@@ -54,6 +54,14 @@ def open_bus(port: str, baud: int, control: str | None = None) -> Bus:
         clock = SteppedClock(remote, bus=line)
     latency = Host().latency_timer_ms(port)
     return Bus(line, clock, Timing(latency_timer_s=Timing.latency_timer_s if latency is None else latency * 1e-3))
+
+
+def imu_of_robot(robot: RobotConfig | None, port: str | None = None) -> ImuConfig | None:
+    """The IMU at `port`, else at robot.toml's, mounted as that says; None where neither names one."""
+    where = port or (str(robot.ports.imu) if robot is not None and robot.ports.imu else None)
+    if where is None or robot is None:
+        return None if where is None else ImuConfig(where)
+    return ImuConfig(where, robot.imu.mounting_rad, robot.imu.gyro_bias_rad_s, robot.imu.acc_bias_m_s2)
 
 
 def config_of_robot(robot: RobotConfig, port: str | None = None, **more: object) -> EngineConfig:

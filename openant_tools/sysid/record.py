@@ -10,6 +10,7 @@ from pathlib import Path
 
 from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.journal import append_writes
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.recording.run import Facts
 from openant_tools.sysid.protocols import CommandSpace, Protocol
@@ -46,6 +47,7 @@ def record_protocol(
     robot_toml: str | None = None,
     progress: Callable[[str, float], None] = lambda words, share: None,
     notice: Callable[[str], None] = lambda text: None,
+    journal: Path | None = None,
 ) -> list[Recorded]:
     """Play a protocol `repeats` times and record each.
 
@@ -56,6 +58,7 @@ def record_protocol(
         robot_toml: the robot's configuration as text, kept inside the recording.
         progress: called with what is being done and the share of all that is done.
         notice: called with what the user should know.
+        journal: file that every write to a servo's permanent memory is added to.
 
     Raises:
         HardwareFault: a guard or the stop key stopped it; the recording up to there is kept.
@@ -68,6 +71,8 @@ def record_protocol(
     with EngineProcess(config) as engine:
         for event in engine.events():
             notice(_words(event))
+        if journal is not None:
+            append_writes(journal, engine.description["eeprom_writes"], "sysid record")
         engine.ask(messages.Torque(True))
         for k, path in enumerate(repeat_paths(out, repeats)):
             progress("to the home pose", k / repeats)
