@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -30,6 +31,8 @@ Image = NDArray[np.uint8]
 
 #: Samples a pixel in each direction.
 SUPERSAMPLE = 3
+#: Instants of an exposure that are drawn at most.
+MAX_MOMENTS = 7
 #: Floor texture: a square around the arena, mirrored at its edges.
 FLOOR_SIDE_M = 4.5
 FLOOR_TEXEL_M = 0.002
@@ -117,12 +120,25 @@ class Scene:
         position: of the body's origin in the world, m. rotation: 3 × 3, world from body.
         limbs: capsules in the world, each (ax, ay, az, bx, by, bz, radius), m.
         torso_radius: m.
+        velocity, rate: of the body, world axes, m/s and rad/s; they make motion blur.
     """
 
     position: Array
     rotation: Array
     limbs: Sequence[Sequence[float]] = ()
     torso_radius: float = 0.075
+    velocity: Sequence[float] = (0.0, 0.0, 0.0)
+    rate: Sequence[float] = (0.0, 0.0, 0.0)
+
+    def moved(self, dt: float) -> Scene:
+        """The scene `dt` later, as a rigid body that goes on as it does."""
+        turn = np.asarray(cv2.Rodrigues(np.asarray(self.rate, float) * dt)[0], float)
+        centre = np.asarray(self.position, float)
+        shift = centre + np.asarray(self.velocity, float) * dt
+        limbs = np.array(self.limbs, float).reshape(-1, 7)
+        for ends in (slice(0, 3), slice(3, 6)):
+            limbs[:, ends] = (limbs[:, ends] - centre) @ turn.T + shift
+        return replace(self, position=shift, rotation=turn @ np.asarray(self.rotation, float), limbs=limbs.tolist())
 
 
 @dataclass(frozen=True)
@@ -152,10 +168,10 @@ class OverheadCamera:
         self._seed = seed
         self._world_from_camera = _look(settings.position, settings.look_at, settings.up_yaw)
         self._eye = np.asarray(settings.position, float)
-        self._rays = self._ray_map()
+        self._rays = _ray_map(self.intrinsics)
         self._vignette = self._vignetting()
         rng = np.random.default_rng([seed, 0x5EED])
-        self._sharp_floor = self._render_floor(rng)
+        self._sharp_floor = self._render_floor()
         self._floor = self._blurred(self._sharp_floor, (0, 0, settings.width, settings.height))
         self._noise = self._noise_bank(rng)
         self._body_tag = (
@@ -164,15 +180,10 @@ class OverheadCamera:
 
     # --- what the world looks like ---------------------------------------------------------------------------------
 
-    def picture(self, index: int, t: float, scenes: Sequence[Scene]) -> Image:
-        """Frame number `index`, exposed around `t`: (height, width, 3), blue green red.
-
-        Args:
-            scenes: the scene at one or more instants of the exposure, in order and evenly spaced; several make
-                motion blur.
-        """
+    def picture(self, index: int, t: float, scene: Scene) -> Image:
+        """Frame number `index`, exposed around `t` while the scene was `scene`: (height, width, 3), blue green red."""
         image = self._floor.copy()
-        parts = [self._parts(scene) for scene in scenes]
+        parts = [self._parts(moment) for moment in self._moments(scene)]
         corners = [part.corners for part in parts if len(part.corners)]
         if corners:
             margin = 6 + math.ceil(4 * self.settings.blur_px)
@@ -185,6 +196,17 @@ class OverheadCamera:
                 box = (int(x0), int(y0), int(x1), int(y1))
                 image[y0:y1, x0:x1] = self._blurred(self._drawn(parts, box), box)
         return self._expose(image, index, t)
+
+    def _moments(self, scene: Scene) -> list[Scene]:
+        """The scene at evenly spaced instants of the exposure, more of them the faster it moves."""
+        speed = float(np.linalg.norm(scene.velocity)) + float(np.linalg.norm(scene.rate)) * scene.torso_radius
+        distance = abs(self._eye[2] - scene.position[2])
+        smear_px = speed * self.settings.exposure_s * self.intrinsics.fx / max(distance, 0.1)
+        count = min(1 + 2 * round(smear_px / 2), MAX_MOMENTS)
+        if count == 1:
+            return [scene]
+        exposure = self.settings.exposure_s
+        return [scene.moved(exposure * ((k + 0.5) / count - 0.5)) for k in range(count)]
 
     def _drawn(self, parts: Sequence[_Parts], box: tuple[int, int, int, int]) -> Image:
         """The sharp picture within a box, averaged over the instants of the exposure."""
@@ -303,13 +325,6 @@ class OverheadCamera:
 
     # --- the lens ---------------------------------------------------------------------------------------------------
 
-    def _ray_map(self) -> NDArray[np.float32]:
-        """x/z and y/z of every pixel's centre: (height + 2, width + 2, 2), with one pixel of margin."""
-        s = self.settings
-        u, v = np.meshgrid(np.arange(-1.0, s.width + 1), np.arange(-1.0, s.height + 1))
-        rays = self.intrinsics.rays(np.stack([u, v], axis=-1).reshape(-1, 2))
-        return rays.reshape(s.height + 2, s.width + 2, 2).astype(np.float32)
-
     def _fine_rays(self, x0: int, y0: int, x1: int, y1: int) -> NDArray[np.float32]:
         """Rays of the n × n samples of each pixel of a box: (n·(y1−y0), n·(x1−x0), 2)."""
         n = SUPERSAMPLE
@@ -343,10 +358,10 @@ class OverheadCamera:
 
     # --- what never changes -----------------------------------------------------------------------------------------
 
-    def _render_floor(self, rng: np.random.Generator) -> Image:
+    def _render_floor(self) -> Image:
         """The floor with its tag, sharp and evenly lit."""
         s = self.settings
-        texture = _floor_texture(rng)
+        texture = _floor_texture(self._seed)
         plane = np.hstack([np.eye(3), np.array([[s.look_at[0]], [s.look_at[1]], [0.0]])])
         at = _plane_coordinates(self._camera_from(plane), self._rays[1:-1, 1:-1])
         u = at[:, :, 0] / FLOOR_TEXEL_M + texture.shape[1] / 2 - 0.5
@@ -390,6 +405,14 @@ def _shadow(point: Array) -> Array:
 def _fixed(outline: Array, x0: int, y0: int) -> NDArray[np.int32]:
     """Fixed-point coordinates of an outline in a box whose corner pixel is (x0, y0)."""
     return np.rint((outline - [x0, y0]) * (1 << _SHIFT)).astype(np.int32)
+
+
+@lru_cache(maxsize=4)
+def _ray_map(lens: Intrinsics) -> NDArray[np.float32]:
+    """x/z and y/z of every pixel's centre: (height + 2, width + 2, 2), with one pixel of margin."""
+    u, v = np.meshgrid(np.arange(-1.0, lens.width + 1), np.arange(-1.0, lens.height + 1))
+    rays = lens.rays(np.stack([u, v], axis=-1).reshape(-1, 2))
+    return rays.reshape(lens.height + 2, lens.width + 2, 2).astype(np.float32)
 
 
 def _look(position: Sequence[float], target: Sequence[float], up_yaw: float) -> Array:
@@ -436,8 +459,10 @@ def _sample(board: _Board, camera_from_tag: Array, rays: NDArray[np.float32]) ->
     return np.asarray(grey, np.uint8), cover
 
 
-def _floor_texture(rng: np.random.Generator) -> Image:
-    """A laminate floor: planks with grain, joints, scuffs; a strip of tape. (n, n, 3), blue green red."""
+@lru_cache(maxsize=2)
+def _floor_texture(seed: int) -> Image:
+    """A laminate floor: planks with grain, joints, stains; a strip of tape. (n, n, 3), blue green red."""
+    rng = np.random.default_rng([seed, 0xF100])
     n = round(FLOOR_SIDE_M / FLOOR_TEXEL_M)
     plank, length = round(0.19 / FLOOR_TEXEL_M), round(1.3 / FLOOR_TEXEL_M)
     base = np.empty((n, n), np.float32)
