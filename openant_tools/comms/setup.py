@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 from openant_tools.comms.bus import Bus, Timing
@@ -14,14 +13,11 @@ from openant_tools.comms.servos import Servo
 from openant_tools.errors import HardwareFault
 from openant_tools.robot.config import RobotConfig
 from openant_tools.robot.joints import JOINTS
-from openant_tools.robot.kit import ANGLE_LIMIT_RAD, PLATFORM_PWM_LIMIT_COUNTS
+from openant_tools.robot.kit import ANGLE_LIMIT_RAD, NOMINAL_ZERO_RAD, PLATFORM_PWM_LIMIT_COUNTS
 from openant_tools.robot.registers import PWM_FULL
 from openant_tools.robot.servo import servo_model
 
 __all__ = ["config_of_robot", "config_of_unknown_robot", "find_bus", "imu_of_robot", "open_bus"]
-
-#: Servo angle at joint zero where no robot.toml says otherwise: horns mounted with the range in the encoder's middle.
-DEFAULT_ZERO_RAD = math.pi
 
 
 def find_bus(port: str | None, robot: RobotConfig | None = None, host: Host | None = None) -> str:
@@ -95,7 +91,7 @@ def config_of_unknown_robot(port: str, control: str | None = None, **more: objec
         found = {joint.name: bus.ping(joint.id, insist=True) for joint in JOINTS.values()}
         bus.require_all({JOINTS[name].id: seen is not None for name, seen in found.items()})
         servos = tuple(
-            Servo(name, seen.id, servo_model(seen.model_number), 1, DEFAULT_ZERO_RAD)
+            Servo(name, seen.id, servo_model(seen.model_number), 1, NOMINAL_ZERO_RAD)
             for name, seen in found.items()
             if seen is not None
         )

@@ -26,7 +26,7 @@ from openant_tools.robot.config import (
     read_document,
 )
 from openant_tools.robot.joints import JOINTS
-from openant_tools.robot.kit import ANGLE_LIMIT_RAD, Kit
+from openant_tools.robot.kit import ANGLE_LIMIT_RAD, NOMINAL_ZERO_RAD, Kit
 from openant_tools.robot.kit import kit as kit_by_name
 from openant_tools.robot.mjcf import nominal_mjcf
 
@@ -417,7 +417,7 @@ def _template(name: str, kit: Kit, date: datetime.datetime) -> str:
             f"id = {joint.id}\n"
             f'model = "{kit.servo(joint.kind).name}"\n'
             f"direction = 1\n"
-            f"zero_offset_rad = 0.0\n"
+            f"zero_offset_rad = {NOMINAL_ZERO_RAD!r}\n"
             f"min_rad = {-limit!r}\n"
             f"max_rad = {limit!r}\n"
         )

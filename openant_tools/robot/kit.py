@@ -11,8 +11,8 @@ from openant_tools.robot.joints import JOINTS, Kind
 from openant_tools.robot.servo import ServoModel, servo_model
 
 __all__ = [
-    "ANGLE_LIMIT_RAD", "HOME_RAD", "KITS", "PLATFORM_PWM_LIMIT", "PLATFORM_PWM_LIMIT_COUNTS", "Kit", "home_angles",
-    "kit",
+    "ANGLE_LIMIT_RAD", "HOME_RAD", "KITS", "NOMINAL_ZERO_RAD", "PLATFORM_PWM_LIMIT", "PLATFORM_PWM_LIMIT_COUNTS", "Kit",
+    "home_angles", "kit",
 ]  # fmt: skip
 
 #: The platform's driver writes int(50 / 0.113) into every servo's `pwm_limit`: half of the full duty.
@@ -23,6 +23,10 @@ PLATFORM_PWM_LIMIT = 0.5
 ANGLE_LIMIT_RAD: Mapping[Kind, float] = {"hip": math.radians(45), "knee": math.radians(70)}
 #: The middle of the platform's action ranges, a firm stand with the torso 0.15 m high.
 HOME_RAD: Mapping[Kind, float] = {"hip": 0.0, "knee": math.radians(-50)}
+
+#: Servo angle at joint zero until it is measured. Horns go on in steps of 45°, and half a turn keeps the whole range of
+#: every joint away from the encoder's seam.
+NOMINAL_ZERO_RAD = math.pi
 
 
 def home_angles() -> tuple[float, ...]:
