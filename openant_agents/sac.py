@@ -273,7 +273,7 @@ class Sac:
         first, second = self.critics(observation_action)
         critic_loss = F.mse_loss(first, target) + F.mse_loss(second, target)
         self.critic_optimiser.zero_grad()
-        critic_loss.backward()
+        critic_loss.backward()  # type: ignore[no-untyped-call]
         self.critic_optimiser.step()
         self.updates += 1
 
@@ -295,7 +295,7 @@ class Sac:
 
         entropy_loss = -self.log_alpha.exp() * (log_pi.detach().mean() + self.target_entropy)
         self.entropy_optimiser.zero_grad()
-        entropy_loss.backward()  # type: ignore[no-untyped-call]
+        entropy_loss.backward()
         self.entropy_optimiser.step()
 
     def _normal(self, rows: int) -> Tensor:
@@ -395,6 +395,7 @@ def train(
     observations, actions = _sizes(env)
     describe = getattr(env.unwrapped, "describe", None)
     described = dict(describe()) if describe is not None else {}
+    agent = Sac(observations, actions, settings, seed=seed, device=_device(device))
     run = Run(
         folder,
         {
@@ -407,9 +408,7 @@ def train(
     torch.set_num_threads(1)
     try:
         with _stop_on_signal() as stop:
-            return _train(
-                env, run, Sac(observations, actions, settings, seed=seed, device=device), steps, seed, report, stop
-            )
+            return _train(env, run, agent, steps, seed, report, stop)
     finally:
         torch.set_num_threads(threads)
         run.close()
@@ -532,6 +531,16 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
             remedy="train into another folder",
         ) from error
     return agent, int(checkpoint["step"])
+
+
+def _device(name: str) -> torch.device:
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0][:120]
+        raise BadInput(f"torch cannot compute on {name}: {reason}", remedy="use --device cpu") from error
+    return device
 
 
 def _sizes(env: gymnasium.Env[Any, Any]) -> tuple[int, int]:

@@ -90,7 +90,7 @@ class Painter:
         circle: tuple[float, float, float] | None = None,
         azimuth_deg: float = 90.0,
         elevation_deg: float = -35.0,
-        distance_m: float = 1.4,
+        distance_m: float = 1.1,
     ) -> Image:
         """One picture, (height, width, 3).
 
@@ -148,12 +148,13 @@ def write_strip(pictures: Sequence[Image], file: Path, *, seconds_apart: float, 
         OSError: the file cannot be written.
     """
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     columns = min(columns, len(pictures))
     rows = -(-len(pictures) // columns)
     height, width, _ = pictures[0].shape
-    figure = Figure(figsize=(2.4 * columns, 2.4 * rows * height / width), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.01, h_pad=0.01, wspace=0.0, hspace=0.0)
+    close_together = ConstrainedLayoutEngine(w_pad=0.01, h_pad=0.01, wspace=0.0, hspace=0.0)
+    figure = Figure(figsize=(2.4 * columns, 2.4 * rows * height / width), layout=close_together)
     for k, axes in enumerate(figure.subplots(rows, columns, squeeze=False).flat):
         axes.axis("off")
         if k < len(pictures):

@@ -79,7 +79,7 @@ def eval_(
                 lambda observation: agent.act(observation, explore=explore),
                 seconds=seconds,
                 seed=seed,
-                report=lambda done, average: bar.update(task, completed=done, description=f"{100 * average:.1f} cm/s"),
+                report=lambda done, average: bar.update(task, completed=done, description=f"{100 * average:+.1f} cm/s"),
                 frames=0 if strip is None else STRIP_FRAMES,
                 frames_from_s=min(STRIP_FROM_S, 0.5 * seconds),
             )
@@ -90,8 +90,8 @@ def eval_(
         click.echo(f"strip: {strip}")
     helped = "".join(f", set up again {count}× ({reason})" for reason, count in result.helped.items())
     click.echo(
-        f"{100 * result.average_reward_m_s:.1f} cm/s over {result.seconds:.0f} s: {result.progress_m:.2f} m progress "
-        f"on a way of {result.path_m:.2f} m, {result.turns} turns{helped} (policy of step {step})"
+        f"{100 * result.average_reward_m_s:+.1f} cm/s over {result.seconds:.0f} s: {result.progress_m:+.2f} m of progress,"
+        f" {result.path_m:.2f} m walked, {result.turns} turns{helped} (policy of step {step})"
     )
     if json_file is not None:
         write_text(json_file, json.dumps({**result.as_dict(), "run": str(run), "step": step}, indent=2) + "\n")

@@ -139,7 +139,7 @@ def sac(
     helped = ", ".join(f"{count}× {reason}" for reason, count in result.helped.items())
     click.echo(
         f"{result.step} steps, {result.robot_seconds / 60:.1f} min of robot time: "
-        f"{100 * result.average_reward_m_s:.1f} cm/s over the last 120 s"
+        f"{100 * result.average_reward_m_s:+.1f} cm/s over the last 120 s"
         + (f" (set up again: {helped})" if helped else "")
     )
     click.echo(f"run: {out}" + (f"   curve: {picture}" if curve else ""))
@@ -181,7 +181,7 @@ class _Bar:
 
     def show(self, progress: Progress) -> None:
         speed = self._bar.tasks[self._task].speed
-        words = [f"{100 * progress.average_reward_m_s:5.1f} cm/s", f"{progress.robot_seconds / 60:5.1f} min walked"]
+        words = [f"{100 * progress.average_reward_m_s:+5.1f} cm/s", f"{progress.robot_seconds / 60:5.1f} min walked"]
         if speed:
             words.append(f"{speed:4.0f} steps/s")
         self._bar.update(
