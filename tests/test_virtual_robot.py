@@ -196,6 +196,57 @@ def test_no_bytes_make_the_line_raise(portions):
             assert reply.t >= t
 
 
+# ---- the same without bytes ----
+
+
+def test_a_transaction_says_what_its_bytes_say_at_the_same_time():
+    table = {"servo": [{"joint": "hip_fl", "return_delay_time": 100}], "motor": {"current_noise_a": 0.0}}
+    spelled, short = Wire(**table), Wire(**table)
+    for instruction in (
+        p2.sync_write(64, 1, dict.fromkeys(IDS, b"\x01")),
+        p2.sync_write(116, 4, {id: (2300).to_bytes(4, "little") for id in IDS}),
+        p2.sync_read(120, 27, IDS),
+        p2.fast_sync_read(132, 4, IDS),
+        p2.bulk_read([(10, 144, 2), (31, 146, 1)]),
+        p2.read(40, 132, 4),
+        p2.read(40, 700, 4),
+        p2.write(40, 65, b"\1"),
+    ):
+        start = max(spelled.reached, spelled.world.line.free_at) + 0.002
+        spelled.world.advance(start)
+        packets, seconds = spelled.ask(instruction, gap=0.0)
+        answers, known = short.world.line.transact(instruction, start)
+        if instruction.code != p2.Inst.FAST_SYNC_READ:
+            assert [answer.status for answer in answers if not answer.error] == packets
+        if packets:
+            assert known == pytest.approx(start + seconds, abs=1e-9)
+
+
+def test_transactions_know_faults_too():
+    wire = Wire(faults=[{"cause": "broken_wire", "where": "knee_rl"}], bus={"byte_error": 0.001})
+    errors = {id: [] for id in IDS}
+    for n in range(300):
+        for answer in wire.world.line.transact(p2.sync_read(132, 4, IDS), n * 0.01)[0]:
+            errors[answer.id].append(answer.error)
+    assert set(errors[41]) == {"timeout"}
+    assert 0.8 < errors[10].count("") / 300 < 1
+    assert errors[10].count("crc") > 0
+
+
+def test_a_dozing_robot_warms_as_a_waking_one():
+    def warm(doze):
+        world = Wire(clock={"doze": doze}, robot={"pose": "home"}).world
+        world.line.transact(p2.sync_write(64, 1, dict.fromkeys(IDS, b"\x01")), 0.0)
+        world.line.transact(p2.sync_write(116, 4, {id: (2600).to_bytes(4, "little") for id in IDS}), 0.1)
+        world.advance(30.0)
+        return world.drives.case.copy(), world.body.q.copy()
+
+    waking, dozing = warm(False), warm(True)
+    assert waking[0].max() > 25.4
+    assert np.allclose(waking[0], dozing[0], atol=0.05)
+    assert np.allclose(waking[1], dozing[1], atol=0.003)
+
+
 # ---- faults ----
 
 

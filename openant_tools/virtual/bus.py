@@ -27,13 +27,15 @@ from openant_tools.comms.protocol2 import (
 )  # fmt: skip
 from openant_tools.virtual.servo import ServoDevice, read_requests
 
-__all__ = ["BusSettings", "Line", "Reply", "Tap"]
+__all__ = ["Answer", "BusSettings", "Line", "Reply", "Tap"]
 
 BITS_PER_BYTE = 10
 #: s, a longer pause inside an instruction packet makes servos drop it (e-manual).
 INTER_BYTE_S = 1.5e-3
 #: bytes after which a USB serial adapter sends without waiting for its timer
 ADAPTER_BUFFER = 510
+#: of a status without parameters
+_STATUS_BYTES = 11
 _SYNC = (Inst.SYNC_READ, Inst.BULK_READ)
 _FAST = (Inst.FAST_SYNC_READ, Inst.FAST_BULK_READ)
 _SILENT = (Inst.SYNC_WRITE, Inst.BULK_WRITE)
@@ -77,6 +79,16 @@ class Reply:
 
     t: float
     data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One servo's part in a transaction: its status, or why there is none ("timeout", "crc"), known at `t` (s)."""
+
+    id: int
+    status: Status | None
+    error: str
+    t: float
 
 
 @dataclass(slots=True)
@@ -202,10 +214,19 @@ class Line:
 
     def _execute(self, packet: Instruction, began: float, ended: float, byte_s: float) -> list[_Burst]:
         """Let the servos act on a packet whose last byte passes at `ended`; what they put on the wire."""
+        said, acted = self._obey(packet, began, ended)
+        bursts = self._speak(packet, said, ended, byte_s)
+        if bursts:
+            self._answer_end = max(burst.end(byte_s) for burst in bursts)
+        self._finish(acted, max(ended, self._answer_end))
+        return bursts
+
+    def _obey(self, packet: Instruction, began: float, ended: float) -> tuple[dict[int, Status], list[ServoDevice]]:
+        """Who hears the packet does it: position → what it says, and all who have heard."""
         self.tap.packets += 1
         if began < self._blind_until and packet.code not in (*_SILENT, Inst.WRITE, Inst.REG_WRITE):
             self.tap.blind += 1
-            return []
+            return {}, []
         self._advance(ended)
         said: dict[int, Status] = {}
         acted: list[ServoDevice] = []
@@ -217,14 +238,13 @@ class Line:
             status = servo.execute(packet, ended)
             if status is not None and not self._lost(position):
                 said[position] = status
-        bursts = self._take_turns(packet, said, ended, byte_s)
-        if bursts:
-            self._answer_end = max(burst.end(byte_s) for burst in bursts)
-        elif packet.code in _SILENT or (packet.id == BROADCAST and packet.code in (Inst.WRITE, Inst.REG_WRITE)):
+        if packet.code in _SILENT or (packet.id == BROADCAST and packet.code in (Inst.WRITE, Inst.REG_WRITE)):
             self._blind_until = ended + self._blind_time()
+        return said, acted
+
+    def _finish(self, acted: list[ServoDevice], t: float) -> None:
         for servo in acted:
-            servo.replied(max(ended, self._answer_end))
-        return bursts
+            servo.replied(t)
 
     def _blind_time(self) -> float:
         """How long servos stay deaf after a write that nobody answers, s.
@@ -239,57 +259,105 @@ class Line:
 
     # ---- servos → host ----
 
-    def _take_turns(self, packet: Instruction, said: dict[int, Status], ended: float, byte_s: float) -> list[_Burst]:
-        """Who speaks when, in the order that the instruction sets."""
-        first = ended + self.settings.response_s
-        if packet.code in (*_SYNC, *_FAST) and packet.id == BROADCAST:
-            asked = read_requests(packet)
-            answers = {status.id: [] for status in said.values()}  # type: dict[int, list[tuple[int, Status]]]
-            for position, status in said.items():
-                answers[status.id].append((position, status))
-            if packet.code in _FAST:
-                return self._join(asked, answers, first, byte_s)
-            turns = [answers.get(id, []) for id, _, _ in asked]
-        elif packet.id == BROADCAST:
-            # Ping: one after another by ID.
-            ids = sorted({status.id for status in said.values()})
-            turns = [[(k, status) for k, status in said.items() if status.id == id] for id in ids]
+    def _turns(self, packet: Instruction, said: dict[int, Status]) -> list[list[tuple[int, Status]]]:
+        """Who speaks after whom: (position, status) of all who take a turn, [] for a servo asked that says nothing."""
+        if packet.id != BROADCAST:
+            return [list(said.items())] if said else []
+        by_id: dict[int, list[tuple[int, Status]]] = {}
+        for position, status in said.items():
+            by_id.setdefault(status.id, []).append((position, status))
+        if packet.code in (*_SYNC, *_FAST):
+            turns = [by_id.get(id, []) for id, _, _ in read_requests(packet)]
         else:
-            turns = [list(said.items())]
+            # A broadcast ping: one after another by ID.
+            turns = [by_id[id] for id in sorted(by_id)]
+        if packet.code in _FAST or self.settings.waits_for_silent:
+            turns = turns[: next((k for k, turn in enumerate(turns) if not turn), len(turns))]
+        return turns
+
+    def _speak(self, packet: Instruction, said: dict[int, Status], ended: float, byte_s: float) -> list[_Burst]:
+        """What the servos put on the wire, and when."""
+        turns = self._turns(packet, said)
+        pieces: list[list[bytes]]
+        if packet.code in _FAST and packet.id == BROADCAST:
+            joined = self._joined(packet, turns)
+            pieces = [[piece] * len(turn) for piece, turn in zip(joined, turns, strict=True)]
+        else:
+            pieces = [[status.encode() for _, status in turn] for turn in turns]
         bursts: list[_Burst] = []
-        t = first
-        for turn in turns:
+        t = ended + self.settings.response_s
+        for turn, data in zip(turns, pieces, strict=True):
             if not turn:
-                if self.settings.waits_for_silent and packet.code in _SYNC:
-                    break
                 t += self.settings.silent_pause_s
                 continue
             spoken = [
-                _Burst(t + self.servos[k].return_delay_s, self._scratched(k, status.encode())) for k, status in turn
+                _Burst(t + self.servos[k].return_delay_s, self._scratched(k, piece))
+                for (k, _), piece in zip(turn, data, strict=True)
             ]
             bursts += spoken
             t = max(burst.end(byte_s) for burst in spoken) + self.settings.response_s
         return bursts
 
-    def _join(
-        self, asked: list[tuple[int, int, int]], answers: dict[int, list[tuple[int, Status]]], t: float, byte_s: float
-    ) -> list[_Burst]:
-        """The joined reply of a fast read, up to the first servo that is silent."""
+    def _joined(self, packet: Instruction, turns: list[list[tuple[int, Status]]]) -> list[bytes]:
+        """The pieces of a joined reply for those who speak; its announced length counts all who were asked."""
         parts: list[JoinedAnswer] = []
-        for id, _, count in asked:
-            turn = answers.get(id)
-            status = turn[0][1] if turn else Status(id)
+        for n, (id, _, count) in enumerate(read_requests(packet)):
+            status = turns[n][0][1] if n < len(turns) else Status(id)
             # A refused read has no data, yet the packet's length is announced: the place is filled with zeros.
             parts.append(JoinedAnswer(id, status.error, status.params.ljust(count, b"\0")[:count]))
-        bursts: list[_Burst] = []
-        for (id, _, _), piece in zip(asked, encode_joined(parts), strict=True):
-            turn = answers.get(id)
+        return encode_joined(parts)[: len(turns)]
+
+    # ---- the same without bytes ----
+
+    def transact(self, packet: Instruction, t: float) -> tuple[list[Answer], float]:
+        """One instruction without its bytes: what each servo asked answers, and when the host knows.
+
+        For soaks of hours, where packets need not be spelled. Devices, order, faults and times are those of `receive`
+        (with the probabilities of broken bytes put together per packet), and the port's rate is right.
+
+        Args:
+            t: s, when the host writes.
+        """
+        self._baud = self._baud or max((self.servos[k].baud for k in self.plugged), default=57_600)
+        byte_s, noise = BITS_PER_BYTE / self._baud, self.settings.byte_error
+        began = max(t, self.free_at, self.settings.stalled_until)
+        length = _wire_length(packet)
+        ended = self._host_end = began + length * byte_s
+        if noise and self._random.random() < 1 - (1 - noise) ** length:
+            self.tap.garbage += 1
+            said, acted = {}, []  # type: dict[int, Status], list[ServoDevice]
+        else:
+            said, acted = self._obey(packet, began, ended)
+        answers: list[Answer] = []
+        at = ended + self.settings.response_s
+        for turn in self._turns(packet, said):
             if not turn:
-                break
-            spoken = [_Burst(t + self.servos[k].return_delay_s, self._scratched(k, piece)) for k, _ in turn]
-            bursts += spoken
-            t = max(burst.end(byte_s) for burst in spoken)
-        return bursts
+                at += self.settings.silent_pause_s
+                continue
+            length = _STATUS_BYTES + len(turn[0][1].params)
+            at += max(self.servos[k].return_delay_s for k, _ in turn) + length * byte_s
+            clean = all(status == turn[0][1] for _, status in turn)
+            broken = max(self.settings.broken.get(k, 0.0) for k, _ in turn)
+            right = (1 - broken) * (1 - noise) ** length
+            if clean and (right == 1 or self._random.random() < right):
+                answers.append(Answer(turn[0][1].id, turn[0][1], "", self._tick_after(at)))
+            else:
+                answers.append(Answer(turn[0][1].id, None, "crc", self._tick_after(at)))
+            at += self.settings.response_s
+        if answers:
+            self._answer_end = at
+        self._finish(acted, max(ended, self._answer_end))
+        heard = {answer.id for answer in answers}
+        asked = [id for id, _, _ in read_requests(packet)] if packet.code in (*_SYNC, *_FAST) else [packet.id]
+        missing = [id for id in asked if id not in heard and id != BROADCAST]
+        answers += [Answer(id, None, "timeout", ended) for id in missing]
+        return answers, max([ended, *(answer.t for answer in answers)])
+
+    def _tick_after(self, t: float) -> float:
+        """When the adapter hands over what has arrived at t."""
+        period = max(self.settings.latency_timer_s, 1e-6)
+        tick = (math.floor(t / period - self._phase) + 1 + self._phase) * period
+        return max(tick, self.settings.stalled_until)
 
     def _deliver(self, bursts: list[_Burst], byte_s: float) -> list[Reply]:
         """What the host gets: the line's bytes, cut at the ticks of the latency timer."""
@@ -305,12 +373,11 @@ class Line:
         data = bytes(int(byte) for _, byte in heard)
         if self.settings.byte_error > 0:
             data = self._corrupt(data)
-        period = max(self.settings.latency_timer_s, 1e-6)
         replies: list[Reply] = []
         k = 0
         while k < len(data):
             # The timer runs free; the byte waits for its next tick, together with all that arrive until then.
-            tick = (math.floor(float(heard[k][0]) / period - self._phase) + 1 + self._phase) * period
+            tick = self._tick_after(float(heard[k][0]))
             stop = k + 1
             while stop < len(data) and float(heard[stop][0]) <= tick and stop - k < ADAPTER_BUFFER:
                 stop += 1

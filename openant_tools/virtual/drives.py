@@ -43,6 +43,8 @@ AMPERE_PER_COUNT = 2.69e-3
 GEAR_DAMPING = 0.25
 #: (angular frequency of the stiffest spring) × (time step) stays below this, well inside what symplectic Euler bears
 SPRING_STEP = 0.5
+#: rad/s, below which a joint stands; encoder noise alone shakes it by less
+REST_RAD_S = 5e-3
 _NOISE_BLOCK = 4096
 
 
@@ -80,6 +82,8 @@ class Drives:
         self._moves: dict[int, Trajectory] = {}
         self._queue: list[tuple[float, int, int, tuple[float, float, float, bool]]] = []
         self._count = 0
+        #: counts what may set anything in motion
+        self.touched = 0
         self._dropped_until = np.full(n, -1.0)
         # what the sensors show
         self.duty, self.current, self.shaft_velocity = np.zeros(n), np.zeros(n), np.zeros(n)
@@ -182,6 +186,7 @@ class Drives:
     # ---- what the firmware does to its loop ----
 
     def set_loop(self, k: int, loop: Loop) -> None:
+        self.touched += 1
         was = self.loops[k]
         if loop.torque and not was.torque:
             self._error[k] = self._sum[k] = self._velocity_sum[k] = 0.0
@@ -203,6 +208,7 @@ class Drives:
             self._special.append(k)
 
     def hold(self, k: int, pulses: float) -> None:
+        self.touched += 1
         self._moves.pop(k, None)
         self._queue = [entry for entry in self._queue if entry[2] != k]
         heapq.heapify(self._queue)
@@ -210,6 +216,7 @@ class Drives:
 
     def set_goal(self, k: int, pulses: float, velocity: float, acceleration: float, time_based: bool) -> None:
         """A goal that arrived now; it takes effect after the motor's delay, unless it is lost."""
+        self.touched += 1
         motor = self.motors[k]
         if motor.dropout_fraction > 0 and self._lost(k, motor):
             return
@@ -246,6 +253,11 @@ class Drives:
                 self.goal[k] = pulses
             else:
                 self._moves[k] = trajectory
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether nothing moves and nothing is about to."""
+        return not self._moves and not self._queue and bool(np.abs(self.body.v).max(initial=0.0) < REST_RAD_S)
 
     # ---- one step ----
 
@@ -410,7 +422,9 @@ class Drives:
 
     def set_path(self, path: Array) -> None:
         """Which servos the supply reaches, (n,) of 0 and 1."""
-        self.path = None if path.all() else path
+        path_now = None if path.all() else path
+        self.touched += path_now is not None or self.path is not None
+        self.path = path_now
 
     def voltage_at(self, k: int) -> float:
         """V at servo k."""

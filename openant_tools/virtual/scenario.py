@@ -40,7 +40,7 @@ _SECTIONS: Mapping[str, Mapping[str, str]] = {
     },
     "supply": {"volts": _NUMBER, "resistance_ohm": _NUMBER},
     "room": {"ambient_c": _NUMBER},
-    "clock": {"mode": "real or stepped"},
+    "clock": {"mode": "real or stepped", "doze": "true or false"},
 }  # fmt: skip
 _FREE_SECTIONS = ("imu", "camera", "motor")
 _SERVO_KEYS = (
@@ -124,6 +124,7 @@ def parse_scenario(table: Mapping[str, Any], name: str = "scenario") -> Scenario
     world.supply.volts = float(supply.get("volts", KITS[kit].supply_v))
     world.supply.resistance_ohm = float(supply.get("resistance_ohm", 0.0))
     world.ambient_c = float(sections["room"].get("ambient_c", 25.0))
+    world.doze = bool(sections["clock"].get("doze", False))
     world.imu = _fields(table.get("imu", {}), FlightControllerSettings, f"{name}, [imu]")
     joints = [servo.joint for servo in servos]
     for n, entry in enumerate(_tables(table, "effect", name)):

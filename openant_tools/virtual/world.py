@@ -27,6 +27,8 @@ __all__ = ["MOUNT_EIGHTHS", "ServoSetup", "SupplySettings", "World", "WorldSetti
 #: s between two looks of firmware and supply at themselves.
 POLL_S = 5e-3
 HEAT_S = 2e-2
+#: s of standstill before mechanics are left out, and for how long at most.
+REST_S, DOZE_S = 0.1, 2.0
 #: Eighths of a turn from the servo's zero to the joint's: horns go on in steps of 45°, and half a turn keeps the whole
 #: range of every joint away from the encoder's seam.
 MOUNT_EIGHTHS = 4
@@ -76,6 +78,7 @@ class WorldSettings:
     bus: BusSettings = field(default_factory=BusSettings)
     supply: SupplySettings = field(default_factory=SupplySettings)
     ambient_c: float = 25.0
+    doze: bool = False
     seed: int = 0
     #: what differs from the defaults of `FlightControllerSettings`
     imu: dict[str, Any] = field(default_factory=dict)
@@ -116,6 +119,9 @@ class World:
         self._poll_every = max(1, round(POLL_S / settings.body.timestep_s))
         self._heat_every = max(1, round(HEAT_S / settings.body.timestep_s))
         self._overloaded_s = np.zeros(len(joints))
+        #: leave mechanics out while everything stands still, for soaks of hours
+        self.doze = settings.doze
+        self._touched, self._rest_since = -1, 0
         self.now = 0.0
 
     def _build_body(self) -> None:
@@ -180,6 +186,8 @@ class World:
         target = math.floor(t / dt + 1e-9)
         drives = self.drives
         while self._steps < target:
+            if self.doze and self._asleep(target):
+                continue
             drives.step(self._steps)
             self._steps += 1
             if self._steps % self._poll_every == 0:
@@ -189,6 +197,29 @@ class World:
         self.now = max(self.now, t)
         for view in self._views:
             view.now = self.now
+
+    def _asleep(self, target: int) -> bool:
+        """While all stands still, let only heat go on: one bound of HEAT_S without mechanics. True where it did so.
+
+        It wakes on whatever the drives are told, and by itself once in DOZE_S, so that what creeps or warms is seen.
+        """
+        drives, dt = self.drives, self.settings.body.timestep_s
+        if drives.touched != self._touched or not drives.at_rest:
+            self._touched, self._rest_since = drives.touched, self._steps
+            return False
+        resting = (self._steps - self._rest_since) * dt
+        if resting < REST_S:
+            return False
+        if resting > REST_S + DOZE_S:
+            self._rest_since = self._steps
+            return False
+        if self._steps % self._heat_every or self._steps + self._heat_every > target:
+            return False
+        self._steps += self._heat_every
+        drives.time += self._heat_every * dt
+        self._poll()
+        drives.heat(self._heat_every * dt)
+        return True
 
     def _poll(self) -> None:
         now = self._steps * self.settings.body.timestep_s
@@ -209,7 +240,8 @@ class World:
                 servo.power_on(now)
             elif servo.powered:
                 servo.watch_bus(now)
-                servo.protect(drives.voltage_at(k), float(drives.case[k]))
+                if self._steps % self._heat_every == 0:
+                    servo.protect(drives.voltage_at(k), float(drives.case[k]))
         heavy = np.abs(drives.current) > OVERLOAD_SHARE * self._stall_current
         self._overloaded_s = np.where(heavy, self._overloaded_s + POLL_S, 0.0)
         if heavy.any():
