@@ -164,7 +164,7 @@ class Rollouts:
 
     @property
     def _qvel(self) -> Ints:
-        return 1 + self.plant.model.nq + self.plant.dof
+        return self.plant.dof + (1 + int(self.plant.model.nq))
 
     def _batch(self, nv: int) -> Batch:
         if nv not in self._batches:

@@ -1,0 +1,375 @@
+"""Fitting a model to runs: bounded nonlinear least squares on rollouts, weighted by noise, with priors.
+
+The estimate maximises a posterior (MAP). Its cost is Σ (measured − simulated)² / s² over positions, plus Σ u² over
+parameters (priors of unit deviation). What s² is decides how far data move a parameter. The residual of a robot is
+not white noise: a model error lasts for as long as the motion that shows it, so a thousand samples may be worth ten. Per
+joint s² is the mean squared residual at the estimate times the integrated autocorrelation time in samples (2τ), found by
+iteration. With a perfect model that is the sensor's noise, sample by sample; with an imperfect one it tempers the
+likelihood by itself, and intervals widen as they must.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from openant_tools.model.gap import HORIZON_S, Gap, gap
+from openant_tools.model.plant import Plant, Setup
+from openant_tools.model.rollout import Rollouts
+from openant_tools.recording.run import Run
+from openant_tools.sysid.parameter import KINDS, Parameter, apply
+
+__all__ = ["Dataset", "Estimate", "Problem", "autocorrelation_time"]
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+#: finite-difference step in prior deviations: far above rounding and the solver's tolerance, far below curvature
+STEP = 0.1
+#: rounds of fit and re-weighting; weights settle in two to three
+ROUNDS = 4
+#: one effective sample per this many seconds where fits are compared whose residuals are model error
+TEMPER_S = 0.5
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Runs of one plant, prepared for rollouts at both horizons.
+
+    Attributes:
+        plant: the model as given, set up as these runs were made.
+        runs: the recordings.
+        measured: (rows, joints) rad, the runs' positions one after another.
+    """
+
+    plant: Plant
+    runs: tuple[Run, ...]
+    full: Rollouts
+    horizon: Rollouts
+    measured: Array
+
+    @classmethod
+    def prepare(cls, plant: Plant, runs: Sequence[Run], nthread: int = 0) -> Dataset:
+        return cls(
+            plant=plant,
+            runs=tuple(runs),
+            full=Rollouts(plant, runs, None, nthread),
+            horizon=Rollouts(plant, runs, HORIZON_S, nthread),
+            measured=np.concatenate([run.signal("pos", plant.joints) for run in runs]),
+        )
+
+    @property
+    def fitted(self) -> Rollouts:
+        """What the fit compares: full runs on the stand; on the floor, where contact makes long runs chaotic, the horizon."""
+        return self.full if self.plant.setup is Setup.STAND else self.horizon
+
+
+@dataclass
+class Estimate:
+    """Where a fit ended.
+
+    Attributes:
+        parameters: what was estimated.
+        u: (parameters,) in prior deviations.
+        covariance: (parameters, parameters) of u, the prior included.
+        centre: (parameters,) the middle of the prior.
+        low, high: (parameters,) the physical bounds of u.
+        information: (parameters,) share of each parameter's posterior precision that the data gave: 0 prior only, 1 data.
+        noise: (joints,) rad, standard deviation of the residual per joint, of all datasets.
+        correlation_s: (joints,) s, integrated autocorrelation time of the residual.
+        converged: whether the optimiser met its tolerances.
+    """
+
+    parameters: tuple[Parameter, ...]
+    u: Array
+    covariance: Array
+    centre: Array
+    low: Array
+    high: Array
+    information: Array
+    noise: Array
+    correlation_s: Array
+    converged: bool
+    evaluations: int
+
+
+def autocorrelation_time(residual: Array, limit: int) -> float:
+    """Integrated autocorrelation time 1 + 2 Σ ρ_k in samples, summed until ρ first falls below zero (at most `limit` lags).
+
+    Args:
+        residual: (n,) evenly enough spaced; NaN counts as missing.
+    """
+    x = residual[np.isfinite(residual)]
+    if len(x) < 4:
+        return 1.0
+    x = x - 0.0  # a bias is model error too and must not be subtracted
+    n = len(x)
+    size = 1 << (2 * n - 1).bit_length()
+    spectrum = np.fft.rfft(x, size)
+    auto = np.fft.irfft(spectrum * np.conj(spectrum), size)[: min(limit, n - 1)]
+    if auto[0] <= 0:
+        return 1.0
+    rho = auto / auto[0]
+    below = np.flatnonzero(rho < 0.0)
+    end = int(below[0]) if len(below) else len(rho)
+    return float(max(1.0, 1.0 + 2.0 * rho[1:end].sum()))
+
+
+@dataclass
+class Problem:
+    """A least-squares problem: parameters, the data they are judged by, and the weights of those data.
+
+    Attributes:
+        datasets: all with the same joints in the same order.
+        parameters: the unknowns.
+        floor: (joints,) rad, the least residual deviation that a sensor of this resolution can show.
+    """
+
+    datasets: Sequence[Dataset]
+    parameters: Sequence[Parameter]
+    floor: Array
+    evaluations: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        nj = len(self.datasets[0].plant.joints)
+        self._stretches = self._find_stretches()
+        self._has_limp = any(not driven for _, driven, _ in self._stretches)
+        self._weight: Array = np.ones((sum(len(data.measured) for data in self.datasets), nj))
+        self.noise, self.correlation_s = np.zeros(nj), np.zeros(nj)
+        self._valley = np.array([KINDS[parameter.kind].valley for parameter in self.parameters], bool)
+        self._colours = _colours(self.datasets, self.parameters)
+        low, high = [], []
+        for parameter in self.parameters:
+            kind = KINDS[parameter.kind]
+            ends = [
+                parameter.bounds(kind.read(data.plant.model, data.plant, j))
+                for data in self.datasets
+                for j in parameter.joints
+            ]
+            low.append(max(end[0] for end in ends))
+            high.append(min(end[1] for end in ends))
+        self.low, self.high = np.array(low), np.array(high)
+        self.centre = np.array([parameter.centre for parameter in self.parameters])
+
+    def models(self, data: Dataset, us: Sequence[Array]) -> list[mujoco.MjModel]:
+        return [apply(data.plant, self.parameters, u) for u in us]
+
+    def residual(self, us: Sequence[Array]) -> Array:
+        """(variants, rows, joints) rad, measured minus simulated; NaN where something is missing."""
+        self.evaluations += len(us)
+        return np.concatenate(
+            [data.measured[None] - data.fitted(self.models(data, us)).pos for data in self.datasets], axis=1
+        )
+
+    def gaps(self, u: Array, datasets: Sequence[Dataset] | None = None) -> Gap:
+        """The gap of the model at u on these datasets (default: the problem's own), at both horizons."""
+        return gaps(datasets or self.datasets, self.parameters, [u])[0]
+
+    def solve(self, start: Array | None = None, progress: Progress | None = None) -> Estimate:
+        """Fit, re-weight, and fit again until the weights settle; from both ends where the cost is known to have valleys.
+
+        Args:
+            start: (parameters,) first guess in prior deviations; default the prior.
+            progress: called with what is being done and the share that is done.
+        """
+        first = np.clip(self.centre if start is None else start, self.low, self.high)
+        starts = [first]
+        if start is None:
+            ends = np.where(np.isfinite(self.low), self.low, first)
+            if self._valley.any():
+                starts.append(np.where(self._valley, ends, first))
+        best: tuple[float, Estimate] | None = None
+        for k, u in enumerate(starts):
+
+            def report(done: float, part: int = k) -> None:
+                if progress:
+                    progress("fitting", (part + done) / len(starts))
+
+            estimate = self._descend(u, report)
+            score = self._score(estimate.u)
+            if best is None or score < best[0]:
+                best = score, estimate
+        assert best is not None
+        return best[1]
+
+    def _descend(self, u: Array, progress: Callable[[float], None]) -> Estimate:
+        """The estimate reached from one start."""
+        # Off the bounds: on them a derivative points one way only and a least-squares step may stick there.
+        margin = np.minimum(0.05, (self.high - self.low) / 4)
+        u = np.clip(u, self.low + margin, self.high - margin)
+        converged = False
+        # A servo works with torque on. What a falling leg adds is taken as far as it agrees with what the driven one
+        # shows: the driven stretches are fitted alone first, and the others enter with the weight that this leaves them.
+        for rounds, driven_only in ((2, True), (ROUNDS, False)) if self._has_limp else ((ROUNDS, False),):
+            for round_ in range(rounds):
+                self._reweigh(self.residual([u])[0], driven_only)
+                before = u
+                solution = least_squares(
+                    self._vector, u, self._jacobian, bounds=(self.low, self.high), xtol=1e-4, ftol=1e-5, max_nfev=25
+                )
+                u, converged = solution.x, bool(solution.success)
+                if driven_only:
+                    # Nothing in driven stretches tells these; their prior alone must not move them out of the valley.
+                    u = np.where(self._valley, before, u)
+                progress((round_ + 1) / rounds)
+                if np.abs(u - before).max(initial=0.0) < 0.05:
+                    break
+        self._reweigh(self.residual([u])[0])
+        jacobian = self._jacobian(u)[: -len(u)]
+        covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(len(u))), np.float64)
+        return Estimate(
+            parameters=tuple(self.parameters),
+            u=u,
+            covariance=covariance,
+            centre=self.centre,
+            low=self.low,
+            high=self.high,
+            # What the data, all other parameters free, say about each: 1 − posterior variance over prior variance.
+            information=1.0 - np.diag(covariance),
+            noise=self.noise,
+            correlation_s=self.correlation_s,
+            converged=converged,
+            evaluations=self.evaluations,
+        )
+
+    def _score(self, u: Array) -> float:
+        """−log posterior with each stretch's own unknown noise, one effective sample per TEMPER_S: compares starts."""
+        residual = self.residual([u])[0]
+        score = 0.5 * float(np.sum((u - self.centre) ** 2))
+        for stretch, _, period in self._stretches:
+            for j, rows in enumerate(stretch):
+                part = residual[rows, j]
+                n = int(np.isfinite(part).sum())
+                if n:
+                    variance = max(float(np.nanmean(part**2)), self.floor[j] ** 2)
+                    score += 0.5 * n * period / TEMPER_S * math.log(variance)
+        return score
+
+    def _reweigh(self, residual: Array, driven_only: bool = False) -> None:
+        """Weigh each joint's stretches by the size and the autocorrelation of their own residuals."""
+        self._weight = np.zeros_like(residual)
+        squares, samples, times = np.zeros(residual.shape[1]), np.zeros(residual.shape[1]), np.zeros(residual.shape[1])
+        for stretch, driven, period in self._stretches:
+            if driven_only and not driven:
+                continue
+            for j, rows in enumerate(stretch):
+                part = residual[rows, j]
+                n = int(np.isfinite(part).sum())
+                if not n:
+                    continue
+                variance = max(float(np.nanmean(part**2)), self.floor[j] ** 2)
+                inflation = autocorrelation_time(part, limit=len(part) // 2)
+                self._weight[rows, j] = 1.0 / math.sqrt(variance * inflation)
+                squares[j] += n * variance
+                samples[j] += n
+                times[j] += n * inflation * period
+        self.noise = np.sqrt(squares / np.maximum(samples, 1))
+        self.correlation_s = times / np.maximum(samples, 1)
+
+    def _find_stretches(self) -> list[tuple[list[NDArray[np.int64]], bool, float]]:
+        """For each run, with torque and without: the rows of each joint, and the run's median sample time (s).
+
+        A model's errors differ from motion to motion, and most of all between driving and falling: a servo without torque
+        is another machine. Each stretch is therefore trusted as far as the model can follow it.
+        """
+        out = []
+        offset = 0
+        for data in self.datasets:
+            joints = data.plant.joints
+            for run, part in zip(data.runs, data.fitted.rows, strict=True):
+                rows = np.arange(part.start, part.stop) + offset
+                on = run.signal("torque", joints, default=1.0) != 0
+                period = float(np.median(np.diff(run.t)))
+                for driven, state in ((True, on), (False, ~on)):
+                    if state.any():
+                        out.append(([rows[state[:, j]] for j in range(len(joints))], driven, period))
+            offset += len(data.measured)
+        return out
+
+    def _vector(self, u: Array) -> Array:
+        weighted = np.nan_to_num(self.residual([u])[0]) * self._weight
+        return np.concatenate([weighted.ravel(), u - self.centre])
+
+    def _jacobian(self, u: Array) -> Array:
+        # Forward where the bound allows, else backward.
+        step = np.where(u + STEP <= self.high, STEP, -STEP)
+        variants = [u]
+        for members, _ in self._colours:
+            moved = u.copy()
+            moved[members] += step[members]
+            variants.append(moved)
+        base, *moved_residuals = self.residual(variants) * self._weight
+        out = np.zeros((base.size + len(u), len(u)))
+        for (members, joints), residual in zip(self._colours, moved_residuals, strict=True):
+            change = np.nan_to_num(residual - base)
+            for p, affected in zip(members, joints, strict=True):
+                column = np.zeros_like(base)
+                column[:, affected] = change[:, affected] / step[p]
+                out[: base.size, p] = column.ravel()
+        out[base.size :] = np.eye(len(u))
+        return out
+
+
+def gaps(datasets: Sequence[Dataset], parameters: Sequence[Parameter], us: Sequence[Array]) -> list[Gap]:
+    """The gap of each variant over all datasets together, at the horizon and over full runs."""
+    measured = np.concatenate([data.measured for data in datasets])
+    simulated = []
+    for horizon in (True, False):
+        per_dataset = [
+            (data.horizon if horizon else data.full)([apply(data.plant, parameters, u) for u in us]).pos
+            for data in datasets
+        ]
+        simulated.append(np.concatenate(per_dataset, axis=1))
+    short, long = simulated
+    return [Gap(gap(measured, short[v]), gap(measured, long[v])) for v in range(len(us))]
+
+
+def _colours(
+    datasets: Sequence[Dataset], parameters: Sequence[Parameter]
+) -> list[tuple[list[int], list[NDArray[np.bool_]]]]:
+    """Parameters that can be perturbed in one rollout, because they move joints of different kinematic trees.
+
+    On the stand the legs do not move each other (the torso is fixed), so that one rollout serves one parameter of each leg.
+    On the floor everything moves everything.
+
+    Returns:
+        for each colour, the indices of its parameters and, for each, the mask of the joints that it moves.
+    """
+    plants = [data.plant for data in datasets]
+    coupled = any(plant.setup is Setup.FLOOR for plant in plants)
+    tree = plants[0].tree if not coupled else np.zeros_like(plants[0].tree)
+    colours: list[tuple[set[int], list[int], list[NDArray[np.bool_]]]] = []
+    for p, parameter in enumerate(parameters):
+        trees = {int(tree[j]) for j in parameter.joints}
+        affected = np.isin(tree, list(trees))
+        for used, members, masks in colours:
+            if not used & trees:
+                used |= trees
+                members.append(p)
+                masks.append(affected)
+                break
+        else:
+            colours.append((trees, [p], [affected]))
+    return [(members, masks) for _, members, masks in colours]
+
+
+def sensor_floor(runs: Sequence[Run], joints: Sequence[str]) -> Array:
+    """(joints,) rad, the deviation that the encoder's resolution alone gives: quantum / √12, from facts or the data."""
+    out = np.zeros(len(joints))
+    for j, joint in enumerate(joints):
+        quanta = []
+        for run in runs:
+            known = run.facts.resolution.get(f"pos.{joint}", run.facts.resolution.get("pos"))
+            if known is None:
+                steps = np.abs(np.diff(run.column(f"pos.{joint}")))
+                steps = steps[np.isfinite(steps) & (steps > 1e-9)]
+                known = float(steps.min()) if len(steps) else 0.0
+            quanta.append(known)
+        out[j] = max(quanta) / math.sqrt(12)
+    return out

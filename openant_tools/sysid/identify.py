@@ -1,0 +1,466 @@
+"""Identification from end to end: runs and a model in; values with intervals and verdicts, judged on held-out runs, out.
+
+What is reported as better was measured on runs that the fit did not see. A parameter that the data cannot determine stays at
+its prior; whatever does not beat the given model on held-out runs, at the short horizon and over full runs, goes back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.errors import BadInput
+from openant_tools.model.gap import HORIZON_S, Gap, gap, share_closed
+from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
+from openant_tools.recording.run import Run
+from openant_tools.sysid.fit import Dataset, Estimate, Problem, gaps, sensor_floor
+from openant_tools.sysid.parameter import KINDS, Parameter, apply, choose
+
+__all__ = ["DEFAULT_KINDS", "Identification", "Value", "identify"]
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+#: what is identified where nothing is said; `damping` stands for whichever of damping and velocity gain the model has
+DEFAULT_KINDS = ("stiffness", "damping", "armature", "coulomb_friction", "zero_offset", "electrical_damping")
+
+#: share of the posterior precision that must come from the data for a value to be called identifiable: the interval is
+#: then less than half as wide as the prior's
+IDENTIFIABLE = 0.75
+#: below this share the data say nothing, and the value stays at its prior
+UNDETERMINED = 0.1
+#: going back must pay this much on held-out runs (relative, over both horizons): less is luck
+WORTH = 0.01
+#: 95 % of a normal distribution
+TWO_SIDED_95 = 1.96
+
+
+@dataclass(frozen=True)
+class Value:
+    """What became of one parameter.
+
+    Attributes:
+        name: `kind.joint` (or `.servo model`, `.all`).
+        unit: SI.
+        joints: whose it is.
+        given: the value in the given model (of the first joint where several are tied).
+        value: the value in the written model.
+        low, high: 95 % interval of the estimate; where the value fell back, of what the data would have said.
+        verdict: `identifiable`, `weak` (between data and prior), `undetermined` (left at its prior) or `fell back`
+            (it did not beat the given model on held-out runs).
+        information: share of the precision that the data gave, 0…1.
+    """
+
+    name: str
+    unit: str
+    joints: tuple[str, ...]
+    given: float
+    value: float
+    low: float
+    high: float
+    verdict: str
+    information: float
+
+    @property
+    def accepted(self) -> bool:
+        return self.verdict in ("identifiable", "weak")
+
+
+@dataclass(frozen=True)
+class Identification:
+    """The result of a fit.
+
+    Attributes:
+        model: the MJCF that was given.
+        joints: what was fitted.
+        values: every parameter.
+        before, after: the gap on held-out runs, of the given and of the written model.
+        floor: rad, what no model could beat on these runs, from repeats or the encoder's resolution.
+        judged_on: names of the held-out runs; where none were given, of the runs left out in turn.
+        in_turn: whether runs were left out in turn, each judged by a fit to the others.
+        noise: joint → rad, residual deviation of the fit.
+        correlation_s: joint → s, how long a residual remembers itself; far above the sample time it is model error.
+        u: (parameters,) of the written model, for `models`.
+        notes: what a reader should know.
+    """
+
+    model: Path
+    joints: tuple[str, ...]
+    values: tuple[Value, ...]
+    before: Gap
+    after: Gap
+    floor: float
+    judged_on: tuple[str, ...]
+    in_turn: bool
+    noise: Mapping[str, float]
+    correlation_s: Mapping[str, float]
+    parameters: tuple[Parameter, ...]
+    u: Array
+    covariance: Array
+    datasets: tuple[Dataset, ...]
+    held_out: tuple[Dataset, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def accepted(self) -> tuple[str, ...]:
+        return tuple(value.name for value in self.values if value.accepted)
+
+    def as_json(self) -> dict[str, Any]:
+        """`fit.json` (formats, section 6)."""
+
+        def figures(figure: Gap) -> dict[str, float]:
+            return {f"gap_{HORIZON_S:g}_s_rad": figure.horizon, "gap_full_rad": figure.full}
+
+        return {
+            "schema": "openant.fit/1",
+            "model": str(self.model),
+            "joints": list(self.joints),
+            "runs": [run.name for data in self.datasets for run in data.runs],
+            "parameters": {
+                value.name: {
+                    "value": value.value,
+                    "low": value.low,
+                    "high": value.high,
+                    "verdict": value.verdict,
+                    "unit": value.unit,
+                    "given": value.given,
+                    "joints": list(value.joints),
+                    "information": value.information,
+                }
+                for value in self.values
+            },
+            "held_out": {
+                "runs": list(self.judged_on),
+                "in_turn": self.in_turn,
+                "before": figures(self.before),
+                "after": figures(self.after),
+                "floor_rad": self.floor,
+                "share_closed": share_closed(self.before.full, self.after.full, self.floor),
+            },
+            "accepted": list(self.accepted),
+            "noise_rad": dict(self.noise),
+            "residual_correlation_s": dict(self.correlation_s),
+            "notes": list(self.notes),
+        }
+
+
+def identify(
+    runs: Sequence[Run],
+    model: Path,
+    hold_out: Sequence[Run] = (),
+    *,
+    joints: Sequence[str] | None = None,
+    kinds: Sequence[str] | None = None,
+    tie: str = "joint",
+    progress: Progress | None = None,
+) -> Identification:
+    """Fit `model` to `runs` and judge the result on `hold_out`, or by leaving out runs in turn.
+
+    Args:
+        runs: what to fit; each may name its own model of the same joints (formats, section 1).
+        model: the MJCF whose values are the priors and into which the result goes.
+        hold_out: runs that the fit must not see.
+        joints: which joints to fit; default every position-controlled joint that all runs command and measure.
+        kinds: keys of KINDS; default DEFAULT_KINDS as far as they apply.
+        tie: `joint` (each its own values), `servo` (one value for all joints of a servo model) or `all`.
+        progress: called with what is being done and the share that is done.
+
+    Raises:
+        BadInput: no runs, no joints in common, no motion, a held-out run that is also fitted, or a model that fails.
+    """
+    everything = [*runs, *hold_out]
+    same = {id(run) for run in runs} & {id(run) for run in hold_out} or (
+        {run.path for run in runs if run.path} & {run.path for run in hold_out if run.path}
+    )
+    if same:
+        raise BadInput("a held-out run is also fitted", remedy="hold out runs that are not among those to fit")
+    joints = _joints_in_common(everything, model, joints)
+    for run in everything:
+        _must_move(run, joints)
+    data = _datasets(runs, model, joints)
+    judged = _datasets(hold_out, model, joints)
+    plant = data[0].plant
+    motors = {k: v for run in everything for k, v in run.facts.motors.items()}
+    chosen = choose(plant, _applicable(kinds, plant, everything), tie, motors)
+    floor = np.maximum(sensor_floor(runs, joints), 1e-6)
+
+    problem = Problem(data, chosen, floor)
+    folds = [] if hold_out else _folds(runs)
+    total = 1 + len(folds)
+
+    def share(part: int) -> Progress | None:
+        return progress and (lambda what, done: progress(what, (part + done) / total))
+
+    estimate = problem.solve(progress=share(0))
+    trials: list[tuple[Estimate, list[Dataset]]]
+    if hold_out:
+        trials = [(estimate, judged)]
+    else:
+        trials = []
+        for k, (train, test) in enumerate(folds):
+            fold = Problem(_datasets(train, model, joints), chosen, floor)
+            trials.append((fold.solve(progress=share(1 + k)), _datasets(test, model, joints)))
+
+    undetermined = estimate.information < UNDETERMINED
+    kept, before, after = _judge(trials, chosen, undetermined)
+    u = np.where(kept, _conditional(estimate, ~kept), 0.0)
+    u[undetermined & kept] = problem.centre[undetermined & kept]
+    tests = [run for _, test in folds for run in test]
+    return Identification(
+        model=model,
+        joints=tuple(joints),
+        values=tuple(_value(p, plant, estimate, k, bool(kept[k]), u[k]) for k, p in enumerate(chosen)),
+        before=before,
+        after=after,
+        floor=_floor([*runs, *hold_out], joints),
+        judged_on=tuple(run.name for run in (hold_out or tests)),
+        in_turn=not hold_out,
+        noise=dict(zip(joints, estimate.noise.tolist(), strict=True)),
+        correlation_s=dict(zip(joints, estimate.correlation_s.tolist(), strict=True)),
+        parameters=tuple(chosen),
+        u=u,
+        covariance=estimate.covariance,
+        datasets=tuple(data),
+        held_out=tuple(judged or data),
+        notes=_notes(estimate, joints, runs),
+    )
+
+
+def _joints_in_common(runs: Sequence[Run], model: Path, wanted: Sequence[str] | None) -> list[str]:
+    if not runs:
+        raise BadInput("no runs to fit", remedy="name at least one recording")
+    plant = load_plant(model, wanted, Setup.FLOOR)
+    missing: dict[str, str] = {}
+    for run in runs:
+        for joint in plant.joints:
+            for signal in ("cmd", "pos"):
+                if not run.has(signal, [joint]):
+                    missing.setdefault(joint, f"{run.path or run.name} has no {signal}.{joint}")
+    common = [joint for joint in plant.joints if joint not in missing]
+    if wanted is not None and missing:
+        raise BadInput("; ".join(missing.values()), remedy="choose joints that every run commands and measures")
+    if not common:
+        raise BadInput(
+            f"the model's joints ({', '.join(plant.joints)}) are not those of the runs ({', '.join(runs[0].joints)})",
+            where=model,
+            remedy="give the model of this robot, with joints named as in the runs",
+        )
+    return common
+
+
+def _must_move(run: Run, joints: Sequence[str]) -> None:
+    """A run in which nothing moves or which ends at once determines nothing; better said before any number is given."""
+    pos = run.signal("pos", joints)
+    span = np.nanmax(pos, axis=0) - np.nanmin(pos, axis=0)
+    where = run.path or run.name
+    if run.duration_s < 2 * HORIZON_S:
+        raise BadInput(f"too short to fit: {run.duration_s:.2f} s", where=where, remedy="record at least a few seconds")
+    still = [joint for joint, moved in zip(joints, span, strict=True) if not moved > 5 * _quantum(run, joint)]
+    if len(still) == len(joints):
+        raise BadInput("nothing moves in this run", where=where, remedy="record a protocol that moves the joints")
+
+
+def _quantum(run: Run, joint: str) -> float:
+    return float(sensor_floor([run], [joint])[0] * math.sqrt(12))
+
+
+def _datasets(runs: Sequence[Run], model: Path, joints: Sequence[str]) -> list[Dataset]:
+    """One dataset per model and setup; runs that name their own model are simulated with it."""
+    groups: dict[tuple[Path, Setup], list[Run]] = {}
+    for run in runs:
+        groups.setdefault((_own_model(run) or model, setup_of(run.facts.setup)), []).append(run)
+    return [Dataset.prepare(load_plant(path, joints, setup), members) for (path, setup), members in groups.items()]
+
+
+def _own_model(run: Run) -> Path | None:
+    own = run.model_path
+    return own if own is not None and own.is_file() else None
+
+
+def _applicable(kinds: Sequence[str] | None, plant: Plant, runs: Sequence[Run]) -> list[str]:
+    """The kinds to fit. Which of damping and velocity gain: the one that stands in the model, for together they cannot be
+    told apart while torque neither saturates nor is switched off. The electrical share of damping shows only without
+    torque."""
+    if kinds is not None:
+        unknown = [kind for kind in kinds if kind not in KINDS]
+        if unknown:
+            raise BadInput(f"no such parameter: {', '.join(unknown)}", remedy=f"choose from {', '.join(KINDS)}")
+        return [kind for kind in KINDS if kind in kinds]
+    in_joint = sum(KINDS["damping"].read(plant.model, plant, j) for j in range(len(plant.joints)))
+    in_servo = sum(KINDS["velocity_gain"].read(plant.model, plant, j) for j in range(len(plant.joints)))
+    limp = any((run.signal("torque", plant.joints, default=1.0) == 0).any() for run in runs)
+    out = []
+    for kind in DEFAULT_KINDS:
+        if kind == "damping" and in_joint == 0 and in_servo > 0:
+            kind = "velocity_gain"
+        if kind == "electrical_damping" and not limp:
+            continue
+        out.append(kind)
+    return out
+
+
+def _folds(runs: Sequence[Run]) -> list[tuple[list[Run], list[Run]]]:
+    """Leave out in turn: each run, together with its repeats; a single run is cut in three and loses a third at a time."""
+    names = {run.name: run.facts.repeat_of or run.name for run in runs}
+    motions = list(dict.fromkeys(names.values()))
+    if len(motions) > 1:
+        return [
+            ([run for run in runs if names[run.name] != motion], [run for run in runs if names[run.name] == motion])
+            for motion in motions
+        ]
+    folds = []
+    for k in range(3):
+        train, test = [], []
+        for run in runs:
+            edges = np.linspace(run.t[0], run.t[-1] + 1e-9, 4)
+            parts = [replace(run.between(edges[i], edges[i + 1]), name=f"{run.name}[{i + 1}/3]") for i in range(3)]
+            test.append(parts[k])
+            train += [part for i, part in enumerate(parts) if i != k]
+        folds.append((train, test))
+    return folds
+
+
+def _conditional(estimate: Estimate, back: NDArray[np.bool_]) -> Array:
+    """The estimate's u given that the parameters in `back` are at the given model's values (0), to first order.
+
+    The mean of a normal posterior, conditioned: u_k − Σ_kb Σ_bb⁻¹ u_b.
+    """
+    u = estimate.u.copy()
+    if back.any():
+        cross = estimate.covariance[np.ix_(~back, back)]
+        within = estimate.covariance[np.ix_(back, back)]
+        u[~back] -= cross @ np.linalg.solve(within, u[back])
+        u[back] = 0.0
+        u[~back] = np.clip(u, estimate.low, estimate.high)[~back]
+    return u
+
+
+def _judge(
+    trials: Sequence[tuple[Estimate, Sequence[Dataset]]],
+    parameters: Sequence[Parameter],
+    undetermined: NDArray[np.bool_],
+) -> tuple[NDArray[np.bool_], Gap, Gap]:
+    """Which parameters keep their estimates: the rule of formats, section 6.
+
+    Starting from all, the kind or joint whose return to the given model helps most on held-out runs goes back, as long as
+    one does; and on, while what is left does not beat the given model at both horizons.
+    """
+    before = _pooled(trials, parameters, [np.zeros(len(parameters), bool)], undetermined)[0]
+    kept = np.ones(len(parameters), bool)
+    after = _pooled(trials, parameters, [kept], undetermined)[0]
+    while kept.any():
+        groups = [
+            np.array([bool(kept[k]) and p.kind == kind for k, p in enumerate(parameters)])
+            for kind in dict.fromkeys(p.kind for p in parameters)
+        ]
+        labels = list(dict.fromkeys(p.label for p in parameters))
+        if len(labels) > 1:
+            groups += [
+                np.array([bool(kept[k]) and p.label == label for k, p in enumerate(parameters)]) for label in labels
+            ]
+        options = [kept & ~group for group in groups if group.any()]
+        results = _pooled(trials, parameters, options, undetermined)
+        best = min(range(len(options)), key=lambda k: _score(results[k], before))
+        beats = after.horizon < before.horizon and after.full < before.full
+        if beats and _score(results[best], before) > _score(after, before) - WORTH:
+            break
+        kept, after = options[best], results[best]
+    return kept, before, after
+
+
+def _score(figure: Gap, before: Gap) -> float:
+    """Mean log ratio to the given model over both horizons; a horizon that is worse than given counts thrice."""
+    ratios = np.log([figure.horizon / before.horizon, figure.full / before.full])
+    return float(np.mean(np.where(ratios > 0, 3 * ratios, ratios)))
+
+
+def _pooled(
+    trials: Sequence[tuple[Estimate, Sequence[Dataset]]],
+    parameters: Sequence[Parameter],
+    options: Sequence[NDArray[np.bool_]],
+    undetermined: NDArray[np.bool_],
+) -> list[Gap]:
+    """The gap over all held-out rows of all trials, for each option of kept parameters."""
+    squares = np.zeros((len(options), 2))
+    count = 0
+    for estimate, test in trials:
+        us = []
+        for kept in options:
+            u = _conditional(estimate, ~kept)
+            us.append(np.where(undetermined & kept, estimate.centre, u))
+        n = sum(int(np.isfinite(data.measured).sum()) for data in test)
+        for k, figure in enumerate(gaps(test, parameters, us)):
+            squares[k] += n * np.array([figure.horizon, figure.full]) ** 2
+        count += n
+    return [Gap(*np.sqrt(row / count)) for row in squares]
+
+
+def _value(parameter: Parameter, plant: Plant, estimate: Estimate, k: int, kept: bool, u: float) -> Value:
+    nominal = KINDS[parameter.kind].read(plant.model, plant, parameter.joints[0])
+    low, high = KINDS[parameter.kind].low, KINDS[parameter.kind].high
+    deviation = TWO_SIDED_95 * math.sqrt(estimate.covariance[k, k])
+    information = float(estimate.information[k])
+    centre = u if kept else estimate.u[k]
+    if not kept:
+        verdict = "fell back"
+    elif information < UNDETERMINED:
+        verdict = "undetermined"
+    else:
+        verdict = "identifiable" if information >= IDENTIFIABLE else "weak"
+    return Value(
+        name=parameter.name,
+        unit=KINDS[parameter.kind].unit,
+        joints=tuple(plant.joints[j] for j in parameter.joints),
+        given=nominal,
+        value=parameter.value(nominal, u),
+        low=float(np.clip(parameter.value(nominal, centre - deviation), low, high)),
+        high=float(np.clip(parameter.value(nominal, centre + deviation), low, high)),
+        verdict=verdict,
+        information=information,
+    )
+
+
+def _floor(runs: Sequence[Run], joints: Sequence[str]) -> float:
+    """rad, what no model could beat: from repeats of the same commands where there are any, else from the resolution."""
+    by_name = {run.name: run for run in runs}
+    squares: list[float] = []
+    for run in runs:
+        first = by_name.get(run.facts.repeat_of or "")
+        if first is not None:
+            again = run.signal("pos", joints)
+            t = run.t - run.t[0] + first.t[0]
+            once = first.signal("pos", joints)
+            for j in range(len(joints)):
+                ok = np.isfinite(once[:, j])
+                if ok.sum() > 1:
+                    # Two repeats differ by both their noises, so that each has half of the squared difference.
+                    squares.append(gap(again[:, j], np.interp(t, first.t[ok], once[ok, j])) ** 2 / 2)
+    if squares:
+        return math.sqrt(float(np.mean(squares)))
+    return float(np.sqrt(np.mean(sensor_floor(runs, joints) ** 2)))
+
+
+def _notes(estimate: Estimate, joints: Sequence[str], runs: Sequence[Run]) -> tuple[str, ...]:
+    notes = []
+    if not estimate.converged:
+        notes.append("The optimiser stopped before its tolerance was met: read the values with care.")
+    period = float(np.median(np.concatenate([np.diff(run.t) for run in runs])))
+    lasting = [joint for joint, time in zip(joints, estimate.correlation_s, strict=True) if time > 10 * period]
+    if lasting:
+        notes.append(
+            f"The residuals of {', '.join(lasting)} remember themselves for many samples: what is left there is model "
+            "error, not noise. Intervals are widened for it; `openant gap diagnose` names causes."
+        )
+    return tuple(notes)
+
+
+def models(identification: Identification, setup: Setup) -> tuple[Plant, Any]:
+    """The given plant and the identified model, both set up as asked."""
+    plant = load_plant(identification.model, identification.joints, setup)
+    return plant, apply(plant, identification.parameters, identification.u)
