@@ -469,9 +469,9 @@ def test_the_robot_stands_up_on_the_floor():
 
 
 @contextmanager
-def served(stepped=False, tcp=False, **table):
+def served(stepped=False, tcp=False, camera=False, **table):
     """A robot on its ports, served by a thread."""
-    server = assemble(parse_scenario(table), clock="stepped" if stepped else "real", tcp=tcp)
+    server = assemble(parse_scenario(table), clock="stepped" if stepped else "real", tcp=tcp, camera=camera)
     stop = threading.Event()
     thread = threading.Thread(target=server.run, args=(stop.is_set,))
     thread.start()
@@ -607,6 +607,27 @@ def test_unplugging_takes_the_port_away_and_plugging_brings_it_back(robot):
     with serial.Serial(path, BAUD, timeout=1.0) as line:
         line.write(p2.ping(10).encode())
         assert len(line.read(14)) == 14
+
+
+def test_the_camera_sees_the_robot_and_can_freeze():
+    import urllib.request
+
+    def picture(source, at):
+        with urllib.request.urlopen(source.replace("stream.mjpg", f"snapshot.jpg?at={at}"), timeout=20) as answer:
+            return answer.headers["X-Frame"], answer.read()
+
+    with served(stepped=True, camera=True) as server:
+        remote, source = Remote(server), server.addresses["camera"]
+        remote.ask("advance", to=1.0)
+        first = picture(source, 1.0)
+        assert first[1].startswith(b"\xff\xd8")
+        remote.ask("advance", to=2.0)
+        assert int(picture(source, 2.0)[0]) - int(first[0]) == 30
+        remote.ask("fault", cause="camera_frozen")
+        remote.ask("advance", to=3.0)
+        frozen = picture(source, 3.0)
+        remote.ask("advance", to=4.0)
+        assert picture(source, 4.0)[1] == frozen[1]
 
 
 # ---- the control socket and stepped time ----

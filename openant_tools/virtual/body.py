@@ -111,6 +111,8 @@ class Body:
         self._torso = model.body("torso").id if settings.setup != "loose" else -1
         knees = [JOINTS[name] for name in joints if name in JOINTS and JOINTS[name].kind == "knee"]
         self._feet = [model.geom(f"lower_{joint.leg.name}").id for joint in knees] if self.on_floor else []
+        links = ("root_", "upper_", "lower_")
+        self._links = [g for g in range(self.model.ngeom) if self.model.geom(g).name.startswith(links)]
         self.reset()
 
     def reset(self) -> None:
@@ -177,6 +179,28 @@ class Body:
     def quaternion(self) -> Array:
         """(4,) w x y z, the torso's attitude in the world."""
         return self.data.xquat[self._torso].copy() if self.has_torso else np.array([1.0, 0.0, 0.0, 0.0])
+
+    @property
+    def rotation(self) -> Array:
+        """(3, 3), world from torso."""
+        return self.data.xmat[self._torso].reshape(3, 3).copy() if self.has_torso else np.eye(3)
+
+    @property
+    def velocity(self) -> Array:
+        """(6,) of the torso in world axes: m/s, then rad/s."""
+        if not self.on_floor:
+            return np.zeros(6)
+        return np.concatenate([self.data.qvel[:3], self.rotation @ self.data.qvel[3:6]])
+
+    def limbs(self) -> list[list[float]]:
+        """The legs as capsules in the world: ax, ay, az, bx, by, bz, radius, m."""
+        model, data = self.model, self.data
+        out: list[list[float]] = []
+        for geom in self._links:
+            reach = data.geom_xmat[geom].reshape(3, 3)[:, 2] * model.geom_size[geom, 1]
+            centre = data.geom_xpos[geom]
+            out.append([*(centre - reach).tolist(), *(centre + reach).tolist(), float(model.geom_size[geom, 0])])
+        return out
 
     @property
     def gyro(self) -> Array:

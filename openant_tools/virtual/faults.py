@@ -44,6 +44,7 @@ CAUSES: Mapping[str, Mapping[str, Any]] = {
     "imu_silent": {},
     "imu_frozen": {},
     "camera_frozen": {},
+    "camera_stalled": {},
 }
 
 _QUANTITIES = ("_s", "_v", "_rad", "_ohm", "fraction", "byte_error", "volts", "_c", "flicker")
@@ -103,7 +104,7 @@ class Faults:
 
     Args:
         unplug: called with ("bus" | "imu" | "camera", plugged) when a USB device goes or comes.
-        imu: the flight controller, whose `silent` and `frozen` are switched. freeze_camera: likewise.
+        imu: the flight controller, whose `silent` and `frozen` are switched. camera: told by `fault`.
     """
 
     def __init__(
@@ -113,11 +114,11 @@ class Faults:
         *,
         unplug: Callable[[str, bool], None] | None = None,
         imu: Any = None,
-        freeze_camera: Callable[[bool], None] | None = None,
+        camera: Any = None,
     ) -> None:
         self.world = world
         self.faults: list[Fault] = list(faults)
-        self.unplug, self.imu, self.freeze_camera = unplug, imu, freeze_camera
+        self.unplug, self.imu, self.camera = unplug, imu, camera
         self._random = np.random.default_rng(world.settings.seed + 7919)
         bus = world.line.settings
         self._latency, self._gap, self._noise = bus.latency_timer_s, bus.write_read_gap_s, bus.byte_error
@@ -126,6 +127,7 @@ class Faults:
         self._stall_at = -math.inf
         self._unplugged: set[str] = set()
         self._registers: dict[tuple[int, str], int] = {}
+        self._camera_fault: str | None = None
         self._last = 0.0
         self._watching = False
         if self.faults:
@@ -167,7 +169,8 @@ class Faults:
         path = np.ones(len(world.joints))
         volts, ohm = self._supply
         unplugged: set[str] = set()
-        silent = frozen = camera = False
+        silent = frozen = False
+        camera: str | None = None
         registers: dict[tuple[int, str], int] = {}
         for fault in self.faults:
             if not fault.from_s <= now < fault.to_s:
@@ -219,15 +222,20 @@ class Faults:
                 case "imu_frozen":
                     frozen = True
                 case "camera_frozen":
-                    camera = True
+                    camera = "frozen"
+                case "camera_stalled":
+                    camera = "stalled"
         world.set_supply(volts, ohm)
         world.drives.set_path(path)
         self._set_registers(registers)
         self._set_devices(unplugged)
         if self.imu is not None:
             self.imu.silent, self.imu.frozen = silent, frozen
-        if self.freeze_camera is not None:
-            self.freeze_camera(camera)
+        if "camera" in unplugged:
+            camera = "gone"
+        if self.camera is not None and camera != self._camera_fault:
+            self.camera.fault(camera)
+            self._camera_fault = camera
 
     def _at(self, where: Sequence[str]) -> list[int]:
         return [self.world.joints.index(name) for name in where]

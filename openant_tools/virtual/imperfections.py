@@ -10,12 +10,13 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from openant_tools.errors import BadInput
 from openant_tools.virtual.body import Cable, Payload
 from openant_tools.virtual.motor import MotorSettings
+from openant_tools.virtual.overhead_camera import OverheadCameraSettings
 from openant_tools.virtual.world import WorldSettings
 
 __all__ = ["CATALOGUE", "Entry", "apply_entry", "nearest"]
@@ -219,6 +220,18 @@ def _imu_bias(w: WorldSettings, joints: Sequence[str], rad_s: Sequence[float], m
     w.imu = {**w.imu, "gyro_bias": tuple(rad_s), "acc_bias": tuple(m_s2)}
 
 
+def _tracker_scale(w: WorldSettings, joints: Sequence[str], scale: float, yaw_rad: float, latency_s: float) -> None:
+    """Tags printed at another size than declared scale every distance; a tag glued askew turns the heading."""
+    settings = OverheadCameraSettings(**w.camera)
+    origin, body = settings.origin, settings.body
+    w.camera = {
+        **w.camera,
+        "latency_s": settings.latency_s + latency_s,
+        "origin": None if origin is None else replace(origin, size=origin.size / scale),
+        "body": None if body is None else replace(body, size=body.size / scale, yaw=body.yaw + yaw_rad),
+    }
+
+
 _ZERO = (0.0, 0.0, 0.0)
 
 #: Every name of the catalogue that this robot can have.
@@ -261,10 +274,8 @@ CATALOGUE: Mapping[str, _Effect] = {
     ),
     "imu_misalignment": _Effect({"rotation_rad": None}, world=_imu_misalignment),
     "imu_bias": _Effect({"rad_s": _ZERO, "m_s2": _ZERO}, world=_imu_bias),
+    "tracker_scale": _Effect({"scale": 1.0, "yaw_rad": 0.0, "latency_s": 0.0}, world=_tracker_scale),
 }  # fmt: skip
-
-#: In the catalogue, not in this robot yet.
-NOT_YET = frozenset({"tracker_scale"})
 
 #: Needs a stand or a floor: nothing is moved in a box of motors.
 _NEEDS_ROBOT = frozenset({"link_mass", "payload", "blocked_joint", "floor_friction", "floor_tilt", "cable_drag"})
@@ -277,8 +288,6 @@ def apply_entry(settings: WorldSettings, entry: Entry, where: str) -> None:
     Raises:
         BadInput: unknown effect, parameter or joint, a missing or impossible value; names `where`.
     """
-    if entry.effect in NOT_YET:
-        raise BadInput(f"the virtual robot cannot have {entry.effect!r} yet", where=where, remedy="leave it out")
     effect = CATALOGUE.get(entry.effect)
     if effect is None:
         raise BadInput(f"no effect is called {entry.effect!r}", where=where, remedy=nearest(entry.effect, CATALOGUE))
@@ -332,6 +341,6 @@ def _number(name: str, value: Any, where: str) -> Any:
         return tuple(float(v) for v in numbers)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise BadInput(f"{value!r} is not a number", where=where)
-    if value < 0 and not name.startswith(("angle", "direction", "positive", "negative", "force")):
+    if value < 0 and not name.startswith(("angle", "direction", "positive", "negative", "force", "yaw")):
         raise BadInput(f"{value} is below zero", where=where)
     return float(value)

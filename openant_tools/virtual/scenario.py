@@ -18,6 +18,7 @@ from openant_tools.virtual.faults import Fault
 from openant_tools.virtual.flight_controller import FlightControllerSettings
 from openant_tools.virtual.imperfections import Entry, apply_entry, nearest
 from openant_tools.virtual.motor import MotorSettings
+from openant_tools.virtual.overhead_camera import OverheadCameraSettings, TagOnFloor, TagOnRobot
 from openant_tools.virtual.world import ServoSetup, WorldSettings, standard_servos
 
 __all__ = ["Scenario", "load_scenario", "parse_scenario"]
@@ -63,8 +64,8 @@ class Scenario:
 
     Attributes:
         name: for messages. world: what the robot is made of. faults: what happens over time.
-        stepped: whether time is stepped. camera: the camera's own settings, as written. imu_present: whether there is
-            a flight controller. eeprom: file that keeps the servos' EEPROM from one start to the next.
+        stepped: whether time is stepped. camera: whether there is one.
+        eeprom: file that keeps the servos' EEPROM from one start to the next.
         plugged: joints on the cable at the start; None for all.
     """
 
@@ -72,7 +73,7 @@ class Scenario:
     world: WorldSettings = field(default_factory=lambda: WorldSettings(standard_servos()))
     faults: list[Fault] = field(default_factory=list)
     stepped: bool = False
-    camera: dict[str, Any] = field(default_factory=dict)
+    camera: bool = True
     eeprom: Path | None = None
     plugged: tuple[str, ...] | None = None
 
@@ -126,6 +127,7 @@ def parse_scenario(table: Mapping[str, Any], name: str = "scenario") -> Scenario
     world.ambient_c = float(sections["room"].get("ambient_c", 25.0))
     world.doze = bool(sections["clock"].get("doze", False))
     world.imu = _fields(table.get("imu", {}), FlightControllerSettings, f"{name}, [imu]")
+    camera = _read_camera(table.get("camera", {}), world, f"{name}, [camera]")
     joints = [servo.joint for servo in servos]
     for n, entry in enumerate(_tables(table, "effect", name)):
         _read_effect(entry, world, f"{name}, [[effect]] {n + 1}")
@@ -142,7 +144,7 @@ def parse_scenario(table: Mapping[str, Any], name: str = "scenario") -> Scenario
         world=world,
         faults=faults,
         stepped=_choice(sections["clock"], "mode", ("real", "stepped"), "real", f"{name}, [clock]") == "stepped",
-        camera=dict(table.get("camera", {})),
+        camera=camera,
         eeprom=Path(robot["eeprom"]) if "eeprom" in robot else None,
         plugged=None if plugged is None else _joints(plugged, joints, f"{name}, [robot] plugged"),
     )
@@ -314,6 +316,21 @@ def _read_bus(bus: Mapping[str, Any], world: WorldSettings, where: str) -> None:
         if not isinstance(chains, list) or not all(isinstance(chain, list) for chain in chains):
             raise BadInput("chain is not a list of lists", where=where, remedy='chain = [["hip_rr", "knee_rr"], …]')
         settings.chains = [[joints.index(name) for name in _joints(chain, joints, where)] for chain in chains]
+
+
+def _read_camera(values: Any, world: WorldSettings, where: str) -> bool:
+    """Whether there is a camera; its settings go into the world's."""
+    if not isinstance(values, dict):
+        raise BadInput("is not a section", where=where)
+    rest = dict(values)
+    present = rest.pop("present", True)
+    tags: dict[str, Any] = {}
+    for key, kind in (("origin", TagOnFloor), ("body", TagOnRobot)):
+        tag = rest.pop(key, {})
+        # origin = false: there is no such tag.
+        tags[key] = None if tag is False else kind(**_fields(tag, kind, f"{where}, {key}"))
+    world.camera = {**_fields(rest, OverheadCameraSettings, where), **tags}
+    return bool(present)
 
 
 def _read_effect(entry: Mapping[str, Any], world: WorldSettings, where: str) -> None:

@@ -43,6 +43,7 @@ from typing import Any, Protocol
 
 from openant_tools.errors import OpenAntError
 from openant_tools.files import write_text
+from openant_tools.virtual.overhead_camera import Scene
 from openant_tools.virtual.ports import Port, PtyPort, TcpPort
 from openant_tools.virtual.world import World
 
@@ -68,6 +69,21 @@ class Device(Protocol):
     def transmit(self, t: float) -> bytes: ...
 
     def next_event(self, t: float) -> float: ...
+
+
+class Camera(Protocol):
+    """The camera's process, as the robot sees it."""
+
+    def wait(self) -> str: ...
+
+    @property
+    def next_exposure(self) -> float: ...
+
+    def expose(self, t: float, scene: Scene) -> None: ...
+
+    def advance(self, t: float) -> None: ...
+
+    def close(self) -> None: ...
 
 
 @dataclass
@@ -99,7 +115,7 @@ class Server:
     Args:
         world: the robot.
         stepped: time moves only by the control socket.
-        imu: the flight controller, if any. camera: the source that clients open.
+        imu: the flight controller, if any. camera: the camera, if any.
         tcp: the bus on a TCP port instead of a pseudo-terminal.
         folder: where the links and the socket stand; by default a temporary one, removed at the end.
     """
@@ -110,11 +126,14 @@ class Server:
         *,
         stepped: bool = False,
         imu: Device | None = None,
-        camera: str | None = None,
+        camera: Camera | None = None,
         tcp: bool = False,
         folder: Path | None = None,
     ) -> None:
-        self.world, self.stepped, self.camera = world, stepped, camera
+        self.world, self.stepped = world, stepped
+        self._camera = camera
+        if camera is not None:
+            world.events.append(self._expose)
         self._imu = imu
         #: switches a fault by a control request; set by whoever builds the robot
         self.fault: Callable[[dict[str, Any]], None] | None = None
@@ -144,12 +163,12 @@ class Server:
 
     @property
     def addresses(self) -> dict[str, Any]:
-        """What the ready file says (formats, section 6)."""
+        """What the ready file says (formats, section 6); waits until the camera serves."""
         bus = self.ports["bus"]
         return {
             "bus": bus.url if isinstance(bus, TcpPort) else str(self.folder / "bus"),
             "imu": str(self.folder / "imu") if "imu" in self.ports else None,
-            "camera": self.camera,
+            "camera": self._camera.wait() if self._camera is not None else None,
             "control": str(self.folder / "control"),
             "pid": os.getpid(),
         }
@@ -162,6 +181,8 @@ class Server:
             port.close()
         for control in self._controls:
             control.socket.close()
+        if self._camera is not None:
+            self._camera.close()
         self._listener.close()
         self._selector.close()
         if self._own_folder:
@@ -295,6 +316,18 @@ class Server:
         if data:
             self._send("imu", data, t)
 
+    def _expose(self, now: float) -> None:
+        """Let the camera see the robot when its next exposure is due."""
+        assert self._camera is not None
+        body = self.world.body
+        if now >= self._camera.next_exposure and body.has_torso:
+            velocity = body.velocity
+            scene = Scene(
+                body.position, body.rotation, body.limbs(), velocity=tuple(velocity[:3]), rate=tuple(velocity[3:])
+            )
+            # The world looks every few milliseconds; the shutter did not wait for it.
+            self._camera.expose(self.now, scene.moved(self._camera.next_exposure - now))
+
     # ---- stepped time ----
 
     def advance(self, to: float, until: Callable[[], bool] = lambda: False) -> None:
@@ -307,7 +340,9 @@ class Server:
             self.world.advance(t)
             self._flush(t)
             if t >= to:
-                return
+                break
+        if self._camera is not None:
+            self._camera.advance(self.world.now)
 
     def _flush(self, t: float) -> None:
         while self._outbox and self._outbox[0][0] <= t:

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.virtual.body import Body
+from openant_tools.virtual.camera_stream import VirtualCamera
 from openant_tools.virtual.eeprom import EepromFile
 from openant_tools.virtual.faults import Faults
 from openant_tools.virtual.flight_controller import FlightController, FlightControllerSettings
+from openant_tools.virtual.overhead_camera import OverheadCameraSettings
 from openant_tools.virtual.scenario import Scenario, load_scenario
 from openant_tools.virtual.server import Server
 from openant_tools.virtual.world import World
@@ -52,19 +54,30 @@ def build(scenario: Scenario | None = None) -> World:
     return world
 
 
-def assemble(script: Scenario, *, clock: str | None = None, tcp: bool = False) -> Server:
+def assemble(script: Scenario, *, clock: str | None = None, tcp: bool = False, camera: bool | None = None) -> Server:
     """A server for a scenario, its ports open.
 
     Args:
         clock: "real" or "stepped"; None for what the scenario says.
         tcp: put the bus on a TCP port.
+        camera: whether to start the camera's process; None for what the scenario says.
     """
-    world = build(script)
-    settings = FlightControllerSettings(**script.world.imu)
-    imu = FlightController(settings, lambda: BodyTruth(world.body), np.random.default_rng(script.world.seed + 2))
     stepped = script.stepped if clock is None else clock == "stepped"
-    server = Server(world, stepped=stepped, imu=imu, tcp=tcp)
-    faults = Faults(world, script.faults, unplug=server.set_plugged, imu=imu)
+    seed = script.world.seed
+    eye = None
+    if script.camera if camera is None else camera:
+        # Started first: its process gets ready while this one builds the robot.
+        eye = VirtualCamera(OverheadCameraSettings(**script.world.camera), seed + 3, stepped=stepped)
+    try:
+        world = build(script)
+        settings = FlightControllerSettings(**script.world.imu)
+        imu = FlightController(settings, lambda: BodyTruth(world.body), np.random.default_rng(seed + 2))
+        server = Server(world, stepped=stepped, imu=imu, camera=eye, tcp=tcp)
+    except BaseException:
+        if eye is not None:
+            eye.close()
+        raise
+    faults = Faults(world, script.faults, unplug=server.set_plugged, imu=imu, camera=eye)
     server.fault = faults.request
     return server
 

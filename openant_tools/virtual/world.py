@@ -82,6 +82,8 @@ class WorldSettings:
     seed: int = 0
     #: what differs from the defaults of `FlightControllerSettings`
     imu: dict[str, Any] = field(default_factory=dict)
+    #: the same for `OverheadCameraSettings`
+    camera: dict[str, Any] = field(default_factory=dict)
 
 
 def standard_servos(kit: str = "standard", *, factory: bool = False) -> list[ServoSetup]:
