@@ -1,0 +1,19 @@
+"""`openant sysid`: from excitation to a calibrated model."""
+
+from __future__ import annotations
+
+import click
+
+from openant_tools.cli.sysid_fit import fit
+from openant_tools.cli.sysid_record import record
+
+__all__ = ["sysid"]
+
+
+@click.group()
+def sysid() -> None:
+    """Record excitations of the robot and fit a calibrated model to them."""
+
+
+sysid.add_command(record)
+sysid.add_command(fit)

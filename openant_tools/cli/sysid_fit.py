@@ -1,0 +1,106 @@
+"""`openant sysid fit`: recordings in, calibrated model out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from openant_tools.cli.options import robot_option
+
+__all__ = ["fit"]
+
+
+@click.command()
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN…")
+@click.option(
+    "--model", type=click.Path(path_type=Path), metavar="M.xml", help="Default: the model of the robot's folder."
+)
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), required=True, metavar="DIR")
+@click.option(
+    "--hold-out", multiple=True, type=click.Path(path_type=Path), metavar="RUN", help="Judge on this run. Repeatable."
+)
+@click.option("--joint", "joints", multiple=True, metavar="NAME", help="Fit this joint only. Repeatable.")
+@click.option(
+    "--parameter", "kinds", multiple=True, metavar="KIND", help="Fit this kind of parameter only. Repeatable."
+)
+@click.option(
+    "--tie",
+    type=click.Choice(["joint", "servo", "all"]),
+    default="joint",
+    show_default=True,
+    help="One value a joint, one a servo model, or one for all.",
+)
+@robot_option
+def fit(
+    runs: tuple[Path, ...],
+    model: Path | None,
+    out: Path,
+    hold_out: tuple[Path, ...],
+    joints: tuple[str, ...],
+    kinds: tuple[str, ...],
+    tie: str,
+    robot: Path | None,
+) -> int:
+    """Fit a model to recordings and write calibrated.xml, fit.json and report.html to DIR.
+
+    What does not beat the given model on held-out runs falls back to it. Without --hold-out, runs are left out in turn.
+    With --robot, calibrated.xml and every value with its provenance go into the robot's folder too.
+
+    \b
+      openant sysid fit run1.mcap run2.mcap --hold-out run3.mcap --robot my-ant --out fit
+      openant sysid fit swing.parquet --model pendulum.xml --out fit
+
+    Kinds of parameters: stiffness, velocity_gain, damping, electrical_damping, armature, coulomb_friction, zero_offset,
+    torque_limit. Exit code 1: nothing beats the given model.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from openant_tools.recording.tables import read_run
+    from openant_tools.robot.folder import RobotFolder
+    from openant_tools.sysid.identify import identify
+    from openant_tools.sysid.result import write_fit, write_robot
+
+    folder = None if robot is None else RobotFolder.at(robot)
+    if model is None:
+        model = (folder or RobotFolder.at(Path())).model_path()
+    recordings = [read_run(path) for path in runs]
+    held_out = [read_run(path) for path in hold_out]
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("fitting", total=1.0)
+        result = identify(
+            recordings,
+            model,
+            held_out,
+            joints=joints or None,
+            kinds=kinds or None,
+            tie=tie,
+            progress=lambda what, done: bar.update(task, description=what, completed=done),
+        )
+        bar.update(task, description="writing the report", completed=1.0)
+        written = write_fit(result, out)
+    if folder is not None and result.accepted:
+        write_robot(result, folder)
+        written.append(folder.config_file)
+
+    width = max(len(value.name) for value in result.values)
+    for value in result.values:
+        click.echo(
+            f"{value.name:{width}}  {value.value:10.5g}  [{value.low:.4g}, {value.high:.4g}] {value.unit:10} {value.verdict}"
+        )
+    judged = "runs left out in turn" if result.in_turn else "held-out runs"
+    click.echo(
+        f"error on {judged}, full run: {1e3 * result.before.full:.2f} → {1e3 * result.after.full:.2f} mrad; "
+        f"0.5 s: {1e3 * result.before.horizon:.2f} → {1e3 * result.after.horizon:.2f} mrad; "
+        f"floor {1e3 * result.floor:.2f} mrad"
+    )
+    for note in result.notes:
+        click.echo(note)
+    if not result.accepted:
+        click.echo("nothing that was fitted beats the given model on held-out runs; calibrated.xml is the given model")
+    for path in written:
+        click.echo(f"wrote {path}", err=True)
+    return 0 if result.accepted else 1

@@ -1,0 +1,188 @@
+"""The report of a fit: first the figure that matters, then what was found, then how it looks joint by joint."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.model.gap import HORIZON_S, gap, share_closed
+from openant_tools.model.rollout import Rollouts
+from openant_tools.recording.run import Run
+from openant_tools.report import Details, Figure, KeyFigure, Mark, Part, Report, plots
+from openant_tools.report.parts import Tone
+from openant_tools.sysid.fit import Dataset
+from openant_tools.sysid.identify import Identification, Value
+from openant_tools.sysid.parameter import apply
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MatplotlibFigure
+
+__all__ = ["fit_report"]
+
+Array = NDArray[np.float64]
+
+#: horizons at which the error is shown, s; the full run comes last
+HORIZONS_S = (0.1, 0.2, 0.5, 1.0, 2.0)
+#: seconds shown around the worst moment of a joint
+WINDOW_S = 3.0
+
+_TONE: dict[str, Tone] = {"identifiable": "good", "weak": "warn", "undetermined": "", "fell back": "bad"}
+
+VERDICTS = """
+- **identifiable**: the data gave most of the value; the interval is theirs.
+- **weak**: between data and prior; more or other motion would settle it.
+- **undetermined**: the data say nothing about it; it stays at its prior.
+- **fell back**: it did not beat the given model on held-out runs; the given value stays. The interval is of what the data would have said.
+"""
+
+
+def fit_report(result: Identification) -> Report:
+    """Everything a reader needs to decide whether to use the calibrated model."""
+    closed = share_closed(result.before.full, result.after.full, result.floor)
+    report = Report(
+        "System identification", f"{result.model.name} · {', '.join(_names(result))}", made_by="openant sysid fit"
+    )
+    report.text(_sentence(result, closed))
+    report.key_figures(
+        KeyFigure("held-out error, full run", _change(result.before.full, result.after.full), "given → calibrated"),
+        KeyFigure(
+            f"held-out error, {HORIZON_S:g} s",
+            _change(result.before.horizon, result.after.horizon),
+            "re-initialised from measurement",
+        ),
+        KeyFigure("floor", f"{1e3 * result.floor:.2f} mrad", "what no model could beat"),
+        KeyFigure(
+            "excess gap closed",
+            f"{100 * closed:.0f} %" if math.isfinite(closed) else "–",
+            "on held-out runs",
+            "good" if closed > 0.5 else "warn",
+        ),
+    )
+    report.section("How far").figure(
+        _error_against_horizon(result),
+        "Root mean square error of joint positions on held-out runs, re-initialised from measurement every so often. "
+        "The model is better where its line is lower; a full run never re-initialises.",
+    )
+    report.section("What was found").table(
+        ["parameter", "given", "value", "95 % interval", "unit", "verdict"], [_row(value) for value in result.values]
+    )
+    report.text(VERDICTS)
+    for note in result.notes:
+        report.text(note)
+    report.section("Measured against simulated")
+    for data in result.held_out:
+        report.add(*_joints(result, data))
+    report.section("How it was judged").text(
+        f"The gap is the root mean square of measured minus simulated position over all joints and samples. "
+        f"{'Runs were left out in turn, each simulated by a fit to the others' if result.in_turn else 'Held-out runs'}: "
+        f"{', '.join(result.judged_on)}. Simulations start from the measured state and play the run's own commands."
+    )
+    report.table(
+        ["joint", "residual (mrad)", "it remembers itself for (s)"],
+        [[j, f"{1e3 * result.noise[j]:.2f}", f"{result.correlation_s[j]:.3f}"] for j in result.joints],
+    )
+    return report
+
+
+def _names(result: Identification) -> list[str]:
+    return [run.name for data in result.datasets for run in data.runs]
+
+
+def _sentence(result: Identification, closed: float) -> str:
+    if not result.accepted:
+        return "**Nothing that was fitted beats the given model on held-out runs, so the model is returned as it was.**"
+    kinds = dict.fromkeys(name.partition(".")[0].replace("_", " ") for name in result.accepted)
+    return (
+        f"**The calibrated model leaves {100 * result.after.full / result.before.full:.0f} % of the given model's error on "
+        f"held-out runs.** It changes {', '.join(kinds)}."
+    )
+
+
+def _change(before: float, after: float) -> str:
+    return f"{1e3 * before:.2f} → {1e3 * after:.2f} mrad"
+
+
+def _row(value: Value) -> list[object]:
+    return [
+        value.name,
+        f"{value.given:.4g}",
+        f"{value.value:.4g}",
+        f"{value.low:.4g} … {value.high:.4g}",
+        value.unit,
+        Mark(value.verdict, _TONE[value.verdict]),
+    ]
+
+
+def _error_against_horizon(result: Identification) -> MatplotlibFigure:
+    figure, axes = plots.figure(height=2.8)
+    given, calibrated = [], []
+    longest = max(run.duration_s for data in result.held_out for run in data.runs)
+    horizons = [horizon for horizon in HORIZONS_S if horizon < longest / 2]
+    for horizon in [*horizons, None]:
+        measured, before, after = [], [], []
+        for data in result.held_out:
+            model = apply(data.plant, result.parameters, result.u)
+            pos = Rollouts(data.plant, data.runs, horizon)([data.plant.model, model]).pos
+            measured.append(data.measured)
+            before.append(pos[0])
+            after.append(pos[1])
+        truth = np.concatenate(measured)
+        given.append(1e3 * gap(truth, np.concatenate(before)))
+        calibrated.append(1e3 * gap(truth, np.concatenate(after)))
+    x = np.arange(len(given))
+    with plots.style():
+        axes.plot(x, given, "s--", label="given model")
+        axes.plot(x, calibrated, "o-", label="calibrated model")
+        axes.axhline(1e3 * result.floor, linestyle=":", color=plots.INK, label="floor")
+        axes.set_xticks(x, [f"{horizon:g}" for horizon in horizons] + ["full run"])
+        axes.set_xlabel(plots.axis_label("re-initialised every", "s"))
+        axes.set_ylabel(plots.axis_label("held-out error", "mrad"))
+        axes.set_ylim(bottom=0)
+    plots.legend(axes)
+    return figure
+
+
+def _joints(result: Identification, data: Dataset) -> Sequence[Part]:
+    """For each joint, the worst moment of the given model: command, measured, and both simulations, with the error below."""
+    model = apply(data.plant, result.parameters, result.u)
+    pos = data.full([data.plant.model, model]).pos
+    parts: list[Part] = []
+    for j, joint in enumerate(data.plant.joints):
+        run, rows = _worst(data, data.measured[:, j] - pos[0, :, j])
+        t = run.t[rows] - run.t[0]
+        part = data.full.rows[data.runs.index(run)]
+        at = np.arange(part.start, part.stop)[rows]
+        figure, (above, below) = plots.figure(2, 1, height=1.8, sharex=True)
+        with plots.style():
+            above.plot(t, run.column(f"cmd.{joint}")[rows], color=plots.INK, linewidth=0.8, alpha=0.6, label="command")
+            above.plot(t, data.measured[at, j], color=plots.GREEN, label="measured")
+            above.plot(t, pos[0, at, j], "--", color=plots.ORANGE, label="given model")
+            above.plot(t, pos[1, at, j], color=plots.BLUE, label="calibrated")
+            above.set_ylabel(plots.axis_label(joint, "rad"))
+            below.plot(t, 1e3 * (data.measured[at, j] - pos[0, at, j]), "--", color=plots.ORANGE)
+            below.plot(t, 1e3 * (data.measured[at, j] - pos[1, at, j]), color=plots.BLUE)
+            below.set_ylabel(plots.axis_label("error", "mrad"))
+            below.set_xlabel(plots.axis_label("time in run", "s"))
+        plots.legend(above)
+        before, after = (1e3 * gap(data.measured[:, j], pos[v, :, j]) for v in (0, 1))
+        shown = Figure(figure, f"{run.name}, where the given model is worst.")
+        parts.append(Details(f"{joint}: {before:.2f} → {after:.2f} mrad over full runs", (shown,)))
+    return parts
+
+
+def _worst(data: Dataset, error: Array) -> tuple[Run, slice]:
+    """The run and the rows of WINDOW_S in which the mean squared error is largest."""
+    best: tuple[float, Run, slice] | None = None
+    for run, part in zip(data.runs, data.full.rows, strict=True):
+        squares = np.nan_to_num(error[part]) ** 2
+        width = max(2, min(len(run.t), round(WINDOW_S / float(np.median(np.diff(run.t))))))
+        total = np.convolve(squares, np.ones(width), "valid")
+        k = int(np.argmax(total))
+        if best is None or total[k] > best[0]:
+            best = float(total[k]), run, slice(k, k + width)
+    assert best is not None
+    return best[1], best[2]

@@ -1,0 +1,65 @@
+"""What a fit leaves behind: `calibrated.xml`, `fit.json`, `report.html`, and the entries of `robot.toml`."""
+
+from __future__ import annotations
+
+import datetime
+import json
+from pathlib import Path
+
+from openant_tools.files import write_text
+from openant_tools.model.mjcf import write_model
+from openant_tools.model.plant import Setup
+from openant_tools.robot.config import Provenance
+from openant_tools.robot.folder import RobotFolder
+from openant_tools.sysid.identify import Identification, models
+from openant_tools.sysid.report import fit_report
+
+__all__ = ["write_fit", "write_robot"]
+
+CALIBRATED = "calibrated.xml"
+
+
+def write_fit(result: Identification, out: Path) -> list[Path]:
+    """Write the model, the figures and the report into `out`, each atomically; returns what was written.
+
+    Where nothing was accepted the model is the given one, so that a script can go on with `calibrated.xml` either way.
+    """
+    runs = ", ".join(run.name for data in result.datasets for run in data.runs)
+    _, calibrated = models(result, Setup.FLOOR)
+    written = [
+        write_model(
+            result.model,
+            calibrated,
+            out / CALIBRATED,
+            joints=result.joints,
+            note=f"Calibrated by `openant sysid fit` on {datetime.date.today()} from {result.model.name} and {runs}",
+        )
+    ]
+    write_text(out / "fit.json", json.dumps(result.as_json(), indent=1, ensure_ascii=False) + "\n")
+    fit_report(result).write(out / "report.html")
+    return [*written, out / "fit.json", out / "report.html"]
+
+
+def write_robot(result: Identification, folder: RobotFolder) -> None:
+    """Put the calibrated model into a robot's folder, and every accepted value with where it came from into `robot.toml`."""
+    _, calibrated = models(result, Setup.FLOOR)
+    write_model(
+        result.model, calibrated, folder.path / CALIBRATED, joints=result.joints, note="Written by `openant sysid fit`"
+    )
+    runs = [run for data in result.datasets for run in data.runs]
+    recording = folder.relative(runs[0].path) if runs[0].path else runs[0].name
+    now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+
+    def source(low: float | None = None, high: float | None = None) -> Provenance:
+        return Provenance("fitted", "openant sysid fit", recording, now, low, high)
+
+    values: dict[str, object] = {"model": CALIBRATED}
+    provenance = {"model": source()}
+    for value in result.values:
+        if value.accepted:
+            kind = value.name.partition(".")[0]
+            for joint in value.joints:
+                path = f"identified.{kind}.{joint}"
+                values[path] = float(f"{value.value:.6g}")
+                provenance[path] = source(float(f"{value.low:.6g}"), float(f"{value.high:.6g}"))
+    folder.update(values, provenance=provenance)
