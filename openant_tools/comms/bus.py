@@ -10,6 +10,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from typing import NamedTuple
 
 from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.clock import Clock
@@ -51,8 +53,7 @@ class Timing:
     write_read_gap_s: float = 0.2e-3
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
+class Answer(NamedTuple):
     """What one servo answered to one request.
 
     Attributes:
@@ -90,6 +91,45 @@ class Answer:
         return Cause.ALERT.value if self.alert else ""
 
 
+@dataclass(slots=True)
+class _Request:
+    """A request and what it takes, made once and sent often.
+
+    Attributes:
+        size: bytes of one answer as it should be. heads: each answer's first eight bytes. crcs: their CRC.
+        whole: s from the request's first byte to the last answer's last.
+        quiet: s without a byte that mean none will come.
+    """
+
+    packet: bytes
+    ids: tuple[int, ...]
+    count: int
+    size: int
+    heads: tuple[bytes, ...]
+    crcs: tuple[int, ...]
+    timing: Timing | None = None
+    baud: int = 0
+    wire: float = 0.0
+    whole: float = 0.0
+    quiet: float = 0.0
+
+    @classmethod
+    def of(cls, instruction: Instruction, ids: Sequence[int], count: int) -> _Request:
+        heads = tuple(p2.HEADER + struct.pack("<BHB", id, count + 4, p2.Inst.STATUS) for id in ids)
+        crcs = tuple(p2.crc16(head) for head in heads)
+        return cls(instruction.encode(), tuple(ids), count, count + STATUS_OVERHEAD, heads, crcs)
+
+    def fit(self, timing: Timing, baud: int) -> None:
+        """Compute the deadlines for this timing and rate."""
+        self.timing, self.baud = timing, baud
+        byte_s = BITS_PER_BYTE / baud
+        one = byte_s * self.size + timing.return_delay_s
+        spare = timing.latency_timer_s + timing.margin_s
+        self.wire = byte_s * len(self.packet)
+        self.whole = self.wire + len(self.ids) * one + spare
+        self.quiet = one + spare
+
+
 @dataclass(frozen=True)
 class Found:
     """A servo that answered a ping."""
@@ -125,6 +165,9 @@ class Bus:
 
     def __post_init__(self) -> None:
         self._quiet_from = 0.0
+        #: something was lost: what it left on the line may still come
+        self._unsettled = True
+        self._known: dict[tuple[int, int, int, tuple[int, ...]], _Request] = {}
 
     # ---- one instruction each ------------------------------------------------------------------------------------
 
@@ -224,17 +267,26 @@ class Bus:
 
     def sync_read(self, address: int, count: int, ids: Sequence[int]) -> list[Answer]:
         """The same registers of several servos, in the order of `ids`. Never raises for a silent servo."""
-        if self.fast.issuperset(ids) and len(ids) > 1:
+        ids = tuple(ids)
+        if self.fast and len(ids) > 1 and self.fast.issuperset(ids):
             answers = self._fast_sync_read(address, count, ids)
-            if answers[0] is not None and all(answer is not None for answer in answers):
+            rest = [id for id, answer in zip(ids, answers, strict=True) if answer is None]
+            if not rest:
                 return [answer for answer in answers if answer is not None]
             # A joined reply ends at the first silent servo: ask those behind it one by one, and joined no more.
             self.statistics.fast_read_fallbacks += 1
             self.fast.clear()
-            rest = [id for id, answer in zip(ids, answers, strict=True) if answer is None]
             others = iter(self._exchange(p2.sync_read(address, count, rest), rest, count))
             return [answer or next(others) for answer in answers]
-        return self._exchange(p2.sync_read(address, count, ids), ids, count)
+        return self._transact(self._request(p2.Inst.SYNC_READ, address, count, ids))
+
+    def _request(self, code: p2.Inst, address: int, count: int, ids: tuple[int, ...]) -> _Request:
+        key = (code, address, count, ids)
+        request = self._known.get(key)
+        if request is None:
+            make = p2.sync_read if code == p2.Inst.SYNC_READ else p2.fast_sync_read
+            request = self._known[key] = _Request.of(make(address, count, ids), ids, count)
+        return request
 
     def bulk_read(self, items: Sequence[tuple[int, int, int]]) -> list[Answer]:
         """(id, address, bytes) each, answered in that order. Never raises for a silent servo."""
@@ -307,12 +359,13 @@ class Bus:
         gap = self._quiet_from + self.timing.write_read_gap_s
         if self.clock.now() < gap:
             self.clock.sleep_until(gap)
-        stale = self.line.read()
-        if stale:
-            self._count_stale(stale)
+        if self._unsettled:
+            stale = self.line.read()
+            if stale:
+                self._count_stale(stale)
         started = self.request_at = self.clock.now()
         self.line.write(packet)
-        self._quiet_from = started + self.wire_s(len(packet))
+        self._quiet_from = started + len(packet) * BITS_PER_BYTE / self.line.baud
         return started
 
     def _count_stale(self, data: bytes) -> None:
@@ -327,62 +380,84 @@ class Bus:
                 if servo.lost.get(Cause.TIMEOUT, 0):
                     servo.lost[Cause.TIMEOUT] -= 1
 
-    def _patience(self, sent: int, replies: int, count: int) -> tuple[float, float]:
-        """(whole, quiet): s from the request's first byte to the last answer's last; s without a byte that mean none
-        will come."""
-        timing = self.timing
-        one = self.wire_s(count + STATUS_OVERHEAD) + timing.return_delay_s
-        spare = timing.latency_timer_s + timing.margin_s
-        return self.wire_s(sent) + replies * one + spare, one + spare
-
     def _exchange(self, instruction: Instruction, ids: Sequence[int], count: int) -> list[Answer]:
         """Send a request and collect one answer of `count` bytes from each of `ids`."""
-        packet = instruction.encode()
-        whole, quiet = self._patience(len(packet), len(ids), count)
-        started = self._send(packet)
-        deadline = started + whole
-        size = count + STATUS_OVERHEAD
-        buffer = bytearray()
-        edges: list[tuple[int, float, bool]] = []  # (bytes so far, when, whether in time)
+        return self._transact(_Request.of(instruction, ids, count))
+
+    def _transact(self, request: _Request) -> list[Answer]:
+        if request.timing is not self.timing or request.baud != self.line.baud:
+            request.fit(self.timing, self.line.baud)
+        started = self._send(request.packet)
+        data, edges = self._collect(request, started)
+        answers = self._whole_answers(request, data, edges, started)
+        if answers is None:
+            answers = self._sort_out(data, request.ids, edges, started)
+            for answer in answers:
+                self.statistics.count(answer.id, answer.cause, answer.rtt, answer.alert)
+            self._unsettled = not all(answer.ok for answer in answers)
+        if data:
+            self._quiet_from = edges[-1][1] - self.timing.write_read_gap_s
+        rtt = answers[-1].rtt
+        if rtt is not None:
+            self.statistics.arrivals.append((started + rtt, rtt))
+        return answers
+
+    def _collect(self, request: _Request, started: float) -> tuple[bytes, list[tuple[int, float, bool]]]:
+        """All bytes that come for a request, and (bytes so far, when, whether in time) of each portion."""
+        data, edges = b"", list[tuple[int, float, bool]]()
+        ids, size, quiet = request.ids, request.size, request.quiet
+        deadline, sent = started + request.whole, started + request.wire
         # A refusal is shorter than an answer and stuffing makes it longer: the length field tells, once it is there.
-        heads = [p2.HEADER + bytes((id,)) for id in ids]
-        known, at_known, plain, expected = 0, 0, True, size * len(ids)
-        in_time, before = True, self.line.received
-        wait, read, arrivals = self.clock.wait_readable, self.line.read, self.clock.arrivals
-        while len(buffer) < expected:
-            if not wait(self.line, deadline):
+        known, at_known, expected = 0, 0, size * len(ids)
+        in_time, line, before = True, self.line, self.line.received
+        while len(data) < expected:
+            if not self.clock.wait_readable(line, deadline):
                 if not in_time or self.timing.grace_s <= 0:
                     break
                 in_time, deadline = False, deadline + self.timing.grace_s
                 continue
-            buffer += read()
-            for total, at in arrivals(self.line):
+            data += line.read()
+            for total, at in self.clock.arrivals(line):
                 # In real time a portion that was read late may have arrived in time: only waiting in vain tells.
                 edges.append((total - before, at, in_time and (at <= deadline or not self.clock.stepped)))
-            while known < len(ids) and len(buffer) >= at_known + 7 and buffer.startswith(heads[known], at_known):
-                actual = 7 + (buffer[at_known + 5] | buffer[at_known + 6] << 8)
-                if actual != size:
-                    plain, expected = False, expected + actual - size
+            if len(data) == expected:
+                break
+            while (
+                known < len(ids) and len(data) >= at_known + 7 and data.startswith(request.heads[known][:5], at_known)
+            ):
+                actual = 7 + (data[at_known + 5] | data[at_known + 6] << 8)
+                expected += actual - size
                 known, at_known = known + 1, at_known + actual
-            if len(buffer) < expected and in_time:
-                deadline = min(deadline, max(edges[-1][1], started + self.wire_s(len(packet))) + quiet)
-        if buffer:
-            self._quiet_from = self.clock.now() - self.timing.write_read_gap_s
+            if len(data) < expected and in_time:
+                deadline = min(deadline, max(edges[-1][1], sent) + quiet)
+        return data, edges
+
+    def _whole_answers(
+        self, request: _Request, data: bytes, edges: list[tuple[int, float, bool]], started: float
+    ) -> list[Answer] | None:
+        """The usual case: every answer where it should be, none stuffed, none late. None where anything is not."""
+        ids, size = request.ids, request.size
+        if len(data) != size * len(ids) or not edges[-1][2] or data.count(_MARK) != len(ids):
+            return None
+        at, alerts = 0, 0
+        at_once = len(edges) == 1
+        rtt = edges[0][1] - started
         answers: list[Answer] = []
-        if plain and known == len(ids) and len(buffer) == expected and edges[-1][2]:
-            # The usual case: every head where it should be; checksums and stuffing are left to look at.
-            for k, id in enumerate(ids):
-                part = bytes(buffer[k * size : (k + 1) * size])
-                if part[7] != p2.Inst.STATUS or p2.crc16(part[:-2]) != part[-2] | part[-1] << 8 or _MARK in part[7:]:
-                    answers.clear()
-                    break
-                answers.append(Answer(id, part[9:-2], part[8], None, _when((k + 1) * size, edges)[0] - started))
-        if not answers:
-            answers = self._sort_out(bytes(buffer), ids, edges, started)
-        for answer in answers:
-            self.statistics.count(answer.id, answer.cause, answer.rtt, answer.alert)
-        if answers[-1].rtt is not None:
-            self.statistics.arrivals.append((started + answers[-1].rtt, answers[-1].rtt))
+        for id, head, crc in zip(ids, request.heads, request.crcs, strict=True):
+            end = at + size
+            part = data[at + 8 : end - 2]
+            if not data.startswith(head, at) or p2.crc16(part, crc) != data[end - 2] | data[end - 1] << 8:
+                return None
+            error = part[0]
+            alerts |= error
+            if not at_once:
+                rtt = _when(end, edges)[0] - started
+            answers.append(Answer(id, part[1:], error, None, rtt))
+            at = end
+        if alerts & p2.ALERT_BIT:
+            return None  # counted one by one
+        self.statistics.count_whole(ids, rtt if at_once else [answer[4] for answer in answers])  # type: ignore[misc]
+        self._unsettled = False
         return answers
 
     def _sort_out(
@@ -423,32 +498,61 @@ class Bus:
             answers.append(answer)
         return answers
 
-    def _fast_sync_read(self, address: int, count: int, ids: Sequence[int]) -> list[Answer | None]:
+    def _fast_sync_read(self, address: int, count: int, ids: tuple[int, ...]) -> Sequence[Answer | None]:
         """The verified part of a joined reply; None for those it does not reach."""
-        packet = p2.fast_sync_read(address, count, ids).encode()
-        whole, quiet = self._patience(len(packet), len(ids), count)
-        started = self._send(packet)
-        deadline = started + whole
-        expected, buffer = 8 + len(ids) * (count + 4), bytearray()
+        request = self._request(p2.Inst.FAST_SYNC_READ, address, count, ids)
+        if request.timing is not self.timing or request.baud != self.line.baud:
+            request.fit(self.timing, self.line.baud)
+        started = self._send(request.packet)
+        deadline, sent = started + request.whole, started + request.wire
+        expected, data = 8 + len(ids) * (count + 4), b""
         edges: list[tuple[int, float, bool]] = []
         before = self.line.received
-        while len(buffer) < expected and self.clock.wait_readable(self.line, deadline):
-            buffer += self.line.read()
+        while len(data) < expected and self.clock.wait_readable(self.line, deadline):
+            data += self.line.read()
             edges += [(total - before, at, True) for total, at in self.clock.arrivals(self.line)]
-            deadline = min(deadline, max(edges[-1][1] + quiet, started + self.wire_s(len(packet)) + quiet))
-        if buffer:
-            self._quiet_from = self.clock.now() - self.timing.write_read_gap_s
-        at = buffer.find(p2.HEADER)
-        parts = p2.split_joined(bytes(buffer[max(at, 0) :]), [(id, count) for id in ids])
+            deadline = min(deadline, max(edges[-1][1], sent) + request.quiet)
+        if data:
+            self._quiet_from = edges[-1][1] - self.timing.write_read_gap_s
+        whole = self._whole_joined(request, data, edges, started)
+        if whole is not None:
+            return whole
+        at = max(data.find(p2.HEADER), 0)
+        parts = p2.split_joined(data[at:], [(id, count) for id in ids])
         answers: list[Answer | None] = [None] * len(ids)
         for k, part in enumerate(parts):
             when, _ = _when(at + 8 + (k + 1) * (count + 4), edges)
             answers[k] = Answer(part.id, part.params, part.error, None, when - started)
-            self.statistics.count(part.id, None, when - started, bool(part.error & p2.ALERT_BIT))
+        for answer in answers:
+            if answer is not None:
+                self.statistics.count(answer.id, None, answer.rtt, answer.alert)
         if len(parts) < len(ids):
-            broken = len(buffer) - max(at, 0) - 8 - len(parts) * (count + 4)
-            cause = Cause.TIMEOUT if broken <= 0 else Cause.SHORT if len(buffer) < expected else Cause.CRC
+            broken = len(data) - at - 8 - len(parts) * (count + 4)
+            cause = Cause.TIMEOUT if broken <= 0 else Cause.SHORT if len(data) < expected else Cause.CRC
             self.statistics.count(ids[len(parts)], cause, None, False)
+            self._unsettled = True
+        return answers
+
+    def _whole_joined(
+        self, request: _Request, data: bytes, edges: list[tuple[int, float, bool]], started: float
+    ) -> list[Answer] | None:
+        """The usual case of a joined reply: all there, the last CRC, which covers the earlier ones, right."""
+        ids, step = request.ids, request.count + 4
+        if len(data) != 8 + len(ids) * step or len(edges) != 1:
+            return None
+        head = _joined_head(len(ids), request.count)
+        if not data.startswith(head) or p2.crc16(data[:-2]) != data[-2] | data[-1] << 8:
+            return None
+        at, rtt = len(head), edges[0][1] - started
+        answers: list[Answer] = []
+        for id in ids:
+            if data[at + 1] != id or data[at]:
+                return None  # out of turn, refused or with an alert: taken apart and counted one by one
+            answers.append(Answer(id, data[at + 2 : at + step - 2], 0, None, rtt))
+            at += step
+        self.statistics.count_whole(ids, rtt)
+        self.statistics.arrivals.append((edges[0][1], rtt))
+        self._unsettled = False
         return answers
 
     def _insist(self, instruction: Instruction, id: int, count: int, what: str) -> Answer:
@@ -480,6 +584,11 @@ class Bus:
             raise Refused(
                 answer.id, answer.refusal, f"refuses {what}: {why}", where=self._place(answer.id), remedy=remedy
             )
+
+
+@cache
+def _joined_head(servos: int, count: int) -> bytes:
+    return p2.HEADER + struct.pack("<BHB", p2.BROADCAST, 1 + servos * (count + 4), p2.Inst.STATUS)
 
 
 def _found(answer: Answer) -> Found:

@@ -13,6 +13,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, IntEnum
+from typing import NamedTuple
 
 __all__ = [
     "ALERT_BIT",
@@ -29,6 +30,7 @@ __all__ = [
     "Parser",
     "Reason",
     "Status",
+    "SyncWriteTemplate",
     "action",
     "bulk_read",
     "bulk_write",
@@ -151,8 +153,7 @@ class JoinedStatus:
     raw: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class JoinedAnswer:
+class JoinedAnswer(NamedTuple):
     """One servo's part of a joined reply, verified by the CRC that runs over everything before it."""
 
     id: int
@@ -184,14 +185,19 @@ def _crc_table() -> list[int]:
 _CRC = _crc_table()
 
 
+_WORDS = [struct.Struct(f">{count}H").unpack_from for count in range(MAX_PACKET // 2 + 1)]
+
+
 def crc16(data: bytes | bytearray | memoryview, crc: int = 0) -> int:
     """CRC-16 of Protocol 2.0 (polynomial 0x8005, not reflected), continued from `crc`; two bytes a step."""
     count = len(data)
-    if count & 1:
+    odd = count & 1
+    if odd:
         crc = ((crc << 8) & 0xFFFF) ^ _CRC[(crc >> 8) ^ data[0]]
-        data = data[1:]
-    for word in struct.unpack(f">{count >> 1}H", data):
-        crc = _CRC[crc ^ word]
+    table = _CRC
+    words = _WORDS[count >> 1] if count <= MAX_PACKET else struct.Struct(f">{count >> 1}H").unpack_from
+    for word in words(data, odd):
+        crc = table[crc ^ word]
     return crc
 
 
@@ -424,6 +430,34 @@ def sync_write(address: int, count: int, data: Mapping[int, bytes]) -> Instructi
             raise ValueError(f"{len(values)} bytes for ID {id} in a sync write of {count}")
         parts.append(bytes((id,)) + values)
     return Instruction(BROADCAST, Inst.SYNC_WRITE, b"".join(parts))
+
+
+class SyncWriteTemplate:
+    """One sync write of whole numbers, encoded again and again: everything that does not change is made once.
+
+    Args:
+        address: of the register.
+        format: of one value, as in `struct`, such as "i".
+        ids: in order.
+    """
+
+    def __init__(self, address: int, format: str, ids: Sequence[int]) -> None:
+        self._address, self._value, self._ids = address, struct.Struct("<" + format), tuple(ids)
+        self._pack = struct.Struct("<" + ("B" + format) * len(ids)).pack
+        self._numbers = [id for id in ids for _ in range(2)]
+        size = self._value.size
+        length = 7 + len(ids) * (1 + size)
+        self._head = HEADER + struct.pack("<BHBHH", BROADCAST, length, Inst.SYNC_WRITE, address, size)
+        self._crc = crc16(self._head)
+
+    def encode(self, values: Sequence[int]) -> bytes:
+        """The whole packet for these values, in the order of the ids; equal to `sync_write(…).encode()`."""
+        self._numbers[1::2] = values
+        body = self._pack(*self._numbers)
+        if _MARK in body:
+            data = {id: self._value.pack(value) for id, value in zip(self._ids, values, strict=True)}
+            return sync_write(self._address, self._value.size, data).encode()
+        return self._head + body + struct.pack("<H", crc16(body, self._crc))
 
 
 def bulk_read(items: Sequence[tuple[int, int, int]]) -> Instruction:

@@ -9,9 +9,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from openant_tools.comms.bus import FAST_READ_FIRMWARE, Answer, Bus, Found
 from openant_tools.comms.faults import Cause, Refused
+from openant_tools.comms.protocol2 import SyncWriteTemplate
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.robot.registers import EEPROM_END, Register
 from openant_tools.robot.servo import HardwareError, ServoModel, hardware_errors, servo_model
@@ -23,13 +25,11 @@ __all__ = ["BLOCK", "BLOCK_ADDRESS", "BLOCK_SIZE", "Block", "EepromWrite", "Serv
 BLOCK_ADDRESS = 120
 BLOCK_SIZE = 27
 BLOCK = struct.Struct("<HBBhhiiiiHB")
-_GOAL = struct.Struct("<i")
 #: A clear of the watchdog and its trip value (register 98).
 WATCHDOG_TRIPPED = -1
 
 
-@dataclass(frozen=True, slots=True)
-class Block:
+class Block(NamedTuple):
     """Registers 120…146 of one servo, in counts."""
 
     tick: int
@@ -93,7 +93,8 @@ class Servos:
 
     def __post_init__(self) -> None:
         self._by_joint = {servo.joint: servo for servo in self.servos}
-        self.ids = [servo.id for servo in self.servos]
+        self.ids = tuple(servo.id for servo in self.servos)
+        self._goals = SyncWriteTemplate(116, "i", self.ids)
         if len(set(self.ids)) != len(self.ids):
             raise BadInput(f"two servos share an id: {sorted(self.ids)}", remedy="give each servo an id of its own")
         self.bus.names = {servo.id: servo.joint for servo in self.servos}
@@ -232,7 +233,7 @@ class Servos:
         """Registers 120…146 of every servo, in order, in one request."""
         answers = self.bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, self.ids)
         return [
-            (answer, Block(*BLOCK.unpack(answer.data)) if answer.data and len(answer.data) == BLOCK_SIZE else None)
+            (answer, Block._make(BLOCK.unpack(answer.data)) if answer.data and len(answer.data) == BLOCK_SIZE else None)
             for answer in answers
         ]
 
@@ -252,7 +253,7 @@ class Servos:
 
     def write_goals(self, counts: Sequence[int]) -> float:
         """Goal positions of all servos in counts; the time the last byte has left (s)."""
-        return self.bus.sync_write(116, 4, {id: _GOAL.pack(count) for id, count in zip(self.ids, counts, strict=True)})
+        return self.bus.send(self._goals.encode(counts))
 
     # ---- torque, watchdog, errors --------------------------------------------------------------------------------
 

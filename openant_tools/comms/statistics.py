@@ -95,11 +95,25 @@ class ServoStatistics:
 class BusStatistics:
     """All servos of a bus, and bytes that belonged to none."""
 
-    servos: dict[int, ServoStatistics] = field(default_factory=dict)
     noise_bytes: int = 0
     fast_read_fallbacks: int = 0
     #: (when, rtt) of the last answer of each of the last requests, s
     arrivals: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=1000))
+    _servos: dict[int, ServoStatistics] = field(default_factory=dict)
+    #: (ids, bin of the latency, of each or of all) → requests that all of them answered; taken apart when looked at
+    _whole: dict[tuple[tuple[int, ...], tuple[int, ...] | int], int] = field(default_factory=dict)
+
+    @property
+    def servos(self) -> dict[int, ServoStatistics]:
+        """id → its statistics."""
+        for (ids, bins), times in self._whole.items():
+            for id, bin in zip(ids, bins if isinstance(bins, tuple) else (bins,) * len(ids), strict=True):
+                servo = self._servos.setdefault(id, ServoStatistics())
+                servo.asked += times
+                servo.answered += times
+                servo.latency[min(bin, LATENCY_BINS - 1)] += times
+        self._whole.clear()
+        return self._servos
 
     @property
     def comb(self) -> Comb | None:
@@ -107,14 +121,11 @@ class BusStatistics:
         return find_comb([when for when, _ in self.arrivals], [rtt for _, rtt in self.arrivals])
 
     def of(self, id: int) -> ServoStatistics:
-        found = self.servos.get(id)
-        if found is None:
-            found = self.servos[id] = ServoStatistics()
-        return found
+        return self.servos.setdefault(id, ServoStatistics())
 
     def count(self, id: int, cause: Cause | None, rtt: float | None, alert: bool) -> None:
         """One request to one servo: answered (`cause` None, after `rtt` s), or lost."""
-        servo = self.servos.get(id) or self.of(id)
+        servo = self.of(id)
         servo.asked += 1
         if cause is None:
             servo.answered += 1
@@ -123,6 +134,14 @@ class BusStatistics:
                 servo.latency[min(int(rtt / LATENCY_BIN_S), LATENCY_BINS - 1)] += 1
         else:
             servo.lost[cause] = servo.lost.get(cause, 0) + 1
+
+    def count_whole(self, ids: tuple[int, ...], rtt: Sequence[float] | float) -> None:
+        """One request that all of `ids` answered without alert, each after its `rtt` (s), or all at once."""
+        if isinstance(rtt, float):
+            key: tuple[tuple[int, ...], tuple[int, ...] | int] = ids, int(rtt / LATENCY_BIN_S)
+        else:
+            key = ids, tuple(int(one / LATENCY_BIN_S) for one in rtt)
+        self._whole[key] = self._whole.get(key, 0) + 1
 
     def as_dict(self, names: Mapping[int, str] | None = None, ids: Iterable[int] | None = None) -> dict[str, object]:
         """For JSON: per servo loss, causes, retries and latency quantiles."""
