@@ -23,6 +23,7 @@ import threading
 import time
 import urllib.parse
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
@@ -523,9 +524,8 @@ def _open(settings: CameraSettings) -> tuple[Any, list[Setting]]:
         raise HardwareFault(str(error.err), where=settings.name) from None
     if not capture.isOpened():
         capture.release()
-        raise HardwareFault(
-            _why_not(settings), where=settings.name, remedy="see `v4l2-ctl --list-devices` for what is there"
-        )
+        what, remedy = _why_not(settings)
+        raise HardwareFault(what, where=settings.name, remedy=remedy)
     asked: list[Setting] = []
     if settings.network:
         return capture, asked
@@ -558,18 +558,23 @@ def _open(settings: CameraSettings) -> tuple[Any, list[Setting]]:
     return capture, asked
 
 
-def _why_not(settings: CameraSettings) -> str:
+def _why_not(settings: CameraSettings) -> tuple[str, str]:
+    """What is wrong with a source that does not open, and what to do."""
     source = settings.source
     if settings.network:
-        return "no picture stream answers at this address"
-    path = f"/dev/video{source}" if isinstance(source, int) else source
+        return (
+            "no picture stream answers at this address",
+            "open it in a browser: is the camera on, is the address right?",
+        )
     if platform.system() == "Linux":
+        path = f"/dev/video{source}" if isinstance(source, int) else source
         if not os.path.exists(path):
-            return f"there is no {path}"
+            there = ", ".join(sorted(str(p) for p in Path("/dev").glob("video*"))) or "none"
+            return f"there is no {path}", f"plug the camera in; cameras that are there: {there}"
         if not os.access(path, os.R_OK | os.W_OK):
-            return f"{path} may not be opened by this user (group video)"
-        return f"{path} cannot be opened: another program holds it, or it is no picture source"
-    return "this camera cannot be opened"
+            return f"{path} may not be opened by this user", "sudo usermod -aG video $USER, then log in again"
+        return f"{path} does not open", "another program holds it (`fuser " + path + "`), or it is no picture source"
+    return "this camera does not open", "allow the terminal to use the camera, and close other programs that do"
 
 
 # --- snapshots of a stepped robot ----------------------------------------------------------------------------------

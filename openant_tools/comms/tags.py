@@ -6,8 +6,8 @@ are x forward, y left, z up; how the body tag sits in them is the mount (`positi
 The estimate. Corner noise of a small tag leaks into its tilt, and through the lever arm between tag and body centre
 into position. So the pose is the most likely one given the four corners *and* a prior on tilt: level to within
 `TILT_PRIOR_RAD`, or as the IMU says where the caller passes it. The prior also decides between the two poses that a
-flat square always allows. The reported errors are those of this estimate (Gauss–Newton covariance, corner noise
-`CORNER_PX`); they do not know a wrong lens or a wrongly declared edge length.
+flat square always allows. The reported errors are those of this estimate and of the origin's (Gauss–Newton covariance,
+corner noise `CORNER_PX`); they do not know a wrong lens or a wrongly declared edge length.
 
 The origin tag does not move, so its corners are averaged over many pictures (median, far ones left out) before its pose
 is computed once; it may then be covered. If it is seen elsewhere for a while, the camera was bumped: poses stop until
@@ -38,6 +38,8 @@ Gray = NDArray[np.uint8]
 
 #: Random corner error of a tag that is in focus, one standard deviation (benchmarks/tag_pose.py measures 0.02 … 0.1).
 CORNER_PX = 0.1
+#: What does not average out: lens blur over unequal surroundings.
+CORNER_BIAS_PX = 0.04
 #: A walking Open Ant tilts by a few degrees.
 TILT_PRIOR_RAD = math.radians(8.0)
 #: The flight controller's attitude while the body is shaken.
@@ -133,7 +135,7 @@ class BodyPose:
         t: when the picture was taken, s.
         position: of the body's origin, m. rotation: 3 × 3, arena from body.
         yaw: heading of the body's x axis, rad, counter-clockwise.
-        position_error, yaw_error: one standard deviation of the random part, m and rad.
+        position_error, yaw_error: one standard deviation, m and rad.
         near_edge: the tag is in the outer part of the picture, where the next step may lose it.
         residual_px: root mean square distance of the corners from where the pose puts them.
         size_px, margin: of the tag in the picture; small values foretell a loss.
@@ -184,7 +186,7 @@ class BodyTracker:
         self._detector = TagDetector(setup.family, decimate=setup.decimate, threads=threads)
         self._seen: deque[Array] = deque(maxlen=ORIGIN_MEMORY)
         self._elsewhere: list[Array] = []
-        self._origin: tuple[Array, Array] | None = None
+        self._origin: _Origin | None = None
         self._origin_t: float | None = None
         self._seen_at_solution = 0
 
@@ -196,7 +198,7 @@ class BodyTracker:
     @property
     def origin(self) -> tuple[Array, Array] | None:
         """Rotation (3, 3) and translation (3,) m, camera from arena; None until it is certain."""
-        return self._origin
+        return None if self._origin is None else (self._origin.rotation, self._origin.position)
 
     def track(
         self, picture: NDArray[np.uint8], t: float, tilt: tuple[float, float] | None = None
@@ -267,19 +269,21 @@ class BodyTracker:
         mean = corners[near].mean(axis=0) if near.any() else middle
         poses = tag_pose(mean, self.setup.origin_size, lens)
         if poses:
-            self._origin = poses[0]
+            noise = max(CORNER_PX / math.sqrt(max(1, int(near.sum()))), CORNER_BIAS_PX)
+            fit = refine(*poses[0], mean, self.setup.origin_size, lens, None, noise)
+            self._origin = _Origin(fit.rotation, fit.position, fit.covariance)
 
     # --- the body --------------------------------------------------------------------------------------------------
 
     def _pose(
         self, seen: Sighting, lens: Intrinsics, t: float, tilt: tuple[float, float] | None, began: float
     ) -> BodyPose | BodyLost:
-        assert self._origin is not None
+        origin = self._origin
+        assert origin is not None
         setup = self.setup
         c, s = math.cos(setup.body_yaw), math.sin(setup.body_yaw)
         body_from_tag = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        r_arena, t_arena = self._origin
-        up = r_arena[:, 2]
+        up = origin.rotation[:, 2]
         prior = _Prior(_up_in_tag(tilt, body_from_tag), up, TILT_PRIOR_RAD if tilt is None else IMU_TILT_RAD)
         solutions = [
             refine(rotation, position, seen.corners, setup.body_size, lens, prior)
@@ -291,24 +295,28 @@ class BodyTracker:
         if fit.residual_px > MAX_RESIDUAL_PX:
             return BodyLost(t, f"the corners of body tag {setup.body_id} make no square ({fit.residual_px:.1f} px off)")
 
-        def body(rotation: Array, position: Array) -> tuple[Array, Array]:
-            arena_from_tag = r_arena.T @ rotation
-            arena_from_body = arena_from_tag @ body_from_tag.T
-            return arena_from_body, r_arena.T @ (position - t_arena) - arena_from_body @ np.asarray(setup.body_position)
+        def body(tag: Array, arena: Array) -> tuple[Array, Array, float]:
+            """Rotation, position and yaw once tag and arena are moved a little (rotation vector and shift, 6 each)."""
+            r_arena = _exp(arena[:3]) @ origin.rotation
+            rotation = r_arena.T @ _exp(tag[:3]) @ fit.rotation @ body_from_tag.T
+            centre = r_arena.T @ (fit.position + tag[3:] - origin.position - arena[3:])
+            place = centre - rotation @ np.asarray(setup.body_position)
+            return rotation, place, math.atan2(rotation[1, 0], rotation[0, 0])
 
-        rotation, position = body(fit.rotation, fit.position)
+        still = np.zeros(6)
+        rotation, position, yaw = body(still, still)
         if rotation[2, 2] <= 0.0:
             return BodyLost(t, f"body tag {setup.body_id} is seen from below: the body lies on its back")
-        yaw = math.atan2(rotation[1, 0], rotation[0, 0])
-        jacobian = np.empty((4, 6))
+        variance = np.zeros(4)
         step = 1e-6
-        for k in range(6):
-            d = np.zeros(6)
-            d[k] = step
-            r, p = body(_exp(d[:3]) @ fit.rotation, fit.position + d[3:])
-            turn = math.remainder(math.atan2(r[1, 0], r[0, 0]) - yaw, 2 * math.pi)
-            jacobian[:, k] = np.append((p - position) / step, turn / step)
-        errors = np.sqrt(np.diag(jacobian @ fit.covariance @ jacobian.T))
+        for which, covariance in enumerate((fit.covariance, origin.covariance)):
+            jacobian = np.empty((4, 6))
+            for k in range(6):
+                moved = np.eye(6)[k] * step
+                _, p, turned = body(moved, still) if which == 0 else body(still, moved)
+                jacobian[:, k] = np.append(p - position, math.remainder(turned - yaw, 2 * math.pi)) / step
+            variance += np.diag(jacobian @ covariance @ jacobian.T)
+        errors = np.sqrt(variance)
         centre = seen.corners.mean(axis=0) / [lens.width, lens.height]
         return BodyPose(
             t=t,
@@ -371,6 +379,15 @@ class _Prior:
 
 
 @dataclass(frozen=True)
+class _Origin:
+    """The arena's frame: camera from arena, and its covariance as in `refine`."""
+
+    rotation: Array
+    position: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
 class _Fit:
     rotation: Array
     position: Array
@@ -379,28 +396,38 @@ class _Fit:
     residual_px: float
 
 
-def refine(rotation: Array, position: Array, corners: Array, size: float, lens: Intrinsics, prior: _Prior) -> _Fit:
+def refine(
+    rotation: Array,
+    position: Array,
+    corners: Array,
+    size: float,
+    lens: Intrinsics,
+    prior: _Prior | None,
+    noise_px: float = CORNER_PX,
+) -> _Fit:
     """The most likely pose near a first one: Gauss–Newton on corners and tilt, with its covariance (6 × 6).
 
     Parameters are a small rotation in the camera's axes and the position. Residuals are corner distances over
-    `CORNER_PX`, and the two components of the tilt over the prior's sigma.
+    `noise_px`, and with a prior the two components of the tilt over its sigma.
     """
     points = tag_points(size)
     focal = np.array([lens.fx, lens.fy])
     rays = lens.rays(corners)
-    # Any two axes across the prior's direction span the tilt.
+    # Any two axes across the prior's direction span the tilt; without a prior it weighs nothing.
+    if prior is None:
+        prior = _Prior(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0]), math.inf)
     across = np.linalg.svd(prior.up_camera[None, :])[2][1:]
 
     def residuals(r: Array, p: Array) -> Array:
         seen = points @ r.T + p
         pixels = ((seen[:, :2] / seen[:, 2:] - rays) * focal).ravel()
         lean = across @ (r @ prior.up_tag - prior.up_camera)
-        return np.concatenate([pixels / CORNER_PX, lean / prior.sigma])
+        return np.concatenate([pixels / noise_px, lean / prior.sigma])
 
     now = residuals(rotation, position)
     damping = 1e-3
     for _ in range(30):
-        jacobian = _jacobian(rotation, position, points, focal, across, prior)
+        jacobian = _jacobian(rotation, position, points, focal, across, prior, noise_px)
         normal = jacobian.T @ jacobian
         step = np.asarray(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -jacobian.T @ now), float)
         trial = (_exp(step[:3]) @ rotation, position + step[3:])
@@ -415,18 +442,13 @@ def refine(rotation: Array, position: Array, corners: Array, size: float, lens: 
             damping *= 10
             if damping > 1e6:
                 break
-    information = _information(rotation, position, points, focal, across, prior)
-    covariance = np.asarray(np.linalg.pinv(information), float)
-    residual = float(np.sqrt(np.mean((now[:8] * CORNER_PX) ** 2) * 2))
+    jacobian = _jacobian(rotation, position, points, focal, across, prior, noise_px)
+    covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian), float)
+    residual = float(np.sqrt(np.mean((now[:8] * noise_px) ** 2) * 2))
     return _Fit(rotation, position, covariance, float(now @ now), residual)
 
 
-def _information(r: Array, p: Array, points: Array, focal: Array, across: Array, prior: _Prior) -> Array:
-    jacobian = _jacobian(r, p, points, focal, across, prior)
-    return np.asarray(jacobian.T @ jacobian)
-
-
-def _jacobian(r: Array, p: Array, points: Array, focal: Array, across: Array, prior: _Prior) -> Array:
+def _jacobian(r: Array, p: Array, points: Array, focal: Array, across: Array, prior: _Prior, noise_px: float) -> Array:
     """Derivatives (10, 6) of the residuals of `refine`."""
     turned = points @ r.T
     seen = turned + p
@@ -437,9 +459,9 @@ def _jacobian(r: Array, p: Array, points: Array, focal: Array, across: Array, pr
     rows[:, 0, 2] = -focal[0] * seen[:, 0] / z**2
     rows[:, 1, 2] = -focal[1] * seen[:, 1] / z**2
     out = np.empty((10, 6))
-    out[:8, 3:] = rows.reshape(8, 3) / CORNER_PX
+    out[:8, 3:] = rows.reshape(8, 3) / noise_px
     for k in range(4):
-        out[2 * k : 2 * k + 2, :3] = -rows[k] @ _cross(turned[k]) / CORNER_PX
+        out[2 * k : 2 * k + 2, :3] = -rows[k] @ _cross(turned[k]) / noise_px
     out[8:, :3] = -across @ _cross(r @ prior.up_tag) / prior.sigma
     out[8:, 3:] = 0.0
     return out
