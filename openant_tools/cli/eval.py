@@ -89,8 +89,9 @@ def eval_(
         write_strip(pictures, strip, seconds_apart=result.seconds / result.steps)
         click.echo(f"strip: {strip}")
     helped = "".join(f", set up again {count}× ({reason})" for reason, count in result.helped.items())
+    speed = 100 * result.average_reward_m_s
     click.echo(
-        f"{100 * result.average_reward_m_s:+.1f} cm/s over {result.seconds:.0f} s: {result.progress_m:+.2f} m of progress,"
+        f"{speed:+.1f} cm/s over {result.seconds:.0f} s: {result.progress_m:+.2f} m of progress,"
         f" {result.path_m:.2f} m walked, {result.turns} turns{helped} (policy of step {step})"
     )
     if json_file is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from openant_tools.cli.options import robot_folder
+from openant_tools.cli.options import json_option, robot_folder, robot_option
 from openant_tools.errors import BadInput
 
 if TYPE_CHECKING:
@@ -42,10 +42,7 @@ def train() -> None:
 
 
 @train.command()
-@click.option(
-    "--robot", type=click.Path(path_type=Path), metavar="DIR",
-    help="The robot's folder (or its robot.toml). Default: $OPENANT_ROBOT, else the working directory.",
-)  # fmt: skip
+@robot_option
 @click.option("--kit", type=click.Choice(["standard", "lite"]), help="The bundled nominal robot, instead of --robot.")
 @click.option("--env", "where", type=click.Choice(["sim"]), default="sim", show_default=True, help="Where to train.")
 @click.option(
@@ -70,8 +67,7 @@ def train() -> None:
     help="Weight of the entropy at first; 0.1 explores less and walks sooner.",
 )  # fmt: skip
 @click.option("--device", default="cpu", show_default=True, help="Where torch computes, such as cpu or cuda.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-              help="Write the result as JSON.")  # fmt: skip
+@json_option
 def sac(
     robot: Path | None,
     kit: str | None,
