@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 
+import mujoco
 import numpy as np
 import pytest
 
 from openant_tools.comms import protocol2 as p2
 from openant_tools.errors import BadInput
+from openant_tools.robot.mjcf import nominal_mjcf
 from openant_tools.virtual.imperfections import CATALOGUE
 from openant_tools.virtual.scenario import load_scenario, parse_scenario
 from openant_tools.virtual.start import build
@@ -196,6 +198,37 @@ def test_a_disabled_effect_is_left_out():
     table = effect("action_delay", delay_s=0.05)
     table["effect"][0]["enabled"] = False
     assert world_of(**table).drives.motors[0].action_delay_s == 0
+
+
+# ---- the healthy robot ----
+
+
+def test_the_healthy_robot_moves_as_the_nominal_model_in_plain_mujoco():
+    """Two ways to the same robot: firmware, winding and friction here, position actuators and joint damping there."""
+    world = world_of()
+    for servo in world.servos:
+        servo.execute(p2.write(servo.id, 36, (442).to_bytes(2, "little")), 0.0)
+    enable(world)
+    spec = mujoco.MjSpec.from_string(nominal_mjcf("standard"))
+    spec.delete(spec.joint("root"))
+    spec.delete(spec.key("home"))
+    spec.geom("floor").contype = spec.geom("floor").conaffinity = 0
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    real, simulated = [], []
+    for n in range(200):
+        t = 0.02 * n
+        for k, joint in enumerate(world.joints):
+            angle = 0.4 * math.sin(2 * math.pi * (0.3 + 0.3 * t) * t + k)
+            goal(world, joint, angle)
+            data.ctrl[k] = angle
+        world.advance(t + 0.02)
+        mujoco.mj_step(model, data, 20)
+        real.append(world.body.q.copy())
+        simulated.append(data.qpos.copy())
+    error = np.array(real) - np.array(simulated)
+    assert np.array(real).std(axis=0).min() > 0.2
+    assert np.sqrt((error**2).mean(axis=0)).max() < 0.004
 
 
 # ---- what effects do ----

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from openant_tools.comms.protocol2 import (
     BROADCAST,
@@ -29,6 +30,8 @@ from openant_tools.virtual.servo import ServoDevice, read_requests
 
 __all__ = ["Answer", "BusSettings", "Line", "Reply", "Tap"]
 
+Array = NDArray[np.float64]
+
 BITS_PER_BYTE = 10
 #: s, a longer pause inside an instruction packet makes servos drop it (e-manual).
 INTER_BYTE_S = 1.5e-3
@@ -36,6 +39,8 @@ INTER_BYTE_S = 1.5e-3
 ADAPTER_BUFFER = 510
 #: of a status without parameters
 _STATUS_BYTES = 11
+#: s, in place of a timer of zero
+SHORTEST_TIMER_S = 1e-6
 _SYNC = (Inst.SYNC_READ, Inst.BULK_READ)
 _FAST = (Inst.FAST_SYNC_READ, Inst.FAST_BULK_READ)
 _SILENT = (Inst.SYNC_WRITE, Inst.BULK_WRITE)
@@ -355,7 +360,7 @@ class Line:
 
     def _tick_after(self, t: float) -> float:
         """When the adapter hands over what has arrived at t."""
-        period = max(self.settings.latency_timer_s, 1e-6)
+        period = max(self.settings.latency_timer_s, SHORTEST_TIMER_S)
         tick = (math.floor(t / period - self._phase) + 1 + self._phase) * period
         return max(tick, self.settings.stalled_until)
 
@@ -364,40 +369,40 @@ class Line:
         if not bursts:
             return []
         bursts.sort(key=lambda burst: burst.start)
-        heard: list[list[float | int]] = []  # (end of byte, value)
-        for burst in bursts:
-            for k, byte in enumerate(burst.data):
-                heard.append([burst.start + (k + 1) * byte_s, byte])
+        data = b"".join(burst.data for burst in bursts)
+        ends = np.concatenate([burst.start + byte_s * np.arange(1, len(burst.data) + 1) for burst in bursts])
         if any(b.start < a.end(byte_s) - byte_s / 2 for a, b in itertools.pairwise(bursts)):
-            heard = _collide(heard, byte_s)
-        data = bytes(int(byte) for _, byte in heard)
+            data, ends = _collide(data, ends, byte_s)
         if self.settings.byte_error > 0:
             data = self._corrupt(data)
+        # The timer runs free; a byte waits for its next tick, together with all that arrive until then.
+        period, stalled = max(self.settings.latency_timer_s, SHORTEST_TIMER_S), self.settings.stalled_until
+        ticks = np.floor(ends / period - self._phase)
+        starts = [0, *(np.flatnonzero(np.diff(ticks)) + 1).tolist()]
+        at = np.maximum((ticks[starts] + 1 + self._phase) * period, stalled).tolist()
         replies: list[Reply] = []
-        k = 0
-        while k < len(data):
-            # The timer runs free; the byte waits for its next tick, together with all that arrive until then.
-            tick = self._tick_after(float(heard[k][0]))
-            stop = k + 1
-            while stop < len(data) and float(heard[stop][0]) <= tick and stop - k < ADAPTER_BUFFER:
-                stop += 1
-            full = stop - k == ADAPTER_BUFFER
-            at = float(heard[stop - 1][0]) if full else tick
-            replies.append(Reply(max(at, self.settings.stalled_until), data[k:stop]))
-            k = stop
+        for start, stop, tick in zip(starts, [*starts[1:], len(data)], at, strict=True):
+            # A full buffer goes out at once.
+            while stop - start >= ADAPTER_BUFFER:
+                full = start + ADAPTER_BUFFER
+                replies.append(Reply(max(float(ends[full - 1]), stalled), data[start:full]))
+                start = full
+            if start < stop:
+                replies.append(Reply(tick, data[start:stop]))
         return replies
 
 
-def _collide(heard: list[list[float | int]], byte_s: float) -> list[list[float | int]]:
+def _collide(data: bytes, ends: Array, byte_s: float) -> tuple[bytes, Array]:
     """Bytes that overlap on the wire become one: the line is low wherever anyone pulls it low."""
-    heard.sort(key=lambda entry: entry[0])
-    merged: list[list[float | int]] = []
-    for end, byte in heard:
-        if merged and float(end) - float(merged[-1][0]) < byte_s / 2:
-            merged[-1][1] = int(merged[-1][1]) & int(byte)
+    order = np.argsort(ends, kind="stable")
+    merged, at = bytearray(), []  # type: bytearray, list[float]
+    for k in order:
+        if at and ends[k] - at[-1] < byte_s / 2:
+            merged[-1] &= data[k]
         else:
-            merged.append([end, byte])
-    return merged
+            merged.append(data[k])
+            at.append(float(ends[k]))
+    return bytes(merged), np.array(at)
 
 
 def _wire_length(packet: object) -> int:

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.robot.control_table import AMPERE_PER_COUNT
 from openant_tools.robot.registers import PULSES_PER_TURN, PWM_FULL, RAD_S_PER_COUNT
 from openant_tools.virtual.body import Body
 from openant_tools.virtual.motor import MotorSettings
@@ -38,7 +39,6 @@ __all__ = ["Drive", "Drives"]
 Array = NDArray[np.float64]
 
 PULSES_PER_RAD = PULSES_PER_TURN / (2 * math.pi)
-AMPERE_PER_COUNT = 2.69e-3
 #: share of the critical damping of the gear's teeth
 GEAR_DAMPING = 0.25
 #: (angular frequency of the stiffest spring) × (time step) stays below this, well inside what symplectic Euler bears

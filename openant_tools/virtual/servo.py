@@ -8,13 +8,17 @@ named in docs/virtual-robot.md so that hardware can settle it.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import accumulate
 from typing import Protocol
 
 from openant_tools.comms.protocol2 import ALERT_BIT, BROADCAST, MAX_ID, Error, Inst, Instruction, Status
-from openant_tools.robot.registers import EEPROM_END, PULSES_PER_TURN, PWM_FULL, Register
+from openant_tools.robot.control_table import AMPERE_PER_COUNT
+from openant_tools.robot.registers import EEPROM_END, PULSES_PER_TURN, PWM_FULL, RAD_S_PER_COUNT, Register
 from openant_tools.robot.servo import BAUD_CODES, ServoModel
 
 __all__ = ["READS", "Loop", "Motor", "Sensed", "ServoDevice", "Snapshot", "read_requests"]
@@ -30,6 +34,7 @@ VOLTAGE_ERROR, HEAT_ERROR, ENCODER_ERROR, SHOCK_ERROR, OVERLOAD_ERROR = 0x01, 0x
 
 REVERSED, TIME_BASED, TORQUE_BY_GOAL = 0x01, 0x04, 0x08
 POSITION_MODE, EXTENDED_MODE, CURRENT_POSITION_MODE, PWM_MODE, VELOCITY_MODE, CURRENT_MODE = 3, 4, 5, 16, 1, 0
+PULSES_S_PER_COUNT = RAD_S_PER_COUNT * PULSES_PER_TURN / (2 * math.pi)
 WATCHDOG_UNIT_S = 0.02
 TICK_WRAP = 32768
 #: In position mode an offset beyond a quarter of a turn is ignored (e-manual, Homing Offset).
@@ -42,6 +47,8 @@ FOLLOWING_ERROR_PULSES = 128
 _MEMORY = 1024
 _DYNAMIC = struct.Struct("<HBBhhiiiiHB")  # 120 … 146
 _DYNAMIC_AT, _DYNAMIC_END = 120, 147
+_FIRST_INDIRECT_DATA = 224
+_I32 = struct.Struct("<i")
 _RAM_CHANGED_BY_MODE = (
     "velocity_i_gain", "velocity_p_gain", "position_d_gain", "position_i_gain", "position_p_gain",
     "feedforward_2nd_gain", "feedforward_1st_gain",
@@ -152,8 +159,12 @@ class _Refused(Exception):
 
 def read_requests(instruction: Instruction) -> list[tuple[int, int, int]]:
     """(id, address, bytes) of every servo that a sync or bulk read asks, in turn; empty where it is malformed."""
-    params = instruction.params
-    if instruction.code in (Inst.SYNC_READ, Inst.FAST_SYNC_READ):
+    return _read_requests(instruction.code, instruction.params)
+
+
+@lru_cache(maxsize=64)  # each servo on the line looks at the same packet
+def _read_requests(code: int, params: bytes) -> list[tuple[int, int, int]]:
+    if code in (Inst.SYNC_READ, Inst.FAST_SYNC_READ):
         if len(params) < 5:
             return []
         address, count = struct.unpack_from("<HH", params)
@@ -193,6 +204,8 @@ class ServoDevice:
         for register in self.registers.values():
             for address in range(register.address, register.end):
                 self._owner[address] = register
+        #: undefined bytes below each address, so that a whole block is checked by one subtraction
+        self._holes = list(accumulate((owner is None for owner in self._owner), initial=0))
         #: data cell → cell of the address that it takes its byte from
         self._indirect: dict[int, int] = {
             self.registers[name.replace("address", "data")].address: register.address
@@ -387,29 +400,27 @@ class ServoDevice:
 
     def refresh(self, now: float) -> None:
         """Bring the dynamic registers 120…146 up to date."""
-        sensed = self.motor.sense()
-        direction = self._direction
+        sensed, memory, direction = self.motor.sense(), self.memory, self._direction
         present = self._present(sensed)
-        velocity = _counts(direction * sensed.velocity / _VELOCITY_UNIT, 31)
-        moving = abs(velocity) > self.get("moving_threshold") or sensed.profile_active
-        status = 0
-        if abs(self.get("goal_position") - present) <= IN_POSITION_PULSES:
+        velocity = round(direction * sensed.velocity / RAD_S_PER_COUNT)
+        goal, threshold = _I32.unpack_from(memory, 116)[0], _I32.unpack_from(memory, 24)[0]
+        moving = abs(velocity) > threshold or sensed.profile_active
+        status = sensed.profile_shape << 4
+        if abs(goal - present) <= IN_POSITION_PULSES:
             status |= 0x01
         if sensed.profile_active:
             status |= 0x02
-        if self.torque and abs(sensed.trajectory - present) > FOLLOWING_ERROR_PULSES:
+        if memory[64] and abs(sensed.trajectory - present) > FOLLOWING_ERROR_PULSES:
             status |= 0x08
-        status |= sensed.profile_shape << 4
         if self.model.has_current_sensor:
-            effort = _counts(direction * sensed.current / _CURRENT_UNIT, 15)
+            effort = max(-32768, min(32767, round(direction * sensed.current / AMPERE_PER_COUNT)))
         else:
             effort = max(-1000, min(1000, round(direction * sensed.duty * 1000)))
         tick = int((now - self.booted_at) * 1000 * (1 + self.clock_ppm * 1e-6)) % TICK_WRAP
         _DYNAMIC.pack_into(
-            self.memory, _DYNAMIC_AT, tick, moving, status, round(direction * sensed.duty * PWM_FULL), effort, velocity,
-            _counts(present, 31), _counts(sensed.trajectory_velocity / _PULSES_S_PER_COUNT, 31),
-            _counts(sensed.trajectory, 31), max(0, min(65535, round(sensed.voltage * 10))),
-            max(0, min(255, int(sensed.temperature))),
+            memory, _DYNAMIC_AT, tick, moving, status, round(direction * sensed.duty * PWM_FULL), effort, velocity,
+            present, round(sensed.trajectory_velocity / PULSES_S_PER_COUNT), round(sensed.trajectory),
+            max(0, round(sensed.voltage * 10)), max(0, min(255, int(sensed.temperature))),
         )  # fmt: skip
 
     # ---- time and protection ----
@@ -563,9 +574,11 @@ class ServoDevice:
         if count == 0:
             raise _Refused(Error.DATA_LENGTH)
         end = address + count
-        if end > _MEMORY or any(owner is None for owner in self._owner[address:end]):
+        if end > _MEMORY or self._holes[end] != self._holes[address]:
             raise _Refused(Error.ACCESS)
-        indirect = [(at, self._target(at)) for at in range(address, end) if at in self._indirect]
+        indirect: list[tuple[int, int | None]] = []
+        if end > _FIRST_INDIRECT_DATA:
+            indirect = [(at, self._target(at)) for at in range(address, end) if at in self._indirect]
         if (address < _DYNAMIC_END and end > _DYNAMIC_AT) or any(target is not None for _, target in indirect):
             self.refresh(now)
         data = bytearray(self.memory[address:end])
@@ -774,16 +787,6 @@ class ServoDevice:
             self.memory[:EEPROM_END] = self._backup[:EEPROM_END]
             self._pending.reboot = True
         self._saved()
-
-
-_VELOCITY_UNIT = 0.229 * 2 * 3.141592653589793 / 60
-_PULSES_S_PER_COUNT = _VELOCITY_UNIT * PULSES_PER_TURN / (2 * 3.141592653589793)
-_CURRENT_UNIT = 2.69e-3
-
-
-def _counts(value: float, bits: int) -> int:
-    high = (1 << bits) - 1
-    return max(-high - 1, min(high, round(value)))
 
 
 def _group_writes(code: int, params: bytes) -> Iterator[tuple[int, int, bytes]]:
