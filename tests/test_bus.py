@@ -128,6 +128,19 @@ def test_a_late_answer_is_late_not_lost() -> None:
     assert answer.rtt > 2.5e-3
 
 
+def test_an_answer_to_an_earlier_question_is_not_taken_for_this_one() -> None:
+    bus, line = ant()
+    bus.retries = 0
+    for delay in (6e-3, 10e-3, 12e-3, 20e-3):
+        line.wire.settings.response_s = delay
+        bus.ping(10)  # its answer, or not, comes whenever
+        line.wire.settings.response_s = 0.0
+        try:
+            assert bus.read(10, 84, 2) == (700).to_bytes(2, "little")
+        except NoAnswer:
+            pass  # the late answer was on the wire when we asked
+
+
 def test_the_write_to_read_gap_is_kept() -> None:
     bus, _ = ant()
     for _ in range(50):

@@ -26,6 +26,8 @@ __all__ = ["Answer", "Bus", "Found", "Timing"]
 BITS_PER_BYTE = 10
 #: A status carries this many bytes besides its data.
 STATUS_OVERHEAD = 11
+#: Model number (2) and firmware.
+PING_SIZE = 3
 #: The FTDI driver's own setting of its latency timer; any longer one is somebody's mistake.
 LONGEST_LATENCY_S = 16e-3
 #: Fast Sync Read came with this firmware (ROBOTIS e-manual).
@@ -96,15 +98,17 @@ class _Request:
     """A request and what it takes, made once and sent often.
 
     Attributes:
-        size: bytes of one answer as it should be. heads: each answer's first eight bytes. crcs: their CRC.
+        counts: bytes of data wanted from each of `ids`. sizes: bytes of each answer as it should be.
+        heads: each answer's first eight bytes. crcs: their CRC.
         whole: s from the request's first byte to the last answer's last.
         quiet: s without a byte that mean none will come.
     """
 
     packet: bytes
     ids: tuple[int, ...]
-    count: int
-    size: int
+    counts: tuple[int, ...]
+    sizes: tuple[int, ...]
+    expected: int
     heads: tuple[bytes, ...]
     crcs: tuple[int, ...]
     timing: Timing | None = None
@@ -114,20 +118,23 @@ class _Request:
     quiet: float = 0.0
 
     @classmethod
-    def of(cls, instruction: Instruction, ids: Sequence[int], count: int) -> _Request:
-        heads = tuple(p2.HEADER + struct.pack("<BHB", id, count + 4, p2.Inst.STATUS) for id in ids)
+    def of(cls, instruction: Instruction, ids: Sequence[int], counts: Sequence[int]) -> _Request:
+        heads = tuple(
+            p2.HEADER + struct.pack("<BHB", id, count + 4, p2.Inst.STATUS)
+            for id, count in zip(ids, counts, strict=True)
+        )
+        sizes = tuple(count + STATUS_OVERHEAD for count in counts)
         crcs = tuple(p2.crc16(head) for head in heads)
-        return cls(instruction.encode(), tuple(ids), count, count + STATUS_OVERHEAD, heads, crcs)
+        return cls(instruction.encode(), tuple(ids), tuple(counts), sizes, sum(sizes), heads, crcs)
 
     def fit(self, timing: Timing, baud: int) -> None:
         """Compute the deadlines for this timing and rate."""
         self.timing, self.baud = timing, baud
         byte_s = BITS_PER_BYTE / baud
-        one = byte_s * self.size + timing.return_delay_s
         spare = timing.latency_timer_s + timing.margin_s
         self.wire = byte_s * len(self.packet)
-        self.whole = self.wire + len(self.ids) * one + spare
-        self.quiet = one + spare
+        self.whole = self.wire + byte_s * self.expected + len(self.ids) * timing.return_delay_s + spare
+        self.quiet = byte_s * max(self.sizes) + timing.return_delay_s + spare
 
 
 @dataclass(frozen=True)
@@ -166,7 +173,8 @@ class Bus:
     def __post_init__(self) -> None:
         self._quiet_from = 0.0
         #: something was lost: what it left on the line may still come
-        self._unsettled = True
+        self._unsettled = False
+        self._last_request = b""
         self._known: dict[tuple[int, int, int, tuple[int, ...]], _Request] = {}
 
     # ---- one instruction each ------------------------------------------------------------------------------------
@@ -175,7 +183,7 @@ class Bus:
         """The servo with this ID, or None where none answers; asked `retries` times more where we `insist`."""
         for attempt in range(1 + self.retries * insist):
             self.statistics.of(id).retries += attempt > 0
-            answer = self._exchange(p2.ping(id), [id], 3)[0]
+            answer = self._exchange(p2.ping(id), [id], [PING_SIZE])[0]
             if answer.ok:
                 return _found(answer)
         return None
@@ -190,9 +198,10 @@ class Bus:
         Raises:
             BrokenAnswer: answers collide: several servos share an ID.
         """
-        started = self._send(p2.ping(p2.BROADCAST).encode())
+        started = self._begin(p2.ping(p2.BROADCAST).encode())
+        self._unsettled = True
         parser, found, garbage = Parser(), dict[int, Found](), 0
-        deadline = started + first_s + self.wire_s(STATUS_OVERHEAD + 3)
+        deadline = started + first_s + self.wire_s(STATUS_OVERHEAD + PING_SIZE)
         while self.clock.wait_readable(self.line, deadline):
             for item in parser.feed(self.line.read()):
                 if isinstance(item, Status) and len(item.params) >= 3:
@@ -276,7 +285,7 @@ class Bus:
             # A joined reply ends at the first silent servo: ask those behind it one by one, and joined no more.
             self.statistics.fast_read_fallbacks += 1
             self.fast.clear()
-            others = iter(self._exchange(p2.sync_read(address, count, rest), rest, count))
+            others = iter(self._exchange(p2.sync_read(address, count, rest), rest, [count] * len(rest)))
             return [answer or next(others) for answer in answers]
         return self._transact(self._request(p2.Inst.SYNC_READ, address, count, ids))
 
@@ -285,13 +294,12 @@ class Bus:
         request = self._known.get(key)
         if request is None:
             make = p2.sync_read if code == p2.Inst.SYNC_READ else p2.fast_sync_read
-            request = self._known[key] = _Request.of(make(address, count, ids), ids, count)
+            request = self._known[key] = _Request.of(make(address, count, ids), ids, (count,) * len(ids))
         return request
 
     def bulk_read(self, items: Sequence[tuple[int, int, int]]) -> list[Answer]:
         """(id, address, bytes) each, answered in that order. Never raises for a silent servo."""
-        ids = [id for id, _, _ in items]
-        return self._exchange(p2.bulk_read(items), ids, max(count for _, _, count in items))
+        return self._exchange(p2.bulk_read(items), [id for id, _, _ in items], [count for _, _, count in items])
 
     def measure_latency_timer(self, id: int, tries: int = 13) -> float:
         """What the adapter holds short answers back, s: for lines whose timer the host cannot read.
@@ -303,9 +311,9 @@ class Bus:
         for k in range(tries):
             # Asked at once after an answer, every ping would meet the timer at the same phase.
             self.clock.sleep_until(self.clock.now() + (0.618 * k) % 1.0 * LONGEST_LATENCY_S)
-            answer = self._exchange(p2.ping(id), [id], 3)[0]
+            answer = self._exchange(p2.ping(id), [id], [PING_SIZE])[0]
             if answer.rtt is not None:
-                waits.append(answer.rtt - self.wire_s(10 + STATUS_OVERHEAD + 3) - self.timing.return_delay_s)
+                waits.append(answer.rtt - self.wire_s(10 + STATUS_OVERHEAD + PING_SIZE) - self.timing.return_delay_s)
         return max(1e-3, 2 * sorted(waits)[len(waits) // 2]) if waits else self.timing.latency_timer_s
 
     # ---- what must be there --------------------------------------------------------------------------------------
@@ -360,13 +368,25 @@ class Bus:
         if self.clock.now() < gap:
             self.clock.sleep_until(gap)
         if self._unsettled:
-            stale = self.line.read()
-            if stale:
-                self._count_stale(stale)
+            self._count_stale(self.line.read())
         started = self.request_at = self.clock.now()
         self.line.write(packet)
         self._quiet_from = started + len(packet) * BITS_PER_BYTE / self.line.baud
         return started
+
+    def _begin(self, packet: bytes) -> float:
+        """Send a request that is answered; returns when its first byte left.
+
+        Answers carry no number: one that comes too late could pass for the answer to the next request. So after a
+        loss another question waits until the line has been quiet; the same question again may take either answer.
+        """
+        if self._unsettled and packet != self._last_request:
+            quiet = self.timing.latency_timer_s + self.timing.margin_s
+            while self.clock.wait_readable(self.line, self.clock.now() + quiet):
+                self._count_stale(self.line.read())
+            self._unsettled = False
+        self._last_request = packet
+        return self._send(packet)
 
     def _count_stale(self, data: bytes) -> None:
         """Bytes nobody waits for any more: answers too late even for the grace, or noise."""
@@ -380,18 +400,18 @@ class Bus:
                 if servo.lost.get(Cause.TIMEOUT, 0):
                     servo.lost[Cause.TIMEOUT] -= 1
 
-    def _exchange(self, instruction: Instruction, ids: Sequence[int], count: int) -> list[Answer]:
-        """Send a request and collect one answer of `count` bytes from each of `ids`."""
-        return self._transact(_Request.of(instruction, ids, count))
+    def _exchange(self, instruction: Instruction, ids: Sequence[int], counts: Sequence[int]) -> list[Answer]:
+        """Send a request and collect one answer, of so many bytes of data, from each of `ids`."""
+        return self._transact(_Request.of(instruction, ids, counts))
 
     def _transact(self, request: _Request) -> list[Answer]:
         if request.timing is not self.timing or request.baud != self.line.baud:
             request.fit(self.timing, self.line.baud)
-        started = self._send(request.packet)
+        started = self._begin(request.packet)
         data, edges = self._collect(request, started)
         answers = self._whole_answers(request, data, edges, started)
         if answers is None:
-            answers = self._sort_out(data, request.ids, edges, started)
+            answers = self._sort_out(data, request, edges, started)
             for answer in answers:
                 self.statistics.count(answer.id, answer.cause, answer.rtt, answer.alert)
             self._unsettled = not all(answer.ok for answer in answers)
@@ -405,10 +425,10 @@ class Bus:
     def _collect(self, request: _Request, started: float) -> tuple[bytes, list[tuple[int, float, bool]]]:
         """All bytes that come for a request, and (bytes so far, when, whether in time) of each portion."""
         data, edges = b"", list[tuple[int, float, bool]]()
-        ids, size, quiet = request.ids, request.size, request.quiet
+        ids, quiet = request.ids, request.quiet
         deadline, sent = started + request.whole, started + request.wire
         # A refusal is shorter than an answer and stuffing makes it longer: the length field tells, once it is there.
-        known, at_known, expected = 0, 0, size * len(ids)
+        known, at_known, expected = 0, 0, request.expected
         in_time, line, before = True, self.line, self.line.received
         while len(data) < expected:
             if not self.clock.wait_readable(line, deadline):
@@ -426,7 +446,7 @@ class Bus:
                 known < len(ids) and len(data) >= at_known + 7 and data.startswith(request.heads[known][:5], at_known)
             ):
                 actual = 7 + (data[at_known + 5] | data[at_known + 6] << 8)
-                expected += actual - size
+                expected += actual - request.sizes[known]
                 known, at_known = known + 1, at_known + actual
             if len(data) < expected and in_time:
                 deadline = min(deadline, max(edges[-1][1], sent) + quiet)
@@ -436,14 +456,14 @@ class Bus:
         self, request: _Request, data: bytes, edges: list[tuple[int, float, bool]], started: float
     ) -> list[Answer] | None:
         """The usual case: every answer where it should be, none stuffed, none late. None where anything is not."""
-        ids, size = request.ids, request.size
-        if len(data) != size * len(ids) or not edges[-1][2] or data.count(_MARK) != len(ids):
+        ids = request.ids
+        if len(data) != request.expected or not edges[-1][2] or data.count(_MARK) != len(ids):
             return None
         at, alerts = 0, 0
         at_once = len(edges) == 1
         rtt = edges[0][1] - started
         answers: list[Answer] = []
-        for id, head, crc in zip(ids, request.heads, request.crcs, strict=True):
+        for id, size, head, crc in zip(ids, request.sizes, request.heads, request.crcs, strict=True):
             end = at + size
             part = data[at + 8 : end - 2]
             if not data.startswith(head, at) or p2.crc16(part, crc) != data[end - 2] | data[end - 1] << 8:
@@ -461,17 +481,20 @@ class Bus:
         return answers
 
     def _sort_out(
-        self, data: bytes, ids: Sequence[int], edges: list[tuple[int, float, bool]], started: float
+        self, data: bytes, request: _Request, edges: list[tuple[int, float, bool]], started: float
     ) -> list[Answer]:
         """Answers from a stream in which something is missing, broken, stuffed or late."""
-        parser = Parser()
+        parser, ids = Parser(), request.ids
         got: dict[int, Answer] = {}
         broken: list[tuple[int, Cause]] = []  # (position in `ids` behind which it stands, cause)
         position, at = 0, 0
         for item in parser.feed(data) + parser.flush():
             if isinstance(item, Status):
                 at += len(item.encode())
-                if item.id in ids and item.id not in got:
+                # An answer of another length was meant for an earlier question; a refusal is empty.
+                wanted = request.counts[ids.index(item.id)] if item.id in ids else None
+                fits = len(item.params) == wanted or (item.code and not item.params)
+                if wanted is not None and item.id not in got and fits:
                     when, in_time = _when(at, edges)
                     cause = None if in_time else Cause.LATE
                     got[item.id] = Answer(item.id, item.params, item.error, cause, when - started)
@@ -503,7 +526,7 @@ class Bus:
         request = self._request(p2.Inst.FAST_SYNC_READ, address, count, ids)
         if request.timing is not self.timing or request.baud != self.line.baud:
             request.fit(self.timing, self.line.baud)
-        started = self._send(request.packet)
+        started = self._begin(request.packet)
         deadline, sent = started + request.whole, started + request.wire
         expected, data = 8 + len(ids) * (count + 4), b""
         edges: list[tuple[int, float, bool]] = []
@@ -537,10 +560,11 @@ class Bus:
         self, request: _Request, data: bytes, edges: list[tuple[int, float, bool]], started: float
     ) -> list[Answer] | None:
         """The usual case of a joined reply: all there, the last CRC, which covers the earlier ones, right."""
-        ids, step = request.ids, request.count + 4
+        ids, count = request.ids, request.counts[0]
+        step = count + 4
         if len(data) != 8 + len(ids) * step or len(edges) != 1:
             return None
-        head = _joined_head(len(ids), request.count)
+        head = _joined_head(len(ids), count)
         if not data.startswith(head) or p2.crc16(data[:-2]) != data[-2] | data[-1] << 8:
             return None
         at, rtt = len(head), edges[0][1] - started
@@ -560,7 +584,7 @@ class Bus:
         for attempt in range(1 + self.retries):
             if attempt:
                 self.statistics.of(id).retries += 1
-            answer = self._exchange(instruction, [id], count)[0]
+            answer = self._exchange(instruction, [id], [count])[0]
             if answer.data is not None:
                 break
         else:
@@ -573,7 +597,7 @@ class Bus:
         if id == p2.BROADCAST:
             self.send(instruction.encode())
             return
-        [answer] = self._exchange(instruction, [id], 0)
+        [answer] = self._exchange(instruction, [id], [0])
         if answer.data is None:
             self.require([answer])
         self._check(answer, what)
