@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.files import write_text
-from openant_tools.model.plant import Plant, Setup, load_plant
+from openant_tools.model.plant import KD, KP, MOTOR_CONSTANT, RESISTANCE, VMAX, Plant, Setup, is_motor, load_plant
 
 __all__ = ["write_model"]
 
@@ -57,7 +57,10 @@ def write_model(
                 remedy="save the expanded model first: python -m mujoco.studio, or MjSpec.to_xml()",
             )
         _write_joint(element, plant, variant, j, degrees)
-        _write_actuator(actuators[plant.actuator[j]], plant, variant, j)
+        if is_motor(variant, int(plant.actuator[j])) and not is_motor(plant.model, int(plant.actuator[j])):
+            _write_motor(actuators[plant.actuator[j]], variant, int(plant.actuator[j]))
+        else:
+            _write_actuator(actuators[plant.actuator[j]], plant, variant, j)
     _append_sensors(root, plant.joints)
     if note:
         root.insert(0, etree.Comment(f" {note.replace('--', '−−')} "))
@@ -161,6 +164,26 @@ def _write_actuator(element: etree._Element, plant: Plant, variant: mujoco.MjMod
         element.set("forcerange", _numbers(variant.actuator_forcerange[i]))
 
 
+def _write_motor(element: etree._Element, variant: mujoco.MjModel, i: int) -> None:
+    """Put a DC motor in a position servo's place (plant.motor_form): same name, joint, order and control."""
+    motor = variant.actuator_gainprm[i]
+    kept = {name: value for name, value in element.attrib.items() if name in _KEPT_BY_MOTOR}
+    element.tag = "dcmotor"
+    element.attrib.clear()
+    for name, value in kept.items():
+        element.set(name, value)
+    element.set("input", "pos")
+    element.set("motorconst", _numbers([motor[MOTOR_CONSTANT]] * 2))
+    element.set("resistance", _number(motor[RESISTANCE]))
+    element.set("controller", _numbers([motor[KP], 0, motor[KD], 0, 0, motor[VMAX]]))
+    if variant.actuator_ctrllimited[i]:
+        element.set("ctrlrange", _numbers(variant.actuator_ctrlrange[i]))
+
+
+#: attributes of a position servo that a DC motor has too, with the same meaning
+_KEPT_BY_MOTOR = ("name", "joint", "group", "user", "nsample", "interp", "delay", "armature", "damping")
+
+
 def _append_sensors(root: etree._Element, joints: Sequence[str]) -> None:
     """After the sensors already there: what the encoder of every servo joint would measure."""
     there = {e.get("name") for section in root.iter("sensor") for e in section if isinstance(e.tag, str)}
@@ -195,6 +218,7 @@ def _check(out: Path, plant: Plant, variant: mujoco.MjModel) -> None:
         i, k, dof, adr = written.actuator[j], plant.actuator[j], plant.dof[j], plant.qpos[j]
         pairs = [
             (written.model.actuator_biasprm[i, 1:3], variant.actuator_biasprm[k, 1:3]),
+            (written.model.actuator_gainprm[i], variant.actuator_gainprm[k]),
             (written.model.actuator_forcerange[i], variant.actuator_forcerange[k]),
             (written.model.dof_damping[written.dof[j]], variant.dof_damping[dof]),
             (written.model.dof_armature[written.dof[j]], variant.dof_armature[dof]),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 
-__all__ = ["Plant", "Setup", "load_plant", "setup_of"]
+__all__ = ["Plant", "Setup", "is_motor", "load_plant", "position_servos", "setup_of"]
 
 Ints = NDArray[np.int64]
 
@@ -85,13 +86,17 @@ class Plant:
         return limp
 
 
-def load_plant(path: Path | str, joints: Sequence[str] | None = None, setup: Setup = Setup.STAND) -> Plant:
+def load_plant(
+    path: Path | str, joints: Sequence[str] | None = None, setup: Setup = Setup.STAND, *, electrical: bool = False
+) -> Plant:
     """Read an MJCF and set it up.
 
     Args:
         path: the MJCF.
         joints: names of the joints to play and compare; None takes every joint that a position servo drives.
         setup: stand or floor.
+        electrical: turn position servos into DC motors that move as they do (`motor_form`), so that a part of the joint's
+            damping can be made back-EMF.
 
     Raises:
         BadInput: the file is missing or MuJoCo cannot load it, it has no position-controlled joint, or it lacks one of
@@ -124,6 +129,10 @@ def load_plant(path: Path | str, joints: Sequence[str] | None = None, setup: Set
             hint = f"did you mean {near[0]!r}?" if near else f"its position-controlled joints are {', '.join(servos)}"
             raise BadInput(f"the model has no position-controlled joint {joint!r}", where=path, remedy=hint)
 
+    if electrical:
+        for joint in joints:
+            motor_form(spec.actuators[servos[joint]], original, joint)
+        original = spec.compile()
     model = _on_stand(spec, original) if setup is Setup.STAND else original
     actuator = [servos[joint] for joint in joints]
     ids = [model.joint(joint).id for joint in joints]
@@ -155,11 +164,65 @@ def position_servos(model: mujoco.MjModel) -> dict[str, int]:
         if int(model.jnt_type[joint]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
             continue
         affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and model.actuator_biasprm[i, 1] < 0
-        dcmotor = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_DCMOTOR
         name = model.joint(joint).name
-        if (affine or dcmotor) and (name not in servos or model.actuator(i).name == name):
+        if (affine or is_motor(model, i)) and (name not in servos or model.actuator(i).name == name):
             servos[name] = i
     return servos
+
+
+#: What `motor_form` leaves in a DC motor of the joint's damping: as little as can be told from none, since its motor
+#: constant must be positive.
+LEAST_SHARE = 1e-4
+#: indices into a DC motor's gainprm (MuJoCo 4, checked by a test): resistance, motor constant, gains, voltage limit
+RESISTANCE, MOTOR_CONSTANT, KP, KD, VMAX = 0, 1, 4, 6, 7
+#: `input="pos"`
+POSITION_INPUT = 1
+
+
+def motor_form(actuator: mujoco.MjsActuator, model: mujoco.MjModel, joint: str) -> bool:
+    """Turn a position servo of a spec into a DC motor that moves the joint in the same way; False where that cannot be.
+
+    A servo's duty is clipped, τ = clip(kp e − kv ω, ±L), and its back-EMF brakes on top of that, clip or not, as long as
+    it has torque. A `position` actuator has nowhere to put the second part: joint damping stays without torque, and kv
+    is clipped. In MuJoCo's DC motor of constant K and resistance 1 Ω both are right: the share K² of the damping is back-EMF,
+    the derivative gain K² + kv takes back the compensation that its controller would add, and Vmax = L / K clips the duty.
+
+    A servo whose setpoint is filtered, whose force is unlimited, or whose joint has no damping stays as it is.
+    """
+    i = actuator.id
+    dof = int(model.jnt_dofadr[model.joint(joint).id])
+    damping = float(model.dof_damping[dof])
+    plain = (
+        model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
+        and model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE
+        and math.isclose(model.actuator_gainprm[i, 0], -model.actuator_biasprm[i, 1], rel_tol=1e-9)
+        and model.actuator_biasprm[i, 0] == 0
+        and model.actuator_forcelimited[i]
+        and math.isclose(model.actuator_forcerange[i, 0], -model.actuator_forcerange[i, 1])
+        and np.array_equal(model.actuator_gear[i], [1, 0, 0, 0, 0, 0])
+        and damping > 0
+    )
+    if not plain:
+        return False
+    stiffness, velocity = float(model.actuator_gainprm[i, 0]), -float(model.actuator_biasprm[i, 2])
+    limit = float(model.actuator_forcerange[i, 1])
+    back_emf = LEAST_SHARE * damping
+    constant = math.sqrt(back_emf)
+    actuator.set_to_dcmotor(
+        motorconst=[constant, constant],
+        resistance=1.0,
+        controller=[stiffness, 0.0, velocity + back_emf, 0.0, 0.0, limit / constant],
+        ctrlspec=POSITION_INPUT,
+    )
+    actuator.forcelimited = 0
+    actuator.forcerange = [0.0, 0.0]
+    return True
+
+
+def is_motor(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator is a DC motor."""
+    return bool(model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_DCMOTOR)
 
 
 def _on_stand(spec: mujoco.MjSpec, original: mujoco.MjModel) -> mujoco.MjModel:

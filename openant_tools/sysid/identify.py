@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +23,7 @@ from openant_tools.recording.run import Run
 from openant_tools.sysid.fit import Dataset, Estimate, Problem, gaps, sensor_floor
 from openant_tools.sysid.parameter import KINDS, Parameter, apply, choose
 
-__all__ = ["DEFAULT_KINDS", "Identification", "Value", "identify"]
+__all__ = ["DEFAULT_KINDS", "Identification", "Value", "calibrated", "identify"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -183,11 +184,16 @@ def identify(
     joints = _joints_in_common(everything, model, joints)
     for run in everything:
         _must_move(run, joints)
-    data = _datasets(runs, model, joints)
-    judged = _datasets(hold_out, model, joints)
+    wanted = _applicable(kinds, load_plant(model, joints, Setup.FLOOR), everything)
+    electrical = "electrical_damping" in wanted
+
+    def datasets(of: Sequence[Run]) -> list[Dataset]:
+        return _datasets(of, model, joints, electrical)
+
+    data, judged = datasets(runs), datasets(hold_out)
     plant = data[0].plant
     motors = {k: v for run in everything for k, v in run.facts.motors.items()}
-    chosen = choose(plant, _applicable(kinds, plant, everything), tie, motors)
+    chosen = choose(plant, wanted, tie, motors)
     floor = np.maximum(sensor_floor(runs, joints), 1e-6)
 
     problem = Problem(data, chosen, floor)
@@ -204,8 +210,8 @@ def identify(
     else:
         trials = []
         for k, (train, test) in enumerate(folds):
-            fold = Problem(_datasets(train, model, joints), chosen, floor)
-            trials.append((fold.solve(progress=share(1 + k)), _datasets(test, model, joints)))
+            fold = Problem(datasets(train), chosen, floor)
+            trials.append((fold.solve(progress=share(1 + k)), datasets(test)))
 
     undetermined = estimate.information < UNDETERMINED
     kept, before, after = _judge(trials, chosen, undetermined)
@@ -270,12 +276,15 @@ def _quantum(run: Run, joint: str) -> float:
     return float(sensor_floor([run], [joint])[0] * math.sqrt(12))
 
 
-def _datasets(runs: Sequence[Run], model: Path, joints: Sequence[str]) -> list[Dataset]:
+def _datasets(runs: Sequence[Run], model: Path, joints: Sequence[str], electrical: bool) -> list[Dataset]:
     """One dataset per model and setup; runs that name their own model are simulated with it."""
     groups: dict[tuple[Path, Setup], list[Run]] = {}
     for run in runs:
         groups.setdefault((_own_model(run) or model, setup_of(run.facts.setup)), []).append(run)
-    return [Dataset.prepare(load_plant(path, joints, setup), members) for (path, setup), members in groups.items()]
+    return [
+        Dataset.prepare(load_plant(path, joints, setup, electrical=electrical), members)
+        for (path, setup), members in groups.items()
+    ]
 
 
 def _own_model(run: Run) -> Path | None:
@@ -460,7 +469,11 @@ def _notes(estimate: Estimate, joints: Sequence[str], runs: Sequence[Run]) -> tu
     return tuple(notes)
 
 
-def models(identification: Identification, setup: Setup) -> tuple[Plant, Any]:
-    """The given plant and the identified model, both set up as asked."""
-    plant = load_plant(identification.model, identification.joints, setup)
-    return plant, apply(plant, identification.parameters, identification.u)
+def calibrated(identification: Identification, setup: Setup = Setup.FLOOR) -> mujoco.MjModel:
+    """The identified model. Its servos become DC motors only where a part of the damping was found to be electrical."""
+    electrical = any(
+        p.kind == "electrical_damping" and u != 0
+        for p, u in zip(identification.parameters, identification.u, strict=True)
+    )
+    plant = load_plant(identification.model, identification.joints, setup, electrical=electrical)
+    return apply(plant, identification.parameters, identification.u)

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.model.plant import Plant
+from openant_tools.model.plant import KD, KP, LEAST_SHARE, MOTOR_CONSTANT, RESISTANCE, VMAX, Plant, is_motor
 
 __all__ = ["KINDS", "Kind", "Parameter", "apply"]
 
@@ -55,23 +55,82 @@ class Kind:
     prior: float | None = None
 
 
+# A servo is either affine (`position`, `general`, `pid`: τ = clip(kp e − kv ω, ±L)) or a DC motor of resistance 1 Ω
+# (plant.motor_form): duty clip(kp e − kv ω, ±L) with back-EMF K² ω beyond it, derivative gain K² + kv, Vmax = L / K.
+
+
+def _motor(model: mujoco.MjModel, plant: Plant, j: int) -> NDArray[np.float64] | None:
+    """The parameters of joint j's DC motor, to read and write; None where its servo is affine."""
+    i = int(plant.actuator[j])
+    return np.asarray(model.actuator_gainprm[i]) if is_motor(model, i) else None
+
+
+def _back_emf(motor: Array) -> float:
+    return float(motor[MOTOR_CONSTANT] ** 2 / motor[RESISTANCE])
+
+
+def _set_back_emf(motor: Array, slope: float) -> None:
+    """Change a motor's back-EMF slope (N·m·s/rad) and keep its gains and torque limit."""
+    limit = motor[MOTOR_CONSTANT] * motor[VMAX]
+    motor[KD] += slope * motor[RESISTANCE] - _back_emf(motor)
+    motor[MOTOR_CONSTANT] = math.sqrt(slope * motor[RESISTANCE])
+    motor[VMAX] = limit / motor[MOTOR_CONSTANT]
+
+
 def _read_stiffness(model: mujoco.MjModel, plant: Plant, j: int) -> float:
-    return -float(model.actuator_biasprm[plant.actuator[j], 1])
+    motor = _motor(model, plant, j)
+    return float(motor[KP]) if motor is not None else -float(model.actuator_biasprm[plant.actuator[j], 1])
 
 
 def _write_stiffness(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
-    i = plant.actuator[j]
+    i, motor = plant.actuator[j], _motor(model, plant, j)
+    if motor is not None:
+        motor[KP] = value
+        return
     if model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED:
         model.actuator_gainprm[i, 0] *= value / -model.actuator_biasprm[i, 1]
     model.actuator_biasprm[i, 1] = -value
 
 
 def _read_velocity_gain(model: mujoco.MjModel, plant: Plant, j: int) -> float:
+    motor = _motor(model, plant, j)
+    if motor is not None:
+        return float(motor[KD]) - _back_emf(motor)
     return -float(model.actuator_biasprm[plant.actuator[j], 2])
 
 
 def _write_velocity_gain(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
-    model.actuator_biasprm[plant.actuator[j], 2] = -value
+    motor = _motor(model, plant, j)
+    if motor is not None:
+        motor[KD] = value + _back_emf(motor)
+    else:
+        model.actuator_biasprm[plant.actuator[j], 2] = -value
+
+
+def _read_damping(model: mujoco.MjModel, plant: Plant, j: int) -> float:
+    motor = _motor(model, plant, j)
+    return float(model.dof_damping[plant.dof[j]]) + (0.0 if motor is None else _back_emf(motor))
+
+
+def _write_damping(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
+    motor, share = _motor(model, plant, j), _read_electrical(model, plant, j)
+    model.dof_damping[plant.dof[j]] = (1 - share) * value
+    if motor is not None:
+        _set_back_emf(motor, share * value)
+
+
+def _read_electrical(model: mujoco.MjModel, plant: Plant, j: int) -> float:
+    motor = _motor(model, plant, j)
+    return 0.0 if motor is None else _back_emf(motor) / _read_damping(model, plant, j)
+
+
+def _write_electrical(model: mujoco.MjModel, plant: Plant, j: int, share: float) -> None:
+    motor, total = _motor(model, plant, j), _read_damping(model, plant, j)
+    if motor is None:
+        return  # a servo that has no motor form keeps its damping where it is
+    share = max(share, LEAST_SHARE)
+    model.dof_damping[plant.dof[j]] = (1 - share) * total
+    _set_back_emf(motor, share * total)
 
 
 def _read_dof(field: str) -> Callable[[mujoco.MjModel, Plant, int], float]:
@@ -101,25 +160,19 @@ def _write_zero(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> No
 
 
 def torque_limit(model: mujoco.MjModel, plant: Plant, j: int) -> float:
-    """The most torque (N·m) that the joint's actuator gives, infinite where the model sets none."""
-    i = plant.actuator[j]
+    """The most torque (N·m) that the joint's servo gives at standstill, infinite where the model sets none."""
+    i, motor = plant.actuator[j], _motor(model, plant, j)
+    if motor is not None:
+        return float(motor[MOTOR_CONSTANT] * motor[VMAX] / motor[RESISTANCE])
     return float(model.actuator_forcerange[i, 1]) if model.actuator_forcelimited[i] else math.inf
 
 
 def _write_torque_limit(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
-    model.actuator_forcerange[plant.actuator[j]] = (-value, value)
-
-
-def _read_electrical(model: mujoco.MjModel, plant: Plant, j: int) -> float:
-    """0: in the model as it is read, what stands in the joint brakes whether or not the servo has torque."""
-    return 0.0
-
-
-def _write_electrical(model: mujoco.MjModel, plant: Plant, j: int, share: float) -> None:
-    dof, i = plant.dof[j], plant.actuator[j]
-    moved = share * model.dof_damping[dof]
-    model.dof_damping[dof] -= moved
-    model.actuator_biasprm[i, 2] -= moved
+    motor = _motor(model, plant, j)
+    if motor is not None:
+        motor[VMAX] = value * motor[RESISTANCE] / motor[MOTOR_CONSTANT]
+    else:
+        model.actuator_forcerange[plant.actuator[j]] = (-value, value)
 
 
 #: What brakes a DC servo beyond its friction is back-EMF, which vanishes with the torque: a share near 1, this uncertain.
@@ -147,8 +200,8 @@ KINDS: dict[str, Kind] = {
         Kind(
             "damping",
             "N·m·s/rad",
-            _read_dof("dof_damping"),
-            _write_dof("dof_damping"),
+            _read_damping,
+            _write_damping,
             0.125,
             lambda limit: DAMPING_PER_NM * limit,
         ),
@@ -270,6 +323,8 @@ def choose(
             nominals = [kind.read(plant.model, plant, j) for j in joints]
             limits = [torque_limit(plant.model, plant, j) for j in joints]
             if name == "torque_limit" and not np.isfinite(limits).all():
+                continue
+            if name == "electrical_damping" and not all(is_motor(plant.model, int(plant.actuator[j])) for j in joints):
                 continue
             limit = float(
                 np.mean(

@@ -118,6 +118,7 @@ def _row(value: Value) -> list[object]:
 
 
 def _error_against_horizon(result: Identification) -> MatplotlibFigure:
+    figure: MatplotlibFigure
     figure, axes = plots.figure(height=2.8)
     given, calibrated = [], []
     longest = max(run.duration_s for data in result.held_out for run in data.runs)

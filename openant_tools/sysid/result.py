@@ -8,10 +8,9 @@ from pathlib import Path
 
 from openant_tools.files import write_text
 from openant_tools.model.mjcf import write_model
-from openant_tools.model.plant import Setup
 from openant_tools.robot.config import Provenance
 from openant_tools.robot.folder import RobotFolder
-from openant_tools.sysid.identify import Identification, models
+from openant_tools.sysid.identify import Identification, calibrated
 from openant_tools.sysid.report import fit_report
 
 __all__ = ["write_fit", "write_robot"]
@@ -25,11 +24,10 @@ def write_fit(result: Identification, out: Path) -> list[Path]:
     Where nothing was accepted the model is the given one, so that a script can go on with `calibrated.xml` either way.
     """
     runs = ", ".join(run.name for data in result.datasets for run in data.runs)
-    _, calibrated = models(result, Setup.FLOOR)
     written = [
         write_model(
             result.model,
-            calibrated,
+            calibrated(result),
             out / CALIBRATED,
             joints=result.joints,
             note=f"Calibrated by `openant sysid fit` on {datetime.date.today()} from {result.model.name} and {runs}",
@@ -42,7 +40,6 @@ def write_fit(result: Identification, out: Path) -> list[Path]:
 
 def write_robot(result: Identification, folder: RobotFolder) -> None:
     """Put the calibrated model into a robot's folder, and every accepted value with where it came from into `robot.toml`."""
-    _, calibrated = models(result, Setup.FLOOR)
     write_model(
         result.model, calibrated, folder.path / CALIBRATED, joints=result.joints, note="Written by `openant sysid fit`"
     )
