@@ -11,10 +11,9 @@ this form, reward times Δt included, is that of the platform's published agent.
 
 The task has no episodes. A termination cuts the bootstrap, a truncation (someone had to help the robot) does not.
 
-Updates are plain torch on one thread: the matrices are too small for two. What makes them quick: the weights of a
-network are one vector, so that fused Adam and the targets' move are one call each; no gradients for the critics'
-weights while the actor learns; log π computed once for actor and entropy; transitions kept as rows of one array, so
-that a batch is one gather.
+Updates are plain torch on one thread: the matrices are too small for two. What makes them quick: fused Adam, one call
+for all target weights, no gradients for the critics' weights while the actor learns, log π computed once for actor and
+entropy, and transitions kept as rows of one array, so that a batch is one gather.
 """
 
 from __future__ import annotations
@@ -196,27 +195,11 @@ class Replay:
 # ------------------------------------------------------------------------------------------------------------ agent
 
 
-def _as_vector(network: nn.Module) -> Tensor:
-    """Move all weights of a network into one vector, of which they become views, and their gradients likewise.
-
-    Adam's step, the targets' move and clearing the gradients are then one call each instead of one a tensor.
-    """
-    weights = list(network.parameters())
-    vector = torch.cat([weight.detach().flatten() for weight in weights]).requires_grad_()
-    vector.grad = torch.zeros_like(vector)
-    sizes = [weight.numel() for weight in weights]
-    parts = zip(weights, vector.detach().split(sizes), vector.grad.split(sizes), strict=True)
-    for weight, values, gradient in parts:
-        weight.data = values.view_as(weight)
-        weight.grad = gradient.view_as(weight)
-    return vector
-
-
-def _adam(vector: Tensor, step: float) -> torch.optim.Adam:
+def _adam(weights: list[Tensor], step: float) -> torch.optim.Adam:
     try:
-        return torch.optim.Adam([vector], lr=step, fused=True)
+        return torch.optim.Adam(weights, lr=step, fused=True)
     except RuntimeError:  # torch before 2.4 has the fused form on graphics cards only
-        return torch.optim.Adam([vector], lr=step)
+        return torch.optim.Adam(weights, lr=step)
 
 
 class Sac:
@@ -247,11 +230,12 @@ class Sac:
         self.targets.requires_grad_(False)
         self.log_alpha = torch.tensor(math.log(settings.entropy_start), device=self.device, requires_grad=True)
         self.target_entropy = -float(actions)
-        self._actor_weights = list(self.actor.parameters())
-        self._critic_vector, self._target_vector = _as_vector(self.critics), _as_vector(self.targets)
-        self.actor_optimiser = _adam(_as_vector(self.actor), settings.actor_step)
-        self.critic_optimiser = _adam(self._critic_vector, settings.critic_step)
-        self.entropy_optimiser = _adam(self.log_alpha, settings.entropy_step)
+        self._actor_weights: list[Tensor] = list(self.actor.parameters())
+        self._critic_weights: list[Tensor] = list(self.critics.parameters())
+        self._target_weights: list[Tensor] = list(self.targets.parameters())
+        self.actor_optimiser = _adam(self._actor_weights, settings.actor_step)
+        self.critic_optimiser = _adam(self._critic_weights, settings.critic_step)
+        self.entropy_optimiser = _adam([self.log_alpha], settings.entropy_step)
         self.replay = Replay(observations, actions, settings.buffer)
         self.updates = 0
 
@@ -288,7 +272,7 @@ class Sac:
             target = settings.reward_scale * reward * dt + discount * value
         first, second = self.critics(observation_action)
         critic_loss = F.mse_loss(first, target) + F.mse_loss(second, target)
-        self.critic_optimiser.zero_grad(set_to_none=False)
+        self.critic_optimiser.zero_grad()
         critic_loss.backward()  # type: ignore[no-untyped-call]
         self.critic_optimiser.step()
         self.updates += 1
@@ -298,13 +282,13 @@ class Sac:
                 self._update_actor(observation)
 
         with torch.no_grad():
-            self._target_vector.lerp_(self._critic_vector, settings.tau)
+            torch._foreach_lerp_(self._target_weights, self._critic_weights, settings.tau)
 
     def _update_actor(self, observation: Tensor) -> None:
         action, log_pi = self.actor(observation, self._normal(self.settings.batch))
         value = torch.minimum(*self.critics(torch.cat((observation, action), dim=1)))
         actor_loss = (self.log_alpha.detach().exp() * log_pi - value).mean()
-        self.actor_optimiser.zero_grad(set_to_none=False)
+        self.actor_optimiser.zero_grad()
         # Only the actor's weights: the critics' would cost a third more and be thrown away.
         actor_loss.backward(inputs=self._actor_weights)
         self.actor_optimiser.step()
