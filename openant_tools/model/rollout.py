@@ -8,7 +8,8 @@ Contract
 * **Time.** Rows may come at any strictly increasing times. A segment steps from its first row's time on the model's own
   time step; positions between two steps are interpolated linearly. A command acts from its own time on (`cmd_t`, else
   the row's `t`), held until the next; each step sees its mean over the step, so that results vary smoothly with delays
-  and time stamps instead of by whole steps. A missing command leaves the one before in force.
+  and time stamps instead of by whole steps. (A servo that limits its setpoint's rate takes the command of the middle of
+  each step: to a limiter a part of a change is as good as the whole.) A missing command leaves the one before in force.
 * **Start of a segment.** Setpoint filters and slew limiters hold the first command, as do the delay buffers; all other
   activations are zero (formats, section 5). Without a measured base, a robot on the floor starts settled on its feet.
 * **Torque off** (`torque.J` = 0) disables that joint's actuator from its row to the next; what stands in the joint
@@ -46,6 +47,8 @@ Bools = NDArray[np.bool_]
 VELOCITY_SPAN_S = 0.02
 #: states kept at a time while a batch runs
 CHUNK_BYTES = 64 * 2**20
+#: where an actuator of this kind keeps the rate limit of its setpoint (`slewmax`) in dynprm, MuJoCo 4
+SLEW_RATE = {int(mujoco.mjtDyn.mjDYN_PID): 1, int(mujoco.mjtDyn.mjDYN_DCMOTOR): 7}
 #: how long a robot without a measured base is left to settle on its feet before a floor run
 SETTLE_S = 1.0
 
@@ -190,11 +193,12 @@ def initial_velocities(t: Array, pos: Array, row: int) -> Array:
     A servo's velocity register is coarse and late; the positions on both sides are neither. Least squares over the
     rows within VELOCITY_SPAN_S (at least one neighbour on each side where there is one); 0 where nothing is known.
     """
-    near = np.abs(t - t[row]) <= VELOCITY_SPAN_S
-    near[max(0, row - 1) : row + 2] = True
+    first = min(int(np.searchsorted(t, t[row] - VELOCITY_SPAN_S)), max(0, row - 1))
+    stop = max(int(np.searchsorted(t, t[row] + VELOCITY_SPAN_S, side="right")), row + 2)
+    t, pos = t[first:stop], pos[first:stop]
     out = np.zeros(pos.shape[1])
     for j in range(pos.shape[1]):
-        ok = near & np.isfinite(pos[:, j])
+        ok = np.isfinite(pos[:, j])
         if ok.sum() >= 2:
             dt = t[ok] - t[ok].mean()
             out[j] = dt @ (pos[ok, j] - pos[ok, j].mean()) / (dt @ dt)
@@ -220,7 +224,9 @@ def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | 
                 starts.append(int(row))
     h, model = plant.timestep, plant.model
     torque_off = run.signal("torque", plant.joints, default=1.0) == 0
-    command_times = run.command_times
+    flips = 1 + np.flatnonzero((torque_off[1:] != torque_off[:-1]).any(axis=1))
+    commands = _Staircase.of(run.command_times, cmd)
+    slewing = np.array([_limits_slew(model, int(i)) for i in plant.actuator])
     segments = []
     for first, stop in zip(starts, [*starts[1:], len(t)], strict=True):
         # The row at which the next segment starts belongs to that one.
@@ -228,13 +234,15 @@ def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | 
         at = (t[rows] - t[first]) / h
         step = np.floor(at + 1e-9).astype(np.int64)
         nstep = int(step[-1]) + 1
-        setpoint = _mean_over_steps(command_times, cmd, t[first] + h * np.arange(nstep + 1))
+        edges = t[first] + h * np.arange(nstep + 1)
+        setpoint = commands.mean(edges)
+        if slewing.any():
+            setpoint[:, slewing] = commands.at(edges[:-1] + h / 2)[:, slewing]
         control = np.zeros((nstep, model.nu))
         control[:, plant.ctrl] = setpoint
         off = {0: torque_off[first]}
-        for row in rows[1:]:
-            if (torque_off[row] != torque_off[row - 1]).any():
-                off[min(nstep - 1, round((t[row] - t[first]) / h))] = torque_off[row]
+        for row in flips[(flips > first) & (flips < stop)]:
+            off[min(nstep - 1, round((t[row] - t[first]) / h))] = torque_off[row]
         velocity = initial_velocities(t, pos, first)
         segments.append(
             _Segment(
@@ -263,18 +271,42 @@ def _held(cmd: Array) -> Array | None:
     return out
 
 
-def _mean_over_steps(times: Array, values: Array, edges: Array) -> Array:
-    """The mean of a staircase over each interval between edges, (intervals, columns).
+@dataclass(frozen=True)
+class _Staircase:
+    """Commands in force: `values[k]` from `times[k]` until the next, before the first time the first value.
 
-    The staircase has `values[k]` from `times[k]` until the next; before the first time it has the first value.
+    Attributes:
+        times: (n,) s, in order; where several are the same, the last one counts.
+        values: (n, columns).
     """
-    order = np.argsort(times, kind="stable")
-    times, values = times[order], values[order]
-    knots = np.concatenate([[min(times[0], edges[0]) - 1.0], times, [max(times[-1], edges[-1]) + 1.0]])
-    levels = np.concatenate([values[:1], values])
-    area = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(levels * np.diff(knots)[:, None], axis=0)])
-    at = np.stack([np.interp(edges, knots, column) for column in area.T], axis=1)
-    return np.diff(at, axis=0) / np.diff(edges)[:, None]
+
+    times: Array
+    values: Array
+
+    @classmethod
+    def of(cls, times: Array, values: Array) -> _Staircase:
+        order = np.argsort(times, kind="stable")
+        return cls(times[order], values[order])
+
+    def _index(self, times: Array) -> Ints:
+        return np.maximum(np.searchsorted(self.times, times, side="right") - 1, 0)
+
+    def at(self, times: Array) -> Array:
+        """The values in force at `times`, (times, columns)."""
+        return self.values[self._index(times)]
+
+    def mean(self, edges: Array) -> Array:
+        """The mean over each interval between two edges, (intervals, columns)."""
+        first, last = self._index(edges[[0, -1]])
+        # Only the steps between the edges, and time from the first edge: sums stay short and exact.
+        levels = self.values[first : last + 1]
+        start = edges[0]
+        knots = np.clip(np.append(self.times[first + 1 : last + 1], edges[-1]) - start, 0.0, None)
+        knots = np.concatenate([[0.0], knots])
+        area = np.concatenate([np.zeros((1, levels.shape[1])), np.cumsum(levels * np.diff(knots)[:, None], axis=0)])
+        at = np.stack([np.interp(edges - start, knots, column) for column in area.T], axis=1)
+        mean: Array = np.diff(at, axis=0) / np.diff(edges)[:, None]
+        return mean
 
 
 def _initial_state(plant: Plant, run: Run, row: int, pos: Array, vel: Array, command: Array) -> Array:
@@ -303,13 +335,19 @@ def fill_setpoints(plant: Plant, data: mujoco.MjData, command: Array) -> None:
         dyn = model.actuator_dyntype[i]
         if num and dyn in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT):
             data.act[adr + num - 1] = command[k]
-        elif num and dyn == mujoco.mjtDyn.mjDYN_PID and model.actuator_dynprm[i, 1] > 0:
-            data.act[adr] = command[k]  # [slew, integral]
+        elif num and _limits_slew(model, int(i)):
+            data.act[adr] = command[k]  # first of its activations
         if model.actuator_history[i, 0] > 0:
             nsample, width = int(model.actuator_history[i, 0]), int(model.actuator_ctrlnum[i])
             values = np.zeros((nsample, width))
             values[:, 0] = command[k]
             mujoco.mj_initCtrlHistory(model, data, int(i), None, values)
+
+
+def _limits_slew(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator limits the rate of its setpoint."""
+    where = SLEW_RATE.get(int(model.actuator_dyntype[actuator]))
+    return where is not None and bool(model.actuator_dynprm[actuator, where] > 0)
 
 
 def _place_base(plant: Plant, data: mujoco.MjData, run: Run, row: int, command: Array) -> None:
