@@ -6,8 +6,9 @@ are x forward, y left, z up; how the body tag sits in them is the mount (`positi
 The estimate. Corner noise of a small tag leaks into its tilt, and through the lever arm between tag and body centre
 into position. So the pose is the most likely one given the four corners *and* a prior on tilt: level to within
 `TILT_PRIOR_RAD`, or as the IMU says where the caller passes it. The prior also decides between the two poses that a
-flat square always allows. The reported errors are those of this estimate and of the origin's (Gauss–Newton covariance,
-corner noise `CORNER_PX`); they do not know a wrong lens or a wrongly declared edge length.
+flat square always allows; where they stay in doubt, the doubt is in the reported errors. Those are of this estimate and
+of the origin's, with the corner noise that this camera's residuals show; they do not know a wrong lens or a wrongly
+declared edge length.
 
 The origin tag does not move, so its corners are averaged over many pictures (median, far ones left out) before its pose
 is computed once; it may then be covered. If it is seen elsewhere for a while, the camera was bumped: poses stop until
@@ -36,14 +37,22 @@ __all__ = ["BodyLost", "BodyPose", "BodyTracker", "Sighting", "TagDetector", "Ta
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
-#: Random corner error of a tag that is in focus, one standard deviation (benchmarks/tag_pose.py measures 0.02 … 0.1).
+#: Corner error of a tag in focus, one standard deviation each way, until this camera's own is known from residuals.
 CORNER_PX = 0.1
+#: Whatever the residuals say: neighbouring corners err alike, which no residual shows.
+CORNER_MIN_PX = 0.04
+CORNER_MEMORY = 200
+CORNER_WARM_UP = 20
+#: Median of chi² with two degrees of freedom (eight coordinates, six unknowns).
+CHI2_2_MEDIAN = 1.386
 #: What does not average out: lens blur over unequal surroundings.
 CORNER_BIAS_PX = 0.04
 #: A walking Open Ant tilts by a few degrees.
 TILT_PRIOR_RAD = math.radians(8.0)
 #: The flight controller's attitude while the body is shaken.
 IMU_TILT_RAD = math.radians(2.0)
+#: Degrees of freedom of the prior (Student's t): its tails let clear corners overrule it, as on a body that tips over.
+PRIOR_FREEDOM = 3.0
 #: A square that fits its corners worse than this is not that square.
 MAX_RESIDUAL_PX = 2.0
 ORIGIN_MEMORY = 60
@@ -65,7 +74,8 @@ class TagSetup:
         body_position: centre of the body tag in the body, m. body_yaw: its up-direction against the body's x, rad.
         min_margin, max_hamming: what the detector must be sure of; upstream accepts a margin of 2.
         edge: share of the picture's width and height, on each side, that counts as its edge.
-        decimate: quads are searched at this fraction of the resolution; corners are refined at full resolution.
+        decimate: quads are searched in a picture this much smaller, corners refined in the whole one. At 2 the families
+            with many cells get lost below 20 px (benchmarks/tag_pose.py).
     """
 
     family: str = "tagCircle21h7"
@@ -78,7 +88,7 @@ class TagSetup:
     min_margin: float = 5.0
     max_hamming: int = 0
     edge: float = 0.10
-    decimate: float = 2.0
+    decimate: float = 1.5
 
     def __post_init__(self) -> None:
         known = len(load_family(self.family).codes)
@@ -110,7 +120,7 @@ class Sighting:
 class TagDetector:
     """pyapriltags' detector for one family. Not for use by two threads at once."""
 
-    def __init__(self, family: str, *, decimate: float = 2.0, threads: int = 1) -> None:
+    def __init__(self, family: str, *, decimate: float = 1.5, threads: int = 1) -> None:
         from pyapriltags import Detector
 
         load_family(family)
@@ -188,7 +198,7 @@ class BodyTracker:
         self._elsewhere: list[Array] = []
         self._origin: _Origin | None = None
         self._origin_t: float | None = None
-        self._seen_at_solution = 0
+        self._misfits: deque[float] = deque(maxlen=CORNER_MEMORY)
 
     @property
     def origin_age(self) -> float | None:
@@ -237,6 +247,13 @@ class BodyTracker:
         others = [i for i in others if i != self.setup.origin_id]
         return f"body tag {tag} not seen" + (f" (but tag {', '.join(map(str, others))})" if others else "")
 
+    @property
+    def corner_noise_px(self) -> float:
+        """Corner error of this camera, from how the corners of late miss the best square."""
+        if len(self._misfits) < CORNER_WARM_UP:
+            return CORNER_PX
+        return max(CORNER_MIN_PX, math.sqrt(float(np.median(self._misfits)) / CHI2_2_MEDIAN))
+
     # --- the arena -------------------------------------------------------------------------------------------------
 
     def _note_origin(self, seen: Sighting | None, lens: Intrinsics, t: float) -> None:
@@ -269,7 +286,7 @@ class BodyTracker:
         mean = corners[near].mean(axis=0) if near.any() else middle
         poses = tag_pose(mean, self.setup.origin_size, lens)
         if poses:
-            noise = max(CORNER_PX / math.sqrt(max(1, int(near.sum()))), CORNER_BIAS_PX)
+            noise = max(self.corner_noise_px / math.sqrt(max(1, int(near.sum()))), CORNER_BIAS_PX)
             fit = refine(*poses[0], mean, self.setup.origin_size, lens, None, noise)
             self._origin = _Origin(fit.rotation, fit.position, fit.covariance)
 
@@ -286,16 +303,18 @@ class BodyTracker:
         up = origin.rotation[:, 2]
         prior = _Prior(_up_in_tag(tilt, body_from_tag), up, TILT_PRIOR_RAD if tilt is None else IMU_TILT_RAD)
         solutions = [
-            refine(rotation, position, seen.corners, setup.body_size, lens, prior)
+            refine(rotation, position, seen.corners, setup.body_size, lens, prior, self.corner_noise_px)
             for rotation, position in tag_pose(seen.corners, setup.body_size, lens)
         ]
         if not solutions:
             return BodyLost(t, f"the corners of body tag {setup.body_id} make no square")
-        fit = min(solutions, key=lambda solution: solution.cost)
+        fit, *other = sorted(solutions, key=lambda solution: solution.cost)
         if fit.residual_px > MAX_RESIDUAL_PX:
             return BodyLost(t, f"the corners of body tag {setup.body_id} make no square ({fit.residual_px:.1f} px off)")
 
-        def body(tag: Array, arena: Array) -> tuple[Array, Array, float]:
+        self._misfits.append(4 * fit.residual_px**2)
+
+        def body(fit: _Fit, tag: Array, arena: Array) -> tuple[Array, Array, float]:
             """Rotation, position and yaw once tag and arena are moved a little (rotation vector and shift, 6 each)."""
             r_arena = _exp(arena[:3]) @ origin.rotation
             rotation = r_arena.T @ _exp(tag[:3]) @ fit.rotation @ body_from_tag.T
@@ -304,7 +323,7 @@ class BodyTracker:
             return rotation, place, math.atan2(rotation[1, 0], rotation[0, 0])
 
         still = np.zeros(6)
-        rotation, position, yaw = body(still, still)
+        rotation, position, yaw = body(fit, still, still)
         if rotation[2, 2] <= 0.0:
             return BodyLost(t, f"body tag {setup.body_id} is seen from below: the body lies on its back")
         variance = np.zeros(4)
@@ -313,9 +332,14 @@ class BodyTracker:
             jacobian = np.empty((4, 6))
             for k in range(6):
                 moved = np.eye(6)[k] * step
-                _, p, turned = body(moved, still) if which == 0 else body(still, moved)
+                _, p, turned = body(fit, moved, still) if which == 0 else body(fit, still, moved)
                 jacobian[:, k] = np.append(p - position, math.remainder(turned - yaw, 2 * math.pi)) / step
             variance += np.diag(jacobian @ covariance @ jacobian.T)
+        for rival in other:
+            # The other pose of a flat square, weighed by its likelihood.
+            _, p, turned = body(rival, still, still)
+            doubt = 1.0 / (1.0 + math.exp(min(50.0, (rival.cost - fit.cost) / 2.0)))
+            variance += doubt * np.append(p - position, math.remainder(turned - yaw, 2 * math.pi)) ** 2
         errors = np.sqrt(variance)
         centre = seen.corners.mean(axis=0) / [lens.width, lens.height]
         return BodyPose(
@@ -424,16 +448,28 @@ def refine(
         lean = across @ (r @ prior.up_tag - prior.up_camera)
         return np.concatenate([pixels / noise_px, lean / prior.sigma])
 
+    def cost(r: Array) -> float:
+        """Minus twice the log likelihood: Gaussian corners, Student's t for the tilt."""
+        lean = float(r[8:] @ r[8:])
+        return float(r[:8] @ r[:8]) + (PRIOR_FREEDOM + 2.0) * math.log1p(lean / PRIOR_FREEDOM)
+
+    def weighted(r: Array) -> Array:
+        """Weights of the residuals with which least squares has the same slope as `cost`."""
+        weights = np.ones(10)
+        weights[8:] = (PRIOR_FREEDOM + 2.0) / (PRIOR_FREEDOM + float(r[8:] @ r[8:]))
+        return weights
+
     now = residuals(rotation, position)
     damping = 1e-3
     for _ in range(30):
         jacobian = _jacobian(rotation, position, points, focal, across, prior, noise_px)
-        normal = jacobian.T @ jacobian
-        step = np.asarray(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -jacobian.T @ now), float)
+        slope = jacobian.T * weighted(now)
+        normal = slope @ jacobian
+        step = np.asarray(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -slope @ now), float)
         trial = (_exp(step[:3]) @ rotation, position + step[3:])
         then = residuals(*trial)
-        if then @ then < now @ now:
-            gained = now @ now - then @ then
+        gained = cost(now) - cost(then)
+        if gained > 0:
             rotation, position, now = trial[0], trial[1], then
             damping = max(damping / 5, 1e-9)
             if gained < 1e-6:
@@ -443,9 +479,9 @@ def refine(
             if damping > 1e6:
                 break
     jacobian = _jacobian(rotation, position, points, focal, across, prior, noise_px)
-    covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian), float)
+    covariance = np.asarray(np.linalg.pinv((jacobian.T * weighted(now)) @ jacobian), float)
     residual = float(np.sqrt(np.mean((now[:8] * noise_px) ** 2) * 2))
-    return _Fit(rotation, position, covariance, float(now @ now), residual)
+    return _Fit(rotation, position, covariance, cost(now), residual)
 
 
 def _jacobian(r: Array, p: Array, points: Array, focal: Array, across: Array, prior: _Prior, noise_px: float) -> Array:
