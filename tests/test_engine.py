@@ -178,6 +178,35 @@ def test_a_silent_servo_stops_the_motion(live: dict[str, str]) -> None:
     wait_until(lambda: not any(on for k, on in enumerate(torques(live)) if JOINT_NAMES[k] != "knee_fl"))
 
 
+def test_unplugging_stops_the_motion_and_plugging_in_goes_on_from_there(live: dict[str, str], tmp_path: Path) -> None:
+    out = tmp_path / "run.mcap"
+    control = VirtualControl(live["control"])
+    with EngineProcess(config(live)) as engine:
+        engine.ask(messages.Torque(True))
+        engine.ask(messages.Record(str(out), Facts(JOINT_NAMES)))
+        moving = engine.start(messages.Play(np.repeat(HOME[None, :], 3000, axis=0)))
+        time.sleep(0.5)
+        control.ask("fault", cause="usb_unplug", device="bus", on=True)
+        with pytest.raises(HardwareFault, match=r"the port is gone .* watchdog stops them"):
+            wait_until(lambda: engine.done(moving))
+        control.ask("fault", cause="usb_unplug", device="bus", on=False)
+        said: list[str] = []
+
+        def back() -> bool:
+            said.extend(event.text for event in engine.events() if isinstance(event, messages.Notice))
+            return "the port is back" in said
+
+        wait_until(back)
+        assert any("torque was still on" in text for text in said)
+        assert not any(torques(live))
+        engine.ask(messages.Torque(True))
+        engine.ask(messages.Hold(0.2))
+    control.close()
+    recording = read_recording(out)
+    assert recording.damage is None
+    assert any(event["kind"] == "stopped" for event in recording.events)
+
+
 # ---- dying with torque on ----------------------------------------------------------------------------------------
 
 PARENT = textwrap.dedent(

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.clock import Clock
 from openant_tools.comms.faults import BrokenAnswer, Cause, Refused, missing_answers, refusal_words
-from openant_tools.comms.line import Line
+from openant_tools.comms.line import Line, PortGone
 from openant_tools.comms.protocol2 import Garbage, Instruction, JoinedStatus, Parser, Reason, Status
 from openant_tools.comms.statistics import BusStatistics
 
@@ -203,7 +203,7 @@ class Bus:
         parser, found, garbage = Parser(), dict[int, Found](), 0
         deadline = started + first_s + self.wire_s(STATUS_OVERHEAD + PING_SIZE)
         while self.clock.wait_readable(self.line, deadline):
-            for item in parser.feed(self.line.read()):
+            for item in parser.feed(self._readable()):
                 if isinstance(item, Status) and len(item.params) >= 3:
                     found[item.id] = _found(Answer(item.id, item.params, item.error))
                 elif isinstance(item, Garbage):
@@ -374,6 +374,13 @@ class Bus:
         self._quiet_from = started + len(packet) * BITS_PER_BYTE / self.line.baud
         return started
 
+    def _readable(self) -> bytes:
+        """The bytes that the line is said to have. A terminal that has hung up is readable for ever, and empty."""
+        data = self.line.read()
+        if not data:
+            raise PortGone(self.line.path, "it hung up")
+        return data
+
     def _begin(self, packet: bytes) -> float:
         """Send a request that is answered; returns when its first byte left.
 
@@ -383,7 +390,7 @@ class Bus:
         if self._unsettled and packet != self._last_request:
             quiet = self.timing.latency_timer_s + self.timing.margin_s
             while self.clock.wait_readable(self.line, self.clock.now() + quiet):
-                self._count_stale(self.line.read())
+                self._count_stale(self._readable())
             self._unsettled = False
         self._last_request = packet
         return self._send(packet)
@@ -436,7 +443,7 @@ class Bus:
                     break
                 in_time, deadline = False, deadline + self.timing.grace_s
                 continue
-            data += line.read()
+            data += self._readable()
             for total, at in self.clock.arrivals(line):
                 # In real time a portion that was read late may have arrived in time: only waiting in vain tells.
                 edges.append((total - before, at, in_time and (at <= deadline or not self.clock.stepped)))
@@ -532,7 +539,7 @@ class Bus:
         edges: list[tuple[int, float, bool]] = []
         before = self.line.received
         while len(data) < expected and self.clock.wait_readable(self.line, deadline):
-            data += self.line.read()
+            data += self._readable()
             edges += [(total - before, at, True) for total, at in self.clock.arrivals(self.line)]
             deadline = min(deadline, max(edges[-1][1], sent) + request.quiet)
         if data:

@@ -53,6 +53,8 @@ RECORDED_REGISTERS = (
 )  # fmt: skip
 #: The unit of the Bus Watchdog, s.
 WATCHDOG_UNIT_S = 0.02
+#: How long torque off is sent again where servos do not confirm it.
+RELEASE_S = 0.5
 #: How long the engine waits for a port that vanished to come back, between two tries.
 REOPEN_PERIOD_S = 0.5
 #: The IMU's port is left alone for so long before a cycle begins.
@@ -270,19 +272,25 @@ class Engine:
             self._line.close()
 
     def _torque_off(self) -> None:
-        """Release every servo: first all at once, then each proven by its answer."""
-        if not self._lost:
-            try:
-                self._servos.torque_off_now()
-                still_on = [joint for joint, on in self._servos.read_all("torque_enable").items() if on]
-                self._servos.set_torque(False, still_on)
-            except PortGone:
-                self._port_lost()
-            except HardwareFault as error:
-                self._say(messages.Notice(f"torque off was sent, but not every servo confirms: {error}"))
+        """Release every servo, again and again until each has confirmed or time is up: the line may be bad."""
         self._torque = False
         self._motions.clear()
         self._goal = self._counts = None
+        if self._lost:
+            return
+        left, give_up = list(self._servos.joints), self.clock.now() + RELEASE_S
+        try:
+            while left:
+                self._servos.torque_off_now()
+                left = self._servos.still_on(left)
+                if self.clock.now() > give_up:
+                    break
+        except PortGone:
+            self._port_lost()
+        if left and not self._lost:
+            self._notice(
+                f"torque off was sent to {', '.join(left)}, but they do not confirm: the servos' own watchdog stops them"
+            )
 
     # ---- the loop ------------------------------------------------------------------------------------------------
 
@@ -370,13 +378,17 @@ class Engine:
         return Trip(f"{servo.joint} (id {servo.id}) reports {names}", errors[0].advice, trip.joint)
 
     def _stopped(self, trip: Trip) -> None:
-        self._torque_off()
+        """Release everyone, tell, and only then make sure: on a bad line that may take a while."""
+        if not self._lost:
+            with contextlib.suppress(HardwareFault):
+                self._servos.torque_off_now()
         if self._recorder is not None:
             self._recorder.event("stopped", what=trip.what, joint=trip.joint)
         self._say(messages.Stopped(trip.what, trip.remedy, trip.joint))
         for number, _ in self._waiting:
             self._say(messages.Reply(number, error=(trip.what, None, trip.remedy)))
         self._waiting.clear()
+        self._torque_off()
 
     def _port_lost(self) -> None:
         self._lost = True

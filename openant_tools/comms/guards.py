@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from openant_tools.comms.bus import Answer
+from openant_tools.comms.faults import Cause
 from openant_tools.comms.servos import Block, Servo
 
 __all__ = ["Guards", "Trip", "Watch"]
@@ -53,10 +55,12 @@ class Watch:
     limits_rad: Mapping[str, tuple[float, float]]
     _strained_since: dict[int, float] = field(default_factory=dict)
     _heard: dict[int, float] = field(default_factory=dict)
+    _missed: dict[int, Counter[Cause]] = field(default_factory=dict)
 
     def reset(self, t: float) -> None:
         """Torque comes on at `t`: what was before does not count."""
         self._strained_since.clear()
+        self._missed.clear()
         self._heard = {servo.id: t for servo in self.servos}
 
     def check(self, t: float, answers: Sequence[tuple[Answer, Block | None]]) -> Trip | None:
@@ -66,6 +70,7 @@ class Watch:
                 trip = self._silence(t, servo, answer)
             else:
                 self._heard[servo.id] = t
+                self._missed.pop(servo.id, None)
                 trip = self._measured(t, servo, answer, block)
             if trip is not None:
                 return trip
@@ -73,11 +78,17 @@ class Watch:
 
     def _silence(self, t: float, servo: Servo, answer: Answer) -> Trip | None:
         silent = t - self._heard.setdefault(servo.id, t)
+        missed = self._missed.setdefault(servo.id, Counter())
+        missed[answer.cause or Cause.SHORT] += 1
         if self.guards.silent_s is None or silent < self.guards.silent_s:
             return None
+        causes = ", ".join(f"{cause.value} {count}" for cause, count in missed.most_common())
+        broken = missed[Cause.CRC] + missed[Cause.SHORT] > missed.total() / 4
         return Trip(
-            f"{servo.joint} (id {servo.id}) has not answered for {silent:.2f} s ({answer.word})",
-            "look at its cable and at the one before it in the chain",
+            f"{servo.joint} (id {servo.id}) has not answered for {silent:.2f} s ({causes})",
+            "its answers come broken: two servos with one id, a loose connector, or noise"
+            if broken
+            else "look at its cable and at the one before it in the chain",
             servo.joint,
         )
 

@@ -277,6 +277,12 @@ class Servos:
         for _ in range(2):
             self.bus.sync_write(64, 1, dict.fromkeys(self.ids, b"\0"))
 
+    def still_on(self, joints: Sequence[str]) -> list[str]:
+        """Those of `joints` that do not say that their torque is off: on, or silent. Never raises for a silent one."""
+        ids = [self[joint].id for joint in joints]
+        answers = self.bus.sync_read(64, 1, ids)
+        return [joint for joint, answer in zip(joints, answers, strict=True) if answer.data != b"\0"]
+
     def hardware_errors(self, joint: str) -> tuple[HardwareError, ...]:
         """What stands in Hardware Error Status (70), decoded."""
         return hardware_errors(self.read_counts("hardware_error_status", joint))
