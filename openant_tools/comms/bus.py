@@ -26,6 +26,8 @@ __all__ = ["Answer", "Bus", "Found", "Timing"]
 BITS_PER_BYTE = 10
 #: A status carries this many bytes besides its data.
 STATUS_OVERHEAD = 11
+#: How much longer each further try waits: a busy host may have been late, not the servo.
+RETRY_PATIENCE_S = 25e-3
 #: Model number (2) and firmware.
 PING_SIZE = 3
 #: The FTDI driver's own setting of its latency timer; any longer one is somebody's mistake.
@@ -183,7 +185,7 @@ class Bus:
         """The servo with this ID, or None where none answers; asked `retries` times more where we `insist`."""
         for attempt in range(1 + self.retries * insist):
             self.statistics.of(id).retries += attempt > 0
-            answer = self._exchange(p2.ping(id), [id], [PING_SIZE])[0]
+            answer = self._exchange(p2.ping(id), [id], [PING_SIZE], attempt * RETRY_PATIENCE_S)[0]
             if answer.ok:
                 return _found(answer)
         return None
@@ -407,15 +409,17 @@ class Bus:
                 if servo.lost.get(Cause.TIMEOUT, 0):
                     servo.lost[Cause.TIMEOUT] -= 1
 
-    def _exchange(self, instruction: Instruction, ids: Sequence[int], counts: Sequence[int]) -> list[Answer]:
+    def _exchange(
+        self, instruction: Instruction, ids: Sequence[int], counts: Sequence[int], extra_s: float = 0.0
+    ) -> list[Answer]:
         """Send a request and collect one answer, of so many bytes of data, from each of `ids`."""
-        return self._transact(_Request.of(instruction, ids, counts))
+        return self._transact(_Request.of(instruction, ids, counts), extra_s)
 
-    def _transact(self, request: _Request) -> list[Answer]:
+    def _transact(self, request: _Request, extra_s: float = 0.0) -> list[Answer]:
         if request.timing is not self.timing or request.baud != self.line.baud:
             request.fit(self.timing, self.line.baud)
         started = self._begin(request.packet)
-        data, edges = self._collect(request, started)
+        data, edges = self._collect(request, started, extra_s)
         answers = self._whole_answers(request, data, edges, started)
         if answers is None:
             answers = self._sort_out(data, request, edges, started)
@@ -429,11 +433,13 @@ class Bus:
             self.statistics.arrivals.append((started + rtt, rtt))
         return answers
 
-    def _collect(self, request: _Request, started: float) -> tuple[bytes, list[tuple[int, float, bool]]]:
+    def _collect(
+        self, request: _Request, started: float, extra_s: float
+    ) -> tuple[bytes, list[tuple[int, float, bool]]]:
         """All bytes that come for a request, and (bytes so far, when, whether in time) of each portion."""
         data, edges = b"", list[tuple[int, float, bool]]()
-        ids, quiet = request.ids, request.quiet
-        deadline, sent = started + request.whole, started + request.wire
+        ids, quiet = request.ids, request.quiet + extra_s
+        deadline, sent = started + request.whole + extra_s, started + request.wire
         # A refusal is shorter than an answer and stuffing makes it longer: the length field tells, once it is there.
         known, at_known, expected = 0, 0, request.expected
         in_time, line, before = True, self.line, self.line.received
@@ -591,7 +597,7 @@ class Bus:
         for attempt in range(1 + self.retries):
             if attempt:
                 self.statistics.of(id).retries += 1
-            answer = self._exchange(instruction, [id], [count])[0]
+            answer = self._exchange(instruction, [id], [count], attempt * RETRY_PATIENCE_S)[0]
             if answer.data is not None:
                 break
         else:
