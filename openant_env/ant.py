@@ -181,6 +181,7 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         self._torso_position = data.xpos[torso]
         self._torso_rotation = data.xmat[torso]
         self._command = np.empty(len(joints))
+        self._least, self._most = np.full(len(joints), -1.0), np.full(len(joints), 1.0)  # quicker than plain −1 and 1
 
         index = np.zeros(len(self.layout), np.intp)
         index[self.layout.slices["pos"]] = [_sensor(model, f"pos.{joint}", 1, where) for joint in joints]
@@ -270,17 +271,16 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
             BadInput: the action has another shape, or is not finite.
         """
         command, actions = self._command, self.actions
-        if np.shape(action) != command.shape:
-            raise BadInput(f"an action has shape {np.shape(action)}", remedy=f"give {len(command)} numbers")
-        np.minimum(np.maximum(action, -1.0, out=command), 1.0, out=command)
+        action = np.asarray(action)
+        if action.shape != command.shape:
+            raise BadInput(f"an action has shape {action.shape}", remedy=f"give {len(command)} numbers")
+        np.minimum(np.maximum(action, self._least, out=command), self._most, out=command)
         command *= actions.half
         command += actions.centre
         if actions.clipped:
             np.minimum(np.maximum(command, actions.low, out=command), actions.high, out=command)
         if not math.isfinite(command.dot(command)):
-            raise BadInput(
-                f"an action is not finite: {np.asarray(action)}", remedy="look for NaN in the agent's networks"
-            )
+            raise BadInput(f"an action is not finite: {action}", remedy="look for NaN in the agent's networks")
         self._ctrl[self._setpoints] = command
         mujoco.mj_step(self.model, self.data, nstep=self._substeps)
         self._seconds += self.dt
