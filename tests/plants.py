@@ -9,7 +9,6 @@ from typing import Any
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-
 from plain import actuator_of
 
 from openant_tools.recording.run import Facts, Run
@@ -27,7 +26,7 @@ def pendulum(
     *,
     joint: str = 'damping="0.12" armature="0.006" frictionloss="0.03"',
     compiler: str = '<compiler angle="radian"/>',
-    option: str = 'timestep="0.002" integrator="implicitfast"',
+    option: str = 'timestep="0.001" integrator="implicitfast"',
     more: str = "",
 ) -> str:
     """A servo that lifts 0.3 kg at 0.1 m."""
