@@ -372,6 +372,7 @@ def train(
     settings: Settings | None = None,
     env_facts: Mapping[str, Any] | None = None,
     device: str = "cpu",
+    tensorboard: bool = False,
     report: Callable[[Progress], None] | None = None,
 ) -> Progress:
     """Train on one environment, or go on with the run that the folder holds.
@@ -385,6 +386,7 @@ def train(
         settings: the paper's by default.
         env_facts: how to make the environment again, for `run.json`.
         device: where torch computes; acting and learning on `"cpu"` take one thread.
+        tensorboard: also write the learning curve and α as TensorBoard events into the folder.
         report: called a few times a second.
 
     Raises:
@@ -404,14 +406,17 @@ def train(
             "versions": {"torch": torch.__version__, "numpy": np.__version__, "gymnasium": gymnasium.__version__},
         },
     )  # fmt: skip
+    events = _event_writer(folder) if tensorboard else None
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         with _stop_on_signal() as stop:
-            return _train(env, run, agent, steps, seed, report, stop)
+            return _train(env, run, agent, steps, seed, events, report, stop)
     finally:
         torch.set_num_threads(threads)
         run.close()
+        if events is not None:
+            events.close()
 
 
 def _train(
@@ -420,6 +425,7 @@ def _train(
     agent: Sac,
     steps: int,
     seed: int,
+    events: Any,
     report: Callable[[Progress], None] | None,
     stop: threading.Event,
 ) -> Progress:
@@ -481,6 +487,9 @@ def _train(
             agent.update()
         if step % CURVE_EVERY == 0:
             run.add_curve_point(CurvePoint(step, seconds, average.value))
+            if events is not None:
+                events.add_scalar("average_reward_m_s", average.value, step)
+                events.add_scalar("alpha", agent.log_alpha.exp().item(), step)
         now = time.monotonic()
         # Rows of a full ring are overwritten by and by: save them before that, however little time has passed.
         if now - last_save > CHECKPOINT_EVERY_S or replay.added - saved >= replay.capacity:
@@ -531,6 +540,16 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
             remedy="train into another folder",
         ) from error
     return agent, int(checkpoint["step"])
+
+
+def _event_writer(folder: Path) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise BadInput(
+            "TensorBoard is not installed", remedy="pip install 'openant-tools[agents]', or train without --tensorboard"
+        ) from error
+    return SummaryWriter(str(folder / "tensorboard"))
 
 
 def _device(name: str) -> torch.device:

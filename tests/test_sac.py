@@ -339,6 +339,12 @@ def test_commands_refuse_in_one_line(trained, tmp_path, capsys, monkeypatch):
     assert "it is no JSON" in capsys.readouterr().err
 
 
+def test_tensorboard_events_are_written_when_asked_for(tmp_path):
+    pytest.importorskip("tensorboard")
+    train(Reach(), folder=tmp_path, steps=100, seed=0, settings=SMALL, tensorboard=True)
+    assert list((tmp_path / "tensorboard").glob("events.out.tfevents.*"))
+
+
 def test_without_torch_the_commands_say_what_to_install(monkeypatch, capsys):
     import importlib.util
 

@@ -67,6 +67,7 @@ def train() -> None:
     help="Weight of the entropy at first; 0.1 explores less and walks sooner.",
 )  # fmt: skip
 @click.option("--device", default="cpu", show_default=True, help="Where torch computes, such as cpu or cuda.")
+@click.option("--tensorboard", is_flag=True, help="Also write TensorBoard events into the run's folder.")
 @json_option
 def sac(
     robot: Path | None,
@@ -82,6 +83,7 @@ def sac(
     learning_start: int,
     entropy_start: float,
     device: str,
+    tensorboard: bool,
     json_file: Path | None,
 ) -> None:
     """Train soft actor-critic, with the settings of the Open Ant paper.
@@ -121,6 +123,7 @@ def sac(
                 settings=settings,
                 env_facts={"id": name, "options": options},
                 device=device,
+                tensorboard=tensorboard,
                 report=bar.show,
             )
     except KeyboardInterrupt:
