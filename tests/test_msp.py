@@ -98,6 +98,23 @@ def test_one_wrong_byte_never_passes_as_a_measurement(framing: Framing, data: st
             assert found.payload == frame.payload
 
 
+@given(st.sampled_from(Framing), st.data())
+def test_a_lost_or_inserted_byte_leaves_the_exchange_unclean(framing: Framing, data: st.DataObject) -> None:
+    raw = bytearray(msp.encode(Frame(Direction.REPLY, 102, RAW_IMU.encode(), framing)))
+    parser = Parser()
+    assert parser.feed(bytes(raw)) != []
+    assert parser.clean
+    at = data.draw(st.integers(0, len(raw) - 1))
+    if data.draw(st.booleans()):
+        del raw[at]
+    else:
+        raw.insert(at, data.draw(st.integers(0, 255).filter(lambda byte: byte != raw[at])))
+    parser.reset()
+    assert parser.clean
+    frames = parser.feed(bytes(raw))
+    assert not frames or not parser.clean
+
+
 def test_a_host_finds_the_frame_behind_a_broken_one_and_a_device_drops_it_whole() -> None:
     good = bytes.fromhex(VECTORS[6][0])
     broken = bytes.fromhex("24 4D 3E 12 66") + good + bytes(7)  # claims 18 bytes; a whole frame stands within them

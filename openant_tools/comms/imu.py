@@ -470,11 +470,13 @@ class Imu:
                 if not data:
                     break
                 broken = self._parser.broken
-                for frame in self._parser.feed(data):
-                    newest = self._receive(frame, info) or newest
-                if self._parser.broken > broken and self._outstanding is not None:
+                frames = self._parser.feed(data)
+                if (frames and not self._parser.clean) or self._parser.broken > broken:
                     self.statistics.broken_frames += 1
                     self._give_up()
+                    continue
+                for frame in frames:
+                    newest = self._receive(frame, info) or newest
             self._empty_at = now
             if self._outstanding is not None and self._clock.now() - self._sent_at > REPLY_TIMEOUT_S:
                 self._time_out()
@@ -557,7 +559,7 @@ class Imu:
 
     def _take(self, poll: _Poll, frame: msp.Frame, sent: float) -> _Reply | None:
         """The reply to `poll` in this frame; None where it is another frame or cannot be decoded."""
-        if frame.command != poll.command or frame.direction is not Direction.REPLY:
+        if frame.command != poll.command or frame.direction is not Direction.REPLY or not self._parser.clean:
             return None
         raw: msp.RawImu | None = None
         # Between the last look at the line and this one the reply came at some time: it is taken to be the middle.
@@ -637,6 +639,7 @@ class Imu:
     def _send(self, data: bytes) -> float:
         """One frame in one write, never a part of one: Betaflight takes a lone `#` or `R` for a command."""
         line = self._port()
+        self._parser.reset()
         sent = self._clock.now()
         line.write(data)
         self.statistics.requests += 1

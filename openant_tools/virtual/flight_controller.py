@@ -251,14 +251,15 @@ class FlightController:
             return
         if self._lone is not None and t - self._lone[1] >= LONE_BYTE_SILENCE_S:
             self._obey(*self._lone)
-        while self._tick_at <= t:
+        while self._tick_at <= t and self._requests:
             run = self._tick_at
             self._tick_at = self._grid(run)
-            if self._requests:
-                self._sense(run)
-                reply = self._answer(self._requests.popleft(), run)
-                if reply is not None and not self.silent:
-                    self._out.append((run + USB_LATENCY_S, reply))
+            self._sense(run)
+            reply = self._answer(self._requests.popleft(), run)
+            if reply is not None and not self.silent:
+                self._out.append((run + USB_LATENCY_S, reply))
+        if self._tick_at <= t:
+            self._tick_at = self._grid(t)  # the runs since had nothing to do
         if t - self._tick >= 0.01 or self._attitude is None:
             self._sense(t)
 
