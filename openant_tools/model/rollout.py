@@ -18,6 +18,8 @@ Contract
   the first complete one are NaN.
 * **Many models.** A call rolls out V variants of the model in one batch on all cores. They must share the layout of the
   plant's model (same compiled sizes); parameters may differ freely. Results do not depend on the number of threads.
+* **Nothing idle is computed.** Sensors are off (positions and velocities are read from the state), and so are contacts on the
+  stand where, at the measured poses, no two parts of the robot come within CLEARANCE_M of each other.
 * **Memory** is bounded: states are sampled at the rows in chunks and never kept for a whole run.
 """
 
@@ -45,6 +47,8 @@ Bools = NDArray[np.bool_]
 
 #: rows are compared, and segments started, on positions; the slope over this span (s) on both sides gives the velocity
 VELOCITY_SPAN_S = 0.02
+#: parts that stay farther apart than this (m) in the measured motion do not touch in a simulation of it
+CLEARANCE_M = 0.01
 #: states kept at a time while a batch runs
 CHUNK_BYTES = 64 * 2**20
 #: where an actuator of this kind keeps the rate limit of its setpoint (`slewmax`) in dynprm, MuJoCo 4
@@ -108,6 +112,9 @@ class Rollouts:
         # The longest first, so that those still running are always the first simulations of the batch.
         self._segments = sorted(segments, key=lambda segment: -len(segment.control))
         self._batches: dict[int, Batch] = {}
+        self._disable = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        if plant.setup is Setup.STAND and not any(_comes_close(plant, run) for run in runs):
+            self._disable |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
     @property
     def steps(self) -> int:
@@ -116,7 +123,7 @@ class Rollouts:
 
     def __call__(self, models: Sequence[mujoco.MjModel] | None = None) -> Trajectories:
         """Roll out every run on each of `models` (default: the plant's own)."""
-        variants = [self.plant.model] if models is None else list(models)
+        variants = [self._lean(model) for model in (models or [self.plant.model])]
         segments, nv = self._segments, len(variants)
         plant = self.plant
         batch = self._batch(nv)
@@ -125,6 +132,7 @@ class Rollouts:
         total, nj = self.rows[-1].stop, len(plant.joints)
         pos, vel = np.full((nv, total, nj), np.nan), np.full((nv, total, nj), np.nan)
 
+        batch.set_models([model for _ in segments for model in variants])
         changes = {step for segment in segments for step in segment.torque_off}
         limp = {(v, _key(np.zeros(nj, bool))): model for v, model in enumerate(variants)}
         off = [segment.torque_off[0] for segment in segments]
@@ -173,6 +181,11 @@ class Rollouts:
         if nv not in self._batches:
             self._batches[nv] = Batch(self.plant.model, nv * len(self._segments), self.nthread)
         return self._batches[nv]
+
+    def _lean(self, model: mujoco.MjModel) -> mujoco.MjModel:
+        lean = copy.copy(model)
+        lean.opt.disableflags |= self._disable
+        return lean
 
     def _limp(
         self, cache: dict[tuple[int, bytes], mujoco.MjModel], model: mujoco.MjModel, variant: int, off: Bools
@@ -257,6 +270,23 @@ def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | 
             )
         )
     return segments
+
+
+def _comes_close(plant: Plant, run: Run) -> bool:
+    """Whether, in the measured poses of a run, any two parts that may touch come within CLEARANCE_M of each other."""
+    model = copy.copy(plant.model)
+    model.geom_margin[:] += CLEARANCE_M
+    data = mujoco.MjData(model)
+    pos = run.signal("pos", plant.joints)
+    pos = pos[np.isfinite(pos).all(axis=1)]
+    # Neighbouring rows are alike: at most a few hundred poses of a run are looked at.
+    for row in pos[:: max(1, len(pos) // 500)]:
+        data.qpos[plant.qpos] = row
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        if data.ncon:
+            return True
+    return False
 
 
 def _held(cmd: Array) -> Array | None:

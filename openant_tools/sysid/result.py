@@ -41,7 +41,11 @@ def write_fit(result: Identification, out: Path) -> list[Path]:
 def write_robot(result: Identification, folder: RobotFolder) -> None:
     """Put the calibrated model into a robot's folder, and every accepted value with where it came from into `robot.toml`."""
     write_model(
-        result.model, calibrated, folder.path / CALIBRATED, joints=result.joints, note="Written by `openant sysid fit`"
+        result.model,
+        calibrated(result),
+        folder.path / CALIBRATED,
+        joints=result.joints,
+        note="Written by `openant sysid fit`",
     )
     runs = [run for data in result.datasets for run in data.runs]
     recording = folder.relative(runs[0].path) if runs[0].path else runs[0].name
