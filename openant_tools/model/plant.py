@@ -154,7 +154,7 @@ def position_servos(model: mujoco.MjModel) -> dict[str, int]:
     """Joint name → id of the actuator that controls its position, in the order of the actuators.
 
     A position servo pulls towards its setpoint: affine bias −kp on the joint's position (`position`, `general`, `pid`),
-    or a DC motor. Where several drive one joint, the one of the joint's own name counts.
+    or a DC motor, and its control is a position. Where several drive one joint, the one of the joint's own name counts.
     """
     servos: dict[str, int] = {}
     for i in range(model.nactuator):
@@ -164,6 +164,11 @@ def position_servos(model: mujoco.MjModel) -> dict[str, int]:
         if int(model.jnt_type[joint]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
             continue
         affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and model.actuator_biasprm[i, 1] < 0
+        inputs = int(model.actuator_ctrlspec[i])  # 0 where it is not said, as in `general`
+        if inputs and not inputs & POSITION_INPUT:
+            continue
+        if model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_INTEGRATOR:
+            continue  # `intvelocity`: its control is a velocity
         name = model.joint(joint).name
         if (affine or is_motor(model, i)) and (name not in servos or model.actuator(i).name == name):
             servos[name] = i
@@ -176,7 +181,7 @@ LEAST_SHARE = 1e-4
 #: indices into a DC motor's gainprm (MuJoCo 4, checked by a test): resistance, motor constant, gains, voltage limit
 RESISTANCE, MOTOR_CONSTANT, KP, KD, VMAX = 0, 1, 4, 6, 7
 #: `input="pos"`
-POSITION_INPUT = 1
+POSITION_INPUT = int(mujoco.mjtCtrlInput.mjINPUT_POS)
 
 
 def motor_form(actuator: mujoco.MjsActuator, model: mujoco.MjModel, joint: str) -> bool:
@@ -230,18 +235,20 @@ def _on_stand(spec: mujoco.MjSpec, original: mujoco.MjModel) -> mujoco.MjModel:
     weld, parent = original.body_weldid, original.body_parentid
     # Elements keep the ids of the first compilation until the next, so the original's tables describe the spec's.
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
+    world = _world(original)
     for geom in spec.geoms:
-        if weld[original.geom_bodyid[geom.id]] == 0:
+        if int(original.geom_bodyid[geom.id]) in world:
             geom.contype = geom.conaffinity = 0
     for pair in list(spec.pairs):
         ends = original.geom(pair.geomname1).bodyid, original.geom(pair.geomname2).bodyid
-        if any(weld[body] == 0 for body in ends):
+        if any(int(body[0]) in world for body in ends):
             spec.delete(pair)
 
     # Once the base is welded to the world, MuJoCo's parent-child filter no longer keeps it from touching its own legs.
     # The pairs that the filter kept apart before are excluded by name, so that self-contacts stay as in the model.
     bodies = {body.id: body for body in spec.bodies}
-    bases = {int(weld[joint.parent.id]) for joint in free}
+    filters = not original.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    bases = {int(weld[joint.parent.id]) for joint in free} if filters else set()
     for child in range(1, original.nbody):
         above = int(weld[parent[weld[child]]])
         if above not in bases or int(weld[child]) == above:
@@ -255,3 +262,15 @@ def _on_stand(spec: mujoco.MjSpec, original: mujoco.MjModel) -> mujoco.MjModel:
     for key in list(spec.keys):
         spec.delete(key)  # a keyframe's qpos counts the free joint's seven numbers
     return spec.compile()
+
+
+def _world(model: mujoco.MjModel) -> set[int]:
+    """The bodies that are the world: all that cannot move, but for what carries a joint, which is a robot's fixed base."""
+    fixed = model.body_weldid == 0
+    world = set(np.flatnonzero(fixed).tolist())
+    for body in np.flatnonzero(~fixed):
+        above = int(model.body_parentid[body])
+        while above != 0 and fixed[above]:
+            world.discard(above)
+            above = int(model.body_parentid[above])
+    return world
