@@ -163,13 +163,14 @@ class _Bar:
 
         self._bar = RichProgress(
             TextColumn("{task.description}"),
-            BarColumn(),
+            BarColumn(bar_width=16),
             MofNCompleteColumn(),
             TextColumn("{task.fields[words]}"),
             TimeRemainingColumn(),
             console=Console(stderr=True),
         )
         self._task = self._bar.add_task("learning", total=steps, words="")
+        self._begun = False
 
     def __enter__(self) -> _Bar:
         self._bar.start()
@@ -179,6 +180,10 @@ class _Bar:
         self._bar.stop()
 
     def show(self, progress: Progress) -> None:
+        if not self._begun:
+            # A run that goes on did not get this far in no time.
+            self._bar.reset(self._task, completed=progress.step)
+            self._begun = True
         speed = self._bar.tasks[self._task].speed
         words = [f"{100 * progress.average_reward_m_s:+5.1f} cm/s", f"{progress.robot_seconds / 60:5.1f} min walked"]
         if speed:
