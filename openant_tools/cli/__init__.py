@@ -23,7 +23,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "comms": ("comms", "Robot", "The bus: scan, watch, measure."),
     "rec": ("rec", "Data", "Recordings: info, repair, export, import."),
     "sysid": ("sysid", "Data", "Record excitations and fit a calibrated model to them."),
-    "train": ("train", "Learning", "Train an agent in simulation or on the robot."),
+    "train": ("train", "Learning", "Train an agent to walk, in simulation."),
     "eval": ("eval", "Learning", "Play a trained agent and measure its reward per second."),
 }
 
