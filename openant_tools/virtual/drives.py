@@ -214,8 +214,11 @@ class Drives:
         heapq.heapify(self._queue)
         self.goal[k] = self.effective_goal[k] = pulses
 
-    def set_goal(self, k: int, pulses: float, velocity: float, acceleration: float, time_based: bool) -> None:
-        """A goal that arrived now; it takes effect after the motor's delay, unless it is lost."""
+    def set_goal(
+        self, k: int, arrival: float, pulses: float, velocity: float, acceleration: float, time_based: bool
+    ) -> None:
+        """A goal that arrived at `arrival` (s); the loop's next turn after it and the motor's delay takes it up, unless
+        it is lost."""
         self.touched += 1
         motor = self.motors[k]
         if motor.dropout_fraction > 0 and self._lost(k, motor):
@@ -224,7 +227,7 @@ class Drives:
         if motor.jitter_s > 0:
             late = max(0.0, late + motor.jitter_s * float(self._random.standard_normal()))
         self._count += 1
-        heapq.heappush(self._queue, (self.time + late, self._count, k, (pulses, velocity, acceleration, time_based)))
+        heapq.heappush(self._queue, (arrival + late, self._count, k, (pulses, velocity, acceleration, time_based)))
 
     def _lost(self, k: int, motor: MotorSettings) -> bool:
         if self.time < self._dropped_until[k]:
@@ -481,7 +484,8 @@ class Drive:
         self._drives.set_loop(self._k, loop)
 
     def set_goal(self, pulses: float, *, velocity: float, acceleration: float, time_based: bool) -> None:
-        self._drives.set_goal(self._k, pulses, velocity, acceleration, time_based)
+        arrival = max(self.now, self._drives.time)
+        self._drives.set_goal(self._k, arrival, pulses, velocity, acceleration, time_based)
 
     def hold(self, pulses: float) -> None:
         self._drives.hold(self._k, pulses)
