@@ -68,9 +68,9 @@ def fit_report(result: Identification) -> Report:
         "The model is better where its line is lower; a full run never re-initialises.",
     )
     report.section("What was found").table(
-        ["parameter", "given", "value", "95 % interval", "unit", "verdict"], [_row(value) for value in result.values]
+        ["parameter", "given", "value", "from", "to", "unit", "verdict"], [_row(value) for value in result.values]
     )
-    report.text(VERDICTS)
+    report.text("*From* and *to* are the ends of the 95 % interval." + VERDICTS)
     for note in result.notes:
         report.text(note)
     report.section("Measured against simulated")
@@ -111,7 +111,8 @@ def _row(value: Value) -> list[object]:
         value.name,
         f"{value.given:.4g}",
         f"{value.value:.4g}",
-        f"{value.low:.4g} … {value.high:.4g}",
+        f"{value.low:.4g}",
+        f"{value.high:.4g}",
         value.unit,
         Mark(value.verdict, _TONE[value.verdict]),
     ]
