@@ -39,7 +39,9 @@ def measure(family: str, distance: float, pictures: int, rng: np.random.Generato
     """One camera height, all tilts, with and without the IMU."""
     height = distance + BODY_HEIGHT + TAG_ABOVE_BODY
     settings = OverheadCameraSettings(
-        position=(0.1 * height, -0.15 * height, height), origin=TagOnFloor(family), body=TagOnRobot(family, 12)
+        position=(0.1 * height, -0.15 * height, height),
+        origin=TagOnFloor(family, x=0.0, y=0.0),
+        body=TagOnRobot(family, 12),
     )
     camera = OverheadCamera(settings, seed=int(rng.integers(2**31)))
     tracker = BodyTracker(TagSetup(family), camera.intrinsics)

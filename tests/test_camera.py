@@ -33,7 +33,8 @@ from openant_tools.virtual.overhead_camera import (
 )
 
 #: A small picture from near by: as many pixels on the tags as the real one has, at a quarter of the work.
-SMALL = OverheadCameraSettings(width=640, height=360, position=(0.0, 0.0, 1.0), fps=30.0)
+MIDDLE = TagOnFloor(x=0.0, y=0.0)
+SMALL = OverheadCameraSettings(width=640, height=360, position=(0.0, 0.0, 1.0), fps=30.0, origin=MIDDLE)
 
 
 def rotation(roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> np.ndarray:
@@ -85,7 +86,7 @@ def test_bitmaps_are_what_the_detector_reads(family: str) -> None:
 def test_each_family_is_found_at_five_distances_and_tilts_within_its_stated_error(family: str) -> None:
     """The camera hangs at 2.6 m, as over a real arena; the body tag comes nearer and tilts more."""
     settings = OverheadCameraSettings(
-        position=(0.3, -0.2, 2.6), origin=TagOnFloor(family), body=TagOnRobot(family, 12), fps=30.0
+        position=(0.3, -0.2, 2.6), origin=replace(MIDDLE, family=family), body=TagOnRobot(family, 12), fps=30.0
     )
     camera = OverheadCamera(settings, seed=4)
     tracker = BodyTracker(TagSetup(family), camera.intrinsics)

@@ -37,14 +37,14 @@ class Body:
 class Bench:
     """A flight controller on a table: its clock moves only while somebody waits, its cable is a pair of lists."""
 
-    stepped = True
-
     def __init__(self, settings: FlightControllerSettings | None = None, seed: int = 1) -> None:
         settings = settings or FlightControllerSettings()
         self.body = Body()
         self.motion: Callable[[float], Body] | None = None
         self.fc = FlightController(settings, lambda: self.body, np.random.default_rng(seed))
         self.t = 0.0
+        self.stepped = False  # whether it tells the driver when bytes arrived, as a virtual robot's clock does
+        self.marks: list[tuple[int, float]] = []
         self.lines: list[Cable] = []
         self.garble: Callable[[bytes], bytes] = lambda data: data
 
@@ -61,12 +61,17 @@ class Bench:
             self.step(deadline)
         return bool(line.waiting) or not line.alive
 
+    def arrivals(self, line: Cable) -> list[tuple[int, float]]:
+        return [self.marks[-1]] if self.stepped and self.marks else [(line.received, self.t)]
+
     def step(self, limit: float) -> None:
         self.t = min(limit, max(self.t + 1e-5, self.fc.next_event(self.t)))
         if self.motion is not None:
             self.body = self.motion(self.t)
         data = self.garble(self.fc.transmit(self.t))
         for line in self.lines:
+            if data:
+                self.marks.append((line.received + len(line.waiting) + len(data), self.t))
             line.waiting += data
             line.alive = line.alive and self.fc.connected
 
@@ -163,6 +168,14 @@ def test_an_accelerometer_that_is_far_off_one_g_is_refused() -> None:
         bench.imu().connect()
 
 
+def test_a_robot_that_comes_to_rest_while_connecting_is_waited_for() -> None:
+    bench = Bench()
+    bench.motion = lambda t: Body(rate=np.array([0, 0, 2.0 if t < 0.6 else 0.0]))
+    info = bench.imu().connect()
+    assert info.gravity == pytest.approx(GRAVITY, rel=0.01)
+    assert info.notes == ()
+
+
 def test_the_gyro_bias_at_rest_is_found() -> None:
     bench = Bench(FlightControllerSettings(gyro_bias=(0.02, -0.01, 0.03)))
     info = bench.imu().connect()
@@ -184,9 +197,10 @@ def test_the_rate_is_what_the_serial_task_allows(rate: float, multiple: bool, ex
     assert imu.last.roll is not None
 
 
-@pytest.mark.parametrize("every", [0.0005, 0.0037, 0.0083])
-def test_the_time_stamp_is_when_the_body_moved_not_when_the_request_waited(every: float) -> None:
+@pytest.mark.parametrize(("every", "stepped"), [(0.0005, False), (0.0037, False), (0.0083, False), (0.02, True)])
+def test_the_time_stamp_is_when_the_body_moved_not_when_the_request_waited(every: float, stepped: bool) -> None:
     bench = Bench(FlightControllerSettings(gyro_noise=0.0))
+    bench.stepped = stepped
     imu = bench.imu()
     imu.connect()
     bench.motion = lambda t: Body(rate=np.array([0.0, 0.0, 5 * math.sin(2 * math.pi * 1.5 * t)]))
@@ -197,6 +211,8 @@ def test_the_time_stamp_is_when_the_body_moved_not_when_the_request_waited(every
     late = [float(np.sum((z - 5 * np.sin(2 * np.pi * 1.5 * (t - d))) ** 2)) for d in np.arange(-0.01, 0.01, 1e-4)]
     assert abs(np.arange(-0.01, 0.01, 1e-4)[int(np.argmin(late))]) < 0.7e-3
     assert np.median([s.round_trip for s in samples]) > 3e-3  # a midpoint would have been off by half of this
+    worst = max(s.t_error for s in samples[1:])
+    assert worst == 0.0 if stepped else worst <= every / 2 + 1e-4
 
 
 def test_angles_have_our_signs_and_yaw_has_whole_degrees() -> None:
@@ -254,7 +270,7 @@ def test_a_silent_controller_is_named_quickly() -> None:
     bench.fc.silent = True
     with pytest.raises(HardwareFault, match=r"bench: the flight controller is silent .* close Betaflight Configurator"):
         bench.imu().connect()
-    assert bench.t < 1.0
+    assert bench.t <= 1.0
 
 
 def test_a_controller_that_falls_silent_is_missed_within_a_fifth_of_a_second_and_taken_back() -> None:

@@ -157,8 +157,9 @@ class SteppedClock:
 
     def wait_readable(self, line: Line, deadline: float) -> bool:
         name = self._name(line)
-        if line.received >= self._sent[name] and name == "bus":
-            # A servo answers at once or never: let all that it has to say arrive by one question.
+        if line.received >= self._sent[name] and (name == "bus" or deadline <= self._t):
+            # A servo answers at once or never: let all that it has to say arrive by one question. And who only looks
+            # is told what came while time moved.
             self._ask("settle")
         if line.received >= self._sent[name] and deadline > self._t:
             self._ask("wait", port=name, to=deadline)

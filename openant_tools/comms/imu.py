@@ -36,7 +36,7 @@ STANDARD_GRAVITY = 9.80665
 IMU_BAUD = 115_200
 REPLY_TIMEOUT_S = 0.05
 HANDSHAKE_TRIES = 3
-HANDSHAKE_TIMEOUT_S = 0.15
+HANDSHAKE_TIMEOUT_S = 0.3
 #: Half a second of silence: the port is closed and opened again, which frees a stuck USB endpoint.
 TIMEOUTS_BEFORE_REOPEN = 10
 REOPEN_EVERY_S = 0.5
@@ -45,6 +45,7 @@ FROZEN_S = 0.5
 RATE_WINDOW_S = 2.0
 
 REST_SAMPLES = 40
+REST_TRIES = 3
 #: At rest: the accelerometer's norm scatters less than this share of itself, the gyro less than this.
 REST_ACC_SCATTER = 0.03
 REST_GYRO_RAD_S = 0.15
@@ -178,6 +179,8 @@ class Imu:
         self._changed_at = 0.0
         self._same = 0
         self._empty_at = 0.0
+        self._arrived = 0.0
+        self._arrived_error = 0.0
         self._last: ImuSample | None = None
         self._stranger: str | None = None
         self._proved = False
@@ -271,6 +274,10 @@ class Imu:
         self._choose_polling(api, notes)
         multiple = len(self._rotation) == 1
         rate, samples = self._rate()
+        for _ in range(REST_TRIES - 1):
+            if _at_rest(samples):
+                break
+            rate, samples = self._rate()
         shortest = self._shortest_round_trip()
         scale, gravity, bias = self._scale(api, samples, notes)
         if rate < 0.9 * (100 if multiple else 50):
@@ -336,6 +343,7 @@ class Imu:
         while self._clock.wait_readable(line, deadline):
             self._empty_at = self._clock.now()
             data = line.read()
+            self._heard(line)
             self._seen += data
             del self._seen[:-512]
             yield from self._parser.feed(data)
@@ -416,9 +424,7 @@ class Imu:
         self, api: msp.ApiVersion, samples: Sequence[msp.RawImu], notes: list[str]
     ) -> tuple[int, float | None, Vector | None]:
         """Accelerometer scale, |acc| with it and the gyro's mean; the latter two are None where the robot moved."""
-        norms = [math.hypot(*raw.acc) for raw in samples]
-        mean = math.fsum(norms) / len(norms)
-        scatter = math.sqrt(math.fsum((n - mean) ** 2 for n in norms) / len(norms))
+        mean = math.fsum(math.hypot(*raw.acc) for raw in samples) / len(samples)
         rates = [tuple(v * msp.GYRO_RAD_S_PER_LSB for v in raw.gyro) for raw in samples]
         bias = (_mean(rates, 0), _mean(rates, 1), _mean(rates, 2))
         expected = msp.acc_scales(api)
@@ -426,8 +432,7 @@ class Imu:
             raise HardwareFault(
                 "the accelerometer reads zero on all axes", where=self.where, remedy="it is switched off or broken"
             )
-        moving = max(abs(v) for rate in rates for v in rate) > REST_GYRO_RAD_S or scatter > REST_ACC_SCATTER * mean
-        if moving:
+        if not _at_rest(samples):
             notes.append(
                 f"The robot moved while connecting, so the accelerometer scale ({expected[0]} LSB/g by API {api}) is "
                 "not checked against gravity."
@@ -469,6 +474,7 @@ class Imu:
                 data = line.read()
                 if not data:
                     break
+                self._heard(line)
                 broken = self._parser.broken
                 frames = self._parser.feed(data)
                 if (frames and not self._parser.clean) or self._parser.broken > broken:
@@ -482,7 +488,7 @@ class Imu:
                 self._time_out()
             if self._outstanding is None and self._line is line:
                 self._outstanding = self._next() if self._proved else _PROOF
-                self._sent_at = self._send(self._outstanding.request)
+                self._send(self._outstanding.request)
         except PortGone:
             self._lose(self._clock.now())
         return newest
@@ -562,10 +568,7 @@ class Imu:
         if frame.command != poll.command or frame.direction is not Direction.REPLY or not self._parser.clean:
             return None
         raw: msp.RawImu | None = None
-        # Between the last look at the line and this one the reply came at some time: it is taken to be the middle.
-        now = self._clock.now()
-        error = (now - min(now, max(self._empty_at, sent))) / 2.0
-        received = now - error
+        received, error = self._arrived, self._arrived_error
         try:
             for command, payload in zip(poll.wanted, poll.split(frame.payload), strict=True):
                 if command == Command.RAW_IMU:
@@ -576,6 +579,15 @@ class Imu:
             self.statistics.undecodable += 1
             return None
         return _Reply(sent, received, error, raw)
+
+    def _heard(self, line: Line) -> None:
+        """When did the bytes just read arrive? A stepped clock knows; else between the last look at the line and now."""
+        now = self._clock.arrivals(line)[-1][1]
+        if self._clock.stepped:
+            self._arrived, self._arrived_error = now, 0.0
+        else:
+            earliest = min(now, max(self._empty_at, self._sent_at))
+            self._arrived, self._arrived_error = (now + earliest) / 2.0, (now - earliest) / 2.0
 
     def _prove(self, frame: msp.Frame, info: ImuInfo) -> None:
         """After a reopening: is it the same board?"""
@@ -640,10 +652,10 @@ class Imu:
         """One frame in one write, never a part of one: Betaflight takes a lone `#` or `R` for a command."""
         line = self._port()
         self._parser.reset()
-        sent = self._clock.now()
+        self._sent_at = self._clock.now()
         line.write(data)
         self.statistics.requests += 1
-        return sent
+        return self._sent_at
 
     def _port(self) -> Line:
         if self._line is None:
@@ -704,6 +716,14 @@ class _Attitude:
         pitch = math.asin(max(-1.0, min(1.0, 2 * (q.w * q.y - q.x * q.z))))
         yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
         return cls(roll, pitch, yaw, 0.0, received)
+
+
+def _at_rest(samples: Sequence[msp.RawImu]) -> bool:
+    norms = [math.hypot(*raw.acc) for raw in samples]
+    mean = math.fsum(norms) / len(norms)
+    scatter = math.sqrt(math.fsum((norm - mean) ** 2 for norm in norms) / len(norms))
+    fastest = max(abs(v) for raw in samples for v in raw.gyro) * msp.GYRO_RAD_S_PER_LSB
+    return fastest < REST_GYRO_RAD_S and scatter < REST_ACC_SCATTER * mean
 
 
 def _mean(rates: Sequence[tuple[float, ...]], axis: int) -> float:

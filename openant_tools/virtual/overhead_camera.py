@@ -44,13 +44,17 @@ MAINS_HZ = 50.0
 
 @dataclass(frozen=True)
 class TagOnFloor:
-    """The origin tag: `size` is its edge length in m; position and yaw of its up-direction in the world."""
+    """The origin tag: `size` is its edge length in m; position and yaw of its up-direction in the world.
+
+    By default it lies where the platform's arena has it: the middle, where the robot starts, is at (0.75, −0.30) in its
+    frame (facts/robot.md, section 5).
+    """
 
     family: str = "tagCircle21h7"
     id: int = 0
     size: float = 0.10
-    x: float = 0.0
-    y: float = 0.0
+    x: float = -0.75
+    y: float = 0.30
     yaw: float = 0.0
 
 
