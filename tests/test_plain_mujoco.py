@@ -208,8 +208,10 @@ def ant_on_stand(tmp_path_factory: pytest.TempPathFactory) -> Path:
     t = plants.jittering(5.0, 100.0)
     joints = list(JOINT_NAMES)
     command = home() + plants.sweep(t, 8, reach=0.4, high_hz=1.5)
+    command[:30] = home()
     columns = plants.drive(model, joints, t, command, quantum=plants.ENCODER_RAD)
-    write_table(plants.run_of(columns, t, joints, "stand", setup="stand"), folder / "stand.parquet")
+    run = plants.run_of(columns, t, joints, "stand", setup="stand").between(t[20], t[-1])  # once it has come to rest
+    write_table(run, folder / "stand.parquet")
     return folder / "stand.parquet"
 
 

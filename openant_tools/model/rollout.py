@@ -36,7 +36,7 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
-from openant_tools.model.plant import Plant, Setup
+from openant_tools.model.plant import Plant, Setup, position_servos
 from openant_tools.recording.run import Run
 
 __all__ = ["Rollouts", "Trajectories", "initial_velocities"]
@@ -204,18 +204,31 @@ def initial_velocities(t: Array, pos: Array, row: int) -> Array:
     """Joint velocities at a row, (joints,) rad/s, from the slope of the positions around it.
 
     A servo's velocity register is coarse and late; the positions on both sides are neither. Least squares over the
-    rows within VELOCITY_SPAN_S (at least one neighbour on each side where there is one); 0 where nothing is known.
+    rows within VELOCITY_SPAN_S (at least one neighbour on each side where there is one). Where one side has fewer, as at
+    the start of a run, the slope of a line would be that of another moment: there it is a parabola's, over twice the span.
+    0 where nothing is known.
     """
-    first = min(int(np.searchsorted(t, t[row] - VELOCITY_SPAN_S)), max(0, row - 1))
-    stop = max(int(np.searchsorted(t, t[row] + VELOCITY_SPAN_S, side="right")), row + 2)
-    t, pos = t[first:stop], pos[first:stop]
     out = np.zeros(pos.shape[1])
     for j in range(pos.shape[1]):
-        ok = np.isfinite(pos[:, j])
-        if ok.sum() >= 2:
-            dt = t[ok] - t[ok].mean()
-            out[j] = dt @ (pos[ok, j] - pos[ok, j].mean()) / (dt @ dt)
+        rows = _measured_around(t, pos[:, j], row, VELOCITY_SPAN_S, 1)
+        degree = 1
+        if len(rows) and abs(t[rows].mean() - t[row]) > VELOCITY_SPAN_S / 4:
+            wider = _measured_around(t, pos[:, j], row, 2 * VELOCITY_SPAN_S, 2)
+            if len(wider) > 2:
+                rows, degree = wider, 2
+        if len(rows) > degree:
+            dt = t[rows] - t[row]
+            powers = dt[:, None] ** np.arange(degree + 1)
+            out[j] = np.linalg.lstsq(powers, pos[rows, j], rcond=None)[0][1]
     return out
+
+
+def _measured_around(t: Array, pos: Array, row: int, span: float, neighbours: int) -> Ints:
+    """The rows with a sample within `span` (s) of a row, and at least that many neighbours on each side if measured."""
+    first = min(int(np.searchsorted(t, t[row] - span)), max(0, row - neighbours))
+    stop = max(int(np.searchsorted(t, t[row] + span, side="right")), row + neighbours + 1)
+    rows: Ints = first + np.flatnonzero(np.isfinite(pos[first:stop]))
+    return rows
 
 
 def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | None) -> list[_Segment]:
@@ -240,6 +253,7 @@ def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | 
     flips = 1 + np.flatnonzero((torque_off[1:] != torque_off[:-1]).any(axis=1))
     commands = _Staircase.of(run.command_times, cmd)
     slewing = np.array([_limits_slew(model, int(i)) for i in plant.actuator])
+    rest = _at_rest(model)
     segments = []
     for first, stop in zip(starts, [*starts[1:], len(t)], strict=True):
         # The row at which the next segment starts belongs to that one.
@@ -251,7 +265,7 @@ def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | 
         setpoint = commands.mean(edges)
         if slewing.any():
             setpoint[:, slewing] = commands.at(edges[:-1] + h / 2)[:, slewing]
-        control = np.zeros((nstep, model.nu))
+        control = np.tile(rest, (nstep, 1))
         control[:, plant.ctrl] = setpoint
         off = {0: torque_off[first]}
         for row in flips[(flips > first) & (flips < stop)]:
@@ -287,6 +301,14 @@ def _comes_close(plant: Plant, run: Run) -> bool:
         if data.ncon:
             return True
     return False
+
+
+def _at_rest(model: mujoco.MjModel) -> Array:
+    """(nu,) controls with which joints that are not played stay where the model puts them."""
+    control = np.zeros(model.nu)
+    for joint, actuator in position_servos(model).items():
+        control[model.actuator_ctrladr[actuator]] = model.qpos0[model.joint(joint).qposadr[0]]
+    return control
 
 
 def _held(cmd: Array) -> Array | None:
