@@ -20,7 +20,7 @@ from openant_tools.model.plant import load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
-from openant_tools.sysid.identify import identify
+from openant_tools.sysid.identify import DEFAULT_KINDS, identify
 from openant_tools.sysid.result import write_fit
 
 #: a Feetech STS3215 that turns an SO-101 about its vertical axis, no gravity on it. Stiffness and damping: BAM's M1 figures of
@@ -47,18 +47,24 @@ def full_error(run: Run, model: Path, joints: Sequence[str] | None) -> float:
     return gap(run.signal("pos", plant.joints), Rollouts(plant, [run])().pos[0])
 
 
-def table(title: str, groups: dict[Path, list[Run]], work: Path, joints: Sequence[str] | None) -> None:
+def table(
+    title: str,
+    groups: dict[Path, list[Run]],
+    work: Path,
+    joints: Sequence[str] | None = None,
+    kinds: Sequence[str] | None = None,
+) -> None:
     print(f"\n### {title}\n")
     print("| held out | given (rad) | others fitted (rad) | ratio | all fitted (rad) | ratio | accepted |")
     print("|---|---|---|---|---|---|---|")
     for model, runs in groups.items():
         out = work / model.stem
-        result = identify(runs, model, joints=joints)
+        result = identify(runs, model, joints=joints, kinds=kinds)
         write_fit(result, out)
         for run in runs:
             others = [other for other in runs if other is not run]
             begun = time.monotonic()
-            single = identify(others, model, [run], joints=joints)
+            single = identify(others, model, [run], joints=joints, kinds=kinds)
             write_fit(single, out / run.name)
             given = full_error(run, model, joints)
             held_out = full_error(run, out / run.name / "calibrated.xml", joints)
@@ -89,7 +95,7 @@ def main() -> None:
             run = read_run(path)
             assert run.model_path is not None
             groups[run.model_path].append(run)
-        table("bam-xl330, full-run position error", groups, options.work, None)
+        table("bam-xl330, full-run position error", groups, options.work)
     if options.only != "bam-xl330":
         model = options.work / "so101_rotation.xml"
         model.parent.mkdir(parents=True, exist_ok=True)
@@ -99,7 +105,7 @@ def main() -> None:
         runs = [
             run for run in runs if float(run.column("cmd.Rotation").max() - run.column("cmd.Rotation").min()) > 0.05
         ]
-        table("sage-so101, joint Rotation", {model: runs}, options.work, ["Rotation"])
+        table("sage-so101, joint Rotation", {model: runs}, options.work, ["Rotation"], [*DEFAULT_KINDS, "action_delay"])
 
 
 if __name__ == "__main__":

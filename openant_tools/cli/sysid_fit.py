@@ -52,7 +52,7 @@ def fit(
       openant sysid fit swing.parquet --model pendulum.xml --out fit
 
     Kinds of parameters: stiffness, velocity_gain, damping, electrical_damping, armature, coulomb_friction, zero_offset,
-    torque_limit. Exit code 1: nothing beats the given model.
+    action_delay, torque_limit. Exit code 1: nothing beats the given model.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn

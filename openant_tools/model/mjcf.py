@@ -18,7 +18,18 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.files import write_text
-from openant_tools.model.plant import KD, KP, MOTOR_CONSTANT, RESISTANCE, VMAX, Plant, Setup, is_motor, load_plant
+from openant_tools.model.plant import (
+    KD,
+    KP,
+    MOTOR_CONSTANT,
+    RESISTANCE,
+    VMAX,
+    Plant,
+    Setup,
+    is_motor,
+    load_plant,
+    samples_for,
+)
 
 __all__ = ["write_model"]
 
@@ -61,6 +72,7 @@ def write_model(
             _write_motor(actuators[plant.actuator[j]], variant, int(plant.actuator[j]))
         else:
             _write_actuator(actuators[plant.actuator[j]], plant, variant, j)
+        _write_delay(actuators[plant.actuator[j]], plant, variant, j)
     _append_sensors(root, plant.joints)
     if note:
         root.insert(0, etree.Comment(f" {note.replace('--', '−−')} "))
@@ -180,6 +192,16 @@ def _write_motor(element: etree._Element, variant: mujoco.MjModel, i: int) -> No
         element.set("ctrlrange", _numbers(variant.actuator_ctrlrange[i]))
 
 
+def _write_delay(element: etree._Element, plant: Plant, variant: mujoco.MjModel, j: int) -> None:
+    i = plant.actuator[j]
+    delay = float(variant.actuator_delay[i])
+    if not _differ(plant.model.actuator_delay[i], delay):
+        return
+    element.set("delay", _number(delay))
+    element.set("nsample", str(max(int(plant.model.actuator_history[i, 0]), samples_for(delay, plant.timestep))))
+    element.set("interp", "linear")
+
+
 #: attributes of a position servo that a DC motor has too, with the same meaning
 _KEPT_BY_MOTOR = ("name", "joint", "group", "user", "nsample", "interp", "delay", "armature", "damping")
 
@@ -220,6 +242,7 @@ def _check(out: Path, plant: Plant, variant: mujoco.MjModel) -> None:
             (written.model.actuator_biasprm[i, 1:3], variant.actuator_biasprm[k, 1:3]),
             (written.model.actuator_gainprm[i], variant.actuator_gainprm[k]),
             (written.model.actuator_forcerange[i], variant.actuator_forcerange[k]),
+            (written.model.actuator_delay[i], variant.actuator_delay[k]),
             (written.model.dof_damping[written.dof[j]], variant.dof_damping[dof]),
             (written.model.dof_armature[written.dof[j]], variant.dof_armature[dof]),
             (written.model.dof_frictionloss[written.dof[j]], variant.dof_frictionloss[dof]),

@@ -87,7 +87,12 @@ class Plant:
 
 
 def load_plant(
-    path: Path | str, joints: Sequence[str] | None = None, setup: Setup = Setup.STAND, *, electrical: bool = False
+    path: Path | str,
+    joints: Sequence[str] | None = None,
+    setup: Setup = Setup.STAND,
+    *,
+    electrical: bool = False,
+    delayed: bool = False,
 ) -> Plant:
     """Read an MJCF and set it up.
 
@@ -97,6 +102,8 @@ def load_plant(
         setup: stand or floor.
         electrical: turn position servos into DC motors that move as they do (`motor_form`), so that a part of the joint's
             damping can be made back-EMF.
+        delayed: give every servo a buffer of past commands, so that it can act late by up to LONGEST_DELAY_S; the delay
+            itself stays what the model says.
 
     Raises:
         BadInput: the file is missing or MuJoCo cannot load it, it has no position-controlled joint, or it lacks one of
@@ -129,9 +136,12 @@ def load_plant(
             hint = f"did you mean {near[0]!r}?" if near else f"its position-controlled joints are {', '.join(servos)}"
             raise BadInput(f"the model has no position-controlled joint {joint!r}", where=path, remedy=hint)
 
-    if electrical:
-        for joint in joints:
+    for joint in joints if electrical or delayed else ():
+        if electrical:
             motor_form(spec.actuators[servos[joint]], original, joint)
+        if delayed:
+            buffer_commands(spec.actuators[servos[joint]], LONGEST_DELAY_S, original.opt.timestep)
+    if electrical or delayed:
         original = spec.compile()
     model = _on_stand(spec, original) if setup is Setup.STAND else original
     actuator = [servos[joint] for joint in joints]
@@ -223,6 +233,23 @@ def motor_form(actuator: mujoco.MjsActuator, model: mujoco.MjModel, joint: str) 
     actuator.forcelimited = 0
     actuator.forcerange = [0.0, 0.0]
     return True
+
+
+#: s; the longest delay of a command that a fit considers: several periods of a 50 Hz loop
+LONGEST_DELAY_S = 0.1
+#: `interp="linear"`: with a zero-order hold a delay moves by whole steps only, and a fit cannot follow it
+LINEAR = 1
+
+
+def buffer_commands(actuator: mujoco.MjsActuator, longest_s: float, timestep: float) -> None:
+    """Give an actuator a buffer for delays up to `longest_s`, unless it has a longer one; its delay stays as it is."""
+    actuator.nsample = max(int(actuator.nsample), samples_for(longest_s, timestep))
+    actuator.interp = max(int(actuator.interp), LINEAR)
+
+
+def samples_for(delay_s: float, timestep: float) -> int:
+    """The commands that a buffer must hold to be read `delay_s` late, with one on each side to interpolate."""
+    return math.ceil(delay_s / timestep - 1e-9) + 2
 
 
 def is_motor(model: mujoco.MjModel, actuator: int) -> bool:

@@ -7,7 +7,7 @@ its prior; whatever does not beat the given model on held-out runs, at the short
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,14 @@ Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 #: what is identified where nothing is said; `damping` stands for whichever of damping and velocity gain the model has
-DEFAULT_KINDS = ("stiffness", "damping", "armature", "coulomb_friction", "zero_offset", "electrical_damping")
+DEFAULT_KINDS = (
+    "stiffness",
+    "damping",
+    "armature",
+    "coulomb_friction",
+    "zero_offset",
+    "electrical_damping",
+)
 
 #: share of the posterior precision that must come from the data for a value to be called identifiable: the interval is
 #: then less than half as wide as the prior's
@@ -185,10 +192,9 @@ def identify(
     for run in everything:
         _must_move(run, joints)
     wanted = _applicable(kinds, load_plant(model, joints, Setup.FLOOR), everything)
-    electrical = "electrical_damping" in wanted
 
     def datasets(of: Sequence[Run]) -> list[Dataset]:
-        return _datasets(of, model, joints, electrical)
+        return _datasets(of, model, joints, wanted)
 
     data, judged = datasets(runs), datasets(hold_out)
     plant = data[0].plant
@@ -276,15 +282,20 @@ def _quantum(run: Run, joint: str) -> float:
     return float(sensor_floor([run], [joint])[0] * math.sqrt(12))
 
 
-def _datasets(runs: Sequence[Run], model: Path, joints: Sequence[str], electrical: bool) -> list[Dataset]:
+def _datasets(runs: Sequence[Run], model: Path, joints: Sequence[str], kinds: Sequence[str]) -> list[Dataset]:
     """One dataset per model and setup; runs that name their own model are simulated with it."""
     groups: dict[tuple[Path, Setup], list[Run]] = {}
     for run in runs:
         groups.setdefault((_own_model(run) or model, setup_of(run.facts.setup)), []).append(run)
     return [
-        Dataset.prepare(load_plant(path, joints, setup, electrical=electrical), members)
+        Dataset.prepare(load_plant(path, joints, setup, **_forms(kinds)), members)
         for (path, setup), members in groups.items()
     ]
+
+
+def _forms(kinds: Collection[str]) -> dict[str, bool]:
+    """The forms that a model must take for these kinds of parameters to act in it."""
+    return {"electrical": "electrical_damping" in kinds, "delayed": "action_delay" in kinds}
 
 
 def _own_model(run: Run) -> Path | None:
@@ -471,9 +482,6 @@ def _notes(estimate: Estimate, joints: Sequence[str], runs: Sequence[Run]) -> tu
 
 def calibrated(identification: Identification, setup: Setup = Setup.FLOOR) -> mujoco.MjModel:
     """The identified model. Its servos become DC motors only where a part of the damping was found to be electrical."""
-    electrical = any(
-        p.kind == "electrical_damping" and u != 0
-        for p, u in zip(identification.parameters, identification.u, strict=True)
-    )
-    plant = load_plant(identification.model, identification.joints, setup, electrical=electrical)
+    moved = {p.kind for p, u in zip(identification.parameters, identification.u, strict=True) if u != 0}
+    plant = load_plant(identification.model, identification.joints, setup, **_forms(moved))
     return apply(plant, identification.parameters, identification.u)

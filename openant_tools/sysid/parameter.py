@@ -17,7 +17,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.model.plant import KD, KP, LEAST_SHARE, MOTOR_CONSTANT, RESISTANCE, VMAX, Plant, is_motor
+from openant_tools.model.plant import (
+    KD,
+    KP,
+    LEAST_SHARE,
+    LONGEST_DELAY_S,
+    MOTOR_CONSTANT,
+    RESISTANCE,
+    VMAX,
+    Plant,
+    is_motor,
+)
 
 __all__ = ["KINDS", "Kind", "Parameter", "apply"]
 
@@ -175,6 +185,17 @@ def _write_torque_limit(model: mujoco.MjModel, plant: Plant, j: int, value: floa
         model.actuator_forcerange[plant.actuator[j]] = (-value, value)
 
 
+def _read_delay(model: mujoco.MjModel, plant: Plant, j: int) -> float:
+    return float(model.actuator_delay[plant.actuator[j]])
+
+
+def _write_delay(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
+    # The newest command in a buffer is one step old, so that MuJoCo makes a whole step of any delay between none and one.
+    model.actuator_delay[plant.actuator[j]] = value if value > plant.timestep / 2 else 0.0
+
+
+#: s; a loop of 50 Hz may act a period late
+DELAY_STD_S = 0.02
 #: What brakes a DC servo beyond its friction is back-EMF, which vanishes with the torque: a share near 1, this uncertain.
 ELECTRICAL_STD = 0.3
 #: Friction of a small geared servo is of the order of a tenth of its stall torque; a model that has none says nothing
@@ -245,6 +266,7 @@ KINDS: dict[str, Kind] = {
             high=math.pi,
             constants=True,
         ),
+        Kind("action_delay", "s", _read_delay, _write_delay, None, lambda limit: DELAY_STD_S, high=LONGEST_DELAY_S),
         Kind("torque_limit", "N·m", torque_limit, _write_torque_limit, 0.075, lambda limit: math.nan, low=1e-6),
     )
 }
