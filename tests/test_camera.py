@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openant_tools.comms import camera as camera_module
+from openant_tools.comms.body_camera import BodyCamera, CameraConfig
 from openant_tools.comms.camera import Camera, CameraSettings, DropCounter
 from openant_tools.comms.clock import RealClock
 from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics, calibrate
@@ -460,6 +461,41 @@ def test_frozen_stalled_and_unplugged_cameras_are_told_apart(stepped: SteppedHos
     assert watch(0.5) == "None"
     with pytest.raises(ValueError, match="no camera fault 'tired'"):
         stepped.camera.fault("tired")
+
+
+def test_the_engines_camera_gives_poses_in_order_and_tells_what_is_wrong_once(stepped: SteppedHost) -> None:
+    settings = stepped.camera.settings
+    config = CameraConfig(CameraSettings(stepped.camera.wait()), TagSetup(), settings.intrinsics)
+    eye = BodyCamera(config, stepped)
+    still, stepped.motion = stepped.motion, lambda t: scene(roll=0.3, yaw=0.5)
+
+    def watch(seconds: float) -> tuple[list[BodyPose | BodyLost], list[str]]:
+        results, news = [], []
+        for _ in range(round(seconds / 0.02)):
+            stepped.sleep_until(stepped.t + 0.02)
+            eye.lean(stepped.t, 0.3, 0.0)
+            results += eye.poses()
+            news += [said for said in [eye.news()] if said]
+        return results, news
+
+    try:
+        results, news = watch(1.0)
+        last = results[-1]
+        assert isinstance(last, BodyPose)
+        assert news == []
+        assert np.all(np.diff([result.t for result in results]) > 0)
+        assert np.allclose(last.position, [0.2, 0.1, 0.15], atol=5e-3)
+        w, x, y, z = last.quaternion
+        assert math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) == pytest.approx(last.yaw)
+        stepped.motion = lambda t: scene(x=5.0)
+        results, news = watch(1.5)
+        assert isinstance(results[-1], BodyLost)
+        assert len(news) == 1
+        assert "does not see the robot for 0.5 s: body tag 12 not seen → look at the picture" in news[0]
+        assert eye.statistics.received > 40
+    finally:
+        stepped.motion = still
+        eye.close()
 
 
 def test_a_stepped_clock_refuses_a_real_camera(stepped: SteppedHost) -> None:

@@ -169,6 +169,14 @@ class BodyPose:
         """The body's x axis in the floor, a unit vector (2,)."""
         return np.array([math.cos(self.yaw), math.sin(self.yaw)])
 
+    @property
+    def quaternion(self) -> Array:
+        """The rotation as w x y z, w ≥ 0."""
+        vector = np.asarray(cv2.Rodrigues(self.rotation)[0], float).ravel()
+        angle = float(np.linalg.norm(vector))
+        axis = vector / angle if angle > 0 else vector
+        return np.concatenate([[math.cos(angle / 2)], math.sin(angle / 2) * axis])
+
 
 @dataclass(frozen=True)
 class BodyLost:

@@ -1,0 +1,154 @@
+"""The overhead camera as the engine uses it: pictures become poses beside the bus loop, its faults are told once.
+
+Finding tags takes 10 to 60 ms a picture, so in real time a thread does it (the detector and OpenCV let other threads
+run); the loop takes what is ready. Under a stepped clock pictures are asked for and searched in turn with everything
+else, so that every run is the same.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from openant_tools.comms.camera import Camera, CameraInfo, CameraSettings, CameraStatistics
+from openant_tools.comms.clock import Clock
+from openant_tools.comms.intrinsics import Intrinsics
+from openant_tools.comms.tags import BodyLost, BodyPose, BodyTracker, TagSetup
+from openant_tools.errors import HardwareFault, OpenAntError
+
+__all__ = ["BodyCamera", "CameraConfig"]
+
+#: What is wrong is said again after so long, if it is still wrong.
+REPEAT_S = 10.0
+#: A lost tag is normal for a picture or two (a leg above it, a blurred one).
+LOST_S = 0.5
+#: Attitudes older than the camera's latency are not needed any more.
+LEANS = 128
+#: An attitude of this age is not that of the picture.
+LEAN_FRESH_S = 0.05
+#: Poses that nobody takes are given up.
+QUEUE = 64
+POLL_S = 0.002
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """The camera, its lens and the tags.
+
+    Attributes:
+        intrinsics: as calibrated; None for a lens without distortion of `fov_diagonal_deg`.
+    """
+
+    settings: CameraSettings = field(default_factory=CameraSettings)
+    tags: TagSetup = field(default_factory=TagSetup)
+    intrinsics: Intrinsics | None = None
+    fov_diagonal_deg: float = 60.0
+
+
+class BodyCamera:
+    """One overhead camera, open.
+
+    Attributes:
+        info: what the camera gives.
+
+    Raises:
+        HardwareFault: it cannot be opened or sends nothing.
+        BadInput: it was calibrated for pictures of another shape.
+    """
+
+    def __init__(self, config: CameraConfig, clock: Clock) -> None:
+        self._clock = clock
+        self._camera = Camera(config.settings, clock)
+        self.info: CameraInfo = self._camera.open()
+        size = self.info.width, self.info.height
+        lens = config.intrinsics or Intrinsics.from_diagonal_fov(*size, config.fov_diagonal_deg)
+        try:
+            self._tracker = BodyTracker(config.tags, lens.scaled(*size))
+        except OpenAntError:
+            self._camera.close()
+            raise
+        self._leans: deque[tuple[float, float, float]] = deque(maxlen=LEANS)
+        self._results: deque[BodyPose | BodyLost] = deque(maxlen=QUEUE)
+        self._seen_at = clock.now()
+        self._lost = ""
+        self._said: tuple[str, float] = ("", -np.inf)
+        self._error: OpenAntError | None = None
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        if not clock.stepped:
+            self._thread = threading.Thread(target=self._run, name="body-camera", daemon=True)
+            self._thread.start()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a builder should know of the camera."""
+        return self.info.notes
+
+    @property
+    def statistics(self) -> CameraStatistics:
+        """Pictures received, dropped and skipped."""
+        return self._camera.statistics
+
+    def lean(self, t: float, roll: float, pitch: float) -> None:
+        """The body's attitude at `t` by the IMU, rad; it steadies the pose of the picture taken then."""
+        self._leans.append((t, roll, pitch))
+
+    def poses(self) -> list[BodyPose | BodyLost]:
+        """What became of the pictures since the last call, in order; does not wait."""
+        if self._thread is None:
+            self._look()
+        out = []
+        while self._results:
+            out.append(self._results.popleft())
+        return out
+
+    def news(self) -> str | None:
+        """What is wrong, once when it begins and from time to time while it lasts."""
+        fault: OpenAntError | None = self._error or self._camera.fault()
+        now = self._clock.now()
+        if fault is None and now - self._seen_at > LOST_S and self._lost:
+            fault = HardwareFault(
+                f"the camera does not see the robot for {now - self._seen_at:.1f} s: {self._lost}",
+                remedy="look at the picture: light, focus, and both tags in view",
+            )
+        if fault is None:
+            self._said = ("", -np.inf)
+            return None
+        kind = fault.what[:30]
+        if kind == self._said[0] and now - self._said[1] < REPEAT_S:
+            return None
+        self._said = (kind, now)
+        return str(fault)
+
+    def close(self) -> None:
+        """Stop looking and let go of the camera."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+        self._camera.close()
+
+    def _run(self) -> None:
+        while not self._stop.wait(POLL_S):
+            try:
+                self._look()
+            except OpenAntError as error:  # the lens and the picture do not fit any more
+                self._error = error
+                return
+
+    def _look(self) -> None:
+        frame = self._camera.newest()
+        if frame is None:
+            return
+        result = self._tracker.track(frame.image, frame.t, self._lean_at(frame.t))
+        if isinstance(result, BodyPose):
+            self._seen_at, self._lost = self._clock.now(), ""
+        else:
+            self._lost = result.reason
+        self._results.append(result)
+
+    def _lean_at(self, t: float) -> tuple[float, float] | None:
+        near = min(tuple(self._leans), key=lambda lean: abs(lean[0] - t), default=None)
+        return None if near is None or abs(near[0] - t) > LEAN_FRESH_S else (near[1], near[2])
