@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from openant_tools.comms import msp
 from openant_tools.comms.clock import RealClock
@@ -370,6 +372,19 @@ def test_the_driver_never_sends_a_byte_outside_a_frame() -> None:
     for data in sent:  # one write is one whole frame
         assert len(msp.Parser().feed(data)) == 1
         assert msp.encode(msp.Parser().feed(data)[0]) == data
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.one_of(st.binary(max_size=40), st.sampled_from([b"#", b"R", b"$M<", b"exit\r", msp.request(230)]))))
+def test_any_bytes_leave_the_controller_answering_after_a_power_cycle(chunks: list[bytes]) -> None:
+    bench = Bench()
+    for chunk in chunks:
+        bench.fc.receive(chunk, bench.t)
+        bench.sleep_until(bench.t + 0.06)
+    bench.fc.unplug(bench.t)
+    bench.fc.plug(bench.t)
+    bench.sleep_until(bench.t + 2.0)
+    assert bench.imu().connect().variant == "BTFL"
 
 
 def test_refused_messages_and_wrong_firmware_are_named() -> None:
