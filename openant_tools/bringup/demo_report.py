@@ -1,0 +1,297 @@
+"""The demo's report: what was found in the recordings against what is true of the virtual robot, and what was learned."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.bringup.demo import Demo
+from openant_tools.bringup.robot_picture import robot_picture
+from openant_tools.files import write_bytes
+from openant_tools.model.plant import Setup, load_plant
+from openant_tools.model.rollout import Rollouts
+from openant_tools.recording.run import Run
+from openant_tools.recording.tables import read_run
+from openant_tools.report import KeyFigure, Mark, Report, plots
+from openant_tools.report.parts import Tone
+from openant_tools.robot.joints import JOINT_NAMES
+from openant_tools.robot.registers import PWM_FULL
+from openant_tools.virtual.scenario import load_scenario
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MatplotlibFigure
+
+__all__ = ["Recovered", "compare", "truth", "write_report"]
+
+Array = NDArray[np.float64]
+
+#: s, shown around the moment at which the nominal model is worst
+WINDOW_S = 2.0
+
+KIND_WORDS = {
+    "stiffness": "stiffness",
+    "damping": "damping",
+    "armature": "armature",
+    "coulomb_friction": "friction",
+    "zero_offset": "zero",
+}
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """One parameter of the fit beside the truth.
+
+    Attributes:
+        name: as in fit.json.
+        given, truth, value, low, high: in `unit`.
+        verdict: of the fit.
+    """
+
+    name: str
+    unit: str
+    given: float
+    truth: float
+    value: float
+    low: float
+    high: float
+    verdict: str
+
+    @property
+    def determined(self) -> bool:
+        """Whether the fit claims to know it."""
+        return self.verdict in ("identifiable", "weak")
+
+    @property
+    def inside(self) -> bool:
+        """Whether the truth lies in the interval."""
+        return self.low <= self.truth <= self.high
+
+
+def truth(scenario: Path) -> dict[str, float]:
+    """What a perfect fit would find of the virtual robot: parameter as in fit.json → value in SI units.
+
+    stiffness = P / divisor / 885 · τ_stall · scale; damping = kt·ke/R + what the gear adds; armature, friction and zero
+    as they are set. The firmware cuts its PWM to whole counts towards zero, half a count on average, which costs the
+    torque τ_stall / 885 / 2 and acts like that much more friction.
+
+    Raises:
+        BadInput: the scenario cannot be read.
+    """
+    world = load_scenario(scenario).world
+    values: dict[str, float] = {}
+    for servo in world.servos:
+        motor = servo.motor
+        assert motor is not None
+        stall = motor.kt * world.supply.volts / motor.resistance
+        gain = servo.registers.get("position_p_gain")
+        scale = motor.stiffness_scale * motor.strength
+        values[f"stiffness.{servo.joint}"] = servo.model.stiffness_nm_rad(gain, world.supply.volts) * scale
+        values[f"damping.{servo.joint}"] = motor.kt * motor.ke / motor.resistance + motor.viscous
+        values[f"armature.{servo.joint}"] = motor.armature
+        values[f"coulomb_friction.{servo.joint}"] = motor.coulomb_nm + stall / PWM_FULL / 2
+        values[f"zero_offset.{servo.joint}"] = servo.zero_error_rad
+    return values
+
+
+def compare(fit: Mapping[str, Any], true: Mapping[str, float]) -> list[Recovered]:
+    """Every parameter of a fit.json that the truth knows."""
+    return [
+        Recovered(
+            name, found["unit"], found["given"], true[name], found["value"], found["low"], found["high"],
+            found["verdict"],
+        )
+        for name, found in fit["parameters"].items()
+        if name in true
+    ]  # fmt: skip
+
+
+def write_report(demo: Demo) -> dict[str, Any]:
+    """Write report.html and the pictures; returns the key figures, as for `--json`."""
+    fit = json.loads((demo.fit / "fit.json").read_text(encoding="utf-8"))
+    rows = compare(fit, truth(demo.scenario))
+    run = read_run(demo.held_out)
+    worst = _worst_moment(run, demo.nominal, demo.fit / "calibrated.xml")
+    curve = _curve(demo.training / "learning_curve.csv") if demo.learns else None
+    reward = _reward(demo) if demo.learns else None
+    picture, drawn_by = robot_picture(demo.fit / "calibrated.xml")
+
+    before, after = fit["held_out"]["before"], fit["held_out"]["after"]
+    floor = fit["held_out"]["floor_rad"]
+    claimed = [row for row in rows if row.determined]
+    inside = sum(row.inside for row in claimed)
+    figures: dict[str, Any] = {
+        "gap_before_rad": before["gap_full_rad"],
+        "gap_after_rad": after["gap_full_rad"],
+        "floor_rad": floor,
+        "settings_determined": len(claimed),
+        "settings_within_interval": inside,
+        "average_reward_m_s": reward,
+    }
+
+    report = Report("A virtual Open Ant, calibrated", _subtitle(demo), made_by=f"openant demo --robot {demo.folder}")
+    keys = [
+        KeyFigure(
+            "held-out error",
+            f"{1e3 * before['gap_full_rad']:.1f} → {1e3 * after['gap_full_rad']:.2f} mrad",
+            f"data sheets → calibrated, over a motion of {run.duration_s:.0f} s that the fit did not see",
+            "good" if after["gap_full_rad"] < before["gap_full_rad"] else "bad",
+        ),
+        KeyFigure("floor", f"{1e3 * floor:.2f} mrad", "what no model could beat: two plays of one motion differ by it"),
+        KeyFigure(
+            "settings recovered",
+            f"{inside} of {len(claimed)}",
+            "true value inside the 95 % interval",
+            "good" if inside >= 0.9 * len(claimed) else "warn",
+        ),
+    ]
+    if reward is not None:
+        keys.append(KeyFigure("learned to walk at", f"{100 * reward:.1f} cm/s", _minutes(curve)))
+    report.key_figures(*keys)
+    if picture is not None:
+        report.picture(picture, f"The calibrated model, at its home pose ({drawn_by}).", "An Open Ant on its four legs")
+        write_bytes(demo.pictures / "robot.png", picture)
+    report.section("Measured against simulated")
+    gap_figure = _gap_figure(worst)
+    report.figure(
+        gap_figure, f"The held-out motion around the moment at which the data sheets' model is worst: {worst.joint}."
+    )
+    write_bytes(demo.pictures / "gap.png", plots.as_png(gap_figure))
+    report.section("What was found, and what is true").table(
+        ["parameter", "data sheet", "true", "found", "95 % interval", "unit", "inside"], [_row(row) for row in rows]
+    )
+    report.text(_explained(rows))
+    if curve is not None:
+        report.section("Learning")
+        learning = _learning_figure(curve)
+        report.figure(learning, "Average reward of the last 120 s, in the simulation that was calibrated.")
+        write_bytes(demo.pictures / "learning.png", plots.as_png(learning))
+        strip = demo.pictures / "walk.png"
+        if strip.exists():
+            report.picture(strip, "What it learned, a picture a step.", "The robot walking")
+    report.section("The same by hand").code("\n".join(line for stage in demo.stages() for line in stage.command_lines))
+    report.write(demo.report)
+    return figures
+
+
+def _subtitle(demo: Demo) -> str:
+    return (
+        "Recorded through its bus, identified, and trained on in simulation. "
+        f"What is wrong with it stands in {demo.scenario.name}, which the fit has not seen."
+    )
+
+
+def _minutes(curve: Array | None) -> str:
+    return "" if curve is None or not len(curve) else f"after {curve[-1, 1] / 60:.0f} minutes of its time"
+
+
+# ---- figures ----
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """A stretch of the held-out run for one joint: measured, and simulated by both models; rad against s."""
+
+    joint: str
+    t: Array
+    command: Array
+    measured: Array
+    nominal: Array
+    calibrated: Array
+
+
+def _worst_moment(run: Run, nominal: Path, calibrated: Path) -> _Moment:
+    simulated = []
+    for path in (nominal, calibrated):
+        plant = load_plant(path, JOINT_NAMES, Setup.STAND)
+        simulated.append(Rollouts(plant, [run])().pos[0])
+    measured = run.signal("pos", JOINT_NAMES)
+    squares = np.nan_to_num(measured - simulated[0]) ** 2
+    width = max(2, min(len(run.t), round(WINDOW_S / float(np.median(np.diff(run.t))))))
+    # Sums over every window, by differences of running sums.
+    sums = np.vstack([np.zeros(squares.shape[1]), np.cumsum(squares, axis=0)])
+    first, j = np.unravel_index(
+        int(np.argmax(sums[width:] - sums[:-width])), (len(run.t) - width + 1, len(JOINT_NAMES))
+    )
+    rows = slice(int(first), int(first) + width)
+    joint = JOINT_NAMES[int(j)]
+    return _Moment(
+        joint, run.t[rows] - run.t[0], run.column(f"cmd.{joint}")[rows], measured[rows, j],
+        simulated[0][rows, j], simulated[1][rows, j],
+    )  # fmt: skip
+
+
+def _gap_figure(moment: _Moment) -> MatplotlibFigure:
+    figure: MatplotlibFigure
+    figure, (above, below) = plots.figure(2, 1, height=2.2, sharex=True)
+    _draw_gap(above, below, moment)
+    plots.legend(above)
+    return figure
+
+
+def _draw_gap(above: Any, below: Any, moment: _Moment) -> None:
+    with plots.style():
+        above.plot(moment.t, moment.command, color=plots.INK, linewidth=0.8, alpha=0.5, label="command")
+        above.plot(moment.t, moment.measured, color=plots.INK, linewidth=2.2, label="measured")
+        above.plot(moment.t, moment.nominal, "--", color=plots.VERMILLION, label="data sheets")
+        above.plot(moment.t, moment.calibrated, color=plots.BLUE, label="calibrated")
+        above.set_ylabel(plots.axis_label(moment.joint, "rad"))
+        below.plot(moment.t, 1e3 * (moment.measured - moment.nominal), "--", color=plots.VERMILLION)
+        below.plot(moment.t, 1e3 * (moment.measured - moment.calibrated), color=plots.BLUE)
+        below.set_ylabel(plots.axis_label("measured − simulated", "mrad"))
+        below.set_xlabel(plots.axis_label("time in run", "s"))
+
+
+def _learning_figure(curve: Array) -> MatplotlibFigure:
+    figure: MatplotlibFigure
+    figure, axes = plots.figure(height=2.6)
+    with plots.style():
+        axes.axhline(0, color=plots.INK, linewidth=0.6)
+        axes.plot(curve[:, 1] / 60, 100 * curve[:, 2], color=plots.BLUE)
+        axes.set_xlabel(plots.axis_label("robot time", "min"))
+        axes.set_ylabel(plots.axis_label("average reward", "cm/s"))
+    return figure
+
+
+def _curve(path: Path) -> Array:
+    """(points, 3): step, seconds, average reward in m/s."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        rows = [
+            (float(row["step"]), float(row["seconds"]), float(row["average_reward_m_s"]))
+            for row in csv.DictReader(stream)
+        ]
+    return np.array(rows).reshape(-1, 3)
+
+
+def _reward(demo: Demo) -> float:
+    return float(json.loads((demo.training / "eval.json").read_text(encoding="utf-8"))["average_reward_m_s"])
+
+
+# ---- the table ----
+
+
+def _row(row: Recovered) -> Sequence[object]:
+    tone: Tone = "good" if row.inside else "bad"
+    mark = Mark("yes" if row.inside else "no", tone) if row.determined else Mark(row.verdict)
+    return [
+        row.name, f"{row.given:.4g}", f"{row.truth:.4g}", f"{row.value:.4g}", f"{row.low:.4g} … {row.high:.4g}",
+        row.unit, mark,
+    ]  # fmt: skip
+
+
+def _explained(rows: Sequence[Recovered]) -> str:
+    words = "Friction is the gear's and what the firmware's cutting of its PWM to whole counts adds, half a count on average."
+    open_ = [row.name for row in rows if not row.determined]
+    if open_:
+        words += (
+            "\n\nNot to be told from these recordings, and left as they were: "
+            + ", ".join(open_)
+            + ". On a level stand a hip's axis is vertical: its command and its encoder shift alike when its zero does."
+        )
+    return words
