@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import socket
 import subprocess
 import sys
@@ -168,6 +169,38 @@ def test_a_pause_inside_a_packet_drops_it():
     assert line.receive(packet[:5], 2.0, BAUD) == []
     assert line.receive(packet[5:], 2.003, BAUD) == []
     assert line.receive(packet, 3.0, BAUD) != []
+
+
+def test_a_host_too_busy_to_read_in_time_is_not_taken_for_a_hasty_client():
+    """Read 1 ms after it was written, a write seems to touch the read that followed it after 0.3 ms."""
+    write, read = p2.sync_write(116, 4, {id: bytes(4) for id in IDS}).encode(), p2.sync_read(132, 4, IDS).encode()
+    line = Wire().world.line
+    for n in range(100):
+        t = 1.0 + n * 0.1
+        assert line.receive(write, t, BAUD, late_s=1e-3) == []
+        assert line.receive(read, line.free_at, BAUD) != []
+    line, packet = Wire().world.line, p2.ping(10).encode()
+    assert line.receive(packet[:5], 1.0, BAUD) == []
+    assert line.receive(packet[5:], 1.003, BAUD, late_s=2e-3) != [], "written within the packet's own time"
+
+
+def test_bytes_that_lay_there_while_the_server_was_busy_are_old():
+    with Server(build(), stepped=False) as server:
+        client = serial.Serial(str(server.folder / "bus"), BAUD, timeout=0)
+        for _ in range(10):
+            server.turn()
+            client.write(p2.sync_write(116, 4, {id: bytes(4) for id in IDS}).encode())
+            time.sleep(2e-3)  # a patient client; the server is busy elsewhere
+            client.write(p2.sync_read(132, 4, IDS).encode())
+            select.select([server.ports["bus"].files[0]], [], [])
+            server.turn()
+            end = time.monotonic() + 20
+            while not client.in_waiting and time.monotonic() < end:
+                server.turn()
+            assert server.world.line.tap.blind == 0
+            time.sleep(5e-3)
+            client.reset_input_buffer()
+        client.close()
 
 
 def test_bytes_may_come_in_any_portions():

@@ -145,7 +145,9 @@ def bench(
     from openant_tools.comms.setup import open_bus
 
     console = Console(stderr=True)
-    with _engine_config(port, virtual_source, robot) as config:
+    # Stepped, a virtual robot shows its bus and nothing of what else this machine does.
+    clock = "stepped" if virtual_source == VIRTUAL_DEFAULT else None
+    with _engine_config(port, virtual_source, robot, clock=clock) as config:
         bus = open_bus(config.port, config.baud, config.control)
         try:
             servos = Servos(bus, config.servos)

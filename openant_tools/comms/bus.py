@@ -373,7 +373,8 @@ class Bus:
             self._count_stale(self.line.read())
         started = self.request_at = self.clock.now()
         self.line.write(packet)
-        self._quiet_from = started + len(packet) * BITS_PER_BYTE / self.line.baud
+        # Counted from when the system has the bytes: whoever was held up before that must not cut the gap short.
+        self._quiet_from = self.clock.now() + len(packet) * BITS_PER_BYTE / self.line.baud
         return started
 
     def _readable(self) -> bytes:

@@ -139,6 +139,8 @@ class Line:
         self._host_end = -math.inf
         self._answer_end = -math.inf
         self._blind_until = -math.inf
+        #: how much earlier than their stamp the host's last bytes may have been written, s
+        self._late_s = 0.0
         self._phase = float(self._random.random())
         #: positions plugged in now; a box of loose motors has one at a time
         self.plugged: set[int] = set(range(len(self.servos)))
@@ -150,13 +152,19 @@ class Line:
 
     # ---- host → servos ----
 
-    def receive(self, data: bytes, t: float, baud: int) -> list[Reply]:
-        """Bytes that the host wrote at `t` (s) with its port at `baud`; what comes back of it, by rising time."""
+    def receive(self, data: bytes, t: float, baud: int, *, late_s: float = 0.0) -> list[Reply]:
+        """Bytes that the host wrote at `t` (s) with its port at `baud`; what comes back of it, by rising time.
+
+        Args:
+            late_s: how much earlier they may have been written, where `t` is when a busy reader came to them. A pause
+                before them may have been shorter by it, one behind them longer: servos miss nothing that they would
+                have heard if it was so.
+        """
         byte_s = BITS_PER_BYTE / baud
         start = max(t, self._host_end, self.settings.stalled_until)
         if baud != self._baud:
             self._parser, self._baud = Parser(), baud
-        elif self._parser.pending and start - self._host_end > INTER_BYTE_S:
+        elif self._parser.pending and start - late_s - self._host_end > INTER_BYTE_S:
             self._parser.flush()
         collided = start < self._answer_end
         if collided:
@@ -167,6 +175,7 @@ class Line:
         pending = self._parser.pending
         found = self._parser.feed(data)
         self._host_end = start + len(data) * byte_s
+        self._late_s = late_s
         at = start - pending * byte_s
         replies: list[Reply] = []
         for packet in found:
@@ -244,7 +253,7 @@ class Line:
             if status is not None and not self._lost(position):
                 said[position] = status
         if packet.code in _SILENT or (packet.id == BROADCAST and packet.code in (Inst.WRITE, Inst.REG_WRITE)):
-            self._blind_until = ended + self._blind_time()
+            self._blind_until = ended - self._late_s + self._blind_time()
         return said, acted
 
     def _finish(self, acted: list[ServoDevice], t: float) -> None:
@@ -323,6 +332,7 @@ class Line:
         Args:
             t: s, when the host writes.
         """
+        self._late_s = 0.0
         self._baud = self._baud or max((self.servos[k].baud for k in self.plugged), default=57_600)
         byte_s, noise = BITS_PER_BYTE / self._baud, self.settings.byte_error
         began = max(t, self.free_at, self.settings.stalled_until)

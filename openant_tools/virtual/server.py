@@ -1,7 +1,9 @@
 """The virtual robot as a process: ports that clients open, a control socket, and one loop that keeps time.
 
 In real time the world is brought to "now" before each packet and every answer leaves when the wire would have
-delivered it. In stepped time nothing moves but by the control socket.
+delivered it. Bytes are stamped when they are read, which on a busy host is later than they were written; how much later
+it may have been is kept with them (`lateness`), and the wire gives the client the benefit of that doubt. In stepped
+time nothing moves but by the control socket.
 
 The control socket (Unix stream, one JSON object a line, one line of answer each):
 
@@ -43,6 +45,7 @@ from typing import Any, Protocol
 
 from openant_tools.errors import OpenAntError
 from openant_tools.files import write_text
+from openant_tools.virtual.lateness import Lateness
 from openant_tools.virtual.overhead_camera import Scene
 from openant_tools.virtual.ports import Port, PtyPort, TcpPort
 from openant_tools.virtual.world import World
@@ -145,7 +148,10 @@ class Server:
             self.ports["imu"] = PtyPort(self.folder / "imu")
         self.received = dict.fromkeys(("bus", "imu"), 0)
         self.sent = dict.fromkeys(("bus", "imu"), 0)
-        self._held: list[tuple[float, str, bytes, int]] = []
+        #: (when read, how much earlier it may have been written, port, bytes, baud)
+        self._held: list[tuple[float, float, str, bytes, int]] = []
+        #: waiting for a processor; when nothing was last seen to read; how late what is read now may be
+        self._lateness, self._empty_at, self._late_s = Lateness(), time.monotonic(), 0.0
         self._outbox: list[tuple[float, int, str, bytes]] = []
         self._count = 0
         self._selector = selectors.DefaultSelector()
@@ -185,6 +191,7 @@ class Server:
             self._camera.close()
         self._listener.close()
         self._selector.close()
+        self._lateness.close()
         if self._own_folder:
             shutil.rmtree(self.folder, ignore_errors=True)
         else:
@@ -212,7 +219,17 @@ class Server:
         """One turn: wait for bytes or the next thing due, and do it."""
         self._watch()
         timeout = 0.05 if self.stepped else self._pause()
-        for key, _ in self._selector.select(timeout):
+        sleeps = timeout > 0 and not self.stepped
+        if sleeps:
+            self._lateness.start()
+        before = time.monotonic()
+        ready = self._selector.select(timeout)
+        after = time.monotonic()
+        self._late_s = after - self._empty_at
+        if ready and sleeps:
+            self._late_s = self._lateness.seconds(after - before, self._late_s)
+        self._empty_at = after
+        for key, _ in ready:
             self._ready(key.data)
         if not self.stepped:
             self._keep_time()
@@ -275,19 +292,20 @@ class Server:
             return
         self.received[name] += len(data)
         baud = port.baud(self.world.line_baud)
-        self._held.append((self.now, name, data, baud))
+        late_s = 0.0 if self.stepped else self._late_s + time.monotonic() - self._empty_at
+        self._held.append((self.now, late_s, name, data, baud))
         if not self.stepped:
             self._act()
 
     def _act(self) -> float:
         """Let held bytes act; when the last of their answers reaches the host, or the wire falls silent, s."""
         last = 0.0
-        for t, name, data, baud in self._held:
+        for t, late_s, name, data, baud in self._held:
             if name == "imu":
                 assert self._imu is not None
                 self._imu.receive(data, t)
                 continue
-            replies = self.world.line.receive(data, t, baud)
+            replies = self.world.line.receive(data, t, baud, late_s=late_s)
             for reply in replies:
                 self._post(reply.t, name, reply.data)
                 last = max(last, reply.t)
