@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from openant_tools.cli.sysid_bench import torque
 from openant_tools.cli.sysid_fit import fit
 from openant_tools.cli.sysid_record import record
 
@@ -17,3 +18,4 @@ def sysid() -> None:
 
 sysid.add_command(record)
 sysid.add_command(fit)
+sysid.add_command(torque)
