@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -33,8 +33,9 @@ from openant_tools.model.plant import (
 
 __all__ = ["write_model"]
 
-#: attributes of <compiler> that name folders relative to the model's file
-ASSET_FOLDERS = ("assetdir", "meshdir", "texturedir")
+#: attribute of <compiler> that names the folder, relative to the model's file, of what these elements read;
+#: `assetdir` stands for both
+ASSET_FOLDERS = {"meshdir": ("mesh", "hfield", "skin", "flexcomp"), "texturedir": ("texture",)}
 
 
 def write_model(
@@ -54,51 +55,103 @@ def write_model(
         BadInput: the source cannot be read, or keeps a joint where it cannot be edited.
     """
     plant = load_plant(source, joints, Setup.FLOOR)
-    tree = _read(source)
+    taken_in: list[tuple[etree._Element, Path]] = []
+    tree = _read(source, source.parent, taken_in)
     root = tree.getroot()
+    _name_from_main(root, source.parent, taken_in)
     _repoint_assets(root, source.parent, out.parent)
     degrees = _in_degrees(root)
-    actuators = [element for section in root.iter("actuator") for element in section if isinstance(element.tag, str)]
+    ratios = {}
     for j, name in enumerate(plant.joints):
-        element = next((e for e in root.iter("joint") if e.get("name") == name and _in_world(e)), None)
-        if element is None:
-            raise BadInput(
-                f"the joint {name!r} is not written out in the file (made by <replicate> or <attach>?)",
-                where=source,
-                remedy="save the expanded model first: python -m mujoco.studio, or MjSpec.to_xml()",
-            )
-        _write_joint(element, plant, variant, j, degrees)
+        joint = next((e for e in root.iter("joint") if e.get("name") == name and _in_world(e)), None)
+        if joint is None:
+            raise _not_written_out(f"the joint {name!r}", source)
+        actuator = _actuator_element(root, plant, j)
+        _write_joint(joint, plant, variant, j, degrees)
         if is_motor(variant, int(plant.actuator[j])) and not is_motor(plant.model, int(plant.actuator[j])):
-            _write_motor(actuators[plant.actuator[j]], variant, int(plant.actuator[j]))
-        else:
-            _write_actuator(actuators[plant.actuator[j]], plant, variant, j)
-        _write_delay(actuators[plant.actuator[j]], plant, variant, j)
+            _write_motor(actuator, variant, int(plant.actuator[j]))
+        elif _write_actuator(actuator, plant, variant, j):
+            ratios[j] = actuator
+        _write_delay(actuator, plant, variant, j)
     _append_sensors(root, plant.joints)
     if note:
         root.insert(0, etree.Comment(f" {note.replace('--', '−−')} "))
         root[0].tail = root.text or "\n  "
-    write_text(out, etree.tostring(tree, encoding="unicode", pretty_print=False) + "\n")
-    _check(out, plant, variant)
+    # MuJoCo decides what the file means before it takes its place; beside it, because folders of assets are relative.
+    trial = out.with_name(f".{out.name}.trial.xml")
+    try:
+        write_text(trial, _text(tree))
+        if ratios:
+            _set_damping_ratios(ratios, trial, plant, variant)
+            write_text(trial, _text(tree))
+        _check(trial, plant, variant)
+    finally:
+        trial.unlink(missing_ok=True)
+    write_text(out, _text(tree))
     return out
 
 
-def _read(path: Path) -> etree._ElementTree:
+def _not_written_out(what: str, source: Path) -> BadInput:
+    return BadInput(
+        f"{what} is not written out in the file (made by <replicate> or <attach>?)",
+        where=source,
+        remedy="save the expanded model first: python -m mujoco.studio, or MjSpec.to_xml()",
+    )
+
+
+def _text(tree: etree._ElementTree) -> str:
+    """The document with a line for each comment around its root, whose line ends a parser does not keep."""
+    root = tree.getroot()
+    before = [etree.tostring(e, encoding="unicode", with_tail=False) for e in root.itersiblings(preceding=True)]
+    after = [etree.tostring(e, encoding="unicode", with_tail=False) for e in root.itersiblings()]
+    return "\n".join([*before[::-1], etree.tostring(root, encoding="unicode", with_tail=False), *after]) + "\n"
+
+
+def _read(path: Path, main: Path, taken_in: list[tuple[etree._Element, Path]]) -> etree._ElementTree:
+    """The document with every <include> replaced by what it stands for.
+
+    Args:
+        path: the file.
+        main: the folder of the outermost file; includes are looked for there, then beside the file that includes.
+        taken_in: gets every element that came by an include, with the folder of the file it stood in.
+    """
     try:
         tree = etree.parse(str(path), etree.XMLParser(remove_blank_text=False, remove_comments=False))
     except etree.XMLSyntaxError as error:
         raise BadInput(f"not well-formed XML: {error.msg}", where=path) from error
     for include in list(tree.getroot().iter("include")):
-        inner = _read(path.parent / str(include.get("file")))
+        named = str(include.get("file"))
+        file = next((folder / named for folder in (main, path.parent) if (folder / named).is_file()), main / named)
+        inner = _read(file, main, taken_in).getroot()
+        taken_in += [(element, file.parent) for element in inner.iter() if _files(element)]
         parent = include.getparent()
         assert parent is not None
         at = parent.index(include)
-        children = list(inner.getroot())
+        children = list(inner)
         for k, child in enumerate(children):
             parent.insert(at + k, child)
         if children:
             children[-1].tail = include.tail
         parent.remove(include)
     return tree
+
+
+def _name_from_main(root: etree._Element, main: Path, taken_in: Sequence[tuple[etree._Element, Path]]) -> None:
+    """MuJoCo looks for an included file's assets beside that file too; taken in, they must be named from the main one."""
+    folders = {"model": main}
+    for name, tags in ASSET_FOLDERS.items():
+        given = [e.get(which) for which in ("assetdir", name) for e in root.iter("compiler") if e.get(which)]
+        folders |= dict.fromkeys(tags, main / str(given[-1]) if given else main)
+    for element, beside in taken_in:
+        folder = folders.get(str(element.tag))
+        for name, value in _files(element) if folder is not None else ():
+            if not (folder / value).is_file() and (beside / value).is_file():
+                element.set(name, os.path.relpath(beside / value, folder))
+
+
+def _files(element: etree._Element) -> list[tuple[str, str]]:
+    """The attributes that name a file (a cube texture has six) and what they name."""
+    return [(str(name), str(value)) for name, value in element.attrib.items() if str(name).startswith("file")]
 
 
 def _in_world(element: etree._Element) -> bool:
@@ -115,15 +168,31 @@ def _repoint_assets(root: etree._Element, source: Path, out: Path) -> None:
     if here == Path("."):
         return
     compilers = list(root.iter("compiler"))
-    given = [(e, name) for e in compilers for name in ASSET_FOLDERS if e.get(name) is not None]
-    for element, name in given:
-        element.set(name, str(here / str(element.get(name))))
-    if not given and any(e.get("file") for e in root.iter("mesh", "texture", "hfield", "skin", "flexcomp")):
-        if not compilers:
-            compilers = [etree.Element("compiler")]
-            compilers[0].tail = "\n  "
-            root.insert(0, compilers[0])
-        compilers[0].set("assetdir", str(here))
+    given = {name for e in compilers for name in ("assetdir", *ASSET_FOLDERS) if e.get(name) is not None}
+    for element in compilers:
+        for name in given:
+            if element.get(name) is not None:
+                element.set(name, str(here / str(element.get(name))))
+    for name, tags in ASSET_FOLDERS.items():
+        if not given & {name, "assetdir"} and any(_files(e) for e in root.iter(*tags)):
+            if not compilers:
+                compilers = [etree.Element("compiler")]
+                compilers[0].tail = "\n  "
+                root.insert(0, compilers[0])
+            compilers[0].set(name, str(here))
+    for element in root.iter("model"):
+        for name, value in _files(element):
+            element.set(name, str(here / value))
+
+
+def _actuator_element(root: etree._Element, plant: Plant, j: int) -> etree._Element:
+    """The element that became the actuator of joint j, by the joint that it names and its own name."""
+    name = plant.model.actuator(int(plant.actuator[j])).name
+    elements = [e for section in root.iter("actuator") for e in section if isinstance(e.tag, str)]
+    named = [e for e in elements if e.get("joint") == plant.joints[j] and (e.get("name") or "") == name]
+    if len(named) != 1:
+        raise _not_written_out(f"the actuator of joint {plant.joints[j]!r}", plant.path)
+    return named[0]
 
 
 def _number(value: float) -> str:
@@ -157,10 +226,12 @@ def _write_joint(element: etree._Element, plant: Plant, variant: mujoco.MjModel,
             element.set("springref", _number(variant.qpos_spring[adr] * scale))
 
 
-def _write_actuator(element: etree._Element, plant: Plant, variant: mujoco.MjModel, j: int) -> None:
+def _write_actuator(element: etree._Element, plant: Plant, variant: mujoco.MjModel, j: int) -> bool:
+    """Set what differs; True where the velocity gain must yet be given as a damping ratio (`_set_damping_ratios`)."""
     given, i = plant.model, plant.actuator[j]
     before, after = given.actuator_biasprm[i], variant.actuator_biasprm[i]
     stiffness, velocity = _differ(before[1], after[1]), _differ(before[2], after[2])
+    as_ratio = False
     if element.tag == "general":
         if stiffness or velocity:
             element.set("biasprm", _numbers(after[:3]))
@@ -168,12 +239,37 @@ def _write_actuator(element: etree._Element, plant: Plant, variant: mujoco.MjMod
     else:
         if stiffness:
             element.set("kp", _number(-after[1]))
-        if velocity or (stiffness and element.get("dampratio") is not None):
-            # A damping ratio would follow the new stiffness; what was identified is the gain itself.
-            element.attrib.pop("dampratio", "")
+        # A damping ratio would follow the new stiffness and inertia; what was identified is the gain itself.
+        own = element.attrib.pop("dampratio", None) is not None
+        as_ratio = element.get("kv") is None and _ratio_by_default(element)
+        if (velocity or own) and not as_ratio:
             element.set("kv", _number(-after[2]))
     if any(_differ(a, b) for a, b in zip(given.actuator_forcerange[i], variant.actuator_forcerange[i], strict=True)):
         element.set("forcerange", _numbers(variant.actuator_forcerange[i]))
+    return as_ratio
+
+
+def _ratio_by_default(element: etree._Element) -> bool:
+    """Whether a default class may give this actuator a damping ratio, beside which MuJoCo accepts no kv."""
+    tree = element.getroottree()
+    return any(e.get("dampratio") for default in tree.iter("default") for e in default.iter(str(element.tag)))
+
+
+def _set_damping_ratios(
+    elements: Mapping[int, etree._Element], trial: Path, plant: Plant, variant: mujoco.MjModel
+) -> None:
+    """Give these actuators the damping ratios that come to the variant's velocity gains (the gain is proportional to it)."""
+    compiled = load_plant(trial, plant.joints, Setup.FLOOR)
+    for j, element in elements.items():
+        now = -float(compiled.model.actuator_biasprm[compiled.actuator[j], 2])
+        wanted = -float(variant.actuator_biasprm[plant.actuator[j], 2])
+        if not math.isclose(now, wanted, rel_tol=1e-9):
+            # Its class's ratio counts where it has none of its own; which that is, a ratio of 1 tells.
+            element.set("dampratio", "1")
+            write_text(trial, _text(element.getroottree()))
+            again = load_plant(trial, plant.joints, Setup.FLOOR)
+            of_one = -float(again.model.actuator_biasprm[again.actuator[j], 2])
+            element.set("dampratio", _number(wanted / of_one))
 
 
 def _write_motor(element: etree._Element, variant: mujoco.MjModel, i: int) -> None:
@@ -250,7 +346,6 @@ def _check(out: Path, plant: Plant, variant: mujoco.MjModel) -> None:
         ]
         for got, wanted in pairs:
             if not np.allclose(got, wanted, rtol=1e-8, atol=1e-12):
-                out.unlink(missing_ok=True)
                 raise BadInput(
                     f"the values of joint {joint!r} do not survive in this file's structure",
                     where=plant.path,

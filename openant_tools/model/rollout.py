@@ -84,6 +84,8 @@ class _Segment:
     fraction: Array  # (rows,) of the step after it
     row: Ints  # (rows,) index among the rows of all runs
     torque_off: dict[int, Bools]  # step → joints off from there on; always has 0
+    start: float  # s, time of its first row
+    commands: _Staircase
 
 
 class Rollouts:
@@ -121,8 +123,14 @@ class Rollouts:
         """Simulation steps of one variant."""
         return sum(len(segment.control) for segment in self._segments)
 
-    def __call__(self, models: Sequence[mujoco.MjModel] | None = None) -> Trajectories:
-        """Roll out every run on each of `models` (default: the plant's own)."""
+    def __call__(self, models: Sequence[mujoco.MjModel] | None = None, delays: Array | None = None) -> Trajectories:
+        """Roll out every run on each of `models` (default: the plant's own).
+
+        Args:
+            models: the variants.
+            delays: (variants, joints) s by which each joint's commands act later than they were sent, on top of what the
+                model's own actuators delay. Continuous, where MuJoCo's buffers know nothing between none and one step.
+        """
         variants = [self._lean(model) for model in (models or [self.plant.model])]
         segments, nv = self._segments, len(variants)
         plant = self.plant
@@ -152,6 +160,8 @@ class Rollouts:
                     [self._limp(limp, variants[v], v, off[s]) for s in range(len(segments)) for v in range(nv)]
                 )
             control = np.repeat([segment.control[begin:end] for segment in segments[:active]], nv, axis=0)
+            if delays is not None:
+                self._delay(control.reshape(active, nv, end - begin, -1), delays, begin)
             record = batch.rollout(
                 end - begin, control, record=("qpos", "qvel"), ids=np.arange(active * nv, dtype=np.int32)
             )
@@ -168,6 +178,16 @@ class Rollouts:
                 vel[:, segment.row[here]] = qvel[s][:, k] * (1 - f) + qvel[s][:, k + 1] * f
             last_pos[:active], last_vel[:active] = qpos[:, :, -1], qvel[:, :, -1]
         return Trajectories(pos, vel, self.rows)
+
+    def _delay(self, control: Array, delays: Array, begin: int) -> None:
+        """Shift the commands in `control` (segments, variants, steps, nu), which starts at step `begin`, in place."""
+        h = self.plant.timestep
+        for j in range(len(self.plant.joints)):
+            for delay in np.unique(delays[:, j][delays[:, j] != 0]):
+                late = np.flatnonzero(delays[:, j] == delay)
+                for s, segment in enumerate(self._segments[: len(control)]):
+                    edges = segment.start + h * np.arange(begin, begin + control.shape[2] + 1) - delay
+                    control[s, late, :, self.plant.ctrl[j]] = segment.commands.column(j).mean(edges)[:, 0]
 
     @property
     def _qpos(self) -> Ints:
@@ -281,6 +301,8 @@ def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | 
                 fraction=np.clip(at - step, 0.0, 1.0),
                 row=offset + rows,
                 torque_off=off,
+                start=float(t[first]),
+                commands=commands,
             )
         )
     return segments
@@ -339,6 +361,9 @@ class _Staircase:
     def of(cls, times: Array, values: Array) -> _Staircase:
         order = np.argsort(times, kind="stable")
         return cls(times[order], values[order])
+
+    def column(self, k: int) -> _Staircase:
+        return _Staircase(self.times, self.values[:, k : k + 1])
 
     def _index(self, times: Array) -> Ints:
         return np.maximum(np.searchsorted(self.times, times, side="right") - 1, 0)

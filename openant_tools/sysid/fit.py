@@ -14,16 +14,15 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from openant_tools.model.gap import HORIZON_S, Gap, gap
 from openant_tools.model.plant import Plant, Setup
-from openant_tools.model.rollout import Rollouts
+from openant_tools.model.rollout import Rollouts, Trajectories
 from openant_tools.recording.run import Run
-from openant_tools.sysid.parameter import KINDS, Parameter, apply
+from openant_tools.sysid.parameter import KINDS, Parameter, apply, delays
 
 __all__ = ["Dataset", "Estimate", "Problem", "autocorrelation_time"]
 
@@ -70,6 +69,14 @@ class Dataset:
     def fitted(self) -> Rollouts:
         """What the fit compares: full runs on the stand; on the floor, where contact makes long runs chaotic, the horizon."""
         return self.full if self.plant.setup is Setup.STAND else self.horizon
+
+    def simulate(
+        self, parameters: Sequence[Parameter], us: Sequence[Array], rollouts: Rollouts | None = None
+    ) -> Trajectories:
+        """What the model would have done with the parameters at each u, (parameters,), by default as the fit compares."""
+        models = [apply(self.plant, parameters, u) for u in us]
+        late = np.array([delays(self.plant, parameters, u) for u in us])
+        return (rollouts or self.fitted)(models, late if late.any() else None)
 
 
 @dataclass
@@ -159,14 +166,11 @@ class Problem:
         self.low, self.high = np.array(low), np.array(high)
         self.centre = np.array([parameter.centre for parameter in self.parameters])
 
-    def models(self, data: Dataset, us: Sequence[Array]) -> list[mujoco.MjModel]:
-        return [apply(data.plant, self.parameters, u) for u in us]
-
     def residual(self, us: Sequence[Array]) -> Array:
         """(variants, rows, joints) rad, measured minus simulated; NaN where something is missing."""
         self.evaluations += len(us)
         return np.concatenate(
-            [data.measured[None] - data.fitted(self.models(data, us)).pos for data in self.datasets], axis=1
+            [data.measured[None] - data.simulate(self.parameters, us).pos for data in self.datasets], axis=1
         )
 
     def gaps(self, u: Array, datasets: Sequence[Dataset] | None = None) -> Gap:
@@ -225,7 +229,11 @@ class Problem:
         self._reweigh(self.residual([u])[0])
         jacobian = self._jacobian(u)[: -len(u)]
         covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(len(u))), np.float64)
-        timing = covariance @ (jacobian.T @ self._timing(u))
+        # A parameter at its bound cannot give way to what the stamps leave open; the others must hold all of it.
+        free = (u > self.low + 1e-6) & (u < self.high - 1e-6)
+        moved = jacobian[:, free]
+        timing = np.zeros((len(u), len(self.noise)))
+        timing[free] = np.linalg.solve(moved.T @ moved + np.eye(int(free.sum())), moved.T @ self._timing(u))
         return Estimate(
             parameters=tuple(self.parameters),
             u=u,
@@ -251,7 +259,7 @@ class Problem:
         """
         columns = []
         for data in self.datasets:
-            vel = data.fitted(self.models(data, [u])).vel[0]
+            vel = data.simulate(self.parameters, [u]).vel[0]
             late = np.full(vel.shape, TIMING_STD_S)
             for run, part in zip(data.runs, data.fitted.rows, strict=True):
                 for j, joint in enumerate(data.plant.joints):
@@ -350,10 +358,7 @@ def gaps(datasets: Sequence[Dataset], parameters: Sequence[Parameter], us: Seque
     measured = np.concatenate([data.measured for data in datasets])
     simulated = []
     for horizon in (True, False):
-        per_dataset = [
-            (data.horizon if horizon else data.full)([apply(data.plant, parameters, u) for u in us]).pos
-            for data in datasets
-        ]
+        per_dataset = [data.simulate(parameters, us, data.horizon if horizon else data.full).pos for data in datasets]
         simulated.append(np.concatenate(per_dataset, axis=1))
     short, long = simulated
     return [Gap(gap(measured, short[v]), gap(measured, long[v])) for v in range(len(us))]

@@ -7,7 +7,7 @@ its prior; whatever does not beat the given model on held-out runs, at the short
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from openant_tools.model.gap import HORIZON_S, Gap, gap, share_closed
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.recording.run import Run
 from openant_tools.sysid.fit import Dataset, Estimate, Problem, gaps, sensor_floor
-from openant_tools.sysid.parameter import KINDS, Parameter, apply, choose
+from openant_tools.sysid.parameter import ACTION_DELAY, KINDS, Parameter, apply, buffered, choose, delays
 
 __all__ = ["DEFAULT_KINDS", "Identification", "Value", "calibrated", "identify"]
 
@@ -36,6 +36,7 @@ DEFAULT_KINDS = (
     "coulomb_friction",
     "zero_offset",
     "electrical_damping",
+    ACTION_DELAY,
 )
 
 #: share of the posterior precision that must come from the data for a value to be called identifiable: the interval is
@@ -288,14 +289,9 @@ def _datasets(runs: Sequence[Run], model: Path, joints: Sequence[str], kinds: Se
     for run in runs:
         groups.setdefault((_own_model(run) or model, setup_of(run.facts.setup)), []).append(run)
     return [
-        Dataset.prepare(load_plant(path, joints, setup, **_forms(kinds)), members)
+        Dataset.prepare(load_plant(path, joints, setup, electrical="electrical_damping" in kinds), members)
         for (path, setup), members in groups.items()
     ]
-
-
-def _forms(kinds: Collection[str]) -> dict[str, bool]:
-    """The forms that a model must take for these kinds of parameters to act in it."""
-    return {"electrical": "electrical_damping" in kinds, "delayed": "action_delay" in kinds}
 
 
 def _own_model(run: Run) -> Path | None:
@@ -483,5 +479,14 @@ def _notes(estimate: Estimate, joints: Sequence[str], runs: Sequence[Run]) -> tu
 def calibrated(identification: Identification, setup: Setup = Setup.FLOOR) -> mujoco.MjModel:
     """The identified model. Its servos become DC motors only where a part of the damping was found to be electrical."""
     moved = {p.kind for p, u in zip(identification.parameters, identification.u, strict=True) if u != 0}
-    plant = load_plant(identification.model, identification.joints, setup, **_forms(moved))
-    return apply(plant, identification.parameters, identification.u)
+    plant = load_plant(
+        identification.model,
+        identification.joints,
+        setup,
+        electrical="electrical_damping" in moved,
+        delayed=ACTION_DELAY in moved,
+    )
+    model = apply(plant, identification.parameters, identification.u)
+    if ACTION_DELAY in moved:
+        buffered(plant, model, delays(plant, identification.parameters, identification.u))
+    return model

@@ -29,7 +29,7 @@ from openant_tools.model.plant import (
     is_motor,
 )
 
-__all__ = ["KINDS", "Kind", "Parameter", "apply"]
+__all__ = ["ACTION_DELAY", "KINDS", "Kind", "Parameter", "apply", "buffered", "choose", "delays"]
 
 Array = NDArray[np.float64]
 
@@ -190,10 +190,10 @@ def _read_delay(model: mujoco.MjModel, plant: Plant, j: int) -> float:
 
 
 def _write_delay(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
-    # The newest command in a buffer is one step old, so that MuJoCo makes a whole step of any delay between none and one.
-    model.actuator_delay[plant.actuator[j]] = value if value > plant.timestep / 2 else 0.0
+    """Nothing in the model: a rollout takes delays beside it (`delays`), a written model in its buffers (`buffered`)."""
 
 
+ACTION_DELAY = "action_delay"
 #: s; a loop of 50 Hz may act a period late
 DELAY_STD_S = 0.02
 #: What brakes a DC servo beyond its friction is back-EMF, which vanishes with the torque: a share near 1, this uncertain.
@@ -325,6 +325,26 @@ def apply(plant: Plant, parameters: Sequence[Parameter], u: Array) -> mujoco.MjM
     if constants:
         mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+def delays(plant: Plant, parameters: Sequence[Parameter], u: Array) -> Array:
+    """(joints,) s by which the parameters at u let commands act later than the given model does."""
+    out = np.zeros(len(plant.joints))
+    for parameter, value in zip(parameters, u, strict=True):
+        if parameter.kind == ACTION_DELAY:
+            out[list(parameter.joints)] = parameter.std * value
+    # A microsecond moves nothing; shifting commands by it would cost as much as by a millisecond.
+    return np.where(np.abs(out) > 1e-6, out, 0.0)
+
+
+def buffered(plant: Plant, model: mujoco.MjModel, late: Array) -> None:
+    """Put delays (joints,) into the buffers of a model loaded with `delayed=True`.
+
+    The newest command in a buffer is one step old, so that MuJoCo makes a whole step of any delay between none and one.
+    """
+    for j, delay in enumerate(late):
+        total = float(plant.model.actuator_delay[plant.actuator[j]]) + float(delay)
+        model.actuator_delay[plant.actuator[j]] = total if total > plant.timestep / 2 else 0.0
 
 
 def choose(

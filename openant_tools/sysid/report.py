@@ -16,7 +16,6 @@ from openant_tools.report import Details, Figure, KeyFigure, Mark, Part, Report,
 from openant_tools.report.parts import Tone
 from openant_tools.sysid.fit import Dataset
 from openant_tools.sysid.identify import Identification, Value
-from openant_tools.sysid.parameter import apply
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -127,8 +126,7 @@ def _error_against_horizon(result: Identification) -> MatplotlibFigure:
     for horizon in [*horizons, None]:
         measured, before, after = [], [], []
         for data in result.held_out:
-            model = apply(data.plant, result.parameters, result.u)
-            pos = Rollouts(data.plant, data.runs, horizon)([data.plant.model, model]).pos
+            pos = _simulated(result, data, Rollouts(data.plant, data.runs, horizon))
             measured.append(data.measured)
             before.append(pos[0])
             after.append(pos[1])
@@ -148,10 +146,14 @@ def _error_against_horizon(result: Identification) -> MatplotlibFigure:
     return figure
 
 
+def _simulated(result: Identification, data: Dataset, rollouts: Rollouts) -> Array:
+    """(2, rows, joints): the given model and the calibrated one."""
+    return data.simulate(result.parameters, [np.zeros(len(result.parameters)), result.u], rollouts).pos
+
+
 def _joints(result: Identification, data: Dataset) -> Sequence[Part]:
     """For each joint, the worst moment of the given model: command, measured, and both simulations, with the error below."""
-    model = apply(data.plant, result.parameters, result.u)
-    pos = data.full([data.plant.model, model]).pos
+    pos = _simulated(result, data, data.full)
     parts: list[Part] = []
     for j, joint in enumerate(data.plant.joints):
         run, rows = _worst(data, data.measured[:, j] - pos[0, :, j])
