@@ -217,7 +217,14 @@ class Problem:
                 self._reweigh(self.residual([u])[0], driven_only)
                 before = u
                 solution = least_squares(
-                    self._vector, u, self._jacobian, bounds=(self.low, self.high), xtol=1e-4, ftol=1e-5, max_nfev=25
+                    self._vector,
+                    u,
+                    self._jacobian,
+                    bounds=(self.low, self.high),
+                    method="dogbox",
+                    xtol=1e-4,
+                    ftol=1e-4,
+                    max_nfev=25,
                 )
                 u, converged = solution.x, bool(solution.success)
                 if driven_only:
