@@ -143,8 +143,8 @@ def _name_from_main(root: etree._Element, main: Path, taken_in: Sequence[tuple[e
         given = [e.get(which) for which in ("assetdir", name) for e in root.iter("compiler") if e.get(which)]
         folders |= dict.fromkeys(tags, main / str(given[-1]) if given else main)
     for element, beside in taken_in:
-        folder = folders.get(str(element.tag))
-        for name, value in _files(element) if folder is not None else ():
+        folder = folders.get(str(element.tag), main)
+        for name, value in _files(element):
             if not (folder / value).is_file() and (beside / value).is_file():
                 element.set(name, os.path.relpath(beside / value, folder))
 
@@ -240,7 +240,7 @@ def _write_actuator(element: etree._Element, plant: Plant, variant: mujoco.MjMod
         if stiffness:
             element.set("kp", _number(-after[1]))
         # A damping ratio would follow the new stiffness and inertia; what was identified is the gain itself.
-        own = element.attrib.pop("dampratio", None) is not None
+        own = element.attrib.pop("dampratio", "") != ""
         as_ratio = element.get("kv") is None and _ratio_by_default(element)
         if (velocity or own) and not as_ratio:
             element.set("kv", _number(-after[2]))
