@@ -123,7 +123,7 @@ class Demo:
     """
 
     folder: Path
-    steps: int = 3500
+    steps: int = 6000
     record_s: float | None = None
     eval_s: float = 60.0
     learns: bool = importlib.util.find_spec("torch") is not None

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +21,7 @@ from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
-from openant_tools.report import KeyFigure, Mark, Report, plots
+from openant_tools.report import KeyFigure, Mark, Report, Table, Text, plots
 from openant_tools.report.parts import Tone
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.registers import PWM_FULL
@@ -35,12 +37,13 @@ Array = NDArray[np.float64]
 #: s, shown around the moment at which the nominal model is worst
 WINDOW_S = 2.0
 
-KIND_WORDS = {
-    "stiffness": "stiffness",
-    "damping": "damping",
-    "armature": "armature",
-    "coulomb_friction": "friction",
-    "zero_offset": "zero",
+#: kind of parameter → its name and unit on an axis; all but zeros are shown relative to the data sheet
+KINDS = {
+    "stiffness": ("stiffness", "1"),
+    "damping": ("damping", "1"),
+    "armature": ("rotor inertia", "1"),
+    "coulomb_friction": ("friction", "1"),
+    "zero_offset": ("zero", "°"),
 }
 
 
@@ -62,6 +65,14 @@ class Recovered:
     low: float
     high: float
     verdict: str
+
+    @property
+    def kind(self) -> str:
+        return self.name.partition(".")[0]
+
+    @property
+    def joint(self) -> str:
+        return self.name.partition(".")[2]
 
     @property
     def determined(self) -> bool:
@@ -117,7 +128,7 @@ def write_report(demo: Demo) -> dict[str, Any]:
     fit = json.loads((demo.fit / "fit.json").read_text(encoding="utf-8"))
     rows = compare(fit, truth(demo.scenario))
     run = read_run(demo.held_out)
-    worst = _worst_moment(run, demo.nominal, demo.fit / "calibrated.xml")
+    moment = _worst_moment(run, demo.nominal, demo.fit / "calibrated.xml")
     curve = _curve(demo.training / "learning_curve.csv") if demo.learns else None
     reward = _reward(demo) if demo.learns else None
     picture, drawn_by = robot_picture(demo.fit / "calibrated.xml")
@@ -155,29 +166,39 @@ def write_report(demo: Demo) -> dict[str, Any]:
         keys.append(KeyFigure("learned to walk at", f"{100 * reward:.1f} cm/s", _minutes(curve)))
     report.key_figures(*keys)
     if picture is not None:
-        report.picture(picture, f"The calibrated model, at its home pose ({drawn_by}).", "An Open Ant on its four legs")
+        report.picture(picture, f"The calibrated model at its home pose, {drawn_by}.", "An Open Ant on its four legs")
         write_bytes(demo.pictures / "robot.png", picture)
+    else:
+        report.text(drawn_by)
     report.section("Measured against simulated")
-    gap_figure = _gap_figure(worst)
     report.figure(
-        gap_figure, f"The held-out motion around the moment at which the data sheets' model is worst: {worst.joint}."
+        _keep(demo, "gap", _gap_figure(moment)),
+        f"The held-out motion around the moment at which the data sheets' model is worst, {moment.joint}.",
     )
-    write_bytes(demo.pictures / "gap.png", plots.as_png(gap_figure))
-    report.section("What was found, and what is true").table(
-        ["parameter", "data sheet", "true", "found", "95 % interval", "unit", "inside"], [_row(row) for row in rows]
+    report.section("What was found, and what is true").figure(
+        _keep(demo, "settings", _settings_figure(rows)),
+        "Every setting of the virtual robot, relative to its data sheet: what is true, and the fit's 95 % interval.",
     )
-    report.text(_explained(rows))
+    columns = ["parameter", "data sheet", "true", "found", "from", "to", "unit", "inside"]
+    report.details("All values", Table(columns, [_row(row) for row in rows]), Text(_explained(rows)))
     if curve is not None:
-        report.section("Learning")
-        learning = _learning_figure(curve)
-        report.figure(learning, "Average reward of the last 120 s, in the simulation that was calibrated.")
-        write_bytes(demo.pictures / "learning.png", plots.as_png(learning))
+        report.section("Learning").figure(
+            _keep(demo, "learning", _learning_figure(curve)),
+            "Average reward of the last 120 s while it trained, in the simulation that was calibrated.",
+        )
         strip = demo.pictures / "walk.png"
         if strip.exists():
             report.picture(strip, "What it learned, a picture a step.", "The robot walking")
+    _keep(demo, "overview", _overview_figure(picture, moment, curve))
     report.section("The same by hand").code("\n".join(line for stage in demo.stages() for line in stage.command_lines))
     report.write(demo.report)
     return figures
+
+
+def _keep(demo: Demo, name: str, figure: MatplotlibFigure) -> MatplotlibFigure:
+    """The same figure, also as a PNG among the demo's pictures."""
+    write_bytes(demo.pictures / f"{name}.png", plots.as_png(figure))
+    return figure
 
 
 def _subtitle(demo: Demo) -> str:
@@ -251,11 +272,69 @@ def _draw_gap(above: Any, below: Any, moment: _Moment) -> None:
 def _learning_figure(curve: Array) -> MatplotlibFigure:
     figure: MatplotlibFigure
     figure, axes = plots.figure(height=2.6)
+    _draw_learning(axes, curve)
+    return figure
+
+
+def _draw_learning(axes: Any, curve: Array) -> None:
     with plots.style():
         axes.axhline(0, color=plots.INK, linewidth=0.6)
         axes.plot(curve[:, 1] / 60, 100 * curve[:, 2], color=plots.BLUE)
         axes.set_xlabel(plots.axis_label("robot time", "min"))
         axes.set_ylabel(plots.axis_label("average reward", "cm/s"))
+
+
+def _settings_figure(rows: Sequence[Recovered]) -> MatplotlibFigure:
+    """A panel a kind, a line a joint: the interval of the fit, and the truth."""
+    figure: MatplotlibFigure
+    kinds = [kind for kind in KINDS if any(row.kind == kind for row in rows)]
+    figure, panels = plots.figure(1, len(kinds), height=3.0, sharey=True, squeeze=False)
+    joints = list(dict.fromkeys(row.joint for row in rows))
+    for axes, kind in zip(panels[0], kinds, strict=True):
+        words, unit = KINDS[kind]
+        with plots.style():
+            for row in (row for row in rows if row.kind == kind):
+                scale = math.degrees(1) if kind == "zero_offset" else 1 / row.given
+                y = joints.index(row.joint)
+                colour = plots.BLUE if row.determined else plots.SKY
+                axes.plot([scale * row.low, scale * row.high], [y, y], color=colour, linewidth=5, alpha=0.45,
+                          solid_capstyle="butt", label="found, 95 %" if y == 0 else None)  # fmt: skip
+                axes.plot(scale * row.value, y, "|", color=colour, markersize=9)
+                axes.plot(
+                    scale * row.truth, y, "x", color=plots.VERMILLION, markersize=6, label="true" if y == 0 else None
+                )
+            axes.axvline(0 if kind == "zero_offset" else 1, color=plots.INK, linewidth=0.8, linestyle=":",
+                         label="data sheet")  # fmt: skip
+            axes.set_yticks(range(len(joints)), joints)
+            axes.set_xlabel(plots.axis_label(words, unit))
+    with plots.style():
+        figure.legend(*panels[0][-1].get_legend_handles_labels(), loc="outside upper right", ncols=3)
+    panels[0][0].invert_yaxis()
+    return figure
+
+
+def _overview_figure(picture: bytes | None, moment: _Moment, curve: Array | None) -> MatplotlibFigure:
+    """The demo in one picture: the robot, measured against simulated, learning."""
+    from matplotlib.figure import Figure
+    from matplotlib.image import imread
+
+    figure = Figure(figsize=(11.0, 4.2))
+    with plots.style():
+        figure.set_layout_engine("constrained")
+        left, right = np.ravel(np.asarray(figure.subfigures(1, 2, width_ratios=(1.0, 1.35))))
+        if curve is None:
+            axes = [left.subplots()]
+        else:
+            axes = list(left.subplots(2, 1, height_ratios=(1.6, 1.0)))
+            _draw_learning(axes[1], curve)
+            axes[1].set_title("… and learned in its simulation")
+        axes[0].axis("off")
+        if picture is not None:
+            axes[0].imshow(imread(io.BytesIO(picture)))
+        above, below = right.subplots(2, 1, sharex=True)
+        above.set_title("A motion it was not fitted to")
+    _draw_gap(above, below, moment)
+    plots.legend(above, loc="upper center", bbox_to_anchor=(0.5, -0.02))
     return figure
 
 
@@ -279,10 +358,8 @@ def _reward(demo: Demo) -> float:
 def _row(row: Recovered) -> Sequence[object]:
     tone: Tone = "good" if row.inside else "bad"
     mark = Mark("yes" if row.inside else "no", tone) if row.determined else Mark(row.verdict)
-    return [
-        row.name, f"{row.given:.4g}", f"{row.truth:.4g}", f"{row.value:.4g}", f"{row.low:.4g} … {row.high:.4g}",
-        row.unit, mark,
-    ]  # fmt: skip
+    numbers = (row.given, row.truth, row.value, row.low, row.high)
+    return [row.name, *(f"{number:.4g}" for number in numbers), row.unit, mark]
 
 
 def _explained(rows: Sequence[Recovered]) -> str:

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 __all__ = ["draw", "render", "robot_picture"]
 
+Array = NDArray[np.float64]
+
 #: where the camera stands, as the portraits of the nominal model have it
-AZIMUTH_DEG, ELEVATION_DEG, DISTANCE_M = 148.0, -24.0, 0.78
+AZIMUTH_DEG, ELEVATION_DEG, DISTANCE_M = 158.0, -31.0, 0.74
 WIDTH, HEIGHT = 960, 600
+#: around a drawn robot
+MARGIN_M = 0.05
 
 
 def robot_picture(model_path: Path) -> tuple[bytes | None, str]:
@@ -64,42 +71,67 @@ def render(model: mujoco.MjModel, data: mujoco.MjData) -> bytes:
 
 
 def draw(model: mujoco.MjModel, data: mujoco.MjData) -> bytes:
-    """A PNG by matplotlib: capsules as thick lines, spheres as balls, the nearest last."""
+    """A PNG by matplotlib: capsules and cylinders as thick lines, spheres as discs, the nearest last."""
     from matplotlib.figure import Figure
+    from matplotlib.patches import Circle
 
+    right, up, forward = _camera_axes()
+    pieces = sorted(_pieces(model, data), key=lambda piece: -float(piece.ends.mean(axis=0) @ forward))
+    if not pieces:
+        raise ValueError("the model has no capsules or spheres to draw")
+    across = np.array([piece.ends @ right for piece in pieces])
+    high = np.array([piece.ends @ up for piece in pieces])
     figure = Figure(figsize=(WIDTH / 150, HEIGHT / 150))
     axes: Any = figure.add_axes((0, 0, 1, 1))
-    right, up, forward = _camera_axes()
-    places = []
-    for geom in range(model.ngeom):
-        kind = model.geom_type[geom]
-        if kind not in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE):
-            continue
-        centre = data.geom_xpos[geom]
-        along = data.geom_xmat[geom].reshape(3, 3)[:, 2]
-        half = 0.0 if kind == mujoco.mjtGeom.mjGEOM_SPHERE else float(model.geom_size[geom, 1])
-        ends = np.array([centre - half * along, centre + half * along])
-        material = int(model.geom_matid[geom])
-        rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
-        places.append((float(centre @ forward), ends @ right, ends @ up, float(model.geom_size[geom, 0]), rgba[:3]))
     axes.set_aspect("equal")
     axes.axis("off")
-    across = np.concatenate([x for _, x, _, _, _ in places])
-    high = np.concatenate([z for _, _, z, _, _ in places])
-    axes.set_xlim(across.min() - 0.05, across.max() + 0.05)
-    axes.set_ylim(high.min() - 0.05, high.max() + 0.05)
-    # Line widths are in points: how many of them a metre is here.
+    axes.set_xlim(across.min() - MARGIN_M, across.max() + MARGIN_M)
+    axes.set_ylim(high.min() - MARGIN_M, high.max() + MARGIN_M)
+    # Widths of lines are in points: how many of them a metre is here.
     points = min(
-        72 * figure.get_figwidth() / (across.max() - across.min() + 0.1),
-        72 * figure.get_figheight() / (high.max() - high.min() + 0.1),
+        72 * figure.get_figwidth() / (np.ptp(across) + 2 * MARGIN_M),
+        72 * figure.get_figheight() / (np.ptp(high) + 2 * MARGIN_M),
     )
-    for _, x, z, radius, colour in sorted(places, key=lambda place: -place[0]):
-        for grown, shade in ((1.08, 0.6), (1.0, 1.0)):
-            axes.plot(x, z, color=np.clip(shade * colour, 0, 1), linewidth=2 * radius * points * grown,
-                      solid_capstyle="round")  # fmt: skip
+    for order, (piece, x, z) in enumerate(zip(pieces, across, high, strict=True)):
+        for size, shade in ((1.06, 0.6), (1.0, 1.0)):
+            colour = np.clip(shade * piece.rgb, 0.0, 1.0)
+            if piece.round:
+                axes.add_patch(Circle((x[0], z[0]), size * piece.radius, color=colour, linewidth=0, zorder=order))
+            else:
+                width = 2 * piece.radius * points * size
+                axes.plot(x, z, color=colour, linewidth=width, solid_capstyle="round", zorder=order)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=150, facecolor="white")
     return buffer.getvalue()
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A part of the robot: (2, 3) m, its ends; m, its radius; its colour; whether it is a sphere."""
+
+    ends: Array
+    radius: float
+    rgb: Array
+    round: bool
+
+
+def _pieces(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[_Piece]:
+    """The round geoms and the sites that can be seen, in the world as `data` has it."""
+    for i in range(model.ngeom):
+        kind = mujoco.mjtGeom(int(model.geom_type[i]))
+        if kind not in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE):
+            continue
+        is_sphere = kind == mujoco.mjtGeom.mjGEOM_SPHERE
+        half = 0.0 if is_sphere else float(model.geom_size[i, 1])
+        along = half * data.geom_xmat[i].reshape(3, 3)[:, 2]
+        material = int(model.geom_matid[i])
+        rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[i]
+        ends = np.array([data.geom_xpos[i] - along, data.geom_xpos[i] + along])
+        yield _Piece(ends, float(model.geom_size[i, 0]), rgba[:3], is_sphere)
+    for i in range(model.nsite):
+        if model.site_rgba[i, 3] > 0:
+            place = data.site_xpos[i]
+            yield _Piece(np.array([place, place]), float(model.site_size[i, 0]), model.site_rgba[i, :3], True)
 
 
 def _camera_axes() -> Any:

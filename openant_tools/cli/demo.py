@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import time
 from pathlib import Path
@@ -24,8 +25,8 @@ __all__ = ["demo"]
     help="The folder for everything it makes.",
 )
 @click.option(
-    "--steps", type=click.IntRange(min=100), default=3500, show_default=True,
-    help="Length of the training; 3,500 steps are 7 minutes of the robot's time.",
+    "--steps", type=click.IntRange(min=100), default=6000, show_default=True,
+    help="Length of the training; 6,000 steps are 12 minutes of the robot's time.",
 )  # fmt: skip
 @click.option("--fresh", is_flag=True, help="Begin anew, instead of going on where an earlier demo stopped.")
 @json_option
@@ -43,6 +44,7 @@ def demo(robot: Path, steps: int, fresh: bool, json_file: Path | None) -> None:
     from openant_tools.files import write_text
 
     console = Console(stderr=True, highlight=False)
+    say = functools.partial(console.print, soft_wrap=True)
     whole = Demo(robot, steps=steps)
     whole.prepare(fresh=fresh)
     began = time.monotonic()
@@ -51,20 +53,20 @@ def demo(robot: Path, steps: int, fresh: bool, json_file: Path | None) -> None:
         for number, stage in enumerate(stages, 1):
             title = f"[bold]{number}/{len(stages) + 1} {stage.name}[/bold]"
             if whole.stands(stage):
-                console.print(f"{title}: stands already ({escape(str(stage.results[-1]))})")
+                say(f"{title}: stands already ({escape(str(stage.results[-1]))})")
                 continue
-            console.print(f"{title}: {escape(stage.words)}")
+            say(f"{title}: {escape(stage.words)}")
             since = time.monotonic()
-            whole.run(stage, lambda line: console.print(f"  [dim]$ {escape(line)}[/dim]", soft_wrap=True))
-            console.print(f"  [green]done[/green] in {time.monotonic() - since:.0f} s")
+            whole.run(stage, lambda line: say(f"  [dim]$ {escape(line)}[/dim]"))
+            say(f"  [green]done[/green] in {time.monotonic() - since:.0f} s")
         if not whole.learns:
-            console.print("learning is left out: it needs torch (pip install 'openant-tools\\[agents]')")
+            say("learning is left out: it needs torch (pip install 'openant-tools\\[agents]')")
         with console.status("report"):
             figures = write_report(whole)
     except KeyboardInterrupt:
-        console.print(f"stopped; the same command goes on from here (in {escape(str(robot))})")
+        say(f"stopped; the same command goes on from here (in {escape(str(robot))})")
         raise
-    console.print(
+    say(
         f"[bold]{len(stages) + 1}/{len(stages) + 1} report[/bold]: {escape(str(whole.report))}; "
         f"{time.monotonic() - began:.0f} s in all"
     )
