@@ -284,8 +284,35 @@ def _write_motor(element: etree._Element, variant: mujoco.MjModel, i: int) -> No
     element.set("motorconst", _numbers([motor[MOTOR_CONSTANT]] * 2))
     element.set("resistance", _number(motor[RESISTANCE]))
     element.set("controller", _numbers([motor[KP], 0, motor[KD], 0, 0, motor[VMAX]]))
+    # It leaves its class, which was made for the servo, and takes along what else stood there.
     if variant.actuator_ctrllimited[i]:
         element.set("ctrlrange", _numbers(variant.actuator_ctrlrange[i]))
+    samples, interpolation = (int(value) for value in variant.actuator_history[i])
+    if samples:
+        element.set("nsample", str(samples))
+        element.set("interp", ("zoh", "linear", "cubic")[interpolation])
+        element.set("delay", _number(variant.actuator_delay[i]))
+    for name, value in (("armature", variant.actuator_armature[i]), ("damping", variant.actuator_damping[i])):
+        if value:
+            element.set(name, _number(value))
+    if variant.actuator_group[i]:
+        element.set("group", str(variant.actuator_group[i]))
+    main = element.getroottree().getroot().find("default")
+    if main is not None and any(e.get("forcerange") or e.get("forcelimited") for e in main if isinstance(e.tag, str)):
+        element.set("class", _class_without_force_range(main))
+
+
+def _class_without_force_range(main: etree._Element) -> str:
+    """The name of a default class whose motors have no force range, made where it is missing.
+
+    A force range in the file's main defaults reaches every actuator; a DC motor inherits it and has no attribute to say no.
+    """
+    name = "motor_without_force_range"
+    if not any(e.get("class") == name for e in main.iter("default")):
+        made = etree.SubElement(main, "default", {"class": name})
+        etree.SubElement(made, "general", forcelimited="false", forcerange="0 0")
+        made.tail = main.text
+    return name
 
 
 def _write_delay(element: etree._Element, plant: Plant, variant: mujoco.MjModel, j: int) -> None:
@@ -299,7 +326,7 @@ def _write_delay(element: etree._Element, plant: Plant, variant: mujoco.MjModel,
 
 
 #: attributes of a position servo that a DC motor has too, with the same meaning
-_KEPT_BY_MOTOR = ("name", "joint", "group", "user", "nsample", "interp", "delay", "armature", "damping")
+_KEPT_BY_MOTOR = ("name", "joint", "user")
 
 
 def _append_sensors(root: etree._Element, joints: Sequence[str]) -> None:
