@@ -20,7 +20,7 @@ from openant_tools.model.plant import load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
-from openant_tools.sysid.identify import DEFAULT_KINDS, identify
+from openant_tools.sysid.identify import identify
 from openant_tools.sysid.result import write_fit
 
 #: a Feetech STS3215 that turns an SO-101 about its vertical axis, no gravity on it. Stiffness and damping: BAM's M1 figures of
@@ -28,7 +28,7 @@ from openant_tools.sysid.result import write_fit
 #: a guess of 0.02 kg·m² that a fit may book in the armature.
 ROTATION = """
 <mujoco model="so101_rotation">
-  <option timestep="0.002" integrator="implicitfast"/>
+  <option timestep="0.005" integrator="implicitfast"/>
   <worldbody>
     <body name="arm">
       <inertial pos="0 0 0" mass="0.5" diaginertia="0.02 0.02 0.02"/>
@@ -53,14 +53,16 @@ def table(
     work: Path,
     joints: Sequence[str] | None = None,
     kinds: Sequence[str] | None = None,
+    together: bool = True,
 ) -> None:
     print(f"\n### {title}\n")
     print("| held out | given (rad) | others fitted (rad) | ratio | all fitted (rad) | ratio | accepted |")
     print("|---|---|---|---|---|---|---|")
     for model, runs in groups.items():
         out = work / model.stem
-        result = identify(runs, model, joints=joints, kinds=kinds)
-        write_fit(result, out)
+        result = identify(runs, model, joints=joints, kinds=kinds) if together else None
+        if result is not None:
+            write_fit(result, out)
         for run in runs:
             others = [other for other in runs if other is not run]
             begun = time.monotonic()
@@ -68,19 +70,19 @@ def table(
             write_fit(single, out / run.name)
             given = full_error(run, model, joints)
             held_out = full_error(run, out / run.name / "calibrated.xml", joints)
-            together = full_error(run, out / "calibrated.xml", joints)
-            kinds = ", ".join(dict.fromkeys(name.partition(".")[0] for name in single.accepted)) or "nothing"
-            print(
-                f"| {run.name} | {given:.4f} | {held_out:.4f} | {held_out / given:.2f} | {together:.4f} "
-                f"| {together / given:.2f} | {kinds} |",
-                flush=True,
-            )
+            accepted = ", ".join(dict.fromkeys(name.partition(".")[0] for name in single.accepted)) or "nothing"
+            cells = [run.name, f"{given:.4f}", f"{held_out:.4f}", f"{held_out / given:.2f}"]
+            if result is not None:
+                error = full_error(run, out / "calibrated.xml", joints)
+                cells += [f"{error:.4f}", f"{error / given:.2f}"]
+            else:
+                cells += ["", ""]
+            print(f"| {' | '.join([*cells, accepted])} |", flush=True)
             print(f"{run.name}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
-        print(
-            f"| *in turn: {model.stem}* | {result.before.full:.4f} | {result.after.full:.4f} "
-            f"| {result.after.full / result.before.full:.2f} | | | {', '.join(result.accepted) or 'nothing'} |",
-            flush=True,
-        )
+        if result is not None:
+            cells = [f"*in turn: {model.stem}*", f"{result.before.full:.4f}", f"{result.after.full:.4f}"]
+            cells += [f"{result.after.full / result.before.full:.2f}", "", "", ", ".join(result.accepted) or "nothing"]
+            print(f"| {' | '.join(cells)} |", flush=True)
 
 
 def main() -> None:
@@ -105,7 +107,7 @@ def main() -> None:
         runs = [
             run for run in runs if float(run.column("cmd.Rotation").max() - run.column("cmd.Rotation").min()) > 0.05
         ]
-        table("sage-so101, joint Rotation", {model: runs}, options.work, ["Rotation"], [*DEFAULT_KINDS, "action_delay"])
+        table("sage-so101, joint Rotation", {model: runs}, options.work, ["Rotation"], together=False)
 
 
 if __name__ == "__main__":
