@@ -23,6 +23,7 @@ from openant_tools.model.plant import Plant, Setup
 from openant_tools.model.rollout import Rollouts, Trajectories
 from openant_tools.recording.run import Run
 from openant_tools.sysid.parameter import KINDS, Parameter, apply, delays
+from openant_tools.sysid.quality import quantum
 
 __all__ = ["Dataset", "Estimate", "Problem", "autocorrelation_time"]
 
@@ -401,16 +402,5 @@ def _colours(
 
 
 def sensor_floor(runs: Sequence[Run], joints: Sequence[str]) -> Array:
-    """(joints,) rad, the deviation that the encoder's resolution alone gives: quantum / √12, from facts or the data."""
-    out = np.zeros(len(joints))
-    for j, joint in enumerate(joints):
-        quanta = []
-        for run in runs:
-            known = run.facts.resolution.get(f"pos.{joint}", run.facts.resolution.get("pos"))
-            if known is None:
-                steps = np.abs(np.diff(run.column(f"pos.{joint}")))
-                steps = steps[np.isfinite(steps) & (steps > 1e-9)]
-                known = float(steps.min()) if len(steps) else 0.0
-            quanta.append(known)
-        out[j] = max(quanta) / math.sqrt(12)
-    return out
+    """(joints,) rad, the deviation that the encoder's resolution alone gives: its coarsest quantum / √12."""
+    return np.array([max(quantum(run, joint) for run in runs) for joint in joints]) / math.sqrt(12)

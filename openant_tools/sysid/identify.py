@@ -22,6 +22,7 @@ from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.recording.run import Run
 from openant_tools.sysid.fit import Dataset, Estimate, Problem, gaps, sensor_floor
 from openant_tools.sysid.parameter import ACTION_DELAY, KINDS, Parameter, apply, buffered, choose, delays
+from openant_tools.sysid.quality import check_runs
 
 __all__ = ["DEFAULT_KINDS", "Identification", "Value", "calibrated", "identify"]
 
@@ -190,8 +191,7 @@ def identify(
     if same:
         raise BadInput("a held-out run is also fitted", remedy="hold out runs that are not among those to fit")
     joints = _joints_in_common(everything, model, joints)
-    for run in everything:
-        _must_move(run, joints)
+    check_runs(everything, load_plant(model, joints, Setup.FLOOR))
     wanted = _applicable(kinds, load_plant(model, joints, Setup.FLOOR), everything)
 
     def datasets(of: Sequence[Run]) -> list[Dataset]:
@@ -265,22 +265,6 @@ def _joints_in_common(runs: Sequence[Run], model: Path, wanted: Sequence[str] | 
             remedy="give the model of this robot, with joints named as in the runs",
         )
     return common
-
-
-def _must_move(run: Run, joints: Sequence[str]) -> None:
-    """A run in which nothing moves or which ends at once determines nothing; better said before any number is given."""
-    pos = run.signal("pos", joints)
-    span = np.nanmax(pos, axis=0) - np.nanmin(pos, axis=0)
-    where = run.path or run.name
-    if run.duration_s < 2 * HORIZON_S:
-        raise BadInput(f"too short to fit: {run.duration_s:.2f} s", where=where, remedy="record at least a few seconds")
-    still = [joint for joint, moved in zip(joints, span, strict=True) if not moved > 5 * _quantum(run, joint)]
-    if len(still) == len(joints):
-        raise BadInput("nothing moves in this run", where=where, remedy="record a protocol that moves the joints")
-
-
-def _quantum(run: Run, joint: str) -> float:
-    return float(sensor_floor([run], [joint])[0] * math.sqrt(12))
 
 
 def _datasets(runs: Sequence[Run], model: Path, joints: Sequence[str], kinds: Sequence[str]) -> list[Dataset]:

@@ -29,7 +29,7 @@ from openant_tools.sysid.bench.finding import Evidence, Finding
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2
 
 __all__ = [
-    "DIVISORS", "DivisorVerdict", "DutyReading", "Line", "Weighing", "decide_divisor", "fit_line", "lever_arm",
+    "ARM_UNCERTAINTY", "DIVISORS", "DivisorVerdict", "DutyReading", "Line", "Weighing", "decide_divisor", "fit_line", "lever_arm",
     "read_weighings", "scale_line", "servo_line", "stiffness_finding",
 ]  # fmt: skip
 
@@ -37,6 +37,8 @@ Array = NDArray[np.float64]
 
 #: P divisors that are known of Dynamixel servos: the manual's, and BAM's measurement of an XL330.
 DIVISORS = (128.0, 256.0)
+#: relative standard deviation of a lever arm: the paper's leg and the platform's model differ by 7 %
+ARM_UNCERTAINTY = 0.03
 #: readings below which a line has no interval
 LEAST_READINGS = 3
 #: share of the torque or duty limit from which a reading is taken to be cut off by it
@@ -360,16 +362,18 @@ def stiffness_finding(
         if not ok and not measured_error and verdict is not None and not verdict.supported:
             actions.append("Repeat with the robot connected, so that the position error is measured, not assumed.")
     elif servo_stiffness is not None:
-        parameters.append(_stiffness(f"stiffness.{joint}", servo_stiffness, "Present PWM over position error"))
+        # Under a name of its own: its interval leaves out what the data sheet's stall torque may be wrong by.
+        parameters.append(_stiffness(f"stiffness_by_duty.{joint}", servo_stiffness, "Present PWM over position error"))
     left_out = (scale.left_out if scale else 0) + (duty.left_out if duty else 0)
     if left_out:
         words.append(f"{left_out} readings at the torque limit are left out")
     best = parameters[0]
+    by = "" if scale is not None else ", if its stall torque is the data sheet's"
     interval = f"[{best.low:.2f}, {best.high:.2f}]"
     return Finding(
         step=f"stiffness-{joint}",
         ok=ok,
-        what=f"{joint}: {best.value:.2f} N·m/rad {interval}. " + "; ".join(words) + ".",
+        what=f"{joint}: {best.value:.2f} N·m/rad {interval}{by}. " + "; ".join(words) + ".",
         evidence=tuple(evidence),
         next_action=" ".join(dict.fromkeys(actions)),
         command=command,

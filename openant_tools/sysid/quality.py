@@ -1,0 +1,157 @@
+"""What is wrong with a recording, said before any number is given: bad data fit too, and silently.
+
+Each check names the run, the joint and what to do. All are about commands and positions only, so that they hold for any log.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.errors import BadInput
+from openant_tools.model.plant import Plant
+from openant_tools.recording.run import Run
+from openant_tools.robot.registers import PWM_FULL
+from openant_tools.sysid.parameter import KINDS, torque_limit
+
+__all__ = ["check_runs", "quantum"]
+
+Array = NDArray[np.float64]
+
+#: s; below it there is not one motion to its end
+SHORTEST_S = 1.0
+#: a joint moves if it does so by more than this many steps of its encoder
+MOVES_QUANTA = 5
+#: share of the samples at the torque limit beyond which a run shows the limit and nothing else
+SATURATED = 0.9
+#: a position follows a command if they correlate above this, and does not below LOOSE
+FOLLOWS, LOOSE = 0.9, 0.5
+#: rad beyond a joint's range that a soft stop and a zero offset may explain
+BEYOND_STOP_RAD = 0.5
+
+
+def quantum(run: Run, joint: str) -> float:
+    """rad, the encoder's step: from the run's facts, else the smallest change in the data."""
+    known = run.facts.resolution.get(f"pos.{joint}", run.facts.resolution.get("pos"))
+    if known is not None:
+        return known
+    steps = np.abs(np.diff(run.column(f"pos.{joint}")))
+    steps = steps[np.isfinite(steps) & (steps > 1e-9)]
+    return float(steps.min()) if len(steps) else 0.0
+
+
+def check_runs(runs: Sequence[Run], plant: Plant) -> None:
+    """Refuse runs that cannot determine what they are fitted for.
+
+    Raises:
+        BadInput: a run is too short, nothing or one joint does not move, its torque is saturated throughout, its positions
+            are outside the model's range (a wrong unit, zero or model), run against their commands, or belong to another
+            joint's.
+    """
+    for run in runs:
+        where = str(run.path or run.name)
+        if run.duration_s < SHORTEST_S:
+            raise BadInput(
+                f"too short to fit: {run.duration_s:.2f} s", where=where, remedy="record at least a few seconds"
+            )
+        pos, cmd = run.signal("pos", plant.joints), run.signal("cmd", plant.joints)
+        moves = [_span(pos[:, j]) > MOVES_QUANTA * quantum(run, joint) for j, joint in enumerate(plant.joints)]
+        if not any(moves):
+            raise BadInput("nothing moves in this run", where=where, remedy="record a protocol that moves the joints")
+        for problem, remedy in _problems(run, plant, pos, cmd, moves):
+            raise BadInput(problem, where=where, remedy=remedy)
+
+
+def _problems(run: Run, plant: Plant, pos: Array, cmd: Array, moves: Sequence[bool]) -> Iterator[tuple[str, str]]:
+    for j, joint in enumerate(plant.joints):
+        on = run.signal("torque", [joint], default=1.0)[:, 0] != 0
+        commanded = _span(cmd[on, j]) if on.any() else 0.0
+        if commanded > 10 * MOVES_QUANTA * quantum(run, joint) and not moves[j]:
+            yield (
+                f"{joint} is commanded over {commanded:.2f} rad and does not move",
+                f"check its cable, horn and torque, or leave it out with --joint (all others: {_others(plant, joint)})",
+            )
+    for j, joint in enumerate(plant.joints):
+        low, high = _range(plant, j)
+        outside = np.nanmean((pos[:, j] < low - BEYOND_STOP_RAD) | (pos[:, j] > high + BEYOND_STOP_RAD))
+        if outside > 0.5:
+            yield (
+                f"pos.{joint} is around {np.nanmedian(pos[:, j]):.2f} rad, outside the model's range {low:.2f} … {high:.2f}",
+                "check its unit (rad), its zero, and whether this is the model of this robot",
+            )
+    yield from _crossed(plant, pos, cmd, moves)
+    for j, joint in enumerate(plant.joints):
+        share = _saturated(run, plant, j, pos[:, j], cmd[:, j])
+        if share > SATURATED:
+            yield (
+                f"{joint} works at its torque limit in {100 * share:.0f} % of the samples",
+                "record smaller or slower motions: a saturated servo shows its limit and nothing else",
+            )
+
+
+def _span(values: Array) -> float:
+    values = values[np.isfinite(values)]
+    return float(np.ptp(values)) if len(values) else 0.0
+
+
+def _range(plant: Plant, j: int) -> tuple[float, float]:
+    joint = int(plant.model.dof_jntid[plant.dof[j]])
+    if not plant.model.jnt_limited[joint]:
+        return -math.inf, math.inf
+    low, high = plant.model.jnt_range[joint]
+    return float(low), float(high)
+
+
+def _others(plant: Plant, joint: str) -> str:
+    return ", ".join(other for other in plant.joints if other != joint) or "none"
+
+
+def _crossed(plant: Plant, pos: Array, cmd: Array, moves: Sequence[bool]) -> Iterator[tuple[str, str]]:
+    """Positions that follow another joint's command, or their own with the wrong sign.
+
+    Only where the commands themselves can be told apart: joints that are always commanded alike say nothing about it.
+    """
+    names = plant.joints
+    live = [j for j in range(len(names)) if moves[j] and _span(cmd[:, j]) > 0]
+    follows = {(k, j): _correlation(cmd[:, k], pos[:, j]) for k in live for j in live}
+    for j in live:
+        if follows[j, j] < -FOLLOWS:
+            yield (
+                f"{names[j]} moves against its command",
+                "one of cmd and pos has the wrong sign: check the joint's direction",
+            )
+        for k in live:
+            alike = abs(_correlation(cmd[:, j], cmd[:, k])) > LOOSE
+            if k > j and not alike and follows[k, j] > FOLLOWS and follows[j, k] > FOLLOWS and follows[j, j] < LOOSE:
+                yield (
+                    f"pos.{names[j]} follows cmd.{names[k]}, and pos.{names[k]} follows cmd.{names[j]}",
+                    "the two columns, or the two servos' ids, are swapped",
+                )
+
+
+def _correlation(a: Array, b: Array) -> float:
+    ok = np.isfinite(a) & np.isfinite(b)
+    if ok.sum() < 3 or np.std(a[ok]) == 0 or np.std(b[ok]) == 0:
+        return 0.0
+    return float(np.corrcoef(a[ok], b[ok])[0, 1])
+
+
+def _saturated(run: Run, plant: Plant, j: int, pos: Array, cmd: Array) -> float:
+    """The share of samples with torque in which the servo gives all it may: by its duty, else by stiffness times error."""
+    joint = plant.joints[j]
+    on = run.signal("torque", [joint], default=1.0)[:, 0] != 0
+    duty = np.abs(run.column(f"pwm.{joint}"))
+    if np.isfinite(duty).any():
+        counts = run.facts.registers.get(joint, {}).get("pwm_limit")
+        limit = counts / PWM_FULL if counts else 1.0
+        full = duty > 0.98 * limit
+        known = np.isfinite(duty) & on
+    else:
+        torque = KINDS["stiffness"].read(plant.model, plant, j) * np.abs(cmd - pos)
+        full = torque > torque_limit(plant.model, plant, j)
+        known = np.isfinite(torque) & on
+    return float(full[known].mean()) if known.any() else 0.0
+
