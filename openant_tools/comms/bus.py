@@ -366,15 +366,17 @@ class Bus:
 
     def _send(self, packet: bytes) -> float:
         """Write a packet after the gap that the last one needs; returns when its first byte left."""
-        gap = self._quiet_from + self.timing.write_read_gap_s
-        if self.clock.now() < gap:
-            self.clock.sleep_until(gap)
+        if self.timing.write_read_gap_s > 0:
+            gap = self._quiet_from + self.timing.write_read_gap_s
+            if self.clock.now() < gap:
+                self.clock.sleep_until(gap)
         if self._unsettled:
             self._count_stale(self.line.read())
         started = self.request_at = self.clock.now()
         self.line.write(packet)
         # Counted from when the system has the bytes: whoever was held up before that must not cut the gap short.
-        self._quiet_from = self.clock.now() + len(packet) * BITS_PER_BYTE / self.line.baud
+        left = max(self._quiet_from, self.clock.now())
+        self._quiet_from = left + len(packet) * BITS_PER_BYTE / self.line.baud
         return started
 
     def _readable(self) -> bytes:

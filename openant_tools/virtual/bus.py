@@ -39,8 +39,8 @@ INTER_BYTE_S = 1.5e-3
 ADAPTER_BUFFER = 510
 #: of a status without parameters
 _STATUS_BYTES = 11
-#: s, in place of a timer of zero
-SHORTEST_TIMER_S = 1e-6
+#: s, a microframe of USB; an adapter with a shorter timer has none, and hands over each answer as it ends.
+SHORTEST_TIMER_S = 125e-6
 _SYNC = (Inst.SYNC_READ, Inst.BULK_READ)
 _FAST = (Inst.FAST_SYNC_READ, Inst.FAST_BULK_READ)
 _SILENT = (Inst.SYNC_WRITE, Inst.BULK_WRITE)
@@ -370,7 +370,9 @@ class Line:
 
     def _tick_after(self, t: float) -> float:
         """When the adapter hands over what has arrived at t."""
-        period = max(self.settings.latency_timer_s, SHORTEST_TIMER_S)
+        period = self.settings.latency_timer_s
+        if period < SHORTEST_TIMER_S:
+            return max(t, self.settings.stalled_until)
         tick = (math.floor(t / period - self._phase) + 1 + self._phase) * period
         return max(tick, self.settings.stalled_until)
 
@@ -380,18 +382,26 @@ class Line:
             return []
         bursts.sort(key=lambda burst: burst.start)
         data = b"".join(burst.data for burst in bursts)
+        stalled, period = self.settings.stalled_until, self.settings.latency_timer_s
+        spaced = all(b.start >= a.end(byte_s) - byte_s / 2 for a, b in itertools.pairwise(bursts))
+        if spaced and period < SHORTEST_TIMER_S and self.settings.byte_error == 0 and len(data) < ADAPTER_BUFFER:
+            return self._pieces(bursts, byte_s)
         ends = np.concatenate([burst.start + byte_s * np.arange(1, len(burst.data) + 1) for burst in bursts])
-        if any(b.start < a.end(byte_s) - byte_s / 2 for a, b in itertools.pairwise(bursts)):
+        if not spaced:
             data, ends = _collide(data, ends, byte_s)
         if self.settings.byte_error > 0:
             data = self._corrupt(data)
-        # The timer runs free; a byte waits for its next tick, together with all that arrive until then.
-        period, stalled = max(self.settings.latency_timer_s, SHORTEST_TIMER_S), self.settings.stalled_until
-        ticks = np.floor(ends / period - self._phase)
+        if period < SHORTEST_TIMER_S:
+            ticks, at_tick = np.cumsum(np.diff(ends, prepend=ends[0]) > 1.5 * byte_s), None
+        else:
+            # The timer runs free; a byte waits for its next tick, together with all that arrive until then.
+            ticks = np.floor(ends / period - self._phase)
+            at_tick = (ticks + 1 + self._phase) * period
         starts = [0, *(np.flatnonzero(np.diff(ticks)) + 1).tolist()]
-        at = np.maximum((ticks[starts] + 1 + self._phase) * period, stalled).tolist()
+        stops = [*starts[1:], len(data)]
+        at = np.maximum(ends[np.array(stops) - 1] if at_tick is None else at_tick[starts], stalled).tolist()
         replies: list[Reply] = []
-        for start, stop, tick in zip(starts, [*starts[1:], len(data)], at, strict=True):
+        for start, stop, tick in zip(starts, stops, at, strict=True):
             # A full buffer goes out at once.
             while stop - start >= ADAPTER_BUFFER:
                 full = start + ADAPTER_BUFFER
@@ -399,6 +409,19 @@ class Line:
                 start = full
             if start < stop:
                 replies.append(Reply(tick, data[start:stop]))
+        return replies
+
+    def _pieces(self, bursts: list[_Burst], byte_s: float) -> list[Reply]:
+        """Without a timer: what comes in one piece is handed over in one piece."""
+        replies: list[Reply] = []
+        piece, until = bursts[0].data, bursts[0].end(byte_s)
+        for burst in bursts[1:]:
+            if burst.start > until + byte_s / 2:
+                replies.append(Reply(max(until, self.settings.stalled_until), piece))
+                piece = b""
+            piece += burst.data
+            until = burst.end(byte_s)
+        replies.append(Reply(max(until, self.settings.stalled_until), piece))
         return replies
 
 

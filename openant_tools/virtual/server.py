@@ -33,12 +33,13 @@ import heapq
 import json
 import math
 import os
+import select
 import selectors
 import shutil
 import socket
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -56,6 +57,8 @@ __all__ = ["Device", "Server"]
 IDLE_S = 4e-3
 #: s before an answer is due in which the loop spins, since sleeping overshoots by 0.1 ms and more.
 SPIN_S = 2e-4
+#: s after bytes of the bus in which the loop spins: a client that goes as fast as the wire lets it is back by then.
+ALERT_S = 3e-4
 #: A world that falls behind by more lets the time go: after a laptop's sleep it does not run to catch up.
 MAX_LAG_S = 1.0
 SETTLE_TIMEOUT_S = 5.0
@@ -154,7 +157,10 @@ class Server:
         self._lateness, self._empty_at, self._late_s = Lateness(), time.monotonic(), 0.0
         self._outbox: list[tuple[float, int, str, bytes]] = []
         self._count = 0
-        self._selector = selectors.DefaultSelector()
+        #: when bytes of the bus last came or went, s
+        self._busy_at = -math.inf
+        # epoll and poll round a timeout up to whole milliseconds, a whole cycle at 4 Mbaud.
+        self._selector = selectors.SelectSelector()
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.bind(str(self.folder / "control"))
         self._listener.listen()
@@ -218,31 +224,50 @@ class Server:
     def turn(self) -> None:
         """One turn: wait for bytes or the next thing due, and do it."""
         self._watch()
-        timeout = 0.05 if self.stepped else self._pause()
-        sleeps = timeout > 0 and not self.stepped
-        if sleeps:
+        if self.stepped:
+            for key, _ in self._selector.select(0.05):
+                self._ready(key.data)
+            return
+        sleep_s, until = self._pause()
+        ready: Sequence[tuple[selectors.SelectorKey, int]]
+        if sleep_s > 0:
             self._lateness.start()
-        before = time.monotonic()
-        ready = self._selector.select(timeout)
-        after = time.monotonic()
-        self._late_s = after - self._empty_at
-        if ready and sleeps:
-            self._late_s = self._lateness.seconds(after - before, self._late_s)
+            before = time.monotonic()
+            ready = self._selector.select(sleep_s)
+            after = time.monotonic()
+            self._late_s = after - self._empty_at
+            if ready:
+                self._late_s = self._lateness.seconds(after - before, self._late_s)
+        else:
+            after = self._spin(until)
+            ready = self._selector.select(0)
         self._empty_at = after
         for key, _ in ready:
             self._ready(key.data)
-        if not self.stepped:
-            self._keep_time()
+        self._keep_time()
 
-    def _pause(self) -> float:
-        """s to sleep until something is due; spins through the last stretch before an answer."""
-        left = IDLE_S
+    def _pause(self) -> tuple[float, float]:
+        """s to sleep until something is due; or 0, and until when (s) to spin."""
+        now = self.now
+        due = now + IDLE_S
         if self._imu is not None:
-            left = min(left, max(0.0, self._imu.next_event(self.world.now) - self.now))
-        if not self._outbox:
-            return left
-        due = self._outbox[0][0] - self.now
-        return 0.0 if due < SPIN_S else min(left, due - SPIN_S)
+            due = min(due, self._imu.next_event(self.world.now))
+        if self._outbox and (answer := self._outbox[0][0]) - SPIN_S <= due:
+            return (answer - SPIN_S - now, 0.0) if now < answer - SPIN_S else (0.0, answer)
+        if now - self._busy_at < ALERT_S:
+            return 0.0, min(due, self._busy_at + ALERT_S)
+        return max(0.0, due - now), now
+
+    def _spin(self, until: float) -> float:
+        """Look again and again until something comes or that time (s since power-on) is there; the last look's time."""
+        until += self._start
+        files = list(self._selector.get_map())
+        while True:
+            before = time.monotonic()
+            if before >= until or select.select(files, (), (), 0)[0]:
+                self._late_s = time.monotonic() - self._empty_at
+                return before
+            self._empty_at = before
 
     def _keep_time(self) -> None:
         now = self.now
@@ -291,6 +316,8 @@ class Server:
         if not data:
             return
         self.received[name] += len(data)
+        if name == "bus":
+            self._busy_at = self.now
         baud = port.baud(self.world.line_baud)
         late_s = 0.0 if self.stepped else self._late_s + time.monotonic() - self._empty_at
         self._held.append((self.now, late_s, name, data, baud))
@@ -319,6 +346,8 @@ class Server:
 
     def _send(self, name: str, data: bytes, t: float) -> None:
         self.sent[name] += self.ports[name].write(data)
+        if name == "bus":
+            self._busy_at = self.now
         if self.stepped:
             for control in self._controls:
                 control.arrivals[name].append((self.sent[name] - control.sent[name], t))

@@ -162,6 +162,12 @@ def read_requests(instruction: Instruction) -> list[tuple[int, int, int]]:
     return _read_requests(instruction.code, instruction.params)
 
 
+@lru_cache(maxsize=64)
+def _wanted(code: int, params: bytes) -> dict[int, tuple[int, int]]:
+    """id → (address, bytes); the first request counts where an id is asked twice."""
+    return {id: (address, count) for id, address, count in reversed(_read_requests(code, params))}
+
+
 @lru_cache(maxsize=64)  # each servo on the line looks at the same packet
 def _read_requests(code: int, params: bytes) -> list[tuple[int, int, int]]:
     if code in (Inst.SYNC_READ, Inst.FAST_SYNC_READ):
@@ -553,17 +559,18 @@ class ServoDevice:
                 raise _Refused(Error.INSTRUCTION)
             if fast and self.firmware < FAST_READ_FIRMWARE:
                 return None
-            for id, address, count in read_requests(instruction):
-                if id == self.id:
-                    return self.read(address, count, now=now)
-            return None
+            wanted = _wanted(code, params).get(self.memory[7])
+            return None if wanted is None else self.read(*wanted, now=now)
         if code in (Inst.SYNC_WRITE, Inst.BULK_WRITE):
             if not broadcast:
                 raise _Refused(Error.INSTRUCTION)
-            for id, address, data in _group_writes(code, params):
-                # A group write reaches a shadow ID too, as any write does.
-                if id == self.id or id == self.memory[12] <= MAX_ID:
-                    self._apply(self._check(address, data, ram_only=id != self.id))
+            writes, own, shadow_id = _group_writes(code, params), self.memory[7], self.memory[12]
+            for address, data in writes.get(own, ()):
+                self._apply(self._check(address, data))
+            # A group write reaches a shadow ID too, as any write does.
+            if shadow_id <= MAX_ID and shadow_id != own:
+                for address, data in writes.get(shadow_id, ()):
+                    self._apply(self._check(address, data, ram_only=True))
             return None
         raise _Refused(Error.INSTRUCTION)
 
@@ -607,6 +614,18 @@ class ServoDevice:
         end = address + len(data)
         if end > _MEMORY:
             raise _Refused(Error.ACCESS)
+        register = self._owner[address]
+        if (
+            register is not None
+            and register.address == address
+            and register.end == end
+            and address not in self._indirect
+        ):
+            if not register.writable:
+                raise _Refused(Error.ACCESS)
+            item = _Item(register, address, int.from_bytes(data, "little", signed=register.signed))
+            self._check_item(item, ram_only=ram_only)
+            return [item]
         # The bytes as they will stand, indirect cells followed.
         targets: list[tuple[int, int]] = []
         for k, byte in enumerate(data):
@@ -789,20 +808,23 @@ class ServoDevice:
         self._saved()
 
 
-def _group_writes(code: int, params: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """(id, address, data) of a sync or bulk write, as far as it is well formed."""
+@lru_cache(maxsize=16)  # each servo on the line looks at the same packet
+def _group_writes(code: int, params: bytes) -> dict[int, list[tuple[int, bytes]]]:
+    """id → (address, data) of a sync or bulk write, as far as it is well formed."""
+    writes: dict[int, list[tuple[int, bytes]]] = {}
     if code == Inst.SYNC_WRITE:
         if len(params) < 4:
-            return
+            return writes
         address, count = struct.unpack_from("<HH", params)
         for at in range(4, len(params) - count, 1 + count):
-            yield params[at], address, params[at + 1 : at + 1 + count]
-        return
+            writes.setdefault(params[at], []).append((address, params[at + 1 : at + 1 + count]))
+        return writes
     at = 0
     while at + 5 <= len(params):
         id, address, count = struct.unpack_from("<BHH", params, at)
         data = params[at + 5 : at + 5 + count]
         if len(data) < count:
-            return
-        yield id, address, data
+            break
+        writes.setdefault(id, []).append((address, data))
         at += 5 + count
+    return writes
