@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from openant_tools.cli.sysid_bench import torque
+from openant_tools.cli.sysid_bench import scale, tilt, torque
 from openant_tools.cli.sysid_fit import fit
 from openant_tools.cli.sysid_record import record
 
@@ -18,4 +18,5 @@ def sysid() -> None:
 
 sysid.add_command(record)
 sysid.add_command(fit)
-sysid.add_command(torque)
+for bench in (torque, scale, tilt):
+    sysid.add_command(bench)

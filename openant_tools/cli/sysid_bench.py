@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import re
-from collections.abc import Mapping
+import select
+import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,15 +16,17 @@ import click
 
 from openant_tools.cli.options import json_option, robot_option
 from openant_tools.cli.sysid_record import robot_of
+from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option, virtual_robot
 
 if TYPE_CHECKING:
+    from openant_tools.comms.messages import EngineConfig
     from openant_tools.robot.folder import RobotFolder
     from openant_tools.sysid.bench.finding import Finding
 
-__all__ = ["ANGLE", "torque"]
+__all__ = ["ANGLE", "scale", "tilt", "torque"]
 
 
-class Angle(click.ParamType[float]):
+class Angle(click.ParamType):  # type: ignore[type-arg]  # generic from click 8.5 on
     """An angle in rad, or in degrees as `45deg` or `45°`."""
 
     name = "angle"
@@ -125,6 +130,341 @@ def torque(
             f"{load.torque_nm:6.2f} N·m  {load.nominal_nm:4.2f} N·m   {load.limit_nm:10.2f} N·m{mark}"
         )
     return _conclude(finding, folder if robot is not None else None, json_file)
+
+
+port_option = click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one plugged in.")
+yes_option = click.option("--yes", is_flag=True, help="The robot may move: do not ask. Needed without a terminal.")
+
+
+@click.command()
+@click.option("--joint", default="knee_fl", show_default=True, help="Whose stiffness.")
+@click.option(
+    "--readings", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    help="CSV of deflection (rad), grams, instead of typing them; without --port or --virtual no robot is needed.",
+)  # fmt: skip
+@robot_option
+@virtual_option
+@port_option
+@click.option("--pose", type=ANGLE, metavar="RAD", help="Joint angle where the foot just touches. Default: home.")
+@click.option(
+    "--step", "step_rad", type=ANGLE, default=0.02, show_default=True, metavar="RAD", help="Deflection a step."
+)
+@click.option("--steps", default=5, show_default=True, metavar="N", help="How many.")
+@click.option("--up", is_flag=True, help="Press in the positive direction. Default: a knee presses its foot down.")
+@click.option(
+    "--length", "length_m", type=float, metavar="M", help="Knee's axis to the foot's contact. Default: 0.159."
+)
+@click.option("--arm", "arm_m", type=float, metavar="M", help="Lever arm of the force, if you measured it instead.")
+@click.option("--servo", metavar="MODEL", help="Default: the robot's, else XM430-W350-T.")
+@click.option("--p-gain", type=float, metavar="P", help="position_p_gain, without a robot. Default: the factory's.")
+@click.option("--supply", "supply_v", type=float, metavar="V", help="Without a robot. Default: the servo's nominal.")
+@click.option("--pwm-limit", type=float, metavar="SHARE", help="Without a robot. Default: the robot's, else 0.5.")
+@yes_option
+@json_option
+def scale(
+    joint: str,
+    readings: Path | None,
+    robot: Path | None,
+    virtual_source: str | None,
+    port: str | None,
+    pose: float | None,
+    step_rad: float,
+    steps: int,
+    up: bool,
+    length_m: float | None,
+    arm_m: float | None,
+    servo: str | None,
+    p_gain: float | None,
+    supply_v: float | None,
+    pwm_limit: float | None,
+    yes: bool,
+    json_file: Path | None,
+) -> int:
+    """Measure a joint's stiffness with a kitchen scale, and by the servo's own duty.
+
+    The robot sits fixed on its stand with a scale under one foot. Its goal goes down in steps; the scale holds the foot, you
+    type grams. A line through them is the stiffness as the leg gives it; Present PWM over the position error is the
+    stiffness as the controller asks for it, and tells the P divisor (the manual says 128, BAM found 256).
+
+    \b
+      openant sysid scale --robot my-ant --joint knee_fl            guided; an empty answer skips a weighing
+      openant sysid scale --readings grams.csv --servo XL430-W250-T no robot: deflection,grams
+      openant sysid scale --virtual blocked.toml --yes              the servo's part alone
+
+    Hips turn about an upright axis: pull their foot sideways with a luggage scale, and give the lever --arm.
+    Exit code 1: the estimators disagree, or neither divisor fits.
+    """
+    from openant_tools.errors import BadInput
+    from openant_tools.robot.joints import JOINTS
+    from openant_tools.robot.kit import HOME_RAD, PLATFORM_PWM_LIMIT
+    from openant_tools.robot.servo import servo_model
+    from openant_tools.sysid.bench.knee_torque import KNEE_TO_GROUND_M
+    from openant_tools.sysid.bench.stiffness import (
+        ARM_UNCERTAINTY,
+        lever_arm,
+        read_weighings,
+        scale_line,
+        servo_line,
+        stiffness_finding,
+    )
+
+    kind = JOINTS[joint].kind if joint in JOINTS else "knee"
+    touch = HOME_RAD[kind] if pose is None else pose
+    length = KNEE_TO_GROUND_M if length_m is None else length_m
+    typed = read_weighings(readings) if readings is not None else []
+
+    def arm_at(angle: float) -> float:
+        if arm_m is not None:
+            return arm_m
+        if kind == "hip":
+            raise BadInput("a hip's lever arm is not known", remedy="measure it from axis to hook and give it by --arm")
+        return lever_arm(length, angle)
+
+    moves = virtual_source is not None or port is not None or readings is None
+    folder = robot_of(robot, needed=moves and virtual_source is None)
+    config = folder.config() if folder else None
+    if config is not None and joint not in config.motors:
+        raise BadInput(
+            f"no joint {joint!r}", where=folder.config_file if folder else None, remedy=f"use {', '.join(config.motors)}"
+        )
+    kept = folder if robot is not None else None
+    common: dict[str, Any] = {"command": _command(), "arm_m": arm_at(touch) if typed or kind == "knee" else arm_m}
+    if not moves:
+        own = servo_model(servo) if servo else config.motors[joint].servo if config else servo_model("XM430-W350-T")
+        supply = own.nominal_voltage_v if supply_v is None else supply_v
+        limit = pwm_limit if pwm_limit is not None else config.bus.pwm_limit if config else PLATFORM_PWM_LIMIT
+        factory = own.register("position_p_gain").default
+        line = scale_line(
+            [w.deflection_rad for w in typed],
+            [w.grams for w in typed],
+            arm_at(touch),
+            torque_limit_nm=own.stall_torque_at(supply, limit),
+            arm_uncertainty_m=ARM_UNCERTAINTY * arm_at(touch),
+        )
+        finding = stiffness_finding(
+            joint, own, p_gain=p_gain or float(factory or 0), supply_v=supply, pwm_limit=limit, scale=line, duty=None,
+            measured_error=False, weighings=typed, **common,
+        )  # fmt: skip
+        _print_stiffness(finding)
+        return _conclude(finding, kept, json_file)
+
+    from openant_tools.sysid.bench.press import Pressing, press
+
+    talk = sys.stdin.isatty()
+    by_step = {round(w.deflection_rad / step_rad): w.grams for w in typed}
+
+    def grams(deflection: float) -> float | None:
+        if typed:
+            return by_step.get(round(deflection / step_rad))
+        return _ask_grams(deflection) if talk else None
+
+    pressing = Pressing(joint, touch, step_rad, steps, 1 if up or kind == "hip" else -1)
+    with _engine_config(folder, virtual_source, port) as engine_config:
+        own = pressing.check(engine_config).model
+        words = (
+            f"{joint} goes to {touch:.2f} rad and presses {steps} × {step_rad:g} rad beyond; the others stand at home."
+        )
+        click.echo(f"{words} Fix the torso on its stand, feet free.", err=True)
+        _may_move(yes)
+        result = press(
+            engine_config,
+            pressing,
+            ready=_place_scale if talk else lambda: None,
+            grams=grams,
+            notice=lambda text: click.echo(text, err=True),
+            progress=lambda words, share: click.echo(f"  {words}", err=True),
+            journal=folder.journal if folder else None,
+        )
+    duty = servo_line(result.readings, result.pwm_limit)
+    weighed = {w.deflection_rad: w.grams for w in result.weighings}
+    pairs = [(r, weighed[r.deflection_rad]) for r in result.readings if r.deflection_rad in weighed]
+    line_or_none = None
+    if pairs:
+        line_or_none = scale_line(
+            [r.error_rad for r, _ in pairs],
+            [g for _, g in pairs],
+            [arm_at(r.position_rad) for r, _ in pairs],
+            torque_limit_nm=own.stall_torque_at(result.volts, result.pwm_limit),
+            arm_uncertainty_m=ARM_UNCERTAINTY * arm_at(touch),
+        )
+    finding = stiffness_finding(
+        joint, own, p_gain=result.p_gain, i_gain=result.i_gain, supply_v=result.volts, pwm_limit=result.pwm_limit,
+        scale=line_or_none, duty=duty, measured_error=True, weighings=result.weighings, readings=result.readings, **common,
+    )  # fmt: skip
+    _print_stiffness(finding)
+    return _conclude(finding, kept, json_file)
+
+
+def _print_stiffness(finding: Finding) -> None:
+    for reading in finding.data["servo_readings"]:
+        click.echo(
+            f"{reading['deflection_rad']:.3f} rad pressed: error {reading['error_rad']:.4f} rad, "
+            f"duty {reading['duty']:.3f}, {reading['volts']:.1f} V"
+        )
+    for evidence in finding.evidence:
+        interval = "" if evidence.low is None else f"  [{evidence.low:.2f}, {evidence.high:.2f}]"
+        unit = "" if evidence.unit == "1" else f" {evidence.unit}"
+        click.echo(f"{evidence.name:42}  {evidence.value:8.2f}{interval}{unit}")
+
+
+@click.command()
+@click.option(
+    "--static", "static", type=ANGLE, multiple=True, metavar="RAD", help="Angle where it began to slide; 31deg."
+)
+@click.option(
+    "--kinetic", "kinetic", type=ANGLE, multiple=True, metavar="RAD", help="Angle where, tapped, it kept sliding."
+)
+@click.option("--readings", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="CSV of angle,kind.")
+@click.option("--imu", is_flag=True, help="Read the angle off the robot's accelerometer; it stands on the plate.")
+@click.option(
+    "--trials", type=click.IntRange(1), default=5, show_default=True, metavar="N", help="With --imu: how often."
+)
+@click.option(
+    "--seconds",
+    type=float,
+    default=3.0,
+    show_default=True,
+    metavar="S",
+    help="With --imu, without a terminal: a trial.",
+)
+@click.option("--held", is_flag=True, help="It did not slide at these angles: they bound the coefficient from below.")
+@click.option(
+    "--resolution", type=ANGLE, default=math.radians(0.5), metavar="RAD", help="Of your protractor. Default: 0.5deg."
+)
+@robot_option
+@virtual_option
+@port_option
+@yes_option
+@json_option
+def tilt(
+    static: tuple[float, ...],
+    kinetic: tuple[float, ...],
+    readings: Path | None,
+    imu: bool,
+    trials: int,
+    seconds: float,
+    held: bool,
+    resolution: float,
+    robot: Path | None,
+    virtual_source: str | None,
+    port: str | None,
+    yes: bool,
+    json_file: Path | None,
+) -> int:
+    """Measure the floor's friction on a tilted plate: μ = tan(angle) where the robot begins to slide.
+
+    Put a plate of the floor's material under the robot, tilt it slowly, note the angle; turn the robot and repeat.
+
+    \b
+      openant sysid tilt --static 32deg --static 31.5deg --static 33deg --kinetic 29deg --kinetic 30deg --robot my-ant
+      openant sysid tilt --imu --robot my-ant       it stands on the plate, its accelerometer reads the angle
+
+    Exit code 1: one reading only, or none slid.
+    """
+    from openant_tools.errors import BadInput
+    from openant_tools.sysid.bench.friction import Slope, checked, friction_finding, read_slopes
+
+    slopes = [Slope(checked(angle, "--static"), "static") for angle in static]
+    slopes += [Slope(checked(angle, "--kinetic"), "kinetic") for angle in kinetic]
+    slopes += read_slopes(readings) if readings is not None else []
+    live = imu or virtual_source is not None or port is not None
+    if live and slopes:
+        raise BadInput("angles are both typed and to be measured", remedy="leave out --imu, or the angles")
+    if not live and not slopes:
+        raise BadInput("no angles", remedy="give --static 31deg for each trial, --readings FILE, or --imu")
+    folder = robot_of(robot, needed=live and virtual_source is None)
+    source = "protractor"
+    if live:
+        from openant_tools.sysid.bench.tilt import tilt_trials
+
+        source = "accelerometer"
+        talk = sys.stdin.isatty()
+        with _engine_config(folder, virtual_source, port, imu=True) as engine_config:
+            click.echo("The robot stands up at home on the plate and holds itself there.", err=True)
+            _may_move(yes)
+            angles = tilt_trials(
+                engine_config,
+                trials,
+                level=lambda: talk and _enter("Hold the plate level and still"),
+                begin=lambda trial: _begin(trial, trials) if talk else None,
+                ended=lambda so_far: _key_pressed() if talk else so_far >= seconds,
+                notice=lambda text: click.echo(text, err=True),
+                journal=folder.journal if folder else None,
+            )
+        for angle in angles:
+            click.echo(f"{angle:.3f} rad ({math.degrees(angle):.1f}°), μ = {math.tan(angle):.3f}")
+        slopes = [Slope(checked(angle, "the accelerometer"), "static") for angle in angles]
+    finding = friction_finding(slopes, _command(), source=source, resolution_rad=resolution, slid=not held)
+    for evidence in finding.evidence:
+        interval = "" if evidence.low is None else f"  [{evidence.low:.3f}, {evidence.high:.3f}]"
+        click.echo(f"{evidence.name:20} {evidence.value:.3f}{interval}")
+    return _conclude(finding, folder if robot is not None else None, json_file)
+
+
+@contextlib.contextmanager
+def _engine_config(
+    folder: RobotFolder | None, virtual_source: str | None, port: str | None, *, imu: bool = False
+) -> Iterator[EngineConfig]:
+    """The engine's config for the robot meant; a virtual one that was started for this command ends with the block."""
+    from openant_tools.comms.setup import config_of_robot, config_of_unknown_robot, imu_of_robot
+
+    with contextlib.ExitStack() as stack:
+        control = imu_port = None
+        if virtual_source is not None:
+            # One that is ours alone need not wait for real time.
+            clock = "stepped" if virtual_source == VIRTUAL_DEFAULT or virtual_source.endswith(".toml") else None
+            found = stack.enter_context(virtual_robot(virtual_source, clock=clock))
+            port, control, imu_port = port or found["bus"], found["control"], found["imu"]
+        described = None if folder is None else folder.config()
+        more = {"imu": imu_of_robot(described, imu_port) if imu else None}
+        if described is not None:
+            yield config_of_robot(described, port, control=control, **more)
+        else:
+            assert port is not None
+            yield config_of_unknown_robot(port, control, **more)
+
+
+def _may_move(yes: bool) -> None:
+    from openant_tools.errors import BadInput
+
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise BadInput("the robot would move and nobody is there to ask", remedy="add --yes if it may")
+    click.confirm("May it move?", abort=True, err=True)
+
+
+def _enter(words: str) -> bool:
+    click.prompt(f"{words}, then press Enter", default="", show_default=False, err=True)
+    return True
+
+
+def _place_scale() -> None:
+    _enter("Slide the scale under the foot until it just touches, and tare it")
+
+
+def _begin(trial: int, trials: int) -> None:
+    _enter(f"Trial {trial + 1} of {trials}: turn the robot a little, plate level")
+    click.echo("Tilt slowly until it slides; then press Enter.", err=True)
+
+
+def _key_pressed() -> bool:
+    if not select.select([sys.stdin], [], [], 0)[0]:
+        return False
+    sys.stdin.readline()
+    return True
+
+
+def _ask_grams(deflection: float) -> float | None:
+    """What the scale shows; an empty answer skips this weighing."""
+    while True:
+        answer = click.prompt(f"{deflection:.3f} rad: grams", default="", show_default=False, err=True).strip()
+        if not answer:
+            return None
+        try:
+            return float(answer.removesuffix("g").replace(",", "."))
+        except ValueError:
+            click.echo(f"{answer!r} is no number of grams", err=True)
 
 
 def _command() -> str:

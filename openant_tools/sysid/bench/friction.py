@@ -130,12 +130,14 @@ def onset_angle(t: Array, acc: Array, up: Array = BODY_UP) -> float:
     t, acc = t[good], acc[good]
     if len(t) < 3 or t[-1] - t[0] < 2 * SMOOTHING_S:
         raise BadInput("too few samples of the accelerometer", remedy="tilt the plate over some seconds")
-    width = max(3, round(SMOOTHING_S / float(np.median(np.diff(t)))))
-    normal = acc @ up
-    along = np.linalg.norm(acc - normal[:, None] * up, axis=1)
-    angles = np.arctan2(along, normal)
-    windows = np.lib.stride_tricks.sliding_window_view(angles, min(width, len(angles)))
-    return float(np.median(windows, axis=1).max())
+    width = min(max(3, round(SMOOTHING_S / float(np.median(np.diff(t))))), len(t))
+    # Means of forces, not of angles: a foot that chatters leaves the ground and comes down hard, and friction stays below
+    # μ times the normal force in the mean of both.
+    mean = np.lib.stride_tricks.sliding_window_view(acc, width, axis=0).mean(axis=2)
+    mean = mean[np.linalg.norm(mean, axis=1) > GRAVITY_M_S2 / 2]
+    normal = mean @ up
+    along = np.linalg.norm(mean - normal[:, None] * up, axis=1)
+    return float(np.arctan2(along, normal).max(initial=0.0))
 
 
 _ANGLE = re.compile(r"([-+]?\d*\.?\d+(?:e[-+]?\d+)?)\s*(rad|deg|°)?", re.IGNORECASE)
@@ -192,10 +194,12 @@ def friction_finding(
         if angles:
             found[kind] = coefficient(angles, resolution_rad)
     data: Mapping[str, object] = {"readings": [vars(slope) for slope in slopes], "slid": slid}
-    evidence = tuple(
-        Evidence(f"{kind} friction", c.value, "1", f"μ = tan α, {c.readings} readings by {source}", c.low, c.high)
-        for kind, c in found.items()
-    )
+
+    def of(kind: Kind, name: str) -> Evidence:
+        c = found[kind]
+        return Evidence(name, c.value, "1", f"{kind}, μ = tan α, {c.readings} readings by {source}", c.low, c.high)
+
+    evidence = tuple(of(kind, f"{kind} friction") for kind in found)
     if not slid:
         most = max(math.tan(slope.angle_rad) for slope in slopes)
         return Finding(
@@ -222,7 +226,7 @@ def friction_finding(
         actions.append("Feet that slip feel the kinetic coefficient, which is lower: tap the plate and add --kinetic.")
     return Finding(
         "floor-friction", ok, what, evidence, " ".join(actions), command,
-        parameters=(Evidence("floor_friction", mu.value, "1", evidence[0].source, mu.low, mu.high),), data=data,
+        parameters=(of(chosen, "floor_friction"),), data=data,
     )  # fmt: skip
 
 

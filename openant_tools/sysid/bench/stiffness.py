@@ -43,6 +43,8 @@ ARM_UNCERTAINTY = 0.03
 LEAST_READINGS = 3
 #: share of the torque or duty limit from which a reading is taken to be cut off by it
 SATURATED = 0.93
+#: what a kitchen scale rounds to
+GRAM_STEP = 1.0
 #: two-sided confidence of intervals
 CONFIDENCE = 0.95
 #: a deflection beyond this is degrees, or a leg that no scale holds
@@ -109,8 +111,12 @@ class Line:
         )
 
 
-def fit_line(x: Array, y: Array, *, left_out: int = 0) -> Line:
+def fit_line(x: Array, y: Array, *, left_out: int = 0, rounding: float = 0.0) -> Line:
     """Fit a line to (n,) readings.
+
+    Args:
+        left_out: readings that were not given, for messages.
+        rounding: standard deviation that y has at least, because it is rounded; rounded values can lie on a line by chance.
 
     Raises:
         BadInput: fewer than three readings, or all at one x.
@@ -126,7 +132,8 @@ def fit_line(x: Array, y: Array, *, left_out: int = 0) -> Line:
     if not np.ptp(x) > 0:
         raise BadInput("all readings are at one deflection", remedy="press in steps")
     result = stats.linregress(x, y)
-    half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, len(x) - 2)) * float(result.stderr)
+    deviation = max(float(result.stderr), rounding / float(np.sqrt(np.sum((x - x.mean()) ** 2))))
+    half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, len(x) - 2)) * deviation
     slope, intercept = float(result.slope), float(result.intercept)
     residual = float(np.sqrt(np.sum((y - slope * x - intercept) ** 2) / (len(x) - 2)))
     return Line(slope, slope - half, slope + half, intercept, residual, len(x), left_out)
@@ -169,7 +176,8 @@ def scale_line(
     free = np.ones(len(x), bool)
     if torque_limit_nm is not None:
         free = torque - torque.min() < SATURATED * torque_limit_nm
-    line = fit_line(x[free], torque[free], left_out=int((~free).sum()))
+    rounding = GRAM_STEP * 1e-3 * GRAVITY_M_S2 * float(arms.mean()) / math.sqrt(12)
+    line = fit_line(x[free], torque[free], left_out=int((~free).sum()), rounding=rounding)
     # The arm multiplies every torque alike, so that its relative error is the slope's.
     half = math.hypot((line.high - line.low) / 2, 1.96 * line.slope * arm_uncertainty_m / float(arms.mean()))
     return Line(
@@ -182,7 +190,8 @@ def servo_line(readings: Sequence[DutyReading], pwm_limit: float = 1.0) -> Line:
     free = [reading for reading in readings if abs(reading.duty) < SATURATED * pwm_limit]
     x = np.array([reading.error_rad for reading in free])
     y = np.array([reading.duty for reading in free])
-    return fit_line(x, y, left_out=len(readings) - len(free))
+    # The error needs no such allowance: its whole pulses are what the controller works with.
+    return fit_line(x, y, left_out=len(readings) - len(free), rounding=1 / PWM_FULL / math.sqrt(12))
 
 
 @dataclass(frozen=True)
