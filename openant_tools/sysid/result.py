@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import json
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from openant_tools.files import write_text
@@ -19,23 +23,41 @@ CALIBRATED = "calibrated.xml"
 
 
 def write_fit(result: Identification, out: Path) -> list[Path]:
-    """Write the model, the figures and the report into `out`, each atomically; returns what was written.
+    """Write the model, the figures and the report into `out`, together or not at all; returns what was written.
 
     Where nothing was accepted the model is the given one, so that a script can go on with `calibrated.xml` either way.
     """
     runs = ", ".join(run.name for data in result.datasets for run in data.runs)
-    written = [
-        write_model(
-            result.model,
-            calibrated(result),
-            out / CALIBRATED,
-            joints=result.joints,
-            note=f"Calibrated by `openant sysid fit` on {datetime.date.today()} from {result.model.name} and {runs}",
-        )
-    ]
-    write_text(out / "fit.json", json.dumps(result.as_json(), indent=1, ensure_ascii=False) + "\n")
-    fit_report(result).write(out / "report.html")
-    return [*written, out / "fit.json", out / "report.html"]
+    note = f"Calibrated by `openant sysid fit` on {datetime.date.today()} from {result.model.name} and {runs}"
+    with _together(out, (CALIBRATED, "fit.json", "report.html")) as (model, figures, report):
+        write_model(result.model, calibrated(result), model, joints=result.joints, note=note)
+        write_text(figures, json.dumps(result.as_json(), indent=1, ensure_ascii=False) + "\n")
+        fit_report(result).write(report)
+    return [out / CALIBRATED, out / "fit.json", out / "report.html"]
+
+
+@contextmanager
+def _together(folder: Path, names: Sequence[str]) -> Iterator[list[Path]]:
+    """Places to write files to that appear in `folder` together once the block is left; by an error, none appears.
+
+    Raises:
+        OSError: what went wrong in writing them, with the folder's name.
+    """
+    was_there = folder.exists()
+    staged = [folder / f".{name}.new" for name in names]
+    try:
+        yield staged
+        for path, name in zip(staged, names, strict=True):
+            os.replace(path, folder / name)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(folder)) from error
+    finally:
+        for path in staged:
+            with contextlib.suppress(OSError):
+                path.unlink()
+        if not was_there:
+            with contextlib.suppress(OSError):
+                folder.rmdir()  # fails where something stands in it, as it should
 
 
 def write_robot(result: Identification, folder: RobotFolder) -> None:
