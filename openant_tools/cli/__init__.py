@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import signal
 import sys
@@ -28,6 +29,18 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
 }
 
 INTERRUPTED = 130
+
+_MAKE_ROOM = "make room there, or choose another place, and repeat the command"
+_OTHER_PLACE = "choose a place that you may write to"
+REMEDIES = {
+    errno.ENOSPC: _MAKE_ROOM,
+    errno.EDQUOT: _MAKE_ROOM,
+    errno.EFBIG: _MAKE_ROOM,
+    errno.EACCES: _OTHER_PLACE,
+    errno.EPERM: _OTHER_PLACE,
+    errno.EROFS: _OTHER_PLACE,
+    errno.ENOTDIR: "a part of this path is a file: choose another place",
+}
 
 
 class Manual(click.Group):
@@ -88,13 +101,20 @@ def main(argv: Sequence[str] | None = None) -> None:
     except OpenAntError as error:
         click.echo(f"openant: {error}", err=True)
         sys.exit(error.exit_code)
-    except click.ClickException as error:
+    except click.exceptions.NoArgsIsHelpError as error:
         error.show()
+        sys.exit(2)
+    except click.ClickException as error:
+        context = getattr(error, "ctx", None)
+        command = context.command_path if context else "openant"
+        words = " ".join(error.format_message().split())
+        click.echo(f"{command}: {words.removesuffix('.')} → `{command} --help` says what it takes", err=True)
         sys.exit(2)
     except OSError as error:
         # A full disk, a missing directory, a permission: the operating system's own words name the cause.
         where = f"{error.filename}: " if error.filename else ""
-        click.echo(f"openant: {where}{error.strerror or error}", err=True)
+        remedy = REMEDIES.get(error.errno or 0)
+        click.echo(f"openant: {where}{error.strerror or error}" + (f" → {remedy}" if remedy else ""), err=True)
         sys.exit(2)
     except (KeyboardInterrupt, click.Abort):
         click.echo("openant: interrupted", err=True)

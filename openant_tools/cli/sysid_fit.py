@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.options import robot_option
+from openant_tools.cli.options import robot_folder, robot_option
+
+if TYPE_CHECKING:
+    from openant_tools.robot.folder import RobotFolder
 
 __all__ = ["fit"]
 
@@ -64,7 +68,7 @@ def fit(
 
     folder = None if robot is None else RobotFolder.at(robot)
     if model is None:
-        model = (folder or RobotFolder.at(Path())).model_path()
+        model = (folder or _robot_here()).model_path()
     recordings = [read_run(path) for path in runs]
     held_out = [read_run(path) for path in hold_out]
     console = Console(stderr=True)
@@ -104,3 +108,15 @@ def fit(
     for path in written:
         click.echo(f"wrote {path}", err=True)
     return 0 if result.accepted else 1
+
+
+def _robot_here() -> RobotFolder:
+    """The robot of $OPENANT_ROBOT or the working directory, where neither model nor robot was named."""
+    from openant_tools.errors import BadInput
+    from openant_tools.robot.config import CONFIG_NAME
+    from openant_tools.robot.folder import RobotFolder
+
+    here = robot_folder(None, must_exist=False)
+    if not (here / CONFIG_NAME).is_file():
+        raise BadInput("no model to fit", remedy="name one with --model M.xml, or its robot with --robot DIR")
+    return RobotFolder.at(here)

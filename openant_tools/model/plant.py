@@ -116,7 +116,9 @@ def load_plant(
         spec = mujoco.MjSpec.from_file(str(path))
         original = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise BadInput(f"MuJoCo cannot load it: {' '.join(str(error).split())}", where=path) from error
+        words = " ".join(str(error).split())
+        remedy = "mend the file at the place it names"
+        raise BadInput(f"MuJoCo cannot load it: {words}", where=path, remedy=remedy) from error
     if original.nu == 0:
         raise BadInput(
             "the model has no actuators", where=path, remedy="give each joint a <position> actuator in its MJCF"
