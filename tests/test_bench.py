@@ -122,7 +122,7 @@ def test_typed_grams_give_stiffness_with_interval_and_the_divisor(
     notebook = notes(tmp_path / "grams.csv", 18.638, STEPS, scatter=10.0)  # the paper's XM430
     assert openant("sysid", "scale", "--readings", notebook, "--json", file) == 0
     assert "the P divisor is 128" in capsys.readouterr().out
-    value = json.loads(file.read_text())["parameters"]["stiffness.knee_fl"]
+    value = json.loads(file.read_text())["parameters"]["scale_stiffness.knee_fl"]
     assert value["low"] < 18.638 < value["high"]
     assert value["value"] == pytest.approx(18.638, rel=0.05)
 
@@ -243,7 +243,7 @@ def test_the_servos_own_duty_tells_its_divisor_and_the_finding_is_kept(
     (file,) = folder.findings.iterdir()
     finding = json.loads(file.read_text())
     assert [round(w["deflection_rad"], 2) for w in finding["data"]["weighings"]] == [0.02, 0.04, 0.06]
-    source = folder.config().provenance["bench.stiffness.knee_fl"]
+    source = folder.config().provenance["bench.scale_stiffness.knee_fl"]
     assert source.how == "measured"
     assert source.recording == f"findings/{file.name}"
     assert source.low < SHEET_STIFFNESS / 2 < source.high  # type: ignore[operator]

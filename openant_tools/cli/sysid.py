@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from openant_tools.cli.sysid_bench import scale, tilt, torque
+from openant_tools.cli.sysid_compare import compare
 from openant_tools.cli.sysid_fit import fit
 from openant_tools.cli.sysid_record import record
 
@@ -18,5 +19,5 @@ def sysid() -> None:
 
 sysid.add_command(record)
 sysid.add_command(fit)
-for bench in (torque, scale, tilt):
-    sysid.add_command(bench)
+for command in (compare, torque, scale, tilt):
+    sysid.add_command(command)

@@ -225,7 +225,9 @@ def scale(
     config = folder.config() if folder else None
     if config is not None and joint not in config.motors:
         raise BadInput(
-            f"no joint {joint!r}", where=folder.config_file if folder else None, remedy=f"use {', '.join(config.motors)}"
+            f"no joint {joint!r}",
+            where=folder.config_file if folder else None,
+            remedy=f"use {', '.join(config.motors)}",
         )
     kept = folder if robot is not None else None
     common: dict[str, Any] = {"command": _command(), "arm_m": arm_at(touch) if typed or kind == "knee" else arm_m}

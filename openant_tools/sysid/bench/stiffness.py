@@ -352,7 +352,7 @@ def stiffness_finding(
         arm = "" if arm_m is None else f", lever arm {arm_m:.3f} m"
         source = f"kitchen scale over {over}, {scale.used} readings{arm}"
         evidence.append(_stiffness("stiffness by the scale", scale, source))
-        parameters.append(_stiffness(f"stiffness.{joint}", scale, source))
+        parameters.append(_stiffness(f"scale_stiffness.{joint}", scale, source))
         if verdict is None:
             verdict = decide_divisor(scale.scaled(1 / stall), p_gain, _SHEET_TOLERANCE)
             words.append(f"By the scale {verdict.words}, as far as the data sheet's stall torque is true")
@@ -372,7 +372,7 @@ def stiffness_finding(
             actions.append("Repeat with the robot connected, so that the position error is measured, not assumed.")
     elif servo_stiffness is not None:
         # Under a name of its own: its interval leaves out what the data sheet's stall torque may be wrong by.
-        parameters.append(_stiffness(f"stiffness_by_duty.{joint}", servo_stiffness, "Present PWM over position error"))
+        parameters.append(_stiffness(f"duty_stiffness.{joint}", servo_stiffness, "Present PWM over position error"))
     left_out = (scale.left_out if scale else 0) + (duty.left_out if duty else 0)
     if left_out:
         words.append(f"{left_out} readings at the torque limit are left out")

@@ -1,0 +1,61 @@
+"""`openant sysid compare`: two fits, two robots or two dates side by side."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from openant_tools.cli.options import json_option, report_option, robot_option
+
+__all__ = ["compare"]
+
+
+@click.command()
+@click.argument("a", metavar="A")
+@click.argument("b", metavar="B")
+@robot_option
+@json_option
+@report_option
+def compare(a: str, b: str, robot: Path | None, json_file: Path | None, report: Path | None) -> int:
+    """What changed between A and B beyond their intervals.
+
+    Each is a fit.json (or its folder), a robot's folder, or with --robot a date: the newest that was known then.
+
+    \b
+      openant sysid compare spring/fit autumn/fit --report aging
+      openant sysid compare ant12 ant13
+      openant sysid compare 2026-03-01 2026-09-01 --robot my-ant
+
+    So many parameters differ a little by chance; Holm's procedure holds the probability that any is wrongly called changed
+    at 5 %. Exit code 1: something changed.
+    """
+    from openant_tools.cli.sysid_record import robot_of
+    from openant_tools.files import write_text
+    from openant_tools.sysid.compare import compare as compared
+    from openant_tools.sysid.compare_sources import snapshot
+
+    folder = robot_of(robot, needed=False)
+    result = compared(snapshot(a, folder), snapshot(b, folder))
+    width = max(len(change.name) for change in result.changes)
+    click.echo(f"{'':{width}}  {'A':>10}  {'B':>10}  {'B − A':>10}  95 % interval")
+    for change in result.changes:
+        line = f"{change.name:{width}}  {change.a.value:10.4g}  {change.b.value:10.4g}  "
+        if change.status == "not comparable":
+            click.echo(f"{line}{'–':>10}  {change.why}")
+            continue
+        p = f"p {change.p_holm:.2g}" if change.status == "changed" else ""
+        said = "changed" if change.status == "changed" else ""
+        interval = f"[{change.low:+.3g}, {change.high:+.3g}] {change.unit}"
+        click.echo(f"{line}{change.difference:+10.3g}  {interval:28} {said} {p}".rstrip())
+    for note in result.notes:
+        click.echo(note)
+    click.echo(result.sentence)
+    if json_file:
+        write_text(json_file, json.dumps(result.as_json(), indent=1, ensure_ascii=False) + "\n")
+    if report:
+        from openant_tools.sysid.compare_report import comparison_report
+
+        click.echo(f"wrote {comparison_report(result).write_folder(report)}", err=True)
+    return 1 if result.changed else 0
