@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from wire import IDS, ant
 
-from openant_tools.comms.bus import Timing
+from openant_tools.comms.bus import FAST_AGAIN, Answer, Timing
 from openant_tools.comms.faults import BrokenAnswer, Cause, NoAnswer, Refused
+from openant_tools.comms.guards import Guards, Trip, Watch
 from openant_tools.comms.line import PortGone
 from openant_tools.comms.servos import Servo, Servos
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import kit
+from openant_tools.virtual.bus import BusSettings
 
 
 def robot(**options: object) -> tuple[Servos, object]:
@@ -55,9 +59,75 @@ def test_fast_read_falls_back_and_keeps_what_was_verified() -> None:
     answers = bus.sync_read(132, 4, IDS)
     assert [answer.ok for answer in answers] == [True] * 4 + [False] + [False] * 3
     assert bus.statistics.fast_read_fallbacks == 1
-    assert not bus.fast
     line.wire.settings.lost.clear()
     assert all(answer.ok for answer in bus.sync_read(132, 4, IDS))
+
+
+def test_fast_reads_come_back_once_the_silent_servo_has_answered_for_a_while() -> None:
+    bus, line = ant()
+    bus.fast = set(IDS)
+
+    def bytes_of_a_read() -> int:
+        before = line.received
+        bus.sync_read(132, 4, IDS)
+        return line.received - before
+
+    joined, plain = 8 + 8 * 8, 8 * 15
+    for fallbacks, wait in ((1, FAST_AGAIN), (2, 2 * FAST_AGAIN)):
+        line.wire.settings.lost[4] = 1.0
+        for _ in range(20):
+            bytes_of_a_read()
+        line.wire.settings.lost.clear()
+        assert [bytes_of_a_read() for _ in range(wait)] == [plain] * wait
+        assert bytes_of_a_read() == joined
+        assert (bus.statistics.fast_read_fallbacks, bus.statistics.fast_read_returns) == (fallbacks, fallbacks)
+
+
+# ---- the guard against silence on a noisy line -------------------------------------------------------------------
+
+
+def cycles_until_stopped(byte_error: float, seed: int, cycles: int) -> tuple[float, Trip] | None:
+    """Write and read at 100 Hz as the engine does; (s, why) it stops, None where it goes on."""
+    bus, line = ant(settings=BusSettings(byte_error=byte_error), seed=seed)
+    servos = Servos(bus, [Servo(joint.name, joint.id, kit("standard").servo(joint.kind)) for joint in JOINTS.values()])
+    bus.fast = set(IDS)
+    start = line.now()
+    watch = Watch(Guards(), servos.servos, {})
+    watch.reset(start)
+    for n in range(cycles):
+        line.sleep_until(start + n * 0.01)
+        servos.write_goals([2048] * 8)
+        answers = servos.read_blocks()
+        trip = watch.check(bus.request_at, answers)
+        if trip is not None:
+            return line.now() - start, trip
+    return None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_byte_in_a_hundred_broken_costs_answers_and_never_the_motion(seed: int) -> None:
+    assert cycles_until_stopped(0.01, seed, 1000) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_one_byte_in_ten_broken_stops_the_motion_within_half_a_second_and_is_called_noise(seed: int) -> None:
+    stopped = cycles_until_stopped(0.1, seed, 1000)
+    assert stopped is not None
+    seconds, trip = stopped
+    assert seconds < 0.5
+    assert re.match(r"[5-8] of 8 servos have not been heard for up to 0\.[2-4]\d s, what comes is broken", trip.what)
+    assert "noise on the bus" in trip.remedy
+
+
+def test_a_busy_host_is_no_silent_servo() -> None:
+    servos = [Servo("hip_rr", 10, kit("standard").servo("hip"))]
+    watch = Watch(Guards(), servos, {})
+    watch.reset(0.0)
+    missed = [(Answer(10, None, 0, Cause.TIMEOUT), None)]
+    assert watch.check(0.3, missed) is None, "asked once in 0.3 s"
+    trip = watch.check(0.51, missed)
+    assert trip is not None
+    assert "hip_rr (id 10) has not answered for 0.51 s (timeout 2)" in trip.what
 
 
 def test_one_silent_servo_does_not_hide_those_behind_it() -> None:

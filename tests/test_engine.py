@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_robot
+from openant_tools.cli.virtual_for_command import virtual_robot
 from openant_tools.comms import messages
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
@@ -34,18 +35,23 @@ HOME = np.array(home_angles())
 PATIENCE_S = 20.0
 
 
+def start(folder: Path, clock: str) -> Iterator[dict[str, str]]:
+    scenario = folder / "blind.toml"
+    scenario.write_text("[camera]\npresent = false\n")
+    with virtual_robot(str(scenario), clock=clock) as robot:
+        yield dict(robot)  # type: ignore[arg-type]
+
+
 @pytest.fixture(scope="module")
-def live() -> Iterator[dict[str, str]]:
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     """A virtual Ant in real time."""
-    with virtual_robot(VIRTUAL_DEFAULT, clock="real") as robot:
-        yield dict(robot)  # type: ignore[arg-type]
+    yield from start(tmp_path_factory.mktemp("live"), "real")
 
 
-@pytest.fixture
-def stepped() -> Iterator[dict[str, str]]:
-    """A virtual Ant whose time moves with the engine's."""
-    with virtual_robot(VIRTUAL_DEFAULT, clock="stepped") as robot:
-        yield dict(robot)  # type: ignore[arg-type]
+@pytest.fixture(scope="module")
+def stepped(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """A virtual Ant whose time moves with the engine's; each test leaves its torque off."""
+    yield from start(tmp_path_factory.mktemp("stepped"), "stepped")
 
 
 def config(robot: dict[str, str], **changes: object) -> EngineConfig:
@@ -115,6 +121,38 @@ def test_recordings_hold_what_was_commanded_and_measured(stepped: dict[str, str]
     assert run.facts.extra["baud"] == 1_000_000
     assert run.facts.extra["latency_timer_ms"] == 1.0
     assert run.facts.registers["knee_fl"]["pwm_limit"] == 442
+    assert ["hip_fl", "knee_fl"] in run.facts.extra["chain"]
+
+
+@pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="limits of another process are Linux'")
+def test_a_full_disk_stops_the_motion_and_the_next_recording_goes_on(stepped: dict[str, str], tmp_path: Path) -> None:
+    with EngineProcess(config(stepped)) as engine:
+        engine.ask(messages.Torque(True))
+        engine.ask(messages.Record(str(tmp_path / "full"), Facts(JOINT_NAMES)))
+        unlimited = resource.prlimit(engine.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(engine.pid, resource.RLIMIT_FSIZE, (30_000, unlimited[1]))
+        with pytest.raises(HardwareFault, match="the recording stopped"):
+            engine.ask(messages.Hold(60.0))
+        resource.prlimit(engine.pid, resource.RLIMIT_FSIZE, unlimited)
+        assert not any(torques(stepped))
+        engine.ask(messages.Torque(True))
+        engine.ask(messages.Record(str(tmp_path / "run"), Facts(JOINT_NAMES)))
+        engine.ask(messages.Hold(0.2))
+        assert engine.ask(messages.StopRecording())[1] == 20
+
+
+def test_a_motion_that_the_watchdog_stopped_is_not_taken_for_going_on(live: dict[str, str]) -> None:
+    with EngineProcess(config(live)) as engine:
+        engine.ask(messages.Torque(True))
+        moving = engine.start(messages.Play(np.repeat(HOME[None, :], 3000, axis=0)))
+        time.sleep(0.3)
+        os.kill(engine.pid, signal.SIGSTOP)
+        time.sleep(0.5)
+        os.kill(engine.pid, signal.SIGCONT)
+        with pytest.raises(HardwareFault, match=r"stood still for 0\.\d+ s, and the servos' Bus Watchdog stopped"):
+            wait_until(lambda: engine.done(moving))
+        engine.ask(messages.Torque(True))
+        engine.ask(messages.Hold(0.1))
 
 
 def test_what_cannot_be_is_refused_and_nothing_moves(stepped: dict[str, str]) -> None:

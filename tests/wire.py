@@ -101,7 +101,7 @@ class WireLine:
 
 
 def ant(
-    timing: Timing | None = None, *, firmware: int = 46, settings: BusSettings | None = None
+    timing: Timing | None = None, *, firmware: int = 46, settings: BusSettings | None = None, seed: int = 0
 ) -> tuple[Bus, WireLine]:
     """A bus with the eight servos of a standard Ant, set up as the guide says."""
     servos = []
@@ -111,8 +111,9 @@ def ant(
             servo.set(name, counts)
         servo.settle()
         servos.append(servo)
-    settings = BusSettings(chains=[[0, 1], [2, 3], [4, 5], [6, 7]])
-    line = WireLine(Wire(servos, settings, lambda t: None))
+    settings = settings or BusSettings()
+    settings.chains = [[0, 1], [2, 3], [4, 5], [6, 7]]
+    line = WireLine(Wire(servos, settings, lambda t: None, seed=seed))
     names = {joint.id: joint.name for joint in JOINTS.values()}
     bus = Bus(line, line, timing or Timing(return_delay_s=0.0, latency_timer_s=1e-3), names)
     return bus, line

@@ -34,6 +34,8 @@ PING_SIZE = 3
 LONGEST_LATENCY_S = 16e-3
 #: Fast Sync Read came with this firmware (ROBOTIS e-manual).
 FAST_READ_FIRMWARE = 45
+#: Whole plain reads in a row after which joined ones are tried again (a second at 100 Hz), and at most after failures.
+FAST_AGAIN, FAST_AGAIN_LONGEST = 100, 6400
 _MARK = p2.HEADER[:3]
 
 
@@ -157,7 +159,8 @@ class Bus:
         names: id → what to call the servo in messages.
         timing: see `Timing`; set from what was measured.
         statistics: every request and every loss so far.
-        fast: ids whose firmware knows Fast Sync Read; where it fails, plain Sync Read is used from then on.
+        fast: ids whose firmware knows Fast Sync Read. Where it fails, plain Sync Read is used until that has been
+            answered whole for a while.
     """
 
     line: Line
@@ -177,6 +180,8 @@ class Bus:
         #: something was lost: what it left on the line may still come
         self._unsettled = False
         self._last_request = b""
+        #: whole plain reads in a row wanted before joined ones are tried again; twice as many after each failure
+        self._plain_left = self._plain_wanted = 0
         self._known: dict[tuple[int, int, int, tuple[int, ...]], _Request] = {}
 
     # ---- one instruction each ------------------------------------------------------------------------------------
@@ -279,17 +284,23 @@ class Bus:
     def sync_read(self, address: int, count: int, ids: Sequence[int]) -> list[Answer]:
         """The same registers of several servos, in the order of `ids`. Never raises for a silent servo."""
         ids = tuple(ids)
-        if self.fast and len(ids) > 1 and self.fast.issuperset(ids):
+        able = bool(self.fast) and len(ids) > 1 and self.fast.issuperset(ids)
+        if able and not self._plain_left:
             answers = self._fast_sync_read(address, count, ids)
             rest = [id for id, answer in zip(ids, answers, strict=True) if answer is None]
             if not rest:
                 return [answer for answer in answers if answer is not None]
-            # A joined reply ends at the first silent servo: ask those behind it one by one, and joined no more.
+            # A joined reply ends at the first silent servo: ask those behind it one by one, and not joined for a while.
             self.statistics.fast_read_fallbacks += 1
-            self.fast.clear()
+            self._plain_wanted = min(2 * self._plain_wanted or FAST_AGAIN, FAST_AGAIN_LONGEST)
+            self._plain_left = self._plain_wanted
             others = iter(self._exchange(p2.sync_read(address, count, rest), rest, [count] * len(rest)))
             return [answer or next(others) for answer in answers]
-        return self._transact(self._request(p2.Inst.SYNC_READ, address, count, ids))
+        plain = self._transact(self._request(p2.Inst.SYNC_READ, address, count, ids))
+        if able:
+            self._plain_left = self._plain_left - 1 if all(answer.ok for answer in plain) else self._plain_wanted
+            self.statistics.fast_read_returns += self._plain_left == 0
+        return plain
 
     def _request(self, code: p2.Inst, address: int, count: int, ids: tuple[int, ...]) -> _Request:
         key = (code, address, count, ids)

@@ -39,7 +39,7 @@ from openant_tools.comms.servos import Block, Servo, Servos
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
 from openant_tools.recording.telemetry import Answer as RecordedAnswer
 from openant_tools.recording.telemetry import Cycle, ServoChannel
-from openant_tools.recording.writer import RecordingWriter
+from openant_tools.recording.writer import RecordingStopped, RecordingWriter
 
 __all__ = ["Engine", "main"]
 
@@ -93,6 +93,8 @@ class Engine:
         self._recorder: RecordingWriter | None = None
         self._overruns = 0
         self._worst_wake = 0.0
+        #: when the servos were last asked, s
+        self._asked_at = 0.0
         self._cycles = 0
         self._guardian: subprocess.Popen[bytes] | None = None
         self._lost = False
@@ -264,7 +266,10 @@ class Engine:
         """Torque off, the recording closed, the guardian sent home; none of them prevents the next."""
         if hasattr(self, "_servos"):
             self._torque_off()
-        self._close_recording()
+        try:
+            self._close_recording()
+        except RecordingStopped as error:
+            self._notice(str(error))
         self._dismiss_guardian()
         if self._imu is not None:
             self._imu.close()
@@ -321,7 +326,10 @@ class Engine:
         if self._imu is not None:
             for sample in self._imu.until(due - IMU_SLACK_S):
                 if self._recorder is not None:
-                    self._recorder.imu(*sample)
+                    try:
+                        self._recorder.imu(*sample)
+                    except RecordingStopped as error:
+                        self._recording_failed(error)
             news = self._imu.news()
             if news is not None:
                 self._notice(news)
@@ -342,18 +350,34 @@ class Engine:
         if self._torque and self._counts is not None:
             cmd_t = self._servos.write_goals(self._counts)
         answers = self._servos.read_blocks()
-        t = self._bus.request_at
+        t, before = self._bus.request_at, self._asked_at
+        self._asked_at = t
         self._cycles += 1
         self._worst_wake = max(self._worst_wake, wake)
         if self._recorder is not None:
             self._record(t, cmd_t, wake, answers)
         self._telemetry(t, cmd_t, wake, answers)
         if self._torque:
-            trip = self._watch.check(t, answers)
+            trip = self._watch.check(t, answers) or self._stood_still(t - before)
             if trip is not None:
                 self._stopped(self._explained(trip))
         if ended is not None:
             self._motion_ended(ended)
+
+    def _stood_still(self, seconds: float) -> Trip | None:
+        """Whether the servos' watchdog has stopped the motion behind our back, since this process was held up."""
+        if seconds < self.config.watchdog_s - WATCHDOG_UNIT_S:
+            return None
+        try:
+            tripped = self._servos.tripped_watchdogs()
+        except HardwareFault:
+            return None  # the guard against silence will see to it
+        if not tripped:
+            return None
+        return Trip(
+            f"this computer stood still for {seconds:.2f} s, and the servos' Bus Watchdog stopped the motion",
+            "close what else keeps it busy, or let it not go to sleep",
+        )
 
     def _motion_ended(self, motion: Motion) -> None:
         for entry in list(self._waiting):
@@ -383,7 +407,8 @@ class Engine:
             with contextlib.suppress(HardwareFault):
                 self._servos.torque_off_now()
         if self._recorder is not None:
-            self._recorder.event("stopped", what=trip.what, joint=trip.joint)
+            with contextlib.suppress(RecordingStopped):  # told by the next cycle's row
+                self._recorder.event("stopped", what=trip.what, joint=trip.joint)
         self._say(messages.Stopped(trip.what, trip.remedy, trip.joint))
         for number, _ in self._waiting:
             self._say(messages.Reply(number, error=(trip.what, None, trip.remedy)))
@@ -432,10 +457,14 @@ class Engine:
         goals: list[int | None] = [None] * n if self._counts is None else list(self._counts)
         try:
             self._recorder.cycle(Cycle(t, goals, cmd_t, wake, recorded, [self._torque] * n))
-        except OpenAntError as error:
-            # The disk is full: the robot must not go on moving for a recording that nobody will have.
-            self._recorder = None
-            self._stopped(Trip(error.what, error.remedy or "", None))
+        except RecordingStopped as error:
+            self._recording_failed(error)
+
+    def _recording_failed(self, error: RecordingStopped) -> None:
+        """The disk is full: the robot must not go on moving for a recording that nobody will have."""
+        with contextlib.suppress(RecordingStopped):
+            self._close_recording()
+        self._stopped(Trip(error.what, error.remedy or "", None))
 
     def _telemetry(
         self, t: float, cmd_t: float | None, wake: float, answers: list[tuple[Answer, Block | None]]
@@ -525,6 +554,8 @@ class Engine:
     def _switch_on(self) -> None:
         """Torque on where the robot stands: goals are set to what is measured before and after."""
         servos = self._servos
+        for joint in servos.tripped_watchdogs():
+            servos.write_counts("bus_watchdog", joint, 0)  # or the goals stay locked
         positions = servos.read_all("present_position")
         self._counts = [positions[joint] for joint in servos.joints]
         try:
@@ -541,7 +572,8 @@ class Engine:
             raise
         self._goal = np.array(servos.joint_rad(self._counts))
         self._torque = True
-        self._watch.reset(self.clock.now())
+        self._asked_at = self.clock.now()
+        self._watch.reset(self._asked_at)
 
     def _do_move(self, number: int, command: messages.Ramp | messages.Play | messages.Hold) -> None:
         if not self._torque or self._goal is None:
@@ -589,11 +621,13 @@ class Engine:
             raise BadInput(f"{self._recorder.path} is being recorded", remedy="stop that recording first")
         channels = [self._channel(servo) for servo in self._servos.servos]
         self._effort = ["cur" if servo.model.has_current_sensor else "load" for servo in self._servos.servos]
-        extra = {
+        extra: dict[str, Any] = {
             "baud": self.config.baud,
             "latency_timer_ms": self._bus.timing.latency_timer_s * 1e3,
             "return_delay_s": self._bus.timing.return_delay_s,
         }
+        if self.config.chain:
+            extra["chain"] = [list(cable) for cable in self.config.chain]
         facts = replace(command.facts, joints=self._servos.joints, extra={**extra, **command.facts.extra})
         self._registers = self._read_registers()
         self._recorder = RecordingWriter(

@@ -21,7 +21,8 @@ class Guards:
         angle_margin_rad: how far beyond its limits a joint may be measured: overshoot, not a wrong way.
         current_share, load_share: of the servo's stall current, or of its full load, over `effort_s`.
         temperature_margin_k: below the servo's own limit, at which it would shut down.
-        silent_s: a servo that does not answer for so long is lost.
+        silent_s: a servo that does not answer for so long is lost, once it has been asked `silent_cycles` times in
+            vain, too: a noisy line loses answers by chance, a busy host asks seldom. Twice as long is too long.
     """
 
     angle_margin_rad: float | None = 0.2
@@ -31,6 +32,7 @@ class Guards:
     temperature_margin_k: float | None = 5.0
     voltage: bool = True
     silent_s: float | None = 0.25
+    silent_cycles: int = 25
 
 
 @dataclass(frozen=True)
@@ -80,10 +82,18 @@ class Watch:
         silent = t - self._heard.setdefault(servo.id, t)
         missed = self._missed.setdefault(servo.id, Counter())
         missed[answer.cause or Cause.SHORT] += 1
-        if self.guards.silent_s is None or silent < self.guards.silent_s:
+        limit = self.guards.silent_s
+        if limit is None or silent < limit or (missed.total() < self.guards.silent_cycles and silent < 2 * limit):
             return None
-        causes = ", ".join(f"{cause.value} {count}" for cause, count in missed.most_common())
-        broken = missed[Cause.CRC] + missed[Cause.SHORT] > missed.total() / 4
+        everyone: Counter[Cause] = sum(self._missed.values(), Counter())
+        if len(self._missed) > len(self.servos) / 2 and _broken(everyone):
+            return Trip(
+                f"{len(self._missed)} of {len(self.servos)} servos have not been heard for up to {silent:.2f} s, what "
+                f"comes is broken ({_words(everyone)})",
+                "noise on the bus, or a loose connector near the adapter: look at the first cables and the ground",
+            )
+        causes = _words(missed)
+        broken = _broken(missed) > missed.total() / 4
         return Trip(
             f"{servo.joint} (id {servo.id}) has not answered for {silent:.2f} s ({causes})",
             "its answers come broken: two servos with one id, a loose connector, or noise"
@@ -140,3 +150,12 @@ class Watch:
                     servo.joint,
                 )
         return None
+
+
+def _broken(missed: Counter[Cause]) -> int:
+    """Answers that came, but not as they were sent."""
+    return missed[Cause.CRC] + missed[Cause.SHORT]
+
+
+def _words(missed: Counter[Cause]) -> str:
+    return ", ".join(f"{cause.value} {count}" for cause, count in missed.most_common())

@@ -60,6 +60,7 @@ class EngineConfig:
         control: control socket of a virtual robot; its clock is used where it is stepped.
         limits_rad: joint → (low, high); commands beyond are refused, measurements far beyond stop the motion.
         registers: joint → register → counts that must be in force; EEPROM is written only where it differs.
+        chain: lists of joints, each in the order of its cable from the adapter outwards, where that is known.
         watchdog_s: how long servos go on moving when nothing is heard of us any more.
     """
 
@@ -74,6 +75,7 @@ class EngineConfig:
     watchdog_s: float = 0.2
     write_read_gap_s: float = 0.2e-3
     imu: ImuConfig | None = None
+    chain: tuple[tuple[str, ...], ...] = ()
 
 
 # ---- to the engine: each is answered by a `Reply` ------------------------------------------------------------------

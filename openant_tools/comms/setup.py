@@ -75,6 +75,7 @@ def config_of_robot(robot: RobotConfig, port: str | None = None, **more: object)
         registers={servo.joint: {"pwm_limit": pwm_limit} for servo in servos},
         watchdog_s=robot.bus.watchdog_s,
         write_read_gap_s=robot.bus.write_read_gap_s,
+        chain=robot.bus.chain,
         **more,  # type: ignore[arg-type]
     )
 
@@ -103,8 +104,20 @@ def config_of_unknown_robot(port: str, control: str | None = None, **more: objec
         control=control,
         limits_rad=_kit_limits(),
         registers={servo.joint: {"pwm_limit": PLATFORM_PWM_LIMIT_COUNTS} for servo in servos},
+        chain=_virtual_chain(control),
         **more,  # type: ignore[arg-type]
     )
+
+
+def _virtual_chain(control: str | None) -> tuple[tuple[str, ...], ...]:
+    """How a virtual robot is wired; empty where the robot is real."""
+    if control is None:
+        return ()
+    remote = VirtualControl(control)
+    try:
+        return tuple(tuple(cable) for cable in remote.ask("wiring")["chain"])
+    finally:
+        remote.close()
 
 
 def _kit_limits() -> Mapping[str, tuple[float, float]]:

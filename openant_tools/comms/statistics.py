@@ -96,7 +96,9 @@ class BusStatistics:
     """All servos of a bus, and bytes that belonged to none."""
 
     noise_bytes: int = 0
+    #: joined reads that ended early, and returns to them after a while of whole plain ones
     fast_read_fallbacks: int = 0
+    fast_read_returns: int = 0
     #: (when, rtt) of the last answer of each of the last requests, s
     arrivals: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=1000))
     _servos: dict[int, ServoStatistics] = field(default_factory=dict)
@@ -150,6 +152,7 @@ class BusStatistics:
             "comb_period_s": comb.period_s if comb else None,
             "noise_bytes": self.noise_bytes,
             "fast_read_fallbacks": self.fast_read_fallbacks,
+            "fast_read_returns": self.fast_read_returns,
             "servos": [
                 {
                     "id": id,

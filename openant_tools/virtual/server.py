@@ -19,6 +19,7 @@ The control socket (Unix stream, one JSON object a line, one line of answer each
 | `{"do": "wait", "port": "bus", "to": s, "bus_written": n, "imu_written": m}` | as `settle`, but time runs only until |
 | | the next bytes leave for that port, or to `to` (stepped only) |
 | `{"do": "state"}` | the truth: angles, torques, temperatures, torque enables, supply, body |
+| `{"do": "wiring"}` | `{"chain": [[joint, …], …]}`, each cable from the adapter outwards |
 | `{"do": "fault", "cause": …, "where": …, "on": bool, …}` | switches a fault; `{"t": s}` |
 | `{"do": "plug", "joint": …}`, `{"do": "unplug", …}` | puts a servo on the bus or takes it off; `{"t": s}` |
 | `{"do": "assemble", "setup": "stand"}` | builds the robot from the motors in the box, or puts it on "floor" or stand |
@@ -460,6 +461,9 @@ class Server:
             if not self.stepped:
                 self.world.advance(self.now)
             return self.world.state()
+        if do == "wiring":
+            joints, chains = self.world.joints, self.world.line.settings.chains
+            return {"chain": [[joints[k] for k in chain] for chain in chains]}
         if do == "fault":
             if self.fault is None:
                 raise _Failed("this robot has no faults to switch")
@@ -475,7 +479,7 @@ class Server:
             self._plug(str(request.get("joint")), do == "plug")
             return {"t": self.now}
         raise _Failed(
-            f"no such request: {do!r} (now, open, advance, settle, wait, state, fault, plug, unplug, assemble)"
+            f"no such request: {do!r} (now, open, advance, settle, wait, state, wiring, fault, plug, unplug, assemble)"
         )
 
     def _arrive(self, control: _Control, request: dict[str, Any]) -> None:
