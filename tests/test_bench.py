@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from openant_tools.cli import main
 from openant_tools.cli.virtual_for_command import virtual_robot
 from openant_tools.comms.clock import VirtualControl
+from openant_tools.comms.messages import ImuConfig
 from openant_tools.comms.setup import config_of_unknown_robot
 from openant_tools.errors import BadInput
 from openant_tools.robot.folder import create_robot
@@ -25,6 +27,7 @@ from openant_tools.sysid.bench.friction import onset_angle, up_direction
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2, KNEE_TO_GROUND_M, knee_load, knee_torque
 from openant_tools.sysid.bench.press import Pressing, press
 from openant_tools.sysid.bench.stiffness import fit_line
+from openant_tools.sysid.bench.tilt import tilt_trials
 
 
 def openant(*words: object) -> int:
@@ -238,8 +241,10 @@ def test_the_servos_own_duty_tells_its_divisor_and_the_finding_is_kept(
     folder = create_robot(tmp_path / "ant", "standard")
     notebook = notes(tmp_path / "grams.csv", SHEET_STIFFNESS / 2, [0.02, 0.04, 0.06])
     words = ["--virtual", held["ready"], "--robot", folder.path, "--readings", notebook, "--steps", 3]
+    words += ["--report", tmp_path / "report"]
     assert openant("sysid", "scale", *words, "--pose", -0.87, "--yes") == 0
     assert "By the servo's own duty the P divisor is 256" in capsys.readouterr().out
+    assert "divisor 256" in (tmp_path / "report" / "report.html").read_text()
     (file,) = folder.findings.iterdir()
     finding = json.loads(file.read_text())
     assert [round(w["deflection_rad"], 2) for w in finding["data"]["weighings"]] == [0.02, 0.04, 0.06]
@@ -301,6 +306,8 @@ def test_static_and_kinetic_are_told_apart(tmp_path: Path, capsys: pytest.Captur
 def test_one_reading_is_no_measurement(capsys: pytest.CaptureFixture[str]) -> None:
     assert openant("sysid", "tilt", "--static", "31deg") == 1
     assert "at least three" in capsys.readouterr().out
+    assert openant("sysid", "tilt", "--static", "0.002", "--static", "0.003") == 1
+    assert "did the plate tilt" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -324,11 +331,15 @@ def test_the_accelerometer_reads_the_plate_of_a_standing_robot(
     control.ask("assemble", setup="floor")
     control.ask("advance", to=control.ask("now")["t"] + 1.0)  # the servos start up
     control.close()
-    words = ["--virtual", held["ready"], "--trials", 2, "--seconds", 1, "--held", "--yes"]
+    words = ["--virtual", held["ready"], "--trials", 1, "--seconds", 1, "--held", "--yes"]
     assert openant("sysid", "tilt", *words) == 1
     # tan 0.2 = 0.203; the robot leans a little downhill on its springy legs.
     at_least = float(capsys.readouterr().out.split("above ")[1].split(".\n")[0])
     assert at_least == pytest.approx(0.203, abs=0.03)
+    # A plate that is called level is level, whatever gravity says: what follows is counted from there.
+    config = replace(config_of_unknown_robot(held["bus"], held["control"]), imu=ImuConfig(held["imu"]))
+    (angle,) = tilt_trials(config, 1, level=lambda: True, ended=lambda seconds: seconds >= 0.5)
+    assert angle < 0.02
     assert not torque_is_on(held)
 
 

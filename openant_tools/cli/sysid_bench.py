@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from openant_tools.cli.options import json_option, robot_option
+from openant_tools.cli.options import json_option, report_option, robot_option
 from openant_tools.cli.sysid_record import robot_of
 from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option, virtual_robot
 
@@ -161,6 +161,7 @@ yes_option = click.option("--yes", is_flag=True, help="The robot may move: do no
 @click.option("--pwm-limit", type=float, metavar="SHARE", help="Without a robot. Default: the robot's, else 0.5.")
 @yes_option
 @json_option
+@report_option
 def scale(
     joint: str,
     readings: Path | None,
@@ -179,6 +180,7 @@ def scale(
     pwm_limit: float | None,
     yes: bool,
     json_file: Path | None,
+    report: Path | None,
 ) -> int:
     """Measure a joint's stiffness with a kitchen scale, and by the servo's own duty.
 
@@ -247,7 +249,7 @@ def scale(
             joint, own, p_gain=p_gain or float(factory or 0), supply_v=supply, pwm_limit=limit, scale=line, duty=None,
             measured_error=False, weighings=typed, **common,
         )  # fmt: skip
-        _print_stiffness(finding)
+        _show_stiffness(finding, report)
         return _conclude(finding, kept, json_file)
 
     from openant_tools.sysid.bench.press import Pressing, press
@@ -293,11 +295,15 @@ def scale(
         joint, own, p_gain=result.p_gain, i_gain=result.i_gain, supply_v=result.volts, pwm_limit=result.pwm_limit,
         scale=line_or_none, duty=duty, measured_error=True, weighings=result.weighings, readings=result.readings, **common,
     )  # fmt: skip
-    _print_stiffness(finding)
+    _show_stiffness(finding, report)
     return _conclude(finding, kept, json_file)
 
 
-def _print_stiffness(finding: Finding) -> None:
+def _show_stiffness(finding: Finding, report: Path | None) -> None:
+    if report:
+        from openant_tools.sysid.bench.report import stiffness_report
+
+        click.echo(f"wrote {stiffness_report(finding).write_folder(report)}", err=True)
     for reading in finding.data["servo_readings"]:
         click.echo(
             f"{reading['deflection_rad']:.3f} rad pressed: error {reading['error_rad']:.4f} rad, "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 from pathlib import Path
 
@@ -52,8 +53,12 @@ def compare(a: str, b: str, robot: Path | None, json_file: Path | None, report: 
     for note in result.notes:
         click.echo(note)
     click.echo(result.sentence)
+    content = json.dumps(result.as_json(), indent=1, ensure_ascii=False) + "\n"
+    if robot is not None and folder is not None:
+        stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
+        write_text(folder.findings / f"comparison-{stamp}.json", content)
     if json_file:
-        write_text(json_file, json.dumps(result.as_json(), indent=1, ensure_ascii=False) + "\n")
+        write_text(json_file, content)
     if report:
         from openant_tools.sysid.compare_report import comparison_report
 

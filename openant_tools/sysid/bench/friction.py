@@ -41,6 +41,8 @@ STEEPEST_RAD = math.radians(58)
 GRAVITY_TOLERANCE = 0.08
 #: s over which the accelerometer is smoothed: longer than a shock of the plate, shorter than the slide begins
 SMOOTHING_S = 0.2
+#: steel on wet ice
+LEAST_FRICTION = 0.02
 #: two-sided confidence of intervals
 CONFIDENCE = 0.95
 
@@ -215,6 +217,9 @@ def friction_finding(
     ok = mu.low is not None
     if not ok:
         actions.append("One reading has no interval: take at least three, with the robot turned in between.")
+    if mu.value < LEAST_FRICTION:
+        ok = False
+        actions.append("No floor is so slippery: did the plate tilt, and was it level when the reference was taken?")
     if len(found) == 2:
         ratio = found["static"].value / mu.value
         what += f" It holds up to {found['static'].value:.3f} before it slides, {ratio:.2f} times as much."

@@ -66,6 +66,7 @@ def tilt_trials(
         engine.ask(messages.Ramp(pose))
         up = BODY_UP
         if level():
+            engine.telemetry()  # what came before, while it stood up, says nothing of the plate
             up = up_direction(_sample(engine, LEVEL_S)[1])
         for trial in range(trials):
             begin(trial)
