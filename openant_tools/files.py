@@ -17,12 +17,20 @@ def atomic_writer(path: str | Path) -> Iterator[IO[bytes]]:
     """A binary stream that takes `path`'s place once the block is left; left by an error, it leaves nothing behind.
 
     The bytes go to a temporary file in the same directory (which is made where it is missing), are synced to the disk
-    and renamed over `path`: a full disk, a kill or a power cut leaves what stood there before.
+    and renamed over `path`: a full disk, a kill or a power cut leaves what stood there before. What is no file (a pipe,
+    /dev/stdout, /dev/null) is written into, and stays what it is.
 
     Raises:
         OSError: the directory cannot be written, or the disk is full; `filename` names `path`.
     """
     path = Path(path)
+    if path.parent == Path("/dev") or (path.exists() and not path.is_file() and not path.is_dir()):
+        try:
+            with path.open("wb") as stream:
+                yield stream
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        return
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")

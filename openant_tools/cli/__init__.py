@@ -94,7 +94,10 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line; exits with 0, 1, 2 or 130 (formats, section 6), never a traceback for bad input."""
-    signal.signal(signal.SIGTERM, _interrupt)
+    # Being told to go, and a terminal that is closed, are as good as Ctrl-C: torque goes off, what was learned is saved.
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+            signal.signal(number, _interrupt)
     try:
         code = openant.main(args=argv, prog_name="openant", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)

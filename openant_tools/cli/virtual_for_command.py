@@ -45,7 +45,8 @@ def virtual_robot(source: str, *, clock: str | None = None) -> Iterator[Mapping[
         yield _read(Path(source))
         return
     if source != VIRTUAL_DEFAULT and not Path(source).is_file():
-        raise BadInput("there is no such scenario", where=source)
+        remedy = "name a scenario (NAME.toml) or a ready file, or give --virtual alone for a healthy robot"
+        raise BadInput("there is no such scenario", where=source, remedy=remedy)
     with tempfile.TemporaryDirectory(prefix="openant-virtual-") as folder:
         ready = Path(folder) / "ready.json"
         command = [sys.executable, "-m", "openant_tools.cli", "virtual", "start", "--ready-file", str(ready)]
@@ -80,8 +81,9 @@ def _await(process: subprocess.Popen[bytes], ready: Path, log: str) -> None:
 def _read(path: Path) -> Mapping[str, str | None]:
     try:
         content = json.loads(path.read_text())
-        return {"bus": str(content["bus"]), "imu": content.get("imu"), "control": content.get("control")}
+        return {"bus": str(content["bus"]), **{key: content.get(key) for key in ("imu", "camera", "control")}}
     except FileNotFoundError:
         raise BadInput("there is no such ready file", where=path, remedy="start a virtual robot first") from None
     except (ValueError, KeyError, TypeError):
-        raise BadInput("this is no ready file of a virtual robot", where=path) from None
+        remedy = "name what `openant virtual start --ready-file` wrote, or a scenario that ends with .toml"
+        raise BadInput("this is no ready file of a virtual robot", where=path, remedy=remedy) from None

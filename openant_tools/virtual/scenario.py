@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,9 +20,10 @@ from openant_tools.virtual.flight_controller import FlightControllerSettings
 from openant_tools.virtual.imperfections import Entry, apply_entry, nearest
 from openant_tools.virtual.motor import MotorSettings
 from openant_tools.virtual.overhead_camera import OverheadCameraSettings, TagOnFloor, TagOnRobot
+from openant_tools.virtual.seal import KEY_VARIABLE, is_sealed, open_sealed, read_key, seal
 from openant_tools.virtual.world import ServoSetup, WorldSettings, standard_servos
 
-__all__ = ["Scenario", "load_scenario", "parse_scenario"]
+__all__ = ["Scenario", "load_scenario", "parse_scenario", "read_scenario_file", "seal_scenario"]
 
 #: s; with play or spring in a gear the teeth want the finer step.
 STEP_S, FINE_STEP_S = 1e-3, 5e-4
@@ -67,6 +69,7 @@ class Scenario:
         stepped: whether time is stepped. camera: whether there is one.
         eeprom: file that keeps the servos' EEPROM from one start to the next.
         plugged: joints on the cable at the start; None for all.
+        sealed: it came out of a seal, so that the robot keeps its truth to itself.
     """
 
     name: str = "healthy standard Ant"
@@ -76,20 +79,40 @@ class Scenario:
     camera: bool = True
     eeprom: Path | None = None
     plugged: tuple[str, ...] | None = None
+    sealed: bool = False
 
 
-def load_scenario(path: Path) -> Scenario:
-    """Read a scenario file; BadInput names file, place and remedy."""
+def load_scenario(path: Path, key_file: Path | None = None) -> Scenario:
+    """Read a scenario file; BadInput names file, place and remedy.
+
+    Args:
+        key_file: opens a sealed one; None for what the environment names.
+    """
+    _, table = read_scenario_file(path)
+    if sealed := is_sealed(table):
+        key_file = key_file or (Path(os.environ[KEY_VARIABLE]) if os.environ.get(KEY_VARIABLE) else None)
+        if key_file is None:
+            raise BadInput("is sealed", where=path, remedy=f"name its key by --key-file or {KEY_VARIABLE}")
+        table = tomllib.loads(open_sealed(table, read_key(key_file), path))
+    scenario = parse_scenario(table, str(path))
+    scenario.sealed = sealed
+    if scenario.eeprom is not None and not scenario.eeprom.is_absolute():
+        scenario.eeprom = path.parent / scenario.eeprom
+    return scenario
+
+
+def read_scenario_file(path: Path) -> tuple[str, dict[str, Any]]:
+    """The text of a scenario and the table in it as they stand, sealed or not; raises BadInput."""
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
-        raise BadInput(error.strerror or str(error), where=path) from None
+        raise BadInput(error.strerror or str(error), where=path, remedy="name a scenario file") from None
     except UnicodeDecodeError:
         raise BadInput("is not a text file", where=path, remedy="a scenario is TOML") from None
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise BadInput(f"is not TOML: {error}", where=path) from None
+        raise BadInput(f"is not TOML: {error}", where=path, remedy="mend it there; a scenario is TOML") from None
     scenario = parse_scenario(table, str(path))
     if scenario.eeprom is not None and not scenario.eeprom.is_absolute():
         scenario.eeprom = path.parent / scenario.eeprom

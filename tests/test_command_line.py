@@ -1,0 +1,347 @@
+"""The command line as a user meets it: manuals that open at once, refusals in one line, Ctrl-C that leaves things in order."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import resource
+import select
+import signal
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from plants import drive, pendulum, run_of, sweep
+
+from openant_tools.recording.tables import write_table
+
+OPENANT = (sys.executable, "-m", "openant_tools.cli")
+#: s; only a command that hangs takes longer
+PATIENCE_S = 120.0
+
+Result = subprocess.CompletedProcess[str]
+
+
+def openant(*arguments: str | Path, cwd: Path | None = None, largest_file: int | None = None) -> Result:
+    """Run a command to its end; `largest_file` (bytes) makes the disk as good as full."""
+
+    def limit() -> None:
+        assert largest_file is not None
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
+
+    return subprocess.run(
+        [*OPENANT, *map(str, arguments)], cwd=cwd, text=True, capture_output=True, timeout=PATIENCE_S,
+        preexec_fn=None if largest_file is None else limit, stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+
+
+def refusal(result: Result) -> str:
+    """The one line of a refusal: exit code 2, nothing else said, no traceback."""
+    assert result.returncode == 2, result.stderr
+    assert result.stdout == ""
+    lines = [line for line in result.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("openant")
+    assert "Traceback" not in lines[0]
+    assert "→" in lines[0], f"no remedy: {lines[0]}"
+    return lines[0]
+
+
+# ---- manuals ----
+
+WALK = """
+import importlib, json, sys
+import click
+from openant_tools.cli import COMMANDS, main, openant
+
+def paths(command, path):
+    yield path
+    if isinstance(command, click.Group):
+        context = click.Context(command)
+        for name in command.list_commands(context):
+            yield from paths(command.get_command(context, name), [*path, name])
+
+manuals = {}
+for path in paths(openant, []):
+    from io import StringIO
+    sys.stdout = StringIO()
+    try:
+        main([*path, "--help"])
+    except SystemExit as end:
+        assert end.code == 0, (path, end.code)
+    manuals[" ".join(path)] = sys.stdout.getvalue()
+sys.stdout = sys.__stdout__
+heavy = ["torch", "mujoco", "scipy", "matplotlib", "cv2", "pyarrow", "numpy", "gymnasium", "textual"]
+print(json.dumps({"manuals": manuals, "imported": [name for name in heavy if name in sys.modules]}))
+"""
+
+
+@pytest.fixture(scope="module")
+def manuals() -> dict[str, str]:
+    result = subprocess.run([sys.executable, "-c", WALK], text=True, capture_output=True, timeout=PATIENCE_S)
+    assert result.returncode == 0, result.stderr
+    answer = json.loads(result.stdout)
+    assert answer["imported"] == [], "a manual that imports these opens slowly"
+    pages: dict[str, str] = answer["manuals"]
+    return pages
+
+
+def test_every_command_has_a_manual_and_none_of_them_imports_what_is_heavy(manuals: dict[str, str]) -> None:
+    for command in ("", "demo", "virtual start", "config check", "comms scan", "rec repair", "sysid record", "sysid fit",
+                    "train sac", "eval"):  # fmt: skip
+        assert command in manuals
+    for command, page in manuals.items():
+        assert page.startswith(f"Usage: openant {command}".rstrip()), page
+        # A sentence at least, before the options.
+        assert re.search(r"\n  [A-Z].{20,}", page), f"{command} does not say what it does"
+
+
+def test_the_first_page_lists_every_command_with_its_line(manuals: dict[str, str]) -> None:
+    commands = {path.split()[0] for path in manuals if path}
+    for command in commands:
+        assert re.search(rf"^  {command} +\S", manuals[""], re.MULTILINE), command
+    assert "openant demo" in manuals[""]
+
+
+def test_an_unknown_command_is_refused_and_a_near_one_suggested() -> None:
+    assert "'nosuch'" in refusal(openant("nosuch"))
+    assert "'fit'" in refusal(openant("sysid", "fitt"))
+    assert "--rate" in refusal(openant("sysid", "record", "--rat", "3"))
+
+
+def test_the_version_is_printed() -> None:
+    result = openant("--version")
+    assert result.returncode == 0
+    assert re.match(r"openant, version \d", result.stdout)
+
+
+# ---- bad input ----
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as a user has it: a log of a motor on a bench, its model, and each of them spoilt in one way."""
+    folder = tmp_path_factory.mktemp("bench")
+    # Nothing stands below the arm in these runs, as formats, section 1, has it for a stand.
+    model = pendulum().replace('name="bench"', 'name="bench" contype="0" conaffinity="0"')
+    (folder / "arm.xml").write_text(model)
+    robot = mujoco.MjModel.from_xml_string(model.replace('damping="0.12"', 'damping="0.16"'))
+    t = np.arange(0.0, 6.0, 0.01)
+    run = run_of(drive(robot, ["joint"], t, sweep(t, 1)), t, ["joint"], "swing", setup="stand")
+    write_table(run, folder / "swing.csv")
+    write_table(run, folder / "whole.parquet")
+
+    header, *rows = (folder / "swing.csv").read_text().replace('"', "").splitlines()
+    position = header.split(",").index("pos.joint")
+
+    def spoil(name: str, lines: list[str]) -> None:
+        (folder / f"{name}.csv").write_text("\n".join(lines) + "\n")
+        (folder / f"{name}.json").write_text('{"joints": ["joint"]}')
+
+    def with_cell(row: int, column: int, text: str) -> list[str]:
+        cells = rows[row].split(",")
+        cells[column] = text
+        return [header, *rows[:row], ",".join(cells), *rows[row + 1 :]]
+
+    spoil("column", [header.replace("pos.joint", "pos.jiont"), *rows])
+    spoil("unit", with_cell(29, position, "300"))
+    spoil("time", with_cell(29, 0, "0.01"))
+    spoil("empty", [header])
+    spoil("facts", [header, *rows])
+    (folder / "facts.json").write_text('{"joints": ["jo')
+    (folder / "cut.parquet").write_bytes((folder / "whole.parquet").read_bytes()[:2000])
+    (folder / "cut.mcap").write_bytes(b"\x89MCAP0\r\n\x01")
+    (folder / "broken.xml").write_text(model.replace("</body>", ""))
+    (folder / "unknown.xml").write_text(model.replace("frictionloss", "fricton"))
+    (folder / "bare.xml").write_text(re.sub(r"<actuator>.*</actuator>", "", model, flags=re.DOTALL))
+    (folder / "motor.xml").write_text(re.sub(r"<position [^>]*>", '<motor joint="joint"/>', model))
+    (folder / "other.xml").write_text(model.replace('"joint"', '"elbow"'))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("run", "more", "said"),
+    [
+        ("column.csv", (), ("column.csv, column pos.jiont", "no such joint", "did you mean joint")),
+        ("unit.csv", (), ("unit.csv, column pos.joint, row 30", "300 rad cannot be", "angles are in rad")),
+        ("time.csv", (), ("time.csv, column t, row 30", "time runs backwards", "sort the rows")),
+        ("empty.csv", (), ("empty.csv", "the run is empty", "record again")),
+        ("facts.csv", (), ("facts.json",)),
+        ("cut.parquet", (), ("cut.parquet", "not a whole parquet file", "export it again")),
+        ("cut.mcap", (), ("cut.mcap",)),
+        ("missing.csv", (), ("missing.csv", "no such file")),
+        ("swing.csv", ("--joint", "elbow"), ("arm.xml", "no position-controlled joint 'elbow'", "joint")),
+        ("swing.csv", ("--parameter", "mass"), ("no such parameter: mass", "stiffness")),
+        ("swing.csv", ("--hold-out", "swing.csv"), ("held-out run is also fitted",)),
+        ("swing.csv", ("--model", "broken.xml"), ("broken.xml", "MuJoCo cannot load it")),
+        ("swing.csv", ("--model", "unknown.xml"), ("unknown.xml", "MuJoCo cannot load it", "fricton")),
+        ("swing.csv", ("--model", "bare.xml"), ("bare.xml", "no actuators", "<position>")),
+        ("swing.csv", ("--model", "motor.xml"), ("motor.xml", "position servo", "<position>")),
+        ("swing.csv", ("--model", "other.xml"), ("other.xml", "elbow", "named as in the runs")),
+        ("swing.csv", ("--model", "missing.xml"), ("missing.xml", "no such model")),
+    ],
+)
+def test_a_fit_refuses_bad_input_in_one_line_and_leaves_nothing(
+    bench: Path, run: str, more: tuple[str, ...], said: tuple[str, ...]
+) -> None:
+    before = set(bench.rglob("*"))
+    model = () if "--model" in more else ("--model", "arm.xml")
+    line = refusal(openant("sysid", "fit", run, *model, *more, "--out", "fit", cwd=bench))
+    for words in said:
+        assert words in line
+    assert set(bench.rglob("*")) == before
+
+
+def test_a_fit_without_model_and_robot_asks_for_one(bench: Path) -> None:
+    assert "--model" in refusal(openant("sysid", "fit", "swing.csv", "--out", "fit", cwd=bench))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("rec", "info", "nowhere"), "no such file"),
+        (("rec", "export", "empty.csv", "--to", "parquet", "--out", "x"), "the run is empty"),
+        (("config", "show", "--robot", "nowhere"), "nowhere"),
+        (("config", "import", "arm.xml", "--robot", "x"), "arm.xml"),
+        (("comms", "scan", "--port", "/dev/ttyNOPE"), "/dev/ttyNOPE"),
+        (("sysid", "record", "--virtual", "nowhere.toml", "--out", "x.mcap", "--yes"), "nowhere.toml"),
+        (("sysid", "record", "--virtual", "nowhere.json", "--out", "x.mcap", "--yes"), "nowhere.json"),
+        (("sysid", "record", "--protocol", "dance", "--virtual", "--out", "x.mcap", "--yes"), "dance"),
+        (("virtual", "start", "--scenario", "broken.xml"), "broken.xml"),
+        (("train", "sac", "--robot", "nowhere", "--out", "x"), "nowhere"),
+        (("eval", "nowhere"), "nowhere"),
+        (("demo", "--robot", "arm.xml"), "arm.xml"),
+    ],
+)
+def test_other_commands_refuse_in_one_line_too(bench: Path, arguments: tuple[str, ...], said: str) -> None:
+    before = set(bench.rglob("*"))
+    assert said in refusal(openant(*arguments, cwd=bench))
+    assert set(bench.rglob("*")) == before
+
+
+# ---- a full disk ----
+
+
+@pytest.mark.parametrize("largest", [100, 4000])
+def test_on_a_full_disk_a_fit_leaves_no_part_of_itself(bench: Path, tmp_path: Path, largest: int) -> None:
+    """At first nothing fits, then the small files do and the report does not."""
+    out = tmp_path / "fit"
+    result = openant("sysid", "fit", bench / "swing.csv", "--model", bench / "arm.xml", "--parameter", "damping",
+                     "--out", out, largest_file=largest)  # fmt: skip
+    line = refusal(result)
+    assert str(out) in line
+    assert "make room" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_on_a_full_disk_an_export_and_a_new_robot_leave_nothing(bench: Path, tmp_path: Path) -> None:
+    line = refusal(openant("rec", "export", bench / "swing.csv", "--to", "parquet", "--out", tmp_path / "tables",
+                           largest_file=500))  # fmt: skip
+    assert "swing.parquet" in line
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+    line = refusal(openant("config", "new", "--robot", tmp_path / "ant", largest_file=500))
+    assert "make room" in line
+    assert not (tmp_path / "ant" / "robot.toml").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="there is no /dev/full here")
+def test_a_device_is_written_to_and_stays_a_device(bench: Path) -> None:
+    line = refusal_after_output(openant("rec", "info", bench / "swing.csv", "--json", "/dev/full"))
+    assert "/dev/full" in line
+    assert stat.S_ISCHR(os.stat("/dev/full").st_mode)
+    result = openant("rec", "info", bench / "swing.csv", "--json", "/dev/stdout")
+    assert '"rows"' in result.stdout
+
+
+def refusal_after_output(result: Result) -> str:
+    return refusal(subprocess.CompletedProcess(result.args, result.returncode, "", result.stderr))
+
+
+# ---- Ctrl-C ----
+
+
+@pytest.fixture
+def started() -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Starts commands, and ends what is still running after the test."""
+    running: list[subprocess.Popen[str]] = []
+
+    def start(*arguments: str | Path) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [*OPENANT, *map(str, arguments)], text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            # rich shows its progress where it is told that someone looks.
+            env={**os.environ, "TTY_COMPATIBLE": "1", "TTY_INTERACTIVE": "1"},
+        )  # fmt: skip
+        running.append(process)
+        return process
+
+    yield start
+    for process in running:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+    give_up = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < give_up, "it never came"
+        time.sleep(0.05)
+
+
+def test_ctrl_c_in_a_fit_leaves_nothing_behind(
+    bench: Path, tmp_path: Path, started: Callable[..., subprocess.Popen[str]]
+) -> None:
+    out = tmp_path / "fit"
+    process = started("sysid", "fit", bench / "swing.csv", "--model", bench / "arm.xml", "--out", out)
+    stderr = process.stderr
+    assert stderr is not None
+    wait_until(lambda: bool(select.select([stderr], [], [], 0)[0]), process)  # the first sign of its progress
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130
+    assert "interrupted" in said
+    assert "Traceback" not in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_in_training_saves_and_the_same_command_goes_on(
+    tmp_path: Path, started: Callable[..., subprocess.Popen[str]]
+) -> None:
+    pytest.importorskip("torch")
+    out = tmp_path / "run"
+    command = ("train", "sac", "--kit", "standard", "--learning-start", "100", "--out", out, "--steps")
+    process = started(*command, "1000000")
+    curve = out / "learning_curve.csv"
+    wait_until(lambda: curve.exists() and len(curve.read_text().splitlines()) > 1, process)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130
+    assert "the same command goes on" in said
+    assert "Traceback" not in said
+    assert sorted(path.name for path in out.iterdir()) == [
+        "checkpoint.pt", "learning_curve.csv", "run.json", "transitions.f32",
+    ]  # fmt: skip
+    done = int(curve.read_text().splitlines()[-1].split(",")[0])
+    result = openant(*command, str(done + 100))
+    assert result.returncode == 0, result.stderr
+    assert int(curve.read_text().splitlines()[-1].split(",")[0]) == done + 100
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_being_told_to_go_is_as_good_as_ctrl_c(
+    bench: Path, tmp_path: Path, started: Callable[..., subprocess.Popen[str]], number: signal.Signals
+) -> None:
+    process = started("virtual", "start", "--ready-file", tmp_path / "ant.json")
+    wait_until((tmp_path / "ant.json").exists, process)
+    process.send_signal(number)
+    process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0
