@@ -26,7 +26,7 @@ from openant_tools.robot.servo import servo_model
 from openant_tools.sysid.bench.friction import onset_angle, up_direction
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2, KNEE_TO_GROUND_M, knee_load, knee_torque
 from openant_tools.sysid.bench.press import Pressing, press
-from openant_tools.sysid.bench.stiffness import fit_line
+from openant_tools.sysid.bench.stiffness import DutyReading, fit_line, servo_line
 from openant_tools.sysid.bench.tilt import tilt_trials
 
 
@@ -274,6 +274,12 @@ def test_a_press_beyond_the_limits_and_one_without_a_word_move_nothing(
     assert "its limits are" in capsys.readouterr().err
     assert openant("sysid", "scale", "--virtual", held["ready"]) == 2
     assert "--yes" in capsys.readouterr().err
+
+
+def test_a_leg_that_nothing_holds_is_no_measurement() -> None:
+    free = [DutyReading(0.02 * k, 0.001, 0.004, 12.0, -0.87 - 0.02 * k) for k in range(6)]
+    with pytest.raises(BadInput, match="nothing holds the leg"):
+        servo_line(free, 0.5)
 
 
 # ---- floor friction ----

@@ -43,6 +43,8 @@ ARM_UNCERTAINTY = 0.03
 LEAST_READINGS = 3
 #: share of the torque or duty limit from which a reading is taken to be cut off by it
 SATURATED = 0.93
+#: share of the deflection that must remain as error: a leg that is held keeps nearly all of it
+HELD = 0.3
 #: what a kitchen scale rounds to
 GRAM_STEP = 1.0
 #: two-sided confidence of intervals
@@ -186,7 +188,17 @@ def scale_line(
 
 
 def servo_line(readings: Sequence[DutyReading], pwm_limit: float = 1.0) -> Line:
-    """Duty per rad of position error, from what the servo said; readings at the PWM limit are left out."""
+    """Duty per rad of position error, from what the servo said; readings at the PWM limit are left out.
+
+    Raises:
+        BadInput: the leg followed its goal because nothing held it, or too few readings are left.
+    """
+    pressed = [r for r in readings if r.deflection_rad > 0]
+    if pressed and max(r.error_rad / r.deflection_rad for r in pressed) < HELD:
+        raise BadInput(
+            f"nothing holds the leg: it followed its goal to within {max(r.error_rad for r in pressed):.3f} rad",
+            remedy="put the scale, or something that does not give, under the foot at the pose where it touches (--pose)",
+        )
     free = [reading for reading in readings if abs(reading.duty) < SATURATED * pwm_limit]
     x = np.array([reading.error_rad for reading in free])
     y = np.array([reading.duty for reading in free])
