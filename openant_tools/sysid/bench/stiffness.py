@@ -196,7 +196,7 @@ def servo_line(readings: Sequence[DutyReading], pwm_limit: float = 1.0) -> Line:
     pressed = [r for r in readings if r.deflection_rad > 0]
     if pressed and max(r.error_rad / r.deflection_rad for r in pressed) < HELD:
         raise BadInput(
-            f"nothing holds the leg: it followed its goal to within {max(r.error_rad for r in pressed):.3f} rad",
+            f"nothing holds the leg: it followed its goal to within {max(abs(r.error_rad) for r in pressed):.3f} rad",
             remedy="put the scale, or something that does not give, under the foot at the pose where it touches (--pose)",
         )
     free = [reading for reading in readings if abs(reading.duty) < SATURATED * pwm_limit]
