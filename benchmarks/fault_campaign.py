@@ -27,7 +27,8 @@ import numpy as np
 
 from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_robot
 from openant_tools.comms import messages
-from openant_tools.comms.clock import VirtualControl
+from openant_tools.comms.camera import Camera, CameraSettings
+from openant_tools.comms.clock import RealClock, VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig, ImuConfig
 from openant_tools.comms.setup import config_of_unknown_robot
@@ -188,6 +189,28 @@ def imu_silent(robot: Robot, folder: Path) -> Row:
     return Row("IMU silent", None, "goes on; its columns are empty from there", told, rows_of(out))
 
 
+def camera_frozen(robot: Robot, folder: Path) -> Row:
+    """The camera is the face's, not the engine's: legs go on, and whoever wants a pose is told."""
+    out = folder / "camera.mcap"
+    clock = RealClock()
+    camera = Camera(CameraSettings(robot.ready["camera"]), clock)
+    camera.open()
+    try:
+        with moving_engine(robot, out) as (engine, number):
+            camera.wait(clock.now() + 5.0)
+            assert camera.fault() is None
+            robot.fault("camera_frozen")
+            noticed = robot.seconds_until(lambda: camera.newest() is None and camera.fault() is not None)
+            told = str(camera.fault())
+            assert not engine.done(number)
+            robot.fault("camera_frozen", on=False)
+    finally:
+        camera.close()
+    return Row(
+        "camera frozen", None, f"goes on; told after {noticed or -1:.1f} s, no pose from there", told, rows_of(out)
+    )
+
+
 def wrong_baud(robot: Robot, folder: Path) -> Row:
     try:
         with EngineProcess(robot.config(baud=57_600)):
@@ -233,6 +256,7 @@ CASES: dict[str, Callable[[Robot, Path], Row]] = {
     "overheated": lambda robot, folder: on_the_bus(robot, folder, "overheated", where="knee_fl", temperature_c=85),
     "broken wire": lambda robot, folder: on_the_bus(robot, folder, "broken_wire", where=["hip_fl", "knee_fl"]),
     "IMU": imu_silent,
+    "camera": camera_frozen,
     "wrong baud": wrong_baud,
 }
 
@@ -243,6 +267,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     table = []
+    load = os.getloadavg()[0]
     print("| fault | after | what happens | what the user is told | rows kept |\n|---|---|---|---|---|")
     for name, case in CASES.items():
         if options.only not in name:
@@ -251,14 +276,18 @@ def main() -> None:
             robot = Robot(dict(ready))
             try:
                 row = case(robot, Path(folder))
-                row.told = row.told.replace(str(robot.ready["bus"]), "BUS").replace(str(robot.ready["imu"]), "IMU")
+                for device in ("bus", "imu", "camera"):
+                    row.told = row.told.replace(str(robot.ready[device]), device.upper())
             except OpenAntError as error:
                 row = Row(name, None, "FAILED", str(error), None)
             table.append(vars(row) | {"case": name})
             after = "" if row.released_s is None else f"{row.released_s:.2f} s"
             print(f"| {name} | {after} | {row.what} | {row.told} | {row.rows or ''} |", flush=True)
+    loads = [load, os.getloadavg()[0]]
+    print(f"\nload {loads[0]:.1f} before, {loads[1]:.1f} after, on {os.cpu_count()} cores")
     if options.json:
-        options.json.write_text(json.dumps(table, indent=2) + "\n")
+        content = {"load": loads, "cores": os.cpu_count(), "faults": table}
+        options.json.write_text(json.dumps(content, indent=2) + "\n")
 
 
 if __name__ == "__main__":

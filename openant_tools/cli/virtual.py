@@ -14,6 +14,15 @@ def virtual() -> None:
     """A virtual Open Ant that speaks the real protocols."""
 
 
+key_file_option = click.option(
+    "--key-file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    envvar="OPENANT_SCENARIO_KEY",
+    metavar="FILE",
+    help="The key of a sealed scenario. Default: the file that OPENANT_SCENARIO_KEY names.",
+)
+
+
 @virtual.command()
 @click.option(
     "--scenario",
@@ -33,8 +42,9 @@ def virtual() -> None:
     type=click.Choice(["real", "stepped"]),
     help="Real time, or time that moves only by the control socket. Default: what the scenario says, else real.",
 )
+@key_file_option
 @click.option("--tcp", is_flag=True, help="Put the bus on a TCP port (pyserial's socket://) instead of a terminal.")
-def start(scenario: Path | None, ready_file: Path | None, clock: str | None, tcp: bool) -> None:
+def start(scenario: Path | None, ready_file: Path | None, clock: str | None, key_file: Path | None, tcp: bool) -> None:
     """Run until interrupted; prints where to connect.
 
     \b
@@ -44,7 +54,7 @@ def start(scenario: Path | None, ready_file: Path | None, clock: str | None, tcp
     """
     from openant_tools.virtual.start import serve
 
-    with serve(scenario, clock=clock, tcp=tcp) as server:
+    with serve(scenario, clock=clock, tcp=tcp, key_file=key_file) as server:
         for name, value in server.addresses.items():
             if value is not None:
                 click.echo(f"{name:8} {value}")
@@ -55,3 +65,25 @@ def start(scenario: Path | None, ready_file: Path | None, clock: str | None, tcp
         except KeyboardInterrupt:
             # Interrupting is how one ends it (formats, section 6): no failure.
             click.echo("stopped", err=True)
+
+
+@virtual.command()
+@click.argument("scenario", type=click.Path(path_type=Path, dir_okay=False))
+@key_file_option
+@click.option(
+    "--out", required=True, type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="The sealed scenario."
+)
+def seal(scenario: Path, key_file: Path | None, out: Path) -> None:
+    """Hide what is wrong with a robot: only the virtual robot that has the key reads it.
+
+    Prints the commitment, a hash that proves later that nothing was changed. A key file that is not there yet is made.
+    """
+    from openant_tools.errors import BadInput
+    from openant_tools.virtual.scenario import check_sealable, seal_scenario
+    from openant_tools.virtual.seal import make_key, read_key
+
+    if key_file is None:
+        raise BadInput("no key file is named", remedy="--key-file FILE; it is made where there is none")
+    check_sealable(scenario)  # no key for a file that is not good
+    commitment = seal_scenario(scenario, read_key(key_file) if key_file.exists() else make_key(key_file), out)
+    click.echo(f"{out}: commitment {commitment}")

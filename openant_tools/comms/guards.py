@@ -22,7 +22,8 @@ class Guards:
         current_share, load_share: of the servo's stall current, or of its full load, over `effort_s`.
         temperature_margin_k: below the servo's own limit, at which it would shut down.
         silent_s: a servo that does not answer for so long is lost, once it has been asked `silent_cycles` times in
-            vain, too: a noisy line loses answers by chance, a busy host asks seldom. Twice as long is too long.
+            vain, too: a noisy line loses answers by chance, a busy host asks seldom.
+        lost_s: a servo that does not answer for so long is lost, however often it was asked.
     """
 
     angle_margin_rad: float | None = 0.2
@@ -32,7 +33,8 @@ class Guards:
     temperature_margin_k: float | None = 5.0
     voltage: bool = True
     silent_s: float | None = 0.25
-    silent_cycles: int = 25
+    silent_cycles: int = 20
+    lost_s: float = 0.4
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class Watch:
         missed = self._missed.setdefault(servo.id, Counter())
         missed[answer.cause or Cause.SHORT] += 1
         limit = self.guards.silent_s
-        if limit is None or silent < limit or (missed.total() < self.guards.silent_cycles and silent < 2 * limit):
+        if limit is None or silent < limit or (missed.total() < self.guards.silent_cycles and silent < self.guards.lost_s):
             return None
         everyone: Counter[Cause] = sum(self._missed.values(), Counter())
         if len(self._missed) > len(self.servos) / 2 and _broken(everyone):

@@ -23,7 +23,7 @@ from openant_tools.virtual.overhead_camera import OverheadCameraSettings, TagOnF
 from openant_tools.virtual.seal import KEY_VARIABLE, is_sealed, open_sealed, read_key, seal
 from openant_tools.virtual.world import ServoSetup, WorldSettings, standard_servos
 
-__all__ = ["Scenario", "load_scenario", "parse_scenario", "read_scenario_file", "seal_scenario"]
+__all__ = ["Scenario", "check_sealable", "load_scenario", "parse_scenario", "read_scenario_file", "seal_scenario"]
 
 #: s; with play or spring in a gear the teeth want the finer step.
 STEP_S, FINE_STEP_S = 1e-3, 5e-4
@@ -110,13 +110,23 @@ def read_scenario_file(path: Path) -> tuple[str, dict[str, Any]]:
     except UnicodeDecodeError:
         raise BadInput("is not a text file", where=path, remedy="a scenario is TOML") from None
     try:
-        table = tomllib.loads(text)
+        return text, tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise BadInput(f"is not TOML: {error}", where=path, remedy="mend it there; a scenario is TOML") from None
-    scenario = parse_scenario(table, str(path))
-    if scenario.eeprom is not None and not scenario.eeprom.is_absolute():
-        scenario.eeprom = path.parent / scenario.eeprom
-    return scenario
+
+
+def seal_scenario(path: Path, key: bytes, out: Path) -> str:
+    """Seal a scenario file that is good; its commitment. Raises BadInput."""
+    return seal(check_sealable(path), key, out)
+
+
+def check_sealable(path: Path) -> str:
+    """The text of a scenario that is plain and good; raises BadInput."""
+    text, table = read_scenario_file(path)
+    if is_sealed(table):
+        raise BadInput("is sealed already", where=path, remedy="seal the plain file")
+    parse_scenario(table, str(path))
+    return text
 
 
 def parse_scenario(table: Mapping[str, Any], name: str = "scenario") -> Scenario:

@@ -18,7 +18,7 @@ The control socket (Unix stream, one JSON object a line, one line of answer each
 | | answer reached the host |
 | `{"do": "wait", "port": "bus", "to": s, "bus_written": n, "imu_written": m}` | as `settle`, but time runs only until |
 | | the next bytes leave for that port, or to `to` (stepped only) |
-| `{"do": "state"}` | the truth: angles, torques, temperatures, torque enables, supply, body |
+| `{"do": "state"}` | the truth: angles, torques, temperatures, torque enables, supply, body; not where it is sealed |
 | `{"do": "wiring"}` | `{"chain": [[joint, …], …]}`, each cable from the adapter outwards |
 | `{"do": "fault", "cause": …, "where": …, "on": bool, …}` | switches a fault; `{"t": s}` |
 | `{"do": "plug", "joint": …}`, `{"do": "unplug", …}` | puts a servo on the bus or takes it off; `{"t": s}` |
@@ -144,6 +144,8 @@ class Server:
         self._imu = imu
         #: switches a fault by a control request; set by whoever builds the robot
         self.fault: Callable[[dict[str, Any]], None] | None = None
+        #: the truth is not told
+        self.sealed = False
         self._unplugged: set[str] = set()
         self._own_folder = folder is None
         self.folder = Path(tempfile.mkdtemp(prefix="openant-")) if folder is None else folder
@@ -458,6 +460,8 @@ class Server:
         if do == "wait":
             return self._wait(control, request)
         if do == "state":
+            if self.sealed:
+                raise _Failed("this robot's scenario is sealed: it keeps its truth to itself")
             if not self.stepped:
                 self.world.advance(self.now)
             return self.world.state()

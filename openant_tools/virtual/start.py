@@ -79,9 +79,12 @@ def assemble(script: Scenario, *, clock: str | None = None, tcp: bool = False, c
         raise
     faults = Faults(world, script.faults, unplug=server.set_plugged, imu=imu, camera=eye)
     server.fault = faults.request
+    server.sealed = script.sealed
     return server
 
 
-def serve(scenario: Path | None = None, *, clock: str | None = None, tcp: bool = False) -> Server:
+def serve(
+    scenario: Path | None = None, *, clock: str | None = None, tcp: bool = False, key_file: Path | None = None
+) -> Server:
     """`assemble` for a scenario file; None for a healthy standard Ant on its stand. Raises BadInput."""
-    return assemble(load_scenario(scenario) if scenario is not None else Scenario(), clock=clock, tcp=tcp)
+    return assemble(load_scenario(scenario, key_file) if scenario is not None else Scenario(), clock=clock, tcp=tcp)
