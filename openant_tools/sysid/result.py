@@ -73,16 +73,30 @@ def write_robot(result: Identification, folder: RobotFolder) -> None:
     recording = folder.relative(runs[0].path) if runs[0].path else runs[0].name
     now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
 
-    def source(low: float | None = None, high: float | None = None) -> Provenance:
-        return Provenance("fitted", "openant sysid fit", recording, now, low, high)
+    def source(how: str = "fitted", low: float | None = None, high: float | None = None) -> Provenance:
+        return Provenance(how, "openant sysid fit", recording, now, low, high)
 
     values: dict[str, object] = {"model": CALIBRATED}
     provenance = {"model": source()}
     for value in result.values:
-        if value.accepted:
-            kind = value.name.partition(".")[0]
-            for joint in value.joints:
-                path = f"identified.{kind}.{joint}"
-                values[path] = float(f"{value.value:.6g}")
-                provenance[path] = source(float(f"{value.low:.6g}"), float(f"{value.high:.6g}"))
+        kind = value.name.partition(".")[0]
+        for joint in value.joints:
+            # What stayed at its prior is written too: it must not be an older fit's value that is read beside this model.
+            path = f"identified.{kind}.{joint}"
+            values[path] = _rounded(value.value)
+            provenance[path] = (
+                source("fitted", _rounded(value.low), _rounded(value.high))
+                if value.accepted
+                else source("undetermined" if value.verdict == "undetermined" else "as given")
+            )
+    finding = {**result.as_json(), "date": now.isoformat()}
+    write_text(
+        folder.findings / f"sysid-fit-{now:%Y%m%dT%H%M%SZ}.json",
+        json.dumps(finding, indent=1, ensure_ascii=False) + "\n",
+    )
     folder.update(values, provenance=provenance)
+
+
+def _rounded(value: float) -> float:
+    """Six digits: more than any interval leaves meaning to, and fit for reading."""
+    return float(f"{value:.6g}")
