@@ -3,20 +3,24 @@
 The other end is a replier with answers computed beforehand, on a pseudo-terminal, in a process of its own, so that
 neither wire nor emulator is the limit. Both clients get the same bytes and take the same values out of them.
 
-    python benchmarks/bus_client.py [--seconds 3] [--json FILE]
+    python benchmarks/bus_client.py [--seconds 3] [--lerobot PYTHON] [--json FILE]
+
+LeRobot runs in an environment of its own; `benchmarks/lerobot_bus.py` says how to make it.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import multiprocessing
 import os
 import pty
 import struct
+import subprocess
 import time
 import tty
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from openant_tools.comms import protocol2 as p2
@@ -97,13 +101,24 @@ def theirs(path: str, fast: bool) -> Callable[[], list[int]]:
     return cycle
 
 
-def measure(make: Callable[[str, bool], Callable[[], list[int]]], fast: bool, seconds: float) -> dict[str, float]:
+@contextlib.contextmanager
+def answered() -> Iterator[str]:
+    """A port behind which the replier sits."""
     master, slave = pty.openpty()
     tty.setraw(slave)
     other = multiprocessing.get_context("fork").Process(target=replier, args=(master,), daemon=True)
     other.start()
     try:
-        cycle = make(os.ttyname(slave), fast)
+        yield os.ttyname(slave)
+    finally:
+        other.terminate()
+        os.close(master)
+        os.close(slave)
+
+
+def measure(make: Callable[[str, bool], Callable[[], list[int]]], fast: bool, seconds: float) -> dict[str, float]:
+    with answered() as path:
+        cycle = make(path, fast)
         assert cycle() == [2048 + id for id in IDS]
         best = {"cpu_us": float("inf"), "hz": 0.0}
         for _ in range(ROUNDS):
@@ -114,15 +129,22 @@ def measure(make: Callable[[str, bool], Callable[[], list[int]]], fast: bool, se
             best["cpu_us"] = min(best["cpu_us"], (time.process_time() - cpu) / cycles * 1e6)
             best["hz"] = max(best["hz"], cycles / took)
         return best
-    finally:
-        other.terminate()
-        os.close(master)
-        os.close(slave)
+
+
+def measure_lerobot(python: Path, seconds: float) -> dict[str, float]:
+    with answered() as path:
+        command = [str(python), str(Path(__file__).with_name("lerobot_bus.py"))]
+        ran = subprocess.run(
+            [*command, "--cycles-at", path, "--seconds", str(seconds)], stdout=subprocess.PIPE, text=True, check=True
+        )
+    best: dict[str, float] = json.loads(ran.stdout.splitlines()[-1])
+    return best
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=3.0)
+    parser.add_argument("--lerobot", type=Path, help="the Python that has LeRobot")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     rows = {}
@@ -131,6 +153,11 @@ def main() -> None:
         for read, fast in (("sync", False), ("fast sync", True)):
             rows[f"{name}, {read}"] = row = measure(make, fast, options.seconds)
             print(f"| {name} | {read} | {row['cpu_us']:.0f} | {row['hz']:.0f} |")
+    if options.lerobot:
+        rows["LeRobot, sync"] = row = measure_lerobot(options.lerobot, options.seconds)
+        print(f"| LeRobot | sync | {row['cpu_us']:.0f} | {row['hz']:.0f} |")
+        own = rows["openant, sync"]
+        print(f"\nsync: CPU {own['cpu_us'] / row['cpu_us']:.2f} of LeRobot's, {own['hz'] / row['hz']:.1f}× its cycles")
     for read in ("sync", "fast sync"):
         sdk, own = rows[f"dynamixel-sdk, {read}"], rows[f"openant, {read}"]
         print(f"{read}: CPU {own['cpu_us'] / sdk['cpu_us']:.2f} of the SDK's, {own['hz'] / sdk['hz']:.1f}× its cycles")

@@ -40,7 +40,12 @@ def main() -> None:
     parser.add_argument("--lerobot", type=Path, help="the Python that has LeRobot")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--client", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--cycles-at", metavar="PORT", help=argparse.SUPPRESS)
+    parser.add_argument("--seconds", type=float, default=3.0, help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.cycles_at:
+        print(json.dumps(cost_of_cycles(options.cycles_at, options.seconds)))
+        return
     if options.client:
         print(json.dumps(client(json.loads(options.client.read_text()))))
         return
@@ -75,6 +80,49 @@ def main() -> None:
 
 
 # ---- what runs in LeRobot's environment --------------------------------------------------------------------------
+
+
+def cost_of_cycles(port: str, seconds: float) -> dict[str, float]:
+    """What `benchmarks/bus_client.py` measures, with LeRobot: "write 8 goals, read 8 blocks of 27 bytes"."""
+    from lerobot.motors import Motor, MotorNormMode
+    from lerobot.motors.dynamixel import DynamixelMotorsBus
+
+    bus = DynamixelMotorsBus(
+        port, {joint: Motor(id, "xl430-w250", MotorNormMode.RANGE_M100_100) for joint, id in IDS.items()}
+    )
+    bus.connect(handshake=False)
+    bus.set_baudrate(1_000_000)
+    ids, goals = list(IDS.values()), {joint: 2048 + k for k, joint in enumerate(IDS)}
+    items = (
+        (120, 2),
+        (122, 1),
+        (123, 1),
+        (124, 2),
+        (126, 2),
+        (128, 4),
+        (132, 4),
+        (136, 4),
+        (140, 4),
+        (144, 2),
+        (146, 1),
+    )
+
+    def cycle() -> list[int]:
+        bus.sync_write("Goal_Position", goals, normalize=False)
+        # Its public sync_read takes one register by name; the block of all eleven goes through what lies below it.
+        bus._sync_read(120, 27, ids)
+        return [[bus.sync_reader.getData(id, address, size) for address, size in items][6] for id in ids]
+
+    assert cycle() == [2048 + id for id in ids]
+    best, rounds = {"cpu_us": float("inf"), "hz": 0.0}, 5
+    for _ in range(rounds):
+        cycles, cpu, start = 0, time.process_time(), time.perf_counter()
+        while (took := time.perf_counter() - start) < seconds / rounds:
+            cycle()
+            cycles += 1
+        best["cpu_us"] = min(best["cpu_us"], (time.process_time() - cpu) / cycles * 1e6)
+        best["hz"] = max(best["hz"], cycles / took)
+    return best
 
 
 def client(ready: dict[str, Any]) -> list[dict[str, Any]]:

@@ -271,11 +271,13 @@ class Faults:
         return not p["flicker"] or bool(self._random.random() >= p["flicker"])
 
     def _degrade(self, places: Sequence[int], fraction: float) -> None:
-        """Half of what a bad contact costs is lost whole, half arrives broken."""
+        """Half of what a bad contact costs is lost whole, there or back, half arrives broken."""
         bus = self.world.line.settings
+        passes = math.sqrt(max(0.0, 1 - fraction / 2))
+        whole = (1 - fraction) / (1 - fraction / 2) if fraction < 1 else 0.0
         for k in places:
-            bus.lost[k] = 1 - (1 - bus.lost.get(k, 0.0)) * (1 - fraction / 2)
-            bus.broken[k] = 1 - (1 - bus.broken.get(k, 0.0)) * (1 - fraction / 2)
+            bus.lost[k] = 1 - (1 - bus.lost.get(k, 0.0)) * passes
+            bus.broken[k] = 1 - (1 - bus.broken.get(k, 0.0)) * whole
 
     def _set_registers(self, wanted: Mapping[tuple[int, str], int]) -> None:
         for (k, name), healthy in list(self._registers.items()):
