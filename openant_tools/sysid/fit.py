@@ -34,6 +34,8 @@ Progress = Callable[[str, float], None]
 STEP = 0.1
 #: rounds of fit and re-weighting; weights settle in two to three
 ROUNDS = 4
+#: Gauss-Newton steps before the first weights, which come from the given model's errors, are replaced
+EARLY_STEPS = 3
 #: one effective sample per this many seconds where fits are compared whose residuals are model error
 TEMPER_S = 0.5
 #: half of the ±2 ms within which delays count as calibrated (effects.md)
@@ -225,7 +227,8 @@ class Problem:
                     method="dogbox",
                     xtol=1e-4,
                     ftol=1e-4,
-                    max_nfev=25,
+                    # No need to reach the bottom of a cost whose weights are about to change.
+                    max_nfev=EARLY_STEPS if round_ < rounds - 2 else 25,
                 )
                 u, converged = solution.x, bool(solution.success)
                 if driven_only:
