@@ -84,7 +84,7 @@ class Screen(App[None]):
         self.rows.extend(rows)
         self.frames += 1
         for plot, column in zip(self.query(Plot), self._columns, strict=True):
-            plot.values = np.concatenate([plot.values, rows[:, column]])[-400:]
+            plot.values = np.concatenate([plot.values, np.nan_to_num(rows[:, column])])[-400:]
             plot.refresh()
 
 

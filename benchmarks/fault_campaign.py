@@ -79,9 +79,12 @@ class Robot:
     def fault(self, cause: str, on: bool = True, **settings: Any) -> None:
         self.control.ask("fault", cause=cause, on=on, **settings)
 
-    def torque(self) -> bool:
+    def torque(self, beyond: tuple[str, ...] = ()) -> bool:
+        """Whether any servo that has power holds its joint, those behind a broken cable left out."""
         truth = self.control.ask("state")
-        return any(on and truth["powered"][joint] for joint, on in truth["torque_enable"].items())
+        return any(
+            on and truth["powered"][joint] for joint, on in truth["torque_enable"].items() if joint not in beyond
+        )
 
     def moving(self) -> bool:
         return any(abs(speed) > STILL_RAD_S for speed in self.control.ask("state")["velocity"].values())
@@ -149,12 +152,12 @@ def on_the_bus(robot: Robot, folder: Path, cause: str, **settings: Any) -> Row:
     out = folder / f"{cause}.mcap"
     with moving_engine(robot, out) as (engine, number):
         robot.fault(cause, **settings)
-        released = robot.seconds_until(lambda: not robot.torque())
+        beyond = (settings["where"][-1],) if cause == "broken_wire" else ()
+        released = robot.seconds_until(lambda: not robot.torque(beyond))
         told = heard(engine, number, 0.3 if released is not None else 1.0)
         what = "torque off"
-        if released is None and told:
-            on = [joint for joint, torque in robot.control.ask("state")["torque_enable"].items() if torque]
-            what, released = f"torque off, but at {', '.join(on)}: its watchdog stops it", robot.seconds_until_still()
+        if beyond:
+            what += f" before the break; watchdog behind it, still: {robot.seconds_until_still() is not None}"
         elif released is None:
             lost = max(servo["loss"] for servo in engine.ask(messages.Statistics())["servos"])
             what = f"goes on, up to {lost:.0%} of a servo's answers lost"

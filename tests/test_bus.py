@@ -375,3 +375,15 @@ def test_emergency_packet_releases_everyone() -> None:
     servos.set_torque(True)
     servos.torque_off_now()
     assert not any(device.torque for device in line.wire.servos)  # type: ignore[attr-defined]
+
+
+def test_torque_off_gets_through_a_line_that_breaks_every_tenth_byte() -> None:
+    released = 0
+    for seed in range(50):
+        bus, line = ant(settings=BusSettings(), seed=seed)
+        servos = Servos(bus, [Servo(j.name, j.id, kit("standard").servo(j.kind)) for j in JOINTS.values()])
+        servos.set_torque(True)
+        line.wire.settings.byte_error = 0.1
+        servos.torque_off_now()
+        released += not any(device.torque for device in line.wire.servos)
+    assert released > 35

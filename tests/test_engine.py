@@ -138,7 +138,8 @@ def test_a_full_disk_stops_the_motion_and_the_next_recording_goes_on(stepped: di
         engine.ask(messages.Torque(True))
         engine.ask(messages.Record(str(tmp_path / "run"), Facts(JOINT_NAMES)))
         engine.ask(messages.Hold(0.2))
-        assert engine.ask(messages.StopRecording())[1] == 20
+        assert engine.ask(messages.StopRecording())[1] >= 15
+    assert read_recording(tmp_path / "run.mcap").damage is None
 
 
 def test_a_motion_that_the_watchdog_stopped_is_not_taken_for_going_on(live: dict[str, str]) -> None:
