@@ -286,8 +286,10 @@ def test_a_controller_that_falls_silent_is_missed_within_a_fifth_of_a_second_and
     assert "silent (for 0." in str(imu.fault())
     with pytest.raises(HardwareFault, match="silent"):
         imu.read(bench.t + 0.1)
-    collect(bench, imu, 2.0)
-    assert imu.fault() is not None
+    for _ in range(20):
+        # Whether the port is just being closed, opened or asked: the board is silent, its cable is in.
+        collect(bench, imu, 0.1)
+        assert "silent" in str(imu.fault())
     bench.fc.silent = False
     assert collect(bench, imu, 1.5)
     assert imu.fault() is None

@@ -173,6 +173,7 @@ class Imu:
         self._turn = 0
         self._sent_at = 0.0
         self._silent = 0
+        self._gone = False  # the port itself failed; we also close it ourselves, to open a silent board again
         self._reopen_at = 0.0
         self._attitude: _Attitude | None = None
         self._raw: msp.RawImu | None = None
@@ -206,7 +207,7 @@ class Imu:
                 where=self.where,
                 remedy="connect again so that its scale is measured",
             )
-        if self._line is None:
+        if self._line is None and self._gone:
             return HardwareFault("the flight controller is unplugged", where=self.where, remedy="look at its USB cable")
         since = self._last.t if self._last else self._sent_at
         if self._silent and now - since > 4 * REPLY_TIMEOUT_S:
@@ -490,6 +491,7 @@ class Imu:
                 self._outstanding = self._next() if self._proved else _PROOF
                 self._send(self._outstanding.request)
         except PortGone:
+            self._gone = True
             self._lose(self._clock.now())
         return newest
 
@@ -629,7 +631,9 @@ class Imu:
         try:
             self._line = self._open_line()
         except HardwareFault:
+            self._gone = True
             return  # not there yet
+        self._gone = False
         silent = self._silent
         self._forget()
         self._silent = silent
