@@ -5,7 +5,7 @@ VENV   ?= .venv
 BIN     = $(VENV)/bin
 DEMO   ?= demo-robot
 
-.PHONY: demo test lint types contracts pytest clean
+.PHONY: demo test lint types contracts pytest pictures clean
 
 demo: $(VENV)/.all
 	$(BIN)/openant demo --robot $(DEMO)
@@ -34,6 +34,10 @@ $(VENV)/.all: pyproject.toml constraints.txt
 $(VENV)/.dev: $(VENV)/.all
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,dev]'
 	@touch $@
+
+# The README's picture is the demo's own.
+pictures: demo
+	cp $(DEMO)/pictures/overview.png docs/pictures/overview.png
 
 clean:
 	rm -rf $(VENV) $(DEMO) build *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache

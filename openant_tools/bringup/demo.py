@@ -60,15 +60,15 @@ effect = "armature_error"
 joints = ["hip_rr", "hip_fr", "hip_fl", "hip_rl"]
 parameters = { kg_m2 = 0.009 }
 
-[[effect]]                  # and two knees whose zeros are a degree off
+[[effect]]                  # and two knees whose zeros are half a degree off
 effect = "zero_offset"
 joints = ["knee_fl"]
-parameters = { angle_rad = 0.021 }
+parameters = { angle_rad = 0.010 }
 
 [[effect]]
 effect = "zero_offset"
 joints = ["knee_rr"]
-parameters = { angle_rad = -0.017 }
+parameters = { angle_rad = -0.008 }
 """
 
 

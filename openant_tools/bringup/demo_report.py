@@ -37,13 +37,14 @@ Array = NDArray[np.float64]
 #: s, shown around the moment at which the nominal model is worst
 WINDOW_S = 2.0
 
-#: kind of parameter → its name and unit on an axis; all but zeros are shown relative to the data sheet
-KINDS = {
-    "stiffness": ("stiffness", "1"),
-    "damping": ("damping", "1"),
-    "armature": ("rotor inertia", "1"),
-    "coulomb_friction": ("friction", "1"),
-    "zero_offset": ("zero", "°"),
+#: kind of parameter → its name and unit on an axis, and what is shown: value × this, or None for value / data sheet
+KINDS: Mapping[str, tuple[str, str, float | None]] = {
+    "stiffness": ("stiffness", "1", None),
+    "damping": ("damping", "1", None),
+    "armature": ("rotor inertia", "1", None),
+    "coulomb_friction": ("friction", "1", None),
+    "zero_offset": ("zero", "°", math.degrees(1)),
+    "action_delay": ("delay", "ms", 1e3),
 }
 
 
@@ -108,6 +109,7 @@ def truth(scenario: Path) -> dict[str, float]:
         values[f"armature.{servo.joint}"] = motor.armature
         values[f"coulomb_friction.{servo.joint}"] = motor.coulomb_nm + stall / PWM_FULL / 2
         values[f"zero_offset.{servo.joint}"] = servo.zero_error_rad
+        values[f"action_delay.{servo.joint}"] = motor.action_delay_s
     return values
 
 
@@ -291,10 +293,10 @@ def _settings_figure(rows: Sequence[Recovered]) -> MatplotlibFigure:
     figure, panels = plots.figure(1, len(kinds), height=3.0, sharey=True, squeeze=False)
     joints = list(dict.fromkeys(row.joint for row in rows))
     for axes, kind in zip(panels[0], kinds, strict=True):
-        words, unit = KINDS[kind]
+        words, unit, factor = KINDS[kind]
         with plots.style():
             for row in (row for row in rows if row.kind == kind):
-                scale = math.degrees(1) if kind == "zero_offset" else 1 / row.given
+                scale = 1 / row.given if factor is None else factor
                 y = joints.index(row.joint)
                 colour = plots.BLUE if row.determined else plots.SKY
                 axes.plot([scale * row.low, scale * row.high], [y, y], color=colour, linewidth=5, alpha=0.45,
@@ -303,7 +305,7 @@ def _settings_figure(rows: Sequence[Recovered]) -> MatplotlibFigure:
                 axes.plot(
                     scale * row.truth, y, "x", color=plots.VERMILLION, markersize=6, label="true" if y == 0 else None
                 )
-            axes.axvline(0 if kind == "zero_offset" else 1, color=plots.INK, linewidth=0.8, linestyle=":",
+            axes.axvline(1 if factor is None else 0, color=plots.INK, linewidth=0.8, linestyle=":",
                          label="data sheet")  # fmt: skip
             axes.set_yticks(range(len(joints)), joints)
             axes.set_xlabel(plots.axis_label(words, unit))
