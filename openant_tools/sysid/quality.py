@@ -154,4 +154,3 @@ def _saturated(run: Run, plant: Plant, j: int, pos: Array, cmd: Array) -> float:
         full = torque > torque_limit(plant.model, plant, j)
         known = np.isfinite(torque) & on
     return float(full[known].mean()) if known.any() else 0.0
-
