@@ -237,16 +237,23 @@ class Problem:
         finally:
             self._prior_weight = 1.0
 
-    def _least_squares(self, u: Array, most: int) -> tuple[Array, bool]:
-        """The minimum near u under the present weights, and whether it was reached within `most` evaluations."""
-        # Off the bounds: on them a derivative points one way only and a least-squares step may stick there.
-        margin = np.minimum(0.05, (self.high - self.low) / 4)
+    def _least_squares(self, u: Array, most: int, *, polish: bool = False) -> tuple[Array, bool]:
+        """The minimum near u under the present weights, and whether it was reached within `most` evaluations.
+
+        Args:
+            polish: with derivatives from both sides, and from u as it is.
+        """
+        if not polish:
+            # Off the bounds: on them a derivative points one way only and a least-squares step may stick there.
+            margin = np.minimum(0.05, (self.high - self.low) / 4)
+            u = np.clip(u, self.low + margin, self.high - margin)
         solution = least_squares(
             self._vector,
-            np.clip(u, self.low + margin, self.high - margin),
-            self._jacobian,
+            u,
+            lambda u: self._jacobian(u, central=polish),
             bounds=(self.low, self.high),
             method="dogbox",
+            x_scale="jac",
             xtol=1e-4,
             ftol=1e-4,
             max_nfev=most,
@@ -270,8 +277,11 @@ class Problem:
                 progress((round_ + 1) / rounds)
                 if np.abs(u - before).max(initial=0.0) < 0.05:
                     break
+        # Differences to one side are good enough to get near. Where parameters almost undo each other (all torques a
+        # per cent larger) they are not: there the minimum and the intervals come from both sides.
+        u, converged = self._least_squares(u, 25, polish=True)
         self._reweigh(self.residual([u])[0])
-        jacobian = self._jacobian(u)[: -len(u)]
+        jacobian = self._jacobian(u, central=True)[: -len(u)]
         covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(len(u))), np.float64)
         # A parameter at its bound cannot give way to what is left open; the others must hold all of it.
         free = (u > self.low + 1e-6) & (u < self.high - 1e-6)
@@ -400,21 +410,25 @@ class Problem:
         weighted = np.nan_to_num(self.residual([u])[0]) * self._weight
         return np.concatenate([weighted.ravel(), self._prior_weight * (u - self.centre)])
 
-    def _jacobian(self, u: Array) -> Array:
-        # Forward where the bound allows, else backward.
-        step = np.where(u + STEP <= self.high, STEP, -STEP)
+    def _jacobian(self, u: Array, central: bool) -> Array:
+        # Forward where the bound allows, else backward; where both, the other side too.
+        up, down = u + STEP <= self.high, u - STEP >= self.low
+        ahead = np.where(up, STEP, -STEP)
+        behind = np.where(up & down, -STEP, 0.0) if central else np.zeros(len(u))
         variants = [u]
-        for members, _ in self._colours:
-            moved = u.copy()
-            moved[members] += step[members]
-            variants.append(moved)
-        base, *moved_residuals = self.residual(variants) * self._weight
+        for step in (ahead, behind) if central else (ahead,):
+            for members, _ in self._colours:
+                moved = u.copy()
+                moved[members] += step[members]
+                variants.append(moved)
+        base, *residuals = self.residual(variants) * self._weight
         out = np.zeros((base.size + len(u), len(u)))
-        for (members, joints), residual in zip(self._colours, moved_residuals, strict=True):
-            change = np.nan_to_num(residual - base)
+        n = len(self._colours)
+        for c, (members, joints) in enumerate(self._colours):
+            change = np.nan_to_num(residuals[c] - (residuals[n + c] if central else base))
             for p, affected in zip(members, joints, strict=True):
                 column = np.zeros_like(base)
-                column[:, affected] = change[:, affected] / step[p]
+                column[:, affected] = change[:, affected] / (ahead[p] - behind[p])
                 out[: base.size, p] = column.ravel()
         out[base.size :] = self._prior_weight * np.eye(len(u))
         return out
