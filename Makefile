@@ -4,6 +4,8 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN     = $(VENV)/bin
 DEMO   ?= demo-robot
+# two workers: what CI has, and any laptop
+PYTEST_ARGS ?= -n 2
 
 .PHONY: demo test lint types contracts pytest pictures clean
 

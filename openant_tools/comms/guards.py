@@ -85,7 +85,11 @@ class Watch:
         missed = self._missed.setdefault(servo.id, Counter())
         missed[answer.cause or Cause.SHORT] += 1
         limit = self.guards.silent_s
-        if limit is None or silent < limit or (missed.total() < self.guards.silent_cycles and silent < self.guards.lost_s):
+        if (
+            limit is None
+            or silent < limit
+            or (missed.total() < self.guards.silent_cycles and silent < self.guards.lost_s)
+        ):
             return None
         everyone: Counter[Cause] = sum(self._missed.values(), Counter())
         if len(self._missed) > len(self.servos) / 2 and _broken(everyone):

@@ -169,6 +169,7 @@ class Drives:
         body = self.body
         if not self.elastic:
             body.set_gear(self._coulomb, self._viscous, self._armature)
+            self._centre_braking()
             return
         # Every rotor is ours then; a gear without play of its own is a stiff spring.
         body.set_gear(np.zeros(self.n), np.zeros(self.n), np.zeros(self.n))
@@ -178,6 +179,16 @@ class Drives:
         self._gear_c = 2 * GEAR_DAMPING * np.sqrt(self._gear_k * inertia)
         if not hasattr(self, "rotor"):
             self.rotor, self.rotor_velocity = body.q.copy(), body.v.copy()
+
+    def _centre_braking(self) -> None:
+        """Let back-EMF and viscous friction brake by the mean of the speeds before and after a step.
+
+        A step takes back-EMF at the speed before it and friction in the joint at the speed after it, which acts like b·dt/2
+        of inertia less or more, b being the slope: several percent of a rotor's. (A + b·dt/2)·Δv/dt = τ − b·v is the mean.
+        """
+        braking = self.kt * self.ke / self._r_cold * self.torque_on
+        inertia = self._armature + self.dt / 2 * (braking - self._viscous)
+        self.body.armature[:] = np.maximum(inertia, self._armature / 2)
 
     def _fill_noise(self) -> None:
         self._noise_rows = self._random.standard_normal((_NOISE_BLOCK, self.n)) * self._noise
@@ -195,6 +206,8 @@ class Drives:
 
     def _take(self, k: int, loop: Loop) -> None:
         self.torque_on[k] = float(loop.torque)
+        if not self.elastic:
+            self._centre_braking()
         self.direction[k], self.offset[k] = loop.direction, loop.offset
         self.p_gain[k] = loop.p_gain / self._p_divisor[k] * self._stiffness_scale[k]
         self.i_gain[k] = loop.i_gain / self._i_divisor[k]
