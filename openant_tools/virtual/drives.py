@@ -186,7 +186,7 @@ class Drives:
         A step takes back-EMF at the speed before it and friction in the joint at the speed after it, which acts like b·dt/2
         of inertia less or more, b being the slope: several percent of a rotor's. (A + b·dt/2)·Δv/dt = τ − b·v is the mean.
         """
-        braking = self.kt * self.ke / self._r_cold * self.torque_on
+        braking = self.kt * self.strength * self.ke / self._r_cold * self.torque_on
         inertia = self._armature + self.dt / 2 * (braking - self._viscous)
         self.body.armature[:] = np.maximum(inertia, self._armature / 2)
 
