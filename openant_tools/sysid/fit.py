@@ -41,8 +41,8 @@ EARLY_STEPS = 3
 TEMPER_S = 0.5
 #: priors weigh this much where the data lead alone: only against directions of which the data say nothing
 LOOSE = 0.1
-#: a residual is white where it forgets itself within this many samples
-WHITE = 1.5
+#: a residual is white where it forgets itself within this many samples, and more than model error where within so many
+WHITE, SHORT_LIVED = 1.5, 10
 #: nats by which a posterior must be better to count as another one: less is where the descent happened to stop
 DECISIVE = 1.0
 #: half of the ±2 ms within which delays count as calibrated (effects.md)
@@ -193,8 +193,8 @@ class Problem:
 
         Weights that the priors' misfit made can settle too: far from the truth residuals are correlated, the data count
         for little, and the priors hold the estimate where it is. So unless what is left is white, the data lead once
-        with the priors all but ignored, and the weights settle from there. Where the model is right, that ends in white
-        residuals; where it is not, the better posterior counts.
+        with the priors all but ignored, and the weights settle from there. Where the model is right, that ends in what
+        sensors leave, which is short-lived; where it is not, the better posterior counts.
 
         Args:
             start: (parameters,) first guess in prior deviations; default the prior.
@@ -218,15 +218,15 @@ class Problem:
             if best is None or score < best[0]:
                 best = score, estimate
         assert best is not None
-        if self._is_white(best[1]):
-            return best[1]
         score, estimate = best
-        again = self._descend(self._by_data_alone(estimate.u), lambda done: None)
-        return again if self._is_white(again) or self._score(again.u) < score - DECISIVE else estimate
-
-    def _is_white(self, estimate: Estimate) -> bool:
         period = max(period for _, _, period in self._stretches)
-        return bool((estimate.correlation_s < WHITE * period).all())
+        if (estimate.correlation_s < WHITE * period).all():
+            return estimate
+        again = self._descend(self._by_data_alone(estimate.u), lambda done: None)
+        short_lived = bool((again.correlation_s < SHORT_LIVED * period).all())
+        if short_lived and again.correlation_s.mean() < estimate.correlation_s.mean():
+            return again
+        return again if self._score(again.u) < score - DECISIVE else estimate
 
     def _by_data_alone(self, u: Array) -> Array:
         """Where the data lead from u with the priors all but ignored, as if all that is left were the sensors' noise."""
