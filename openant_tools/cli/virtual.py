@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from pathlib import Path
 
 import click
@@ -60,11 +62,16 @@ def start(scenario: Path | None, ready_file: Path | None, clock: str | None, key
                 click.echo(f"{name:8} {value}")
         if ready_file is not None:
             server.announce(ready_file)
+        # Interrupting is how one ends it (formats, section 6): no failure. A flag, since an exception that is raised
+        # wherever the loop happens to be can be swallowed there.
+        ended = threading.Event()
+        before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
-            server.run()
-        except KeyboardInterrupt:
-            # Interrupting is how one ends it (formats, section 6): no failure.
-            click.echo("stopped", err=True)
+            server.run(ended.is_set)
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+        click.echo("stopped", err=True)
 
 
 @virtual.command()
