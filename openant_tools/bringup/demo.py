@@ -117,14 +117,14 @@ class Demo:
     Attributes:
         folder: made where it is missing.
         steps: of training.
-        record_s: length of each recording, s; None for the protocol's own.
+        record_s: length of each recording, s; shorter than the protocol's own, because a fit takes as long as its data.
         eval_s: robot time that the trained agent is measured for, s.
         learns: whether torch is there to train with.
     """
 
     folder: Path
     steps: int = 6000
-    record_s: float | None = None
+    record_s: float = 16.0
     eval_s: float = 60.0
     learns: bool = importlib.util.find_spec("torch") is not None
 
@@ -137,14 +137,14 @@ class Demo:
         return self.folder / "nominal.xml"
 
     @property
-    def recordings(self) -> tuple[Path, Path]:
-        """What the model is fitted to: a motion and its repeat."""
-        return self.folder / "recordings" / "stand.mcap", self.folder / "recordings" / "stand-2.mcap"
+    def fitted(self) -> Path:
+        """The recording that the model is fitted to."""
+        return self.folder / "recordings" / "stand.mcap"
 
     @property
-    def held_out(self) -> Path:
-        """Another motion, which judges the fit."""
-        return self.folder / "recordings" / "held-out.mcap"
+    def held_out(self) -> tuple[Path, Path]:
+        """Another motion, played twice: it judges the fit, and its repeat says what no model could beat."""
+        return self.folder / "recordings" / "held-out.mcap", self.folder / "recordings" / "held-out-2.mcap"
 
     @property
     def fit(self) -> Path:
@@ -165,9 +165,17 @@ class Demo:
     def stages(self) -> tuple[Stage, ...]:
         """The stages in order, without the report that ends them."""
         robot, training = str(self.folder), self.training
-        first, again = self.recordings
-        length = () if self.record_s is None else ("--seconds", f"{self.record_s:g}")
-        play = ("sysid", "record", "--virtual", str(self.scenario), "--protocol", "stand", *length, "--robot", robot)
+        recordings = (self.fitted, *self.held_out)
+        play = (
+            "sysid",
+            "record",
+            "--virtual",
+            str(self.scenario),
+            "--protocol",
+            "stand",
+            "--seconds",
+            f"{self.record_s:g}",
+        )
         fit_json = self.fit / "fit.json"
         stages = [
             Stage(
@@ -179,25 +187,26 @@ class Demo:
             ),
             Stage(
                 "record",
-                "drive the virtual robot on its stand: a motion twice, then another one to judge by",
+                "drive the virtual robot on its stand: a motion to fit, and another one twice, to judge by",
                 (
-                    (*play, "--repeat", "2", "--out", str(first), "--yes"),
-                    (*play, "--seed", "1", "--out", str(self.held_out), "--yes"),
+                    (*play, "--robot", robot, "--out", str(self.fitted), "--yes"),
+                    (*play, "--seed", "1", "--repeat", "2", "--robot", robot, "--out", str(self.held_out[0]), "--yes"),
                 ),
                 (self.scenario,),
-                (first, again, self.held_out),
-                replaced=(first, again, self.held_out),
+                recordings,
+                replaced=recordings,
             ),
             Stage(
                 "fit",
                 "find what the data sheets do not know, and judge it on the motion that was held out",
                 (
                     (
-                        *("sysid", "fit", str(first), str(again), "--hold-out", str(self.held_out)),
+                        *("sysid", "fit", str(self.fitted)),
+                        *(word for path in self.held_out for word in ("--hold-out", str(path))),
                         *("--model", str(self.nominal), "--robot", robot, "--out", str(self.fit)),
                     ),
                 ),
-                (first, again, self.held_out),
+                recordings,
                 (self.fit / "calibrated.xml", fit_json, self.fit / "report.html"),
             ),
         ]

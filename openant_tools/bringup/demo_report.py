@@ -129,7 +129,7 @@ def write_report(demo: Demo) -> dict[str, Any]:
     """Write report.html and the pictures; returns the key figures, as for `--json`."""
     fit = json.loads((demo.fit / "fit.json").read_text(encoding="utf-8"))
     rows = compare(fit, truth(demo.scenario))
-    run = read_run(demo.held_out)
+    run = read_run(demo.held_out[0])
     moment = _worst_moment(run, demo.nominal, demo.fit / "calibrated.xml")
     curve = _curve(demo.training / "learning_curve.csv") if demo.learns else None
     reward = _reward(demo) if demo.learns else None

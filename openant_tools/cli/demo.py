@@ -86,7 +86,7 @@ def _print(whole: Any, figures: dict[str, Any]) -> None:
         (whole.report, "everything at a glance; opens in any browser, offline"),
         (robot / "robot.toml", "the robot, and where each value came from"),
         (robot / "calibrated.xml", "its MJCF, for plain MuJoCo too"),
-        (whole.recordings[0].parent, "what was recorded; `openant rec info` looks inside"),
+        (whole.fitted.parent, "what was recorded; `openant rec info` looks inside"),
         (whole.fit / "report.html", "the fit, joint by joint"),
         (whole.scenario, "what was wrong with the virtual robot; change it and run the demo again"),
     ]
@@ -99,6 +99,6 @@ def _print(whole: Any, figures: dict[str, Any]) -> None:
         click.echo(
             f"  openant train sac --robot {robot} --steps 15000 --out {robot}/runs/sac-1    half an hour of walking"
         )
-    click.echo(f"  openant rec info {whole.held_out}")
+    click.echo(f"  openant rec info {whole.fitted}")
     click.echo("  openant virtual start --ready-file ant.json    a virtual Ant that any Dynamixel software can drive")
     click.echo("  openant config new --kit standard --robot my-ant    a folder for your own robot")
