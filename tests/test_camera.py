@@ -534,7 +534,7 @@ def test_opencv_opens_the_stream_and_its_drops_and_return_are_noticed() -> None:
         assert 0 < last.arrived - last.t < 0.2
         counted = driver.statistics
         # Whoever lost them (the camera on purpose, a busy machine on top): what was exposed came or is counted.
-        assert abs(counted.received + counted.dropped - exposed) <= 0.15 * exposed
+        assert abs(counted.received + counted.dropped - exposed) <= 0.3 * exposed
         virtual.fault("gone")
         until = time.monotonic() + 10
         while driver.fault() is None and time.monotonic() < until:
