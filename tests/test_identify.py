@@ -1,0 +1,456 @@
+"""Identification against robots whose values are known, simulated otherwise than the fit simulates; and on real servos."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import plain
+import plants
+import pytest
+
+from openant_tools.errors import BadInput
+from openant_tools.model.plant import Setup, load_plant
+from openant_tools.recording.run import Run
+from openant_tools.recording.tables import read_run, write_table
+from openant_tools.robot.joints import JOINT_NAMES
+from openant_tools.robot.mjcf import nominal_mjcf
+from openant_tools.sysid.fit import autocorrelation_time
+from openant_tools.sysid.identify import Identification, Value, calibrated, identify
+from openant_tools.sysid.protocols import CommandSpace, protocol
+
+REAL = Path(__file__).parents[2] / "shared" / "realdata" / "bam-xl330"
+
+NOISE = 3e-4
+#: what no model can beat: an encoder of 4096 steps a turn, and the noise before it
+FLOOR = math.hypot(plants.ENCODER_RAD / math.sqrt(12), NOISE)
+#: the fit's step; the robots below are stepped sixteen times as finely, by another integrator
+MODEL = plants.pendulum(option='timestep="0.002" integrator="implicitfast"')
+GIVEN = {"stiffness": 8.0, "damping": 0.12, "armature": 0.006, "coulomb_friction": 0.03, "zero_offset": 0.0}
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A pendulum on a servo, with values of its own."""
+
+    stiffness: float = 8.0
+    damping: float = 0.12
+    armature: float = 0.006
+    coulomb_friction: float = 0.03
+    zero_offset: float = 0.0
+    delay_s: float = 0.0
+    electrical: bool = False
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        return {
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "armature": self.armature,
+            "coulomb_friction": self.coulomb_friction,
+            "zero_offset": self.zero_offset,
+            "action_delay": self.delay_s,
+        }
+
+    def record(
+        self, name: str, seconds: float = 4.0, seed: int = 0, *, falls: bool = False, time: int = 1, **facts: Any
+    ) -> Run:
+        """What its bus logs: jittering stamps, a coarse and noisy encoder; `seed` decides what is commanded.
+
+        Args:
+            falls: torque is off for a fifth of it. Its stamps are even then: a rollout switches torque between two steps.
+            time: which time it is that these commands are played; the noise is another each time.
+        """
+        model = mujoco.MjModel.from_xml_string(MODEL)
+        model.opt.timestep, model.opt.integrator = 0.000125, mujoco.mjtIntegrator.mjINT_IMPLICIT
+        model.geom_contype[0] = model.geom_conaffinity[0] = 0  # the bench
+        model.actuator_gainprm[0, 0], model.actuator_biasprm[0, 1] = self.stiffness, -self.stiffness
+        model.dof_damping[0], model.dof_armature[0] = self.damping, self.armature
+        model.dof_frictionloss[0], model.qpos0[0] = self.coulomb_friction, self.zero_offset
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        t = plants.jittering(seconds, 100.0, 0.0 if falls else 0.001, seed=seed)
+        command = plants.sweep(t, 1, reach=0.5 + 0.05 * (seed % 4), high_hz=2.0 + 0.2 * (seed % 3))
+        off = falls & (t > t[0] + 0.7 * seconds) & (t < t[0] + 0.9 * seconds)
+        if falls:
+            command[(t > t[0] + 0.55 * seconds) & (t < t[0] + 0.9 * seconds)] = 1.3
+        # A command acts `delay_s` after its row: as if there were a row of its own then.
+        rows = np.unique(np.concatenate([t, t + self.delay_s]))
+        rows = rows[rows <= t[-1]]
+        acting = np.maximum(np.searchsorted(t + self.delay_s, rows + 1e-9, side="right") - 1, 0)
+        limp = off[np.maximum(np.searchsorted(t, rows + 1e-9, side="right") - 1, 0)]
+        data = mujoco.MjData(model)
+        data.qpos[0] = command[0, 0]
+        position = np.empty(len(rows))
+        for k in range(len(rows)):
+            position[k] = data.qpos[0]
+            data.ctrl[0] = command[acting[k], 0]
+            model.actuator_group[0] = 30 if limp[k] else 0
+            model.opt.disableactuator = 1 << 30
+            model.dof_damping[0] = 0.0 if self.electrical and limp[k] else self.damping
+            if k + 1 < len(rows):
+                steps = math.ceil((rows[k + 1] - rows[k]) / 0.000125)
+                model.opt.timestep = (rows[k + 1] - rows[k]) / steps
+                mujoco.mj_step(model, data, steps)
+        measured = position[np.searchsorted(rows, t)]
+        measured = measured + NOISE * np.random.default_rng([seed, time]).standard_normal(len(t))
+        columns = {
+            "cmd.joint": command[:, 0],
+            "pos.joint": np.round(measured / plants.ENCODER_RAD) * plants.ENCODER_RAD,
+        }
+        if falls:
+            columns["torque.joint"] = (~off).astype(float)
+        return plants.run_of(columns, t, ["joint"], name, **facts)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return plants.write(tmp_path_factory.mktemp("model") / "pendulum.xml", MODEL)
+
+
+def value(result: Identification, name: str) -> Value:
+    return next(value for value in result.values if value.name == name)
+
+
+def holds(result: Identification, truth: Mapping[str, float]) -> None:
+    """Every value that is reported as identified has the truth in its interval, and the interval says something."""
+    for found in result.values:
+        kind = found.name.partition(".")[0]
+        if kind in truth and found.verdict in ("identifiable", "weak"):
+            assert found.low - 1e-12 <= truth[kind] <= found.high + 1e-12, (found, truth[kind])
+            assert found.low <= found.value <= found.high
+
+
+# --- what is known is recovered ----------------------------------------------------------------------------------------
+
+
+def test_a_pendulum_gives_its_values_away(model: Path) -> None:
+    robot = Robot(7.3, 0.145, 0.0072, 0.055, 0.012, delay_s=0.012)
+    result = identify([robot.record("a")], model, [robot.record("b", seed=1)])
+    holds(result, robot.values)
+    assert {found.verdict for found in result.values} == {"identifiable"}
+    assert result.after.full < 2.5 * FLOOR < 10 * FLOOR < result.before.full
+    assert result.after.horizon < 4 * FLOOR
+    assert value(result, "stiffness.joint").value == pytest.approx(7.3, rel=0.03)
+    assert value(result, "coulomb_friction.joint").value == pytest.approx(0.055, abs=0.004)
+    assert result.judged_on == ("b",)
+    assert not result.in_turn
+
+
+def test_a_robot_far_from_its_data_sheet_is_found_all_the_same(model: Path) -> None:
+    """Each value two prior deviations off: the misfit must not talk the fit into distrusting the data."""
+    robot = Robot(6.9, 0.095, 0.0045, 0.03, -0.022)
+    result = identify([robot.record("a", 5.0)], model, [robot.record("b", seed=1)])
+    holds(result, robot.values)
+    assert result.after.full < 2.5 * FLOOR
+    assert result.correlation_s["joint"] < 0.05
+
+
+@pytest.fixture(scope="module")
+def ant(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, dict[str, float]], Identification]:
+    """The nominal Ant's file (with a coarser step), an Ant's true values by kind and joint, and what is found of them."""
+    text = nominal_mjcf().replace('timestep="0.001"', 'timestep="0.002"')
+    path = plants.write(tmp_path_factory.mktemp("ant") / "ant.xml", text)
+    model = plain.on_stand(path)
+    model.opt.timestep, model.opt.integrator = 0.0005, mujoco.mjtIntegrator.mjINT_IMPLICIT
+    chance = np.random.default_rng(7)
+    truth: dict[str, dict[str, float]] = {kind: {} for kind in GIVEN}
+    for k, joint in enumerate(JOINT_NAMES):
+        dof, adr = model.joint(joint).dofadr[0], model.joint(joint).qposadr[0]
+        scale = math.exp(0.075 * chance.standard_normal())
+        model.actuator_gainprm[k, 0] *= scale
+        model.actuator_biasprm[k, 1] *= scale
+        model.dof_damping[dof] *= math.exp(0.125 * chance.standard_normal())
+        model.dof_armature[dof] *= math.exp(0.15 * chance.standard_normal())
+        model.dof_frictionloss[dof] = 0.02 + 0.05 * chance.random()
+        model.qpos0[adr] = 0.008 * chance.standard_normal()
+        truth["stiffness"][joint] = float(model.actuator_gainprm[k, 0])
+        truth["damping"][joint] = float(model.dof_damping[dof])
+        truth["armature"][joint] = float(model.dof_armature[dof])
+        truth["coulomb_friction"][joint] = float(model.dof_frictionloss[dof])
+        truth["zero_offset"][joint] = float(model.qpos0[adr])
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+    def record(name: str, seed: int) -> Run:
+        command = protocol("stand", 5.0).commands(CommandSpace.around_home(), 100.0, seed)
+        t = plants.jittering(len(command) / 100.0, 100.0, 0.001, seed=seed)
+        columns = plants.drive(model, JOINT_NAMES, t, command, noise=NOISE, quantum=plants.ENCODER_RAD, seed=seed)
+        return plants.run_of(columns, t, JOINT_NAMES, name, setup="stand")
+
+    return path, truth, identify([record("a", 0)], path, [record("b", 1)], kinds=tuple(GIVEN))
+
+
+def test_an_ant_on_its_stand_gives_its_values_away(
+    ant: tuple[Path, dict[str, dict[str, float]], Identification],
+) -> None:
+    _, truth, result = ant
+    told = [found for found in result.values if found.verdict in ("identifiable", "weak")]
+    inside = [
+        found.low <= truth[kind][joint] <= found.high
+        for found in told
+        for kind, _, joint in [found.name.partition(".")]
+    ]
+    assert len(told) >= 28, "all but the zeros, of eight joints"
+    # Of some thirty intervals at 95 %, more than three outside would be a wonder.
+    assert inside.count(False) <= 3
+    assert result.after.full < 1.5 * FLOOR < 4 * FLOOR < result.before.full
+
+
+def test_what_the_data_cannot_tell_is_named_and_left_where_it_was(
+    ant: tuple[Path, dict[str, dict[str, float]], Identification],
+) -> None:
+    """On a level stand a hip's axis is vertical: its command and its encoder shift alike, and nothing else changes."""
+    path, _, result = ant
+    for joint in JOINT_NAMES:
+        if joint.startswith("hip"):
+            zero = value(result, f"zero_offset.{joint}")
+            assert zero.verdict == "undetermined"
+            assert zero.value == zero.given == 0.0
+            assert not zero.accepted
+            assert zero.information < 0.1
+            assert zero.low < -math.radians(0.9) < math.radians(0.9) < zero.high, "no narrower than what was believed"
+    written, given = calibrated(result), load_plant(path, setup=Setup.FLOOR).model
+    hips = [written.joint(joint).qposadr[0] for joint in JOINT_NAMES if joint.startswith("hip")]
+    assert np.array_equal(written.qpos0[hips], given.qpos0[hips])
+
+
+@pytest.mark.parametrize("electrical", [True, False])
+def test_a_fall_without_torque_tells_whose_the_damping_is(electrical: bool, model: Path) -> None:
+    robot = Robot(8.4, 0.13, coulomb_friction=0.025, electrical=electrical)
+    kinds = ["stiffness", "damping", "coulomb_friction", "electrical_damping"]
+    runs = [robot.record("a", 3.0, falls=True), robot.record("b", 3.0, seed=1, falls=True)]
+    result = identify(runs[:1], model, runs[1:], kinds=kinds)
+    share = value(result, "electrical_damping.joint")
+    assert share.low <= float(electrical) <= share.high
+    assert abs(share.value - float(electrical)) < 0.05
+    holds(result, robot.values)
+    # A falling leg is fast: here it is the model's step of 2 ms that leaves some milliradians.
+    assert result.after.full < 0.3 * result.before.full
+    motor = calibrated(result).actuator_biastype[0] == mujoco.mjtBias.mjBIAS_DCMOTOR
+    assert motor == electrical or share.value > 0
+
+
+def test_without_torque_off_nothing_is_said_about_back_emf(model: Path) -> None:
+    robot = Robot(7.5)
+    result = identify([robot.record("a", 2.0)], model, [robot.record("b", 2.0, seed=1)])
+    assert not [found for found in result.values if found.name.startswith("electrical")]
+
+
+def test_tied_joints_share_a_value(tmp_path: Path) -> None:
+    """Two arms of the same servo: one value for both, whose interval is narrower than one arm's alone."""
+    arm = '<joint name="{0}" axis="0 1 0" damping="0.12" armature="0.006" frictionloss="0.03"/>'
+    body = f'<body pos="0 {{1}} 0">{arm}<geom size="0.03" mass="0.3" pos="0 0 -0.1"/></body>'
+    text = f"""\
+<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>{body.format("left", 0)}{body.format("right", 1)}</worldbody>
+  <actuator>
+    <position name="left" joint="left" kp="8" forcerange="-2 2"/>
+    <position name="right" joint="right" kp="8" forcerange="-2 2"/>
+  </actuator>
+</mujoco>"""
+    path = plants.write(tmp_path / "two.xml", text)
+    robot = plain.on_stand(path)
+    robot.dof_frictionloss[:] = 0.05
+    t = plants.jittering(3.0, 100.0)
+    both = ["left", "right"]
+
+    def record(name: str, seed: int) -> Run:
+        command = plants.sweep(t, 2, reach=0.4 + 0.1 * seed)
+        columns = plants.drive(robot, both, t, command, noise=NOISE, quantum=plants.ENCODER_RAD, seed=seed)
+        return plants.run_of(columns, t, both, name, motors={"left": "XL430-W250-T", "right": "XL430-W250-T"})
+
+    kinds = ["coulomb_friction", "stiffness"]
+    runs = [record("a", 0), record("b", 1)]
+    apart = identify(runs[:1], path, runs[1:], kinds=kinds)
+    servo = identify(runs[:1], path, runs[1:], kinds=kinds, tie="servo")
+    assert [found.name for found in servo.values] == ["stiffness.XL430-W250-T", "coulomb_friction.XL430-W250-T"]
+    tied, alone = value(servo, "coulomb_friction.XL430-W250-T"), value(apart, "coulomb_friction.left")
+    assert tied.joints == ("left", "right")
+    assert tied.low <= 0.05 <= tied.high
+    assert tied.high - tied.low < alone.high - alone.low
+    assert np.ptp(calibrated(servo).dof_frictionloss) == 0
+
+
+def test_each_run_is_simulated_with_the_model_that_it_names(model: Path, tmp_path: Path) -> None:
+    """Two gains, two files: what is fitted is what they have in common, and each keeps its own gain."""
+    soft = plants.write(tmp_path / "soft.xml", MODEL.replace('kp="8"', 'kp="4"'))
+    robots = {8.0: Robot(7.4, coulomb_friction=0.05), 4.0: Robot(3.7, coulomb_friction=0.05)}
+    runs = []
+    for k, (gain, robot) in enumerate(robots.items()):
+        for j in range(2):
+            run = robot.record(f"{gain:g} {j}", 2.5, seed=2 * k + j)
+            runs.append(replace(run, facts=replace(run.facts, model=str(soft if gain == 4.0 else model))))
+    result = identify([runs[0], runs[2]], model, [runs[1], runs[3]], kinds=["stiffness", "coulomb_friction"])
+    assert value(result, "stiffness.joint").value / 8.0 == pytest.approx(7.4 / 8.0, rel=0.02)
+    assert value(result, "coulomb_friction.joint").value == pytest.approx(0.05, abs=0.003)
+    assert result.after.full < 4 * FLOOR
+    assert len(result.datasets) == 2
+
+
+# --- what is better is measured on what was not seen -------------------------------------------------------------------
+
+
+def test_a_fit_that_beats_nothing_goes_back(model: Path) -> None:
+    """Fitted to one robot and judged on another that is just like the given model."""
+    result = identify([Robot(6.6, 0.15).record("a", 2.0)], model, [Robot().record("b", 2.0, seed=1)])
+    assert result.accepted == ()
+    assert {found.verdict for found in result.values} == {"fell back"}
+    assert all(found.value == found.given for found in result.values)
+    assert result.after == result.before
+    plant = load_plant(model, setup=Setup.FLOOR)
+    written = calibrated(result)
+    for field in ("actuator_gainprm", "actuator_biasprm", "dof_damping", "dof_armature", "dof_frictionloss", "qpos0"):
+        assert np.array_equal(getattr(written, field), getattr(plant.model, field))
+    assert value(result, "stiffness.joint").high < 8.0, "the interval still says what the data said"
+
+
+def test_what_is_worse_on_held_out_runs_falls_back_alone(model: Path) -> None:
+    """The held-out robot is as stiff as the given model, the fitted one is not: that goes back, and the rest stays."""
+    fitted, judged = Robot(6.4, 0.15, coulomb_friction=0.06), Robot(8.0, 0.15, coulomb_friction=0.06)
+    kinds = ["stiffness", "damping", "coulomb_friction"]
+    result = identify([fitted.record("a", 3.0)], model, [judged.record("b", 3.0, seed=1)], kinds=kinds)
+    assert value(result, "stiffness.joint").verdict == "fell back"
+    assert value(result, "stiffness.joint").value == 8.0
+    assert "damping.joint" in result.accepted
+    assert result.after.full < result.before.full
+    assert result.after.horizon < result.before.horizon
+
+
+def test_without_held_out_runs_each_motion_is_left_out_in_turn(model: Path) -> None:
+    robot = Robot(7.3, 0.14, coulomb_friction=0.05)
+    a, b = robot.record("a", 2.0), robot.record("b", 2.0, seed=1)
+    again = robot.record("a again", 2.0, time=2, repeat_of="a")
+    result = identify([a, b, again], model, kinds=["stiffness", "damping", "coulomb_friction"])
+    assert result.in_turn
+    assert sorted(result.judged_on) == ["a", "a again", "b"]
+    assert result.after.full < 0.3 * result.before.full
+    assert result.accepted
+    # Two recordings of the same commands differ by what no model can know.
+    assert result.floor == pytest.approx(FLOOR, rel=0.5)
+
+
+def test_a_single_run_is_cut_in_three(model: Path) -> None:
+    robot = Robot(7.3, 0.14)
+    result = identify([robot.record("only", 4.5)], model, kinds=["stiffness", "damping"])
+    assert result.judged_on == ("only[1/3]", "only[2/3]", "only[3/3]")
+    assert result.after.full < 0.5 * result.before.full
+    assert "damping.joint" in result.accepted
+
+
+def test_progress_runs_from_start_to_end(model: Path) -> None:
+    seen: list[float] = []
+    robot = Robot(7.3)
+    runs = [robot.record("a", 1.5), robot.record("b", 1.5, seed=1)]
+    identify(runs, model, kinds=["stiffness"], progress=lambda what, done: seen.append(done))
+    assert seen
+    assert all(a <= b + 1e-9 for a, b in itertools.pairwise(seen))
+    assert 0 <= seen[0] <= seen[-1] <= 1
+
+
+def test_the_result_as_json_has_what_scripts_rely_on(model: Path) -> None:
+    robot = Robot(7.3, 0.14)
+    result = identify([robot.record("a", 1.5)], model, [robot.record("b", 1.5, seed=1)], kinds=["stiffness", "damping"])
+    told = json.loads(json.dumps(result.as_json(), allow_nan=False))
+    assert set(told["parameters"]) == {"stiffness.joint", "damping.joint"}
+    for parameter in told["parameters"].values():
+        assert {"value", "low", "high", "verdict"} <= set(parameter)
+    assert told["held_out"]["runs"] == ["b"]
+    assert told["held_out"]["before"]["gap_full_rad"] == result.before.full
+    assert told["held_out"]["after"]["gap_0.5_s_rad"] == result.after.horizon
+    assert told["accepted"] == list(result.accepted) != []
+
+
+def test_how_long_a_residual_remembers_itself() -> None:
+    chance = np.random.default_rng(0)
+    white = chance.standard_normal(4000)
+    assert autocorrelation_time(white, 500) == pytest.approx(1.0, abs=0.15)
+    slow = np.convolve(white, np.ones(20) / 20, "same")
+    assert autocorrelation_time(slow, 500) == pytest.approx(20, rel=0.25)
+    holed = slow.copy()
+    holed[::7] = np.nan
+    assert autocorrelation_time(holed, 500) == pytest.approx(17, rel=0.3)
+    assert autocorrelation_time(np.full(100, 0.3), 50) > 30, "a bias is model error for ever"
+    assert autocorrelation_time(np.zeros(100), 50) == 1.0
+    assert autocorrelation_time(np.full(5, np.nan), 50) == 1.0
+
+
+# --- bad input ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    return Robot().record("mine", 2.0)
+
+
+def test_no_runs_are_refused(model: Path) -> None:
+    with pytest.raises(BadInput, match="no runs to fit → name at least one recording"):
+        identify([], model)
+
+
+def test_holding_out_what_is_fitted_is_refused(run: Run, model: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="a held-out run is also fitted → hold out runs that are not among those to fit"):
+        identify([run], model, [run])
+    write_table(run, tmp_path / "mine.parquet")
+    twice = [read_run(tmp_path / "mine.parquet") for _ in range(2)]
+    with pytest.raises(BadInput, match="a held-out run is also fitted"):
+        identify(twice[:1], model, twice[1:])
+
+
+def test_too_short_a_run_is_refused(run: Run, model: Path) -> None:
+    with pytest.raises(BadInput, match=r"mine: too short to fit: 0\.\d\d s → record at least a few seconds"):
+        identify([run.between(run.t[0], run.t[0] + 0.5)], model)
+
+
+def test_a_run_in_which_nothing_moves_is_refused(run: Run, model: Path) -> None:
+    still = replace(run, columns={"cmd.joint": np.zeros(len(run.t)), "pos.joint": np.full(len(run.t), 0.01)})
+    with pytest.raises(BadInput, match="mine: nothing moves in this run → record a protocol that moves the joints"):
+        identify([still], model)
+
+
+def test_a_joint_that_no_run_has_is_refused(run: Run, model: Path) -> None:
+    with pytest.raises(BadInput, match="no position-controlled joint 'elbow' → "):
+        identify([run], model, joints=["elbow"])
+    other = replace(run, columns={"cmd.knee": run.columns["cmd.joint"], "pos.knee": run.columns["pos.joint"]})
+    other = replace(other, facts=replace(run.facts, joints=("knee",)))
+    with pytest.raises(
+        BadInput, match=r"the model's joints \(joint\) are not those of the runs \(knee\) → give the model"
+    ):
+        identify([other], model)
+    blind = replace(run, columns={"cmd.joint": run.columns["cmd.joint"]})
+    with pytest.raises(BadInput, match=r"mine has no pos\.joint → choose joints that every run commands and measures"):
+        identify([blind], model, joints=["joint"])
+
+
+def test_an_unknown_parameter_gets_the_list(run: Run, model: Path) -> None:
+    with pytest.raises(BadInput, match="no such parameter: stifness → choose from stiffness, velocity_gain, damping"):
+        identify([run], model, kinds=["stifness"])
+
+
+def test_a_model_that_does_not_load_is_refused(run: Run, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="MuJoCo cannot load it"):
+        identify([run], plants.write(tmp_path / "broken.xml", "<mujoco"))
+
+
+# --- a real servo ------------------------------------------------------------------------------------------------------
+
+MOTIONS = ("lift_and_drop", "sin_sin", "sin_time_square")
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="the recordings lie beside the repository, not in it")
+@pytest.mark.parametrize("held_out", MOTIONS)
+def test_a_real_servo_is_never_modelled_worse_than_it_was(held_out: str, tmp_path: Path) -> None:
+    """With a coarser step than the recordings' own model has, for time's sake."""
+    text = (REAL / "pendulum_kp400.xml").read_text()
+    model = plants.write(tmp_path / "pendulum.xml", text.replace('timestep="0.001"', 'timestep="0.004"'))
+    runs = {motion: read_run(REAL / f"kp400_{motion}.parquet") for motion in MOTIONS}
+    runs = {motion: replace(run, facts=replace(run.facts, model=None)) for motion, run in runs.items()}
+    fitted = [run for motion, run in runs.items() if motion != held_out]
+    result = identify(fitted, model, [runs[held_out]])
+    assert result.after.full <= result.before.full
+    assert result.after.horizon <= result.before.horizon
