@@ -46,15 +46,15 @@ def openant(*arguments: str | Path, cwd: Path | None = None, largest_file: int |
 
 
 def refusal(result: Result) -> str:
-    """The one line of a refusal: exit code 2, nothing else said, no traceback."""
+    """The one line of a refusal: exit code 2, no result, no traceback; what it was about to do may stand before it."""
     assert result.returncode == 2, result.stderr
     assert result.stdout == ""
-    lines = [line for line in result.stderr.splitlines() if line.strip()]
-    assert len(lines) == 1, result.stderr
-    assert lines[0].startswith("openant")
-    assert "Traceback" not in lines[0]
-    assert "→" in lines[0], f"no remedy: {lines[0]}"
-    return lines[0]
+    assert "Traceback" not in result.stderr
+    *progress, line = [line for line in result.stderr.splitlines() if line.strip()]
+    assert line.startswith("openant")
+    assert not any(before.startswith("openant") for before in progress), result.stderr
+    assert "→" in line, f"no remedy: {line}"
+    return line
 
 
 # ---- manuals ----

@@ -60,8 +60,6 @@ def start(scenario: Path | None, ready_file: Path | None, clock: str | None, key
         for name, value in server.addresses.items():
             if value is not None:
                 click.echo(f"{name:8} {value}")
-        if ready_file is not None:
-            server.announce(ready_file)
         # Interrupting is how one ends it (formats, section 6): no failure. A flag, since an exception that is raised
         # wherever the loop happens to be can be swallowed there.
         ended = threading.Event()
@@ -70,6 +68,8 @@ def start(scenario: Path | None, ready_file: Path | None, clock: str | None, key
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
         }
         try:
+            if ready_file is not None:
+                server.announce(ready_file)
             server.run(ended.is_set)
         finally:
             for number, handler in before.items():
