@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import threading
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -21,9 +23,12 @@ from openant_tools.comms.camera import Camera, CameraSettings, DropCounter
 from openant_tools.comms.clock import RealClock
 from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics, calibrate
 from openant_tools.comms.latency import camera_latency
+from openant_tools.comms.setup import camera_of_robot
 from openant_tools.comms.tag_family import FAMILIES, load_family
 from openant_tools.comms.tags import BodyLost, BodyPose, BodyTracker, TagDetector, TagSetup
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.robot.config import parse_config
+from openant_tools.robot.folder import create_robot
 from openant_tools.virtual.camera_stream import VirtualCamera
 from openant_tools.virtual.overhead_camera import (
     OverheadCamera,
@@ -649,3 +654,21 @@ def test_a_camera_that_is_not_there_or_sends_nothing_is_named(monkeypatch: pytes
         Camera(CameraSettings(0), RealClock()).open()
     with pytest.raises(HardwareFault, match="the camera is not open"):
         Camera(CameraSettings(0), RealClock()).newest()
+
+
+def test_a_robots_file_describes_its_camera(tmp_path: Path) -> None:
+    """Lens, mount and tags come from robot.toml; a robot that wears no known tag cannot be looked for."""
+    folder = create_robot(tmp_path / "ant", kit="standard", name="ant")
+    assert camera_of_robot(folder.config()) is None
+    text = folder.config_file.read_text()
+    with_camera = text.replace('camera = ""', "camera = 2")
+    with pytest.raises(BadInput, match="body_tag_id"):
+        camera_of_robot(parse_config(tomllib.loads(with_camera))[0])
+    lens = "size_px = [1920, 1080]\nfocal_px = [1500, 1501]\ncentre_px = [960, 540]\ndistortion = [0.1, 0, 0, 0, 0]\n"
+    known = with_camera.replace("body_tag_id = -1", f"latency_s = 0.08\n{lens}body_tag_id = 7")
+    found = camera_of_robot(parse_config(tomllib.loads(known))[0])
+    assert found is not None
+    assert found.intrinsics is not None
+    assert (found.settings.source, found.settings.latency_s) == (2, 0.08)
+    assert (found.tags.body_id, found.tags.body_position) == (7, (0.0, 0.0, 0.085))
+    assert (found.intrinsics.fx, found.intrinsics.distortion[0]) == (1500, 0.1)

@@ -23,7 +23,7 @@ from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.guards import Guards
 from openant_tools.comms.messages import EngineConfig
-from openant_tools.comms.setup import config_of_unknown_robot
+from openant_tools.comms.setup import camera_of_robot, config_of_unknown_robot, imu_of_robot
 from openant_tools.errors import HardwareFault
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
@@ -340,3 +340,27 @@ def test_sigterm_ends_in_good_order(
     wait_until(lambda: not alive(pids["engine"]))
     assert not any(torques(live))
     assert len(read_recording(out).run.t) > 30
+
+
+def test_body_and_joints_stand_in_one_recording(tmp_path: Path) -> None:
+    """On the floor the engine takes poses and IMU beside the bus, all on one clock."""
+    scenario, out = tmp_path / "floor.toml", tmp_path / "run.mcap"
+    look = "position = [-0.35, 0.2, 1.3]\nlook_at = [-0.35, 0.2, 0.0]\n"
+    scenario.write_text(f'[robot]\nsetup = "floor"\n[camera]\nwidth = 640\nheight = 360\n{look}')
+    with virtual_robot(str(scenario), clock="stepped") as robot:
+        seen = {"imu": imu_of_robot(None, robot["imu"]), "camera": camera_of_robot(None, robot["camera"])}
+        with EngineProcess(config(robot, **seen)) as engine:  # type: ignore[arg-type]
+            engine.ask(messages.Torque(True))
+            engine.ask(messages.Ramp(HOME))
+            engine.ask(messages.Record(str(out), Facts(joints=(), setup="floor")))
+            engine.ask(messages.Hold(1.0))
+            truth = VirtualControl(robot["control"]).ask("state")["base"]
+            row = dict(zip(engine.columns, engine.telemetry()[-1].tolist(), strict=True))
+            engine.ask(messages.StopRecording())
+    recording = read_recording(out)
+    assert recording.pose is not None
+    assert len(recording.pose.t) > 15
+    x, y, z = truth["position"]
+    assert [row["base.x"], row["base.y"], row["base.z"]] == pytest.approx([x + 0.75, y - 0.30, z], abs=0.02)
+    assert row["base.yaw"] == pytest.approx(2 * truth["quaternion"][3], abs=0.03)
+    assert np.nanmedian(recording.run.columns["base.x"]) == pytest.approx(row["base.x"], abs=5e-3)

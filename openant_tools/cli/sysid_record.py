@@ -31,6 +31,7 @@ __all__ = ["record", "robot_of"]
 @click.option("--repeat", "repeats", type=click.IntRange(1), default=1, show_default=True, help="Play it so often.")
 @click.option("--setup", type=click.Choice(["stand", "floor"]), default="stand", show_default=True)
 @click.option("--imu/--no-imu", default=None, help="Record the IMU too. Default: on the floor.")
+@click.option("--camera/--no-camera", default=None, help="Record the pose too. Default: on the floor, if there is one.")
 @click.option("--yes", is_flag=True, help="The robot may move: do not ask. Needed where no terminal is attached.")
 def record(
     name: str,
@@ -44,6 +45,7 @@ def record(
     repeats: int,
     setup: str,
     imu: bool | None,
+    camera: bool | None,
     yes: bool,
 ) -> None:
     """Play an excitation on the robot and record it.
@@ -58,7 +60,7 @@ def record(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from openant_tools.comms.setup import config_of_robot, config_of_unknown_robot, imu_of_robot
+    from openant_tools.comms.setup import camera_of_robot, config_of_robot, config_of_unknown_robot, imu_of_robot
     from openant_tools.errors import BadInput
     from openant_tools.recording.writer import recording_path
     from openant_tools.sysid.protocols import protocol
@@ -72,15 +74,20 @@ def record(
     folder = robot_of(robot, needed=virtual_source is None)
     console = Console(stderr=True)
     with contextlib.ExitStack() as stack:
-        control = imu_port = None
+        control = imu_port = camera_source = None
         if virtual_source is not None:
             # One that is ours alone need not wait for real time.
             clock = "stepped" if virtual_source == VIRTUAL_DEFAULT else None
             found = stack.enter_context(virtual_robot(virtual_source, clock=clock))
             port, control, imu_port = port or found["bus"], found["control"], found["imu"]
+            camera_source = found["camera"]
         described = None if folder is None else folder.config()
-        wanted = setup == "floor" if imu is None else imu
-        more = {"rate_hz": rate_hz, "imu": imu_of_robot(described, imu_port) if wanted else None}
+        floor = setup == "floor"
+        more = {
+            "rate_hz": rate_hz,
+            "imu": imu_of_robot(described, imu_port) if (floor if imu is None else imu) else None,
+            "camera": camera_of_robot(described, camera_source) if (floor if camera is None else camera) else None,
+        }
         if described is not None:
             config = config_of_robot(described, port, control=control, **more)
         else:

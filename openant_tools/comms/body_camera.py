@@ -31,6 +31,8 @@ LEANS = 128
 LEAN_FRESH_S = 0.05
 #: Poses that nobody takes are given up.
 QUEUE = 64
+#: s; an older pose is not where the robot is now. A camera of 30 pictures a second and 0.1 s latency is within it.
+FRESH_S = 0.25
 POLL_S = 0.002
 
 
@@ -72,6 +74,7 @@ class BodyCamera:
             raise
         self._leans: deque[tuple[float, float, float]] = deque(maxlen=LEANS)
         self._results: deque[BodyPose | BodyLost] = deque(maxlen=QUEUE)
+        self._pose: BodyPose | None = None
         self._seen_at = clock.now()
         self._lost = ""
         self._said: tuple[str, float] = ("", -np.inf)
@@ -103,7 +106,17 @@ class BodyCamera:
         out = []
         while self._results:
             out.append(self._results.popleft())
+        if out:
+            self._pose = out[-1] if isinstance(out[-1], BodyPose) else None
         return out
+
+    def newest(self, t: float) -> tuple[float, float, float, float]:
+        """x, y, z (m) and yaw (rad) of the last pose taken by `poses`, as of `t`; NaN where it is old or was lost."""
+        pose = self._pose
+        if pose is None or t - pose.t > FRESH_S:
+            return (float("nan"),) * 4
+        x, y, z = pose.position.tolist()
+        return x, y, z, pose.yaw
 
     def news(self) -> str | None:
         """What is wrong, once when it begins and from time to time while it lasts."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.comms.clock import Clock, SteppedClock
-from openant_tools.comms.imu import IMU_BAUD, Imu
+from openant_tools.comms.imu import IMU_BAUD, Imu, ImuSample
 from openant_tools.comms.line import Line, SerialLine
 from openant_tools.comms.messages import ImuConfig
 from openant_tools.errors import HardwareFault
@@ -48,6 +48,7 @@ class BodyImu:
         self._gyro_bias, self._acc_bias = np.array(config.gyro_bias_rad_s), np.array(config.acc_bias_m_s2)
         self._values: tuple[float, ...] = (float("nan"),) * 6
         self._t = -np.inf
+        self._sample: ImuSample | None = None
         self._said: tuple[str, float] = ("", -np.inf)
         self._imu = Imu(lambda: self._open(config.port), clock, where=config.port)
         self.notes = self._imu.connect().notes
@@ -58,6 +59,17 @@ class BodyImu:
             self._clock.attach(imu=line)
         return line
 
+    @property
+    def lean(self) -> tuple[float, float, float] | None:
+        """(t, roll, pitch) of the body by the flight controller's own estimate, rad; None where it has none."""
+        sample = self._sample
+        if sample is None or sample.attitude_t is None or sample.roll is None or sample.pitch is None:
+            return None
+        # Up, seen from the sensor and then from the body: roll about x after pitch about y (ISO 8855 angles).
+        sr, cr, sp, cp = np.sin(sample.roll), np.cos(sample.roll), np.sin(sample.pitch), np.cos(sample.pitch)
+        x, y, z = (self._rotation @ np.array([-sp, cp * sr, cp * cr])).tolist()
+        return sample.attitude_t, float(np.arctan2(y, z)), float(-np.arcsin(np.clip(x, -1.0, 1.0)))
+
     def until(self, deadline: float) -> Iterator[tuple[float, list[float], list[float]]]:
         """Samples (t, gyro rad/s, acc m/s²) in the body's frame as they come, until the deadline."""
         while self._clock.now() < deadline:
@@ -67,6 +79,7 @@ class BodyImu:
                 return  # none by the deadline; `news` knows whether that matters
             gyro = (self._rotation @ sample.gyro - self._gyro_bias).tolist()
             acc = (self._rotation @ sample.acc - self._acc_bias).tolist()
+            self._sample = sample
             self._values, self._t = (*gyro, *acc), sample.t
             yield sample.t, gyro, acc
 

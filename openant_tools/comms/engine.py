@@ -18,7 +18,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,9 @@ from openant_tools.errors import BadInput, HardwareFault, OpenAntError
 from openant_tools.recording.telemetry import Answer as RecordedAnswer
 from openant_tools.recording.telemetry import Cycle, ServoChannel
 from openant_tools.recording.writer import RecordingStopped, RecordingWriter
+
+if TYPE_CHECKING:
+    from openant_tools.comms.body_camera import BodyCamera, CameraConfig
 
 __all__ = ["Engine", "main"]
 
@@ -99,6 +102,7 @@ class Engine:
         self._guardian: subprocess.Popen[bytes] | None = None
         self._lost = False
         self._imu: BodyImu | None = None
+        self._camera: BodyCamera | None = None
 
     # ---- life ----------------------------------------------------------------------------------------------------
 
@@ -167,6 +171,18 @@ class Engine:
                     self._notice(f"IMU: {note}")
             except HardwareFault as error:
                 self._notice(f"going on without the IMU: {error}")
+        if config.camera is not None:
+            self._open_camera(config.camera)
+
+    def _open_camera(self, config: CameraConfig) -> None:
+        from openant_tools.comms.body_camera import BodyCamera  # OpenCV takes its time to load
+
+        try:
+            self._camera = BodyCamera(config, self.clock)
+            for note in self._camera.notes:
+                self._notice(f"camera: {note}")
+        except HardwareFault as error:
+            self._notice(f"going on without the camera: {error}")
 
     def _set_latency_timer(self) -> float | None:
         """The adapter's timer, s, set to 1 ms where that is allowed; None where the host cannot tell."""
@@ -273,6 +289,8 @@ class Engine:
         self._dismiss_guardian()
         if self._imu is not None:
             self._imu.close()
+        if self._camera is not None:
+            self._camera.close()
         if hasattr(self, "_line"):
             self._line.close()
 
@@ -322,18 +340,33 @@ class Engine:
             due += cycles * self._period
 
     def _pass_time(self, due: float) -> None:
-        """Wait for the next cycle; the IMU's samples come meanwhile."""
-        if self._imu is not None:
-            for sample in self._imu.until(due - IMU_SLACK_S):
-                if self._recorder is not None:
-                    try:
+        """Wait for the next cycle; the IMU's samples and the camera's poses come meanwhile."""
+        try:
+            if self._imu is not None:
+                for sample in self._imu.until(due - IMU_SLACK_S):
+                    if self._recorder is not None:
                         self._recorder.imu(*sample)
-                    except RecordingStopped as error:
-                        self._recording_failed(error)
-            news = self._imu.news()
+            if self._camera is not None:
+                self._take_poses(self._camera)
+        except RecordingStopped as error:
+            self._recording_failed(error)
+        for sensor in (self._imu, self._camera):
+            news = None if sensor is None else sensor.news()
             if news is not None:
                 self._notice(news)
         self.clock.sleep_until(due)
+
+    def _take_poses(self, camera: BodyCamera) -> None:
+        from openant_tools.comms.tags import BodyPose
+
+        lean = None if self._imu is None else self._imu.lean
+        if lean is not None:
+            camera.lean(*lean)
+        for seen in camera.poses():
+            if self._recorder is not None and isinstance(seen, BodyPose):
+                self._recorder.pose(
+                    seen.t, position=seen.position.tolist(), yaw=seen.yaw, quaternion=seen.quaternion.tolist()
+                )
 
     def _cycle(self, wake: float, cycles: int) -> None:
         if self._lost:
@@ -471,7 +504,8 @@ class Engine:
     ) -> None:
         nan = float("nan")
         body = (nan,) * 6 if self._imu is None else self._imu.newest(t)
-        row = [t, nan if cmd_t is None else cmd_t, wake, float(self._torque), *body]
+        base = (nan,) * 4 if self._camera is None else self._camera.newest(t)
+        row = [t, nan if cmd_t is None else cmd_t, wake, float(self._torque), *body, *base]
         for k, (answer, block) in enumerate(answers):
             servo = self._servos.servos[k]
             command = nan if self._goal is None else float(self._goal[k])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from openant_tools.comms.guards import Guards
 from openant_tools.comms.servos import Servo
 from openant_tools.recording.run import Facts
+
+if TYPE_CHECKING:
+    from openant_tools.comms.body_camera import CameraConfig
 
 __all__ = [
     "Command",
@@ -75,6 +78,7 @@ class EngineConfig:
     watchdog_s: float = 0.2
     write_read_gap_s: float = 0.2e-3
     imu: ImuConfig | None = None
+    camera: CameraConfig | None = None
     chain: tuple[tuple[str, ...], ...] = ()
 
 

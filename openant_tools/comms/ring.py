@@ -19,7 +19,10 @@ __all__ = ["ERR_CODES", "SIGNALS", "Ring", "columns"]
 #: per joint, in this order
 SIGNALS = ("cmd", "pos", "vel", "cur", "load", "pwm", "volt", "temp", "tick", "ok", "err", "rtt")
 #: of the loop and the body, before the joints
-COMMON = ("t", "cmd_t", "wake", "torque", "gyro.x", "gyro.y", "gyro.z", "acc.x", "acc.y", "acc.z")
+COMMON = (
+    "t", "cmd_t", "wake", "torque", "gyro.x", "gyro.y", "gyro.z", "acc.x", "acc.y", "acc.z",
+    "base.x", "base.y", "base.z", "base.yaw",
+)  # fmt: skip
 #: numbers for the words of `err.J`
 ERR_CODES = ("", "timeout", "crc", "short", "late", "port", "alert")
 #: 10 s at 100 Hz, what a screen shows

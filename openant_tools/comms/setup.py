@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from openant_tools.comms.bus import Bus, Timing
 from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
@@ -10,14 +12,17 @@ from openant_tools.comms.line import SerialLine
 from openant_tools.comms.messages import EngineConfig, ImuConfig
 from openant_tools.comms.ports import Host
 from openant_tools.comms.servos import Servo
-from openant_tools.errors import HardwareFault
+from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.robot.config import RobotConfig
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import ANGLE_LIMIT_RAD, NOMINAL_ZERO_RAD, PLATFORM_PWM_LIMIT_COUNTS
 from openant_tools.robot.registers import PWM_FULL
 from openant_tools.robot.servo import servo_model
 
-__all__ = ["config_of_robot", "config_of_unknown_robot", "find_bus", "imu_of_robot", "open_bus"]
+if TYPE_CHECKING:
+    from openant_tools.comms.body_camera import CameraConfig
+
+__all__ = ["camera_of_robot", "config_of_robot", "config_of_unknown_robot", "find_bus", "imu_of_robot", "open_bus"]
 
 
 def find_bus(port: str | None, robot: RobotConfig | None = None, host: Host | None = None) -> str:
@@ -58,6 +63,44 @@ def imu_of_robot(robot: RobotConfig | None, port: str | None = None) -> ImuConfi
     if where is None or robot is None:
         return None if where is None else ImuConfig(where)
     return ImuConfig(where, robot.imu.mounting_rad, robot.imu.gyro_bias_rad_s, robot.imu.acc_bias_m_s2)
+
+
+def camera_of_robot(robot: RobotConfig | None, source: str | int | None = None) -> CameraConfig | None:
+    """The camera `source`, else robot.toml's, with that robot's lens and tags; None where neither names a camera.
+
+    Raises:
+        BadInput: nobody has said which tag the robot wears.
+    """
+    where = source if source is not None else "" if robot is None else robot.ports.camera
+    if where == "":
+        return None
+    from openant_tools.comms.body_camera import CameraConfig
+    from openant_tools.comms.camera import CameraSettings
+    from openant_tools.comms.intrinsics import Intrinsics
+    from openant_tools.comms.tags import TagSetup
+
+    if robot is None:
+        return CameraConfig(CameraSettings(where))
+    seen = robot.camera
+    if seen.body_tag_id < 0:
+        raise BadInput(
+            "camera.body_tag_id is not known yet", where="robot.toml", remedy="set it to the number of the robot's tag"
+        )
+    lens = None
+    if seen.size_px is not None and seen.focal_px is not None and seen.centre_px is not None:
+        (width, height), (fx, fy), (cx, cy) = seen.size_px, seen.focal_px, seen.centre_px
+        k1, k2, p1, p2, k3 = seen.distortion
+        lens = Intrinsics(round(width), round(height), fx, fy, cx, cy, (k1, k2, p1, p2, k3), "robot.toml")
+    x, y, z = seen.body_tag_position_m
+    return CameraConfig(
+        CameraSettings(where, exposure=seen.exposure, focus=seen.focus, latency_s=seen.latency_s),
+        TagSetup(
+            seen.tag_family, seen.origin_tag_id, seen.body_tag_id, seen.origin_tag_size_m, seen.body_tag_size_m,
+            (x, y, z), seen.body_tag_yaw_rad,
+        ),
+        lens,
+        math.degrees(seen.fov_diagonal_rad),
+    )  # fmt: skip
 
 
 def config_of_robot(robot: RobotConfig, port: str | None = None, **more: object) -> EngineConfig:

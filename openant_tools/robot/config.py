@@ -147,12 +147,20 @@ class Imu:
 
 @dataclass(frozen=True)
 class Camera:
-    """The overhead camera and the tags that it looks for (family tagCircle21h7).
+    """The overhead camera and the tags that it looks for.
 
     Attributes:
-        fov_diagonal_rad: angle from corner to corner of the picture.
+        fov_diagonal_rad: angle from corner to corner of the picture; used while the lens has not been calibrated.
+        tag_family: which family both tags are of.
         origin_tag_id, body_tag_id: the tag on the floor, and the one on the torso; −1 while unknown.
         origin_tag_size_m, body_tag_size_m: length of a tag's edge. A wrong one scales every distance.
+        body_tag_position_m: centre of the body tag in the torso's frame.
+        body_tag_yaw_rad: the tag's up-direction against the torso's x axis.
+        latency_s: from exposure to arrival, as measured.
+        exposure, focus: in the driver's unit; automatic where absent.
+        size_px: width and height of the pictures with which the lens was calibrated.
+        focal_px, centre_px: fx and fy, cx and cy.
+        distortion: k1, k2, p1, p2, k3 (OpenCV's order).
     """
 
     fov_diagonal_rad: float = number(0.1, 3.0, "rad", math.radians(60))
@@ -160,6 +168,16 @@ class Camera:
     body_tag_id: int = whole(-1, 100_000, -1)
     origin_tag_size_m: float = number(0.005, 2, "m", 0.10)
     body_tag_size_m: float = number(0.005, 2, "m", 0.045)
+    tag_family: str = text("tagCircle21h7")
+    body_tag_position_m: tuple[float, ...] = vector(3, -1, 1, "m", (0.0, 0.0, 0.085))
+    body_tag_yaw_rad: float = number(-TURN, TURN, "rad", 0.0)
+    latency_s: float | None = number(0, 2, "s", None)
+    exposure: float | None = number(0, 1e6, "", None)
+    focus: float | None = number(0, 1e6, "", None)
+    size_px: tuple[float, ...] | None = vector(2, 16, 20_000, "px", None)
+    focal_px: tuple[float, ...] | None = vector(2, 1, 1e6, "px", None)
+    centre_px: tuple[float, ...] | None = vector(2, 0, 20_000, "px", None)
+    distortion: tuple[float, ...] = vector(5, -1000, 1000, "", (0.0, 0.0, 0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)

@@ -461,6 +461,9 @@ origin_tag_id = 0
 origin_tag_size_m = 0.1  # edge of the tag on the floor; a wrong size scales every distance
 body_tag_id = -1  # the tag on the torso; -1 while unknown
 body_tag_size_m = 0.045
+tag_family = "tagCircle21h7"  # or tag36h11, tag25h9, tag16h5
+body_tag_position_m = [0.0, 0.0, 0.085]  # its centre in the torso's frame
+body_tag_yaw_rad = 0.0  # its up-direction against the torso's x axis (forward)
 
 [timing]
 dt_s = 0.12  # from one action to the next
