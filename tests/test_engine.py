@@ -217,6 +217,21 @@ def test_a_silent_servo_stops_the_motion(live: dict[str, str]) -> None:
     wait_until(lambda: not any(on for k, on in enumerate(torques(live)) if JOINT_NAMES[k] != "knee_fl"))
 
 
+def test_two_servos_with_one_id_are_told_from_a_cable(live: dict[str, str]) -> None:
+    """A common read stays silent from the first missing id on; asked one by one, the two give themselves away."""
+    control = VirtualControl(live["control"])
+    with EngineProcess(config(live)) as engine:
+        engine.ask(messages.Torque(True))
+        moving = engine.start(messages.Play(np.repeat(HOME[None, :], 3000, axis=0)))
+        control.ask("fault", cause="duplicate_id", where="knee_rr", of="hip_fl", on=True)
+        try:
+            with pytest.raises(HardwareFault, match=r"knee_rr \(id 11\) is silent and .* hip_fl .* both have id 30"):
+                wait_until(lambda: engine.done(moving))
+        finally:
+            control.ask("fault", cause="duplicate_id", where="knee_rr", on=False)
+            control.close()
+
+
 def test_unplugging_stops_the_motion_and_plugging_in_goes_on_from_there(live: dict[str, str], tmp_path: Path) -> None:
     out = tmp_path / "run.mcap"
     control = VirtualControl(live["control"])

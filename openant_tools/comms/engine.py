@@ -35,7 +35,7 @@ from openant_tools.comms.messages import EngineConfig
 from openant_tools.comms.motion import Motion, hold, play, ramp
 from openant_tools.comms.ports import WANTED_LATENCY_MS, Host, udev_rule
 from openant_tools.comms.ring import ERR_CODES, Ring
-from openant_tools.comms.servos import Block, Servo, Servos
+from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Block, Servo, Servos
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
 from openant_tools.recording.telemetry import Answer as RecordedAnswer
 from openant_tools.recording.telemetry import Cycle, ServoChannel
@@ -420,11 +420,13 @@ class Engine:
         self._say(messages.Finished(motion.name))
 
     def _explained(self, trip: Trip) -> Trip:
-        """An alert says only that register 70 has something: read it, once torque is off."""
-        if trip.joint is None or "alert" not in trip.what:
+        """What a cycle's answers alone do not tell, asked once everyone is released."""
+        if trip.joint is None or not trip.examine:
             return trip
-        self._torque_off()
         try:
+            self._servos.torque_off_now()
+            if trip.examine == "silence":
+                return self._who_is_silent(trip)
             errors = self._servos.hardware_errors(trip.joint)
         except HardwareFault:
             return trip
@@ -433,6 +435,32 @@ class Engine:
         servo = self._servos[trip.joint]
         names = ", ".join(error.name for error in errors)
         return Trip(f"{servo.joint} (id {servo.id}) reports {names}", errors[0].advice, trip.joint)
+
+    def _who_is_silent(self, trip: Trip) -> Trip:
+        """Each servo asked alone: in a common read those behind a silent one wait for it and seem silent, too."""
+        silent, broken = list[str](), list[str]()
+        for servo in self._servos.servos:
+            seen = [answer for _ in range(3) for answer in self._bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, [servo.id])]
+            if any(answer.ok for answer in seen):
+                continue
+            heard = any(answer.cause in (Cause.CRC, Cause.SHORT) for answer in seen)
+            (broken if heard else silent).append(f"{servo.joint} (id {servo.id})")
+        if len(silent) == len(broken) == 1:
+            id = broken[0].rpartition(" ")[2].rstrip(")")
+            return replace(
+                trip,
+                what=f"{silent[0]} is silent and what comes from {broken[0]} is broken",
+                remedy=f"probably both have id {id}: unplug {broken[0].partition(' ')[0]}, and `openant comms scan` shows it",
+            )
+        if len(silent) == 1 and not broken:
+            return trip if silent[0] in trip.what else replace(trip, what=f"{silent[0]} does not answer")
+        if silent and not broken:
+            return replace(
+                trip,
+                what=f"{', '.join(silent)} do not answer",
+                remedy=f"look at the cable before {silent[0].partition(' ')[0]} and at each servo's connectors",
+            )
+        return trip
 
     def _stopped(self, trip: Trip) -> None:
         """Release everyone, tell, and only then make sure: on a bad line that may take a while."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 from openant_tools.comms.bus import Answer
 from openant_tools.comms.faults import Cause
@@ -39,11 +40,16 @@ class Guards:
 
 @dataclass(frozen=True)
 class Trip:
-    """Why the motion was stopped."""
+    """Why the motion was stopped.
+
+    Attributes:
+        examine: what to look into once torque is off, to say it more exactly.
+    """
 
     what: str
     remedy: str
     joint: str | None = None
+    examine: Literal["", "alert", "silence"] = ""
 
 
 @dataclass
@@ -106,12 +112,13 @@ class Watch:
             if broken
             else "look at its cable and at the one before it in the chain",
             servo.joint,
+            "silence",
         )
 
     def _measured(self, t: float, servo: Servo, answer: Answer, block: Block) -> Trip | None:
         guards, model, place = self.guards, servo.model, f"{servo.joint} (id {servo.id})"
         if answer.alert:
-            return Trip(f"{place} raises its alert bit", "read its hardware error status", servo.joint)
+            return Trip(f"{place} raises its alert bit", "read its hardware error status", servo.joint, "alert")
         if guards.angle_margin_rad is not None and servo.joint in self.limits_rad:
             angle = servo.to_joint(model.registers["present_position"].to_si(block.position))
             low, high = self.limits_rad[servo.joint]
