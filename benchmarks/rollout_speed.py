@@ -90,7 +90,7 @@ class BareLoop:
     def __init__(self, plant: Plant, run: Run) -> None:
         self.model, self.data = plant.model, mujoco.MjData(plant.model)
         rollouts = Rollouts(plant, [run])
-        self.start = rollouts._segments[0].state
+        self.start = rollouts.segments[0].state
         self.nstep = round(1.0 / COMMANDS_HZ / plant.timestep)
         rows = slice(None, None, round(ROWS_HZ / COMMANDS_HZ))
         self.controls = np.zeros((len(run.t[rows]), plant.model.nu))

@@ -39,7 +39,7 @@ from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, position_servos
 from openant_tools.recording.run import Run
 
-__all__ = ["Rollouts", "Trajectories", "initial_velocities"]
+__all__ = ["Rollouts", "Segment", "Trajectories", "initial_velocities"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -73,7 +73,7 @@ class Trajectories:
 
 
 @dataclass(frozen=True)
-class _Segment:
+class Segment:
     """A stretch of one run, ready to be stepped."""
 
     run: int
@@ -131,7 +131,7 @@ class Rollouts:
             delays: (variants, joints) s by which each joint's commands act later than they were sent, on top of what the
                 model's own actuators delay. Continuous, where MuJoCo's buffers know nothing between none and one step.
         """
-        variants = [self._lean(model) for model in (models or [self.plant.model])]
+        variants = [self.lean(model) for model in (models or [self.plant.model])]
         segments, nv = self._segments, len(variants)
         plant = self.plant
         batch = self._batch(nv)
@@ -161,7 +161,7 @@ class Rollouts:
                 )
             control = np.repeat([segment.control[begin:end] for segment in segments[:active]], nv, axis=0)
             if delays is not None:
-                self._delay(control.reshape(active, nv, end - begin, -1), delays, begin)
+                self.delay(control.reshape(active, nv, end - begin, -1), delays, begin)
             record = batch.rollout(
                 end - begin, control, record=("qpos", "qvel"), ids=np.arange(active * nv, dtype=np.int32)
             )
@@ -179,7 +179,7 @@ class Rollouts:
             last_pos[:active], last_vel[:active] = qpos[:, :, -1], qvel[:, :, -1]
         return Trajectories(pos, vel, self.rows)
 
-    def _delay(self, control: Array, delays: Array, begin: int) -> None:
+    def delay(self, control: Array, delays: Array, begin: int) -> None:
         """Shift the commands in `control` (segments, variants, steps, nu), which starts at step `begin`, in place."""
         h = self.plant.timestep
         for j in range(len(self.plant.joints)):
@@ -188,6 +188,17 @@ class Rollouts:
                 for s, segment in enumerate(self._segments[: len(control)]):
                     edges = segment.start + h * np.arange(begin, begin + control.shape[2] + 1) - delay
                     control[s, late, :, self.plant.ctrl[j]] = segment.commands.column(j).mean(edges)[:, 0]
+
+    @property
+    def segments(self) -> Sequence[Segment]:
+        """What is stepped, the longest first."""
+        return self._segments
+
+    def lean(self, model: mujoco.MjModel) -> mujoco.MjModel:
+        """A copy of a variant that computes nothing that nobody reads."""
+        lean = copy.copy(model)
+        lean.opt.disableflags |= self._disable
+        return lean
 
     @property
     def _qpos(self) -> Ints:
@@ -201,11 +212,6 @@ class Rollouts:
         if nv not in self._batches:
             self._batches[nv] = Batch(self.plant.model, nv * len(self._segments), self.nthread)
         return self._batches[nv]
-
-    def _lean(self, model: mujoco.MjModel) -> mujoco.MjModel:
-        lean = copy.copy(model)
-        lean.opt.disableflags |= self._disable
-        return lean
 
     def _limp(
         self, cache: dict[tuple[int, bytes], mujoco.MjModel], model: mujoco.MjModel, variant: int, off: Bools
@@ -251,7 +257,7 @@ def _measured_around(t: Array, pos: Array, row: int, span: float, neighbours: in
     return rows
 
 
-def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | None) -> list[_Segment]:
+def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | None) -> list[Segment]:
     t, pos = run.t, run.signal("pos", plant.joints)
     cmd = _held(run.signal("cmd", plant.joints))
     if cmd is None:
@@ -292,7 +298,7 @@ def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | 
             off[min(nstep - 1, round((t[row] - t[first]) / h))] = torque_off[row]
         velocity = initial_velocities(t, pos, first)
         segments.append(
-            _Segment(
+            Segment(
                 run=index,
                 first=first,
                 state=_initial_state(plant, run, first, pos[first], velocity, setpoint[0]),
