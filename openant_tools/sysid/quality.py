@@ -15,7 +15,7 @@ from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant
 from openant_tools.recording.run import Run
 from openant_tools.robot.registers import PWM_FULL
-from openant_tools.sysid.parameter import KINDS, torque_limit
+from openant_tools.sysid.kinds import KINDS, torque_limit
 
 __all__ = ["check_runs", "quantum"]
 
