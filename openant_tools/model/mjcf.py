@@ -26,6 +26,7 @@ from openant_tools.model.plant import (
     VMAX,
     Plant,
     Setup,
+    is_filtered,
     is_motor,
     load_plant,
     samples_for,
@@ -46,7 +47,8 @@ def write_model(
     Args:
         source: the MJCF to start from.
         variant: a model compiled from it as it is (with its free joint), in which some of these differ: stiffness and
-            velocity gain of actuators, their force range; damping, armature, friction and zero of joints.
+            velocity gain of actuators, their force range, delay and lag; damping, armature, friction and zero of joints;
+            mass and inertia of bodies, together; friction and softness of geoms.
         out: the file to write, atomically.
         joints: the servo joints; default all.
         note: a line for the comment at the top.
@@ -73,6 +75,8 @@ def write_model(
         elif _write_actuator(actuator, plant, variant, j):
             ratios[j] = actuator
         _write_delay(actuator, plant, variant, j)
+    _write_bodies(root, plant, variant)
+    _write_contacts(root, plant, variant)
     _append_sensors(root, plant.joints)
     if note:
         root.insert(0, etree.Comment(f" {note.replace('--', '−−')} "))
@@ -244,9 +248,19 @@ def _write_actuator(element: etree._Element, plant: Plant, variant: mujoco.MjMod
         as_ratio = element.get("kv") is None and _ratio_by_default(element)
         if (velocity or own) and not as_ratio:
             element.set("kv", _number(-after[2]))
+    if is_filtered(variant, int(i)) and _differ(_lag(given, int(i)), _lag(variant, int(i))):
+        if element.tag == "general":
+            element.set("dyntype", "filterexact")
+            element.set("dynprm", _number(_lag(variant, int(i))))
+        else:
+            element.set("timeconst", _number(_lag(variant, int(i))))
     if any(_differ(a, b) for a, b in zip(given.actuator_forcerange[i], variant.actuator_forcerange[i], strict=True)):
         element.set("forcerange", _numbers(variant.actuator_forcerange[i]))
     return as_ratio
+
+
+def _lag(model: mujoco.MjModel, actuator: int) -> float:
+    return float(model.actuator_dynprm[actuator, 0]) if is_filtered(model, actuator) else 0.0
 
 
 def _ratio_by_default(element: etree._Element) -> bool:
@@ -325,6 +339,71 @@ def _write_delay(element: etree._Element, plant: Plant, variant: mujoco.MjModel,
     element.set("interp", "linear")
 
 
+def _write_bodies(root: etree._Element, plant: Plant, variant: mujoco.MjModel) -> None:
+    """Make the bodies denser whose mass differs: where the file states it, in the inertial or in the geoms."""
+    given = plant.model
+    heavier = np.flatnonzero(~np.isclose(variant.body_mass, given.body_mass, rtol=1e-12, atol=0.0))
+    if not len(heavier):
+        return
+    spec = mujoco.MjSpec.from_file(str(plant.path))
+    bodies, geoms = _in_order(root, plant)
+    for body in heavier:
+        factor = float(variant.body_mass[body] / given.body_mass[body])
+        for inertial in bodies[body].findall("inertial"):
+            inertial.set("mass", _number(float(inertial.get("mass", "0")) * factor))
+            for name in ("diaginertia", "fullinertia"):
+                if inertial.get(name):
+                    inertial.set(name, _numbers([float(x) * factor for x in str(inertial.get(name)).split()]))
+        for k in np.flatnonzero(given.geom_bodyid == body):
+            # What a default class says of it is what the spec says; a mass stands before a density.
+            mass, density = float(spec.geoms[k].mass), float(spec.geoms[k].density)
+            if math.isnan(mass):
+                geoms[k].set("density", _number(density * factor))
+            elif mass:
+                geoms[k].set("mass", _number(mass * factor))
+
+
+def _write_contacts(root: etree._Element, plant: Plant, variant: mujoco.MjModel) -> None:
+    given = plant.model
+    fields = (("friction", "geom_friction"), ("solref", "geom_solref"), ("solimp", "geom_solimp"))
+    for attribute, field in fields:
+        before, after = getattr(given, field), getattr(variant, field)
+        differing = np.flatnonzero(~np.isclose(before, after, rtol=1e-12, atol=1e-15).all(axis=1))
+        if len(differing):
+            _, geoms = _in_order(root, plant)
+            for k in differing:
+                geoms[k].set(attribute, _numbers(after[k]))
+
+
+def _in_order(root: etree._Element, plant: Plant) -> tuple[list[etree._Element], list[etree._Element]]:
+    """The elements that became the model's bodies (the world first) and geoms, by their ids.
+
+    MuJoCo numbers bodies depth first, and geoms body by body.
+    """
+    worlds = list(root.iter("worldbody"))
+    bodies: list[list[etree._Element]] = [worlds]
+    for world in worlds:
+        bodies += [[body] for body in world.iter("body")]
+    geoms = [geom for body in bodies for part in body for geom in _own(part, "geom")]
+    model = plant.model
+    named = [(model.body(k).name, e[0]) for k, e in enumerate(bodies[: model.nbody]) if k]
+    named += [(model.geom(k).name, e) for k, e in enumerate(geoms[: model.ngeom])]
+    if len(bodies) != model.nbody or len(geoms) != model.ngeom or any((e.get("name") or "") != n for n, e in named):
+        raise _not_written_out("some body or geom", plant.path)
+    return [body[0] for body in bodies], geoms
+
+
+def _own(body: etree._Element, tag: str) -> list[etree._Element]:
+    """The elements of a body, not those of the bodies in it; a <frame> is none."""
+    out = []
+    for child in body:
+        if child.tag == tag:
+            out.append(child)
+        elif child.tag == "frame":
+            out += _own(child, tag)
+    return out
+
+
 #: attributes of a position servo that a DC motor has too, with the same meaning
 _KEPT_BY_MOTOR = ("name", "joint", "user")
 
@@ -365,6 +444,7 @@ def _check(out: Path, plant: Plant, variant: mujoco.MjModel) -> None:
             (written.model.actuator_biasprm[i, 1:3], variant.actuator_biasprm[k, 1:3]),
             (written.model.actuator_gainprm[i], variant.actuator_gainprm[k]),
             (written.model.actuator_forcerange[i], variant.actuator_forcerange[k]),
+            (_lag(written.model, int(i)), _lag(variant, int(k))),
             (written.model.actuator_delay[i], variant.actuator_delay[k]),
             (written.model.dof_damping[written.dof[j]], variant.dof_damping[dof]),
             (written.model.dof_armature[written.dof[j]], variant.dof_armature[dof]),
@@ -376,5 +456,19 @@ def _check(out: Path, plant: Plant, variant: mujoco.MjModel) -> None:
                 raise BadInput(
                     f"the values of joint {joint!r} do not survive in this file's structure",
                     where=plant.path,
-                    remedy="save the expanded model first with MjSpec.to_xml(), and fit that",
+                    remedy=EXPAND,
                 )
+    for what, field in _OF_BODIES:
+        got, wanted = getattr(written.model, field), getattr(variant, field)
+        if got.shape != wanted.shape or not np.allclose(got, wanted, rtol=1e-7, atol=1e-12):
+            raise BadInput(f"{what} does not survive in this file's structure", where=plant.path, remedy=EXPAND)
+
+
+EXPAND = "save the expanded model first with MjSpec.to_xml(), and fit that"
+_OF_BODIES = (
+    ("the mass of a body", "body_mass"),
+    ("the inertia of a body", "body_inertia"),
+    ("the friction of a geom", "geom_friction"),
+    ("the softness of a geom (solref)", "geom_solref"),
+    ("the softness of a geom (solimp)", "geom_solimp"),
+)

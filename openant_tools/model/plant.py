@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 
-__all__ = ["Plant", "Setup", "is_motor", "load_plant", "position_servos", "setup_of"]
+__all__ = ["Plant", "Setup", "is_filtered", "is_motor", "load_plant", "position_servos", "setup_of", "world_bodies"]
 
 Ints = NDArray[np.int64]
 
@@ -93,6 +93,7 @@ def load_plant(
     *,
     electrical: bool = False,
     delayed: bool = False,
+    lagging: bool = False,
 ) -> Plant:
     """Read an MJCF and set it up.
 
@@ -104,6 +105,8 @@ def load_plant(
             damping can be made back-EMF.
         delayed: give every servo a buffer of past commands, so that it can act late by up to LONGEST_DELAY_S; the delay
             itself stays what the model says.
+        lagging: filter the setpoint of every servo that can have it (`filter_form`), with no lag as yet. What is filtered
+            does not become a DC motor: MuJoCo's has no filter.
 
     Raises:
         BadInput: the file is missing or MuJoCo cannot load it, it has no position-controlled joint, or it lacks one of
@@ -138,12 +141,13 @@ def load_plant(
             hint = f"did you mean {near[0]!r}?" if near else f"its position-controlled joints are {', '.join(servos)}"
             raise BadInput(f"the model has no position-controlled joint {joint!r}", where=path, remedy=hint)
 
-    for joint in joints if electrical or delayed else ():
-        if electrical:
+    for joint in joints if electrical or delayed or lagging else ():
+        filtered = lagging and filter_form(spec.actuators[servos[joint]], original)
+        if electrical and not filtered:
             motor_form(spec.actuators[servos[joint]], original, joint)
         if delayed:
             buffer_commands(spec.actuators[servos[joint]], LONGEST_DELAY_S, original.opt.timestep)
-    if electrical or delayed:
+    if electrical or delayed or lagging:
         original = spec.compile()
     model = _on_stand(spec, original) if setup is Setup.STAND else original
     actuator = [servos[joint] for joint in joints]
@@ -237,6 +241,42 @@ def motor_form(actuator: mujoco.MjsActuator, model: mujoco.MjModel, joint: str) 
     return True
 
 
+def filter_form(actuator: mujoco.MjsActuator, model: mujoco.MjModel) -> bool:
+    """Let the setpoint of a position servo of a spec pass a first-order filter (`timeconst`); False where that cannot be.
+
+    Its time constant is 0 until it is set (`set_lag`). A servo that has a filter keeps it.
+    """
+    i = actuator.id
+    plain = (
+        model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
+        and model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE
+    )
+    if plain:
+        actuator.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
+        actuator.dynprm[0] = 0.0
+        actuator.actearly = 1
+    return plain or is_filtered(model, i)
+
+
+def set_lag(model: mujoco.MjModel, actuator: int, time_constant: float) -> None:
+    """Set the time constant (s) of a filtered servo.
+
+    A filter shows a setpoint one step after it came, which is how a file's `timeconst` acts. Without lag there is no filter:
+    there the setpoint must act at once, which MuJoCo calls early.
+    """
+    model.actuator_dynprm[actuator, 0] = time_constant
+    model.actuator_actearly[actuator] = time_constant <= 0
+
+
+def is_filtered(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator's setpoint passes a first-order filter."""
+    return int(model.actuator_dyntype[actuator]) in (
+        int(mujoco.mjtDyn.mjDYN_FILTER),
+        int(mujoco.mjtDyn.mjDYN_FILTEREXACT),
+    )
+
+
 #: s; the longest delay of a command that a fit considers: several periods of a 50 Hz loop
 LONGEST_DELAY_S = 0.1
 #: `interp="linear"`: with a zero-order hold a delay moves by whole steps only, and a fit cannot follow it
@@ -264,7 +304,7 @@ def _on_stand(spec: mujoco.MjSpec, original: mujoco.MjModel) -> mujoco.MjModel:
     weld, parent = original.body_weldid, original.body_parentid
     # Elements keep the ids of the first compilation until the next, so the original's tables describe the spec's.
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
-    world = _world(original)
+    world = world_bodies(original)
     for geom in spec.geoms:
         if int(original.geom_bodyid[geom.id]) in world:
             geom.contype = geom.conaffinity = 0
@@ -293,7 +333,7 @@ def _on_stand(spec: mujoco.MjSpec, original: mujoco.MjModel) -> mujoco.MjModel:
     return spec.compile()
 
 
-def _world(model: mujoco.MjModel) -> set[int]:
+def world_bodies(model: mujoco.MjModel) -> set[int]:
     """The bodies that are the world: all that cannot move, but for what carries a joint, which is a robot's fixed base."""
     fixed = model.body_weldid == 0
     world = set(np.flatnonzero(fixed).tolist())

@@ -21,6 +21,7 @@ from openant_tools.model.gap import HORIZON_S, Gap, gap, share_closed
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.recording.run import Run
 from openant_tools.sysid.fit import Dataset, Estimate, Problem, gaps, sensor_floor
+from openant_tools.sysid.kinds import ACTUATOR_LAG, SPEED_LIMIT
 from openant_tools.sysid.parameter import ACTION_DELAY, KINDS, Parameter, apply, buffered, choose, delays
 from openant_tools.sysid.quality import check_runs
 
@@ -58,7 +59,7 @@ class Value:
     Attributes:
         name: `kind.joint` (or `.servo model`, `.all`).
         unit: SI.
-        joints: whose it is.
+        joints: whose it is; none where it is the body's or the world's.
         given: the value in the given model (of the first joint where several are tied).
         value: the value in the written model.
         low, high: 95 % interval of the estimate; where the value fell back, of what the data would have said.
@@ -273,7 +274,10 @@ def _datasets(runs: Sequence[Run], model: Path, joints: Sequence[str], kinds: Se
     for run in runs:
         groups.setdefault((_own_model(run) or model, setup_of(run.facts.setup)), []).append(run)
     return [
-        Dataset.prepare(load_plant(path, joints, setup, electrical="electrical_damping" in kinds), members)
+        Dataset.prepare(
+            load_plant(path, joints, setup, electrical="electrical_damping" in kinds, lagging=ACTUATOR_LAG in kinds),
+            members,
+        )
         for (path, setup), members in groups.items()
     ]
 
@@ -291,6 +295,11 @@ def _applicable(kinds: Sequence[str] | None, plant: Plant, runs: Sequence[Run]) 
         unknown = [kind for kind in kinds if kind not in KINDS]
         if unknown:
             raise BadInput(f"no such parameter: {', '.join(unknown)}", remedy=f"choose from {', '.join(KINDS)}")
+        if SPEED_LIMIT in kinds and "damping" in kinds:
+            raise BadInput(
+                "speed_limit and damping are two words for one thing: the speed limit is torque limit over damping",
+                remedy="fit one of them",
+            )
         return [kind for kind in KINDS if kind in kinds]
     in_joint = sum(KINDS["damping"].read(plant.model, plant, j) for j in range(len(plant.joints)))
     in_servo = sum(KINDS["velocity_gain"].read(plant.model, plant, j) for j in range(len(plant.joints)))
@@ -416,7 +425,7 @@ def _value(parameter: Parameter, plant: Plant, estimate: Estimate, k: int, kept:
     return Value(
         name=parameter.name,
         unit=KINDS[parameter.kind].unit,
-        joints=tuple(plant.joints[j] for j in parameter.joints),
+        joints=() if KINDS[parameter.kind].body else tuple(plant.joints[j] for j in parameter.joints),
         given=nominal,
         value=parameter.value(nominal, u),
         low=float(np.clip(parameter.value(nominal, centre - deviation), low, high)),
@@ -469,6 +478,7 @@ def calibrated(identification: Identification, setup: Setup = Setup.FLOOR) -> mu
         setup,
         electrical="electrical_damping" in moved,
         delayed=ACTION_DELAY in moved,
+        lagging=ACTUATOR_LAG in moved,
     )
     model = apply(plant, identification.parameters, identification.u)
     if ACTION_DELAY in moved:

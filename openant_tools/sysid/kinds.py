@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.effects.catalogue import catalogue
+from openant_tools.model.body import deciding_geoms, link_bodies, scale_mass, torso_body
 from openant_tools.model.plant import (
     KD,
     KP,
@@ -24,10 +25,21 @@ from openant_tools.model.plant import (
     RESISTANCE,
     VMAX,
     Plant,
+    is_filtered,
     is_motor,
+    set_lag,
 )
 
-__all__ = ["ACTION_DELAY", "KINDS", "Kind", "torque_limit", "usual_torque"]
+__all__ = [
+    "ACTION_DELAY",
+    "ACTUATOR_LAG",
+    "ELECTRICAL_DAMPING",
+    "KINDS",
+    "SPEED_LIMIT",
+    "Kind",
+    "torque_limit",
+    "usual_torque",
+]
 
 Array = NDArray[np.float64]
 
@@ -48,6 +60,9 @@ class Kind:
         constants: whether a change alters constants that MuJoCo derives from the model (mj_setConst).
         valley: whether the cost has a valley at each end of its range, so that a fit must start from both.
         prior: the value that physics suggests, where that is not what the given model says.
+        holds: whether a joint can have it at all; default every one.
+        body: of the body or the world: one number whatever the joints, which moves all of them.
+        alike: of links: those of the same mass are the same part, and share it.
         effect: the effect and its parameter, for what acts between steps because MuJoCo has no feature for it.
     """
 
@@ -62,6 +77,9 @@ class Kind:
     constants: bool = False
     valley: bool = False
     prior: float | None = None
+    holds: Callable[[mujoco.MjModel, Plant, int], bool] = lambda model, plant, j: True
+    body: bool = False
+    alike: bool = False
     effect: tuple[str, str] | None = None
 
 
@@ -193,14 +211,93 @@ def _write_delay(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> N
     """Nothing in the model: a rollout takes delays beside it (`delays`), a written model in its buffers (`buffered`)."""
 
 
+def _read_lag(model: mujoco.MjModel, plant: Plant, j: int) -> float:
+    i = int(plant.actuator[j])
+    return float(model.actuator_dynprm[i, 0]) if is_filtered(model, i) else 0.0
+
+
+def _write_lag(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
+    set_lag(model, int(plant.actuator[j]), value)
+
+
+def _read_speed_limit(model: mujoco.MjModel, plant: Plant, j: int) -> float:
+    """Where the servo's whole torque goes into its damping: what a data sheet calls its no-load speed."""
+    damping = _read_damping(model, plant, j)
+    return torque_limit(model, plant, j) / damping if damping > 0 else math.inf
+
+
+def _write_speed_limit(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
+    _write_damping(model, plant, j, torque_limit(model, plant, j) / value)
+
+
+def _read_link_mass(model: mujoco.MjModel, plant: Plant, j: int) -> float:
+    return float(model.body_mass[link_bodies(model, plant, j)].sum())
+
+
+def _write_link_mass(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
+    scale_mass(model, link_bodies(model, plant, j), value / _read_link_mass(model, plant, j))
+
+
+def _read_torso_mass(model: mujoco.MjModel, plant: Plant, j: int) -> float:
+    return float(model.body_mass[torso_body(model, plant)])
+
+
+def _write_torso_mass(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
+    torso = torso_body(model, plant)
+    scale_mass(model, np.array([torso]), value / float(model.body_mass[torso]))
+
+
+def _read_floor_friction(model: mujoco.MjModel, plant: Plant, j: int) -> float:
+    return float(model.geom_friction[deciding_geoms(model), 0].max(initial=0.0))
+
+
+def _write_floor_friction(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
+    model.geom_friction[deciding_geoms(model), 0] *= value / _read_floor_friction(model, plant, j)
+
+
+def _read_softness(model: mujoco.MjModel, plant: Plant, j: int) -> float:
+    """s, the time constant; where `solref` is a stiffness and a damping (negative) there is none."""
+    return float(model.geom_solref[deciding_geoms(model), 0].max(initial=0.0))
+
+
+def _write_softness(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
+    geoms = deciding_geoms(model)
+    geoms = geoms[model.geom_solref[geoms, 0] > 0]
+    model.geom_solref[geoms, 0] *= value / _read_softness(model, plant, j)
+
+
+def _read_impedance(model: mujoco.MjModel, plant: Plant, j: int) -> float:
+    return float(model.geom_solimp[deciding_geoms(model), 0].max(initial=0.0))
+
+
+def _write_impedance(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
+    model.geom_solimp[deciding_geoms(model), 0] *= value / _read_impedance(model, plant, j)
+
+
 def usual_torque(plant: Plant, j: int) -> float:
     """A torque scale (N·m) for a joint without a limit: what its stiffness gives at a tenth of a radian of error."""
     return 0.1 * _read_stiffness(plant.model, plant, j)
 
 
+def _carried(model: mujoco.MjModel, plant: Plant) -> bool:
+    """Whether the robot's torso is a body of its own, with mass, that its joints do not move."""
+    torso = torso_body(model, plant)
+    joints = set(model.jnt_bodyid[model.dof_jntid[plant.dof]].tolist())
+    return bool(model.body_mass[torso] > 0 and torso not in joints)
+
+
 ACTION_DELAY = "action_delay"
+ACTUATOR_LAG = "actuator_lag"
+ELECTRICAL_DAMPING = "electrical_damping"
+SPEED_LIMIT = "speed_limit"
 #: s; a loop of 50 Hz may act a period late
 DELAY_STD_S = 0.02
+#: s; a servo that filters its setpoint at all does so within a few periods of its loop, and the platform's MJCF up to 0.6 s
+LAG_STD_S, LONGEST_LAG_S = 0.02, 1.0
+#: ±0.03 kg of the Open Ant's torso of 0.32 kg are two deviations (effects.md)
+TORSO_STD = 0.05
+#: share; `solimp` is tuned, not measured: between MuJoCo's default of 0.9 and the platform's 0.7
+IMPEDANCE_STD = 0.15
 #: What brakes a DC servo beyond its friction is back-EMF, which vanishes with the torque: a share near 1, this uncertain.
 ELECTRICAL_STD = 0.3
 #: Friction of a small geared servo is of the order of a tenth of its stall torque; a model that has none says nothing
@@ -250,7 +347,7 @@ KINDS: dict[str, Kind] = {
         ),
         # After damping, whose share it is.
         Kind(
-            "electrical_damping",
+            ELECTRICAL_DAMPING,
             "1",
             _read_electrical,
             _write_electrical,
@@ -259,6 +356,7 @@ KINDS: dict[str, Kind] = {
             high=1.0,
             valley=True,
             prior=1.0,
+            holds=lambda model, plant, j: is_motor(model, int(plant.actuator[j])),
         ),
         Kind(
             "zero_offset",
@@ -271,8 +369,96 @@ KINDS: dict[str, Kind] = {
             high=math.pi,
             constants=True,
         ),
-        Kind("action_delay", "s", _read_delay, _write_delay, None, lambda limit: DELAY_STD_S, high=LONGEST_DELAY_S),
-        Kind("torque_limit", "N·m", torque_limit, _write_torque_limit, 0.075, lambda limit: math.nan, low=1e-6),
+        Kind(ACTION_DELAY, "s", _read_delay, _write_delay, None, lambda limit: DELAY_STD_S, high=LONGEST_DELAY_S),
+        Kind(
+            "torque_limit",
+            "N·m",
+            torque_limit,
+            _write_torque_limit,
+            0.075,
+            lambda limit: math.nan,
+            low=1e-6,
+            holds=lambda model, plant, j: math.isfinite(torque_limit(model, plant, j)),
+        ),
+        # After the torque limit, whose ratio to the damping it is.
+        Kind(
+            SPEED_LIMIT,
+            "rad/s",
+            _read_speed_limit,
+            _write_speed_limit,
+            0.125,
+            lambda limit: math.nan,
+            low=1e-6,
+            holds=lambda model, plant, j: math.isfinite(_read_speed_limit(model, plant, j)),
+        ),
+        Kind(
+            ACTUATOR_LAG,
+            "s",
+            _read_lag,
+            _write_lag,
+            0.3,
+            lambda limit: LAG_STD_S,
+            high=LONGEST_LAG_S,
+            holds=lambda model, plant, j: is_filtered(model, int(plant.actuator[j])),
+        ),
+        Kind(
+            "link_mass",
+            "kg",
+            _read_link_mass,
+            _write_link_mass,
+            0.025,
+            lambda limit: math.nan,
+            low=1e-9,
+            constants=True,
+            holds=lambda model, plant, j: _read_link_mass(model, plant, j) > 0,
+            alike=True,
+        ),
+        Kind(
+            "torso_mass",
+            "kg",
+            _read_torso_mass,
+            _write_torso_mass,
+            TORSO_STD,
+            lambda limit: math.nan,
+            low=1e-9,
+            constants=True,
+            holds=lambda model, plant, j: _carried(model, plant),
+            body=True,
+        ),
+        Kind(
+            "floor_friction",
+            "1",
+            _read_floor_friction,
+            _write_floor_friction,
+            0.075,
+            lambda limit: math.nan,
+            low=1e-6,
+            holds=lambda model, plant, j: _read_floor_friction(model, plant, j) > 0,
+            body=True,
+        ),
+        Kind(
+            "contact_softness",
+            "s",
+            _read_softness,
+            _write_softness,
+            0.15,
+            lambda limit: math.nan,
+            low=1e-6,
+            holds=lambda model, plant, j: _read_softness(model, plant, j) > 0,
+            body=True,
+        ),
+        Kind(
+            "contact_impedance",
+            "1",
+            _read_impedance,
+            _write_impedance,
+            IMPEDANCE_STD,
+            lambda limit: math.nan,
+            low=1e-4,
+            high=0.9999,
+            holds=lambda model, plant, j: _read_impedance(model, plant, j) > 0,
+            body=True,
+        ),
     )
 }
 
@@ -286,18 +472,25 @@ def _write_nothing(model: mujoco.MjModel, plant: Plant, j: int, value: float) ->
     """What acts between steps is told to the rollout, beside the model (`effect_values`)."""
 
 
+def _share_of_limit(share: float) -> Callable[[float], float]:
+    return lambda limit: share * limit
+
+
+def _constant(std: float) -> Callable[[float], float]:
+    return lambda limit: std
+
+
 def _effect_kinds() -> Iterator[Kind]:
     """One kind for each parameter of each effect that acts between steps; named as the effect where it has only one."""
     for effect in catalogue().values():
         for quantity in effect.quantities:
-            scale = quantity.std
             yield Kind(
                 effect.name if len(effect.quantities) == 1 else f"{effect.name}_{quantity.name}",
                 quantity.unit,
                 _nothing,
                 _write_nothing,
                 None,
-                (lambda limit, share=scale: share * limit) if quantity.unit == "N·m" else lambda limit, std=scale: std,
+                _share_of_limit(quantity.std) if quantity.unit == "N·m" else _constant(quantity.std),
                 low=quantity.low,
                 high=quantity.high,
                 effect=(effect.name, quantity.name),

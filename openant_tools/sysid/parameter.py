@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.model.plant import Plant, is_motor
+from openant_tools.model.plant import Plant
 from openant_tools.sysid.kinds import ACTION_DELAY, KINDS, Kind, torque_limit, usual_torque
 
 __all__ = ["ACTION_DELAY", "KINDS", "Kind", "Parameter", "apply", "buffered", "choose", "delays", "effect_values"]
@@ -31,7 +31,7 @@ class Parameter:
 
     Attributes:
         kind: a key of KINDS.
-        label: the joint, the servo model, or `all`.
+        label: the joint, the servo model, `all`, the links of one mass by the first word of their joints' names, or `body`.
         joints: indices into the plant's joints.
         relative: whether u scales the model's value (else it is added).
         std: the prior's standard deviation, of log(value) if relative, else in the kind's unit.
@@ -55,7 +55,8 @@ class Parameter:
         """The internal numbers between which the value stays physical."""
         kind = KINDS[self.kind]
         if self.relative:
-            return -math.inf, math.inf
+            low = math.log(kind.low / nominal) / self.std if kind.low > 0 else -math.inf
+            return low, math.log(kind.high / nominal) / self.std if math.isfinite(kind.high) else math.inf
         return (kind.low - nominal) / self.std, (kind.high - nominal) / self.std
 
     @property
@@ -115,22 +116,17 @@ def choose(
 ) -> list[Parameter]:
     """The parameters of these kinds, one a joint, one a servo model (`tie="servo"`), or one for all (`tie="all"`).
 
-    Kinds that a model cannot have are left out: a torque limit where the actuator has none.
+    Kinds that a model cannot have are left out: a torque limit where the actuator has none. Of a kind that belongs to the
+    body there is one; links of the same mass share theirs, whatever `tie` says.
     """
-    groups: dict[str, list[int]] = {}
-    for j, joint in enumerate(plant.joints):
-        label = {"joint": joint, "servo": (motors or {}).get(joint, "all"), "all": "all"}[tie]
-        groups.setdefault(label, []).append(j)
     chosen = []
     for name in kinds:
         kind = KINDS[name]
-        for label, joints in groups.items():
+        for label, joints in _groups(plant, kind, tie, motors or {}).items():
+            if not all(kind.holds(plant.model, plant, j) for j in joints):
+                continue
             nominals = [kind.read(plant.model, plant, j) for j in joints]
             limits = [torque_limit(plant.model, plant, j) for j in joints]
-            if name == "torque_limit" and not np.isfinite(limits).all():
-                continue
-            if name == "electrical_damping" and not all(is_motor(plant.model, int(plant.actuator[j])) for j in joints):
-                continue
             limit = float(
                 np.mean(
                     [
@@ -143,3 +139,23 @@ def choose(
             std = kind.relative_std if relative and kind.relative_std is not None else kind.absolute_std(limit)
             chosen.append(Parameter(name, label, tuple(joints), relative, std))
     return chosen
+
+
+def _groups(plant: Plant, kind: Kind, tie: str, motors: Mapping[str, str]) -> dict[str, list[int]]:
+    """Label → the joints that share one value of a kind."""
+    if kind.body:
+        return {"body": list(range(len(plant.joints)))}
+    groups: dict[str, list[int]] = {}
+    if kind.alike:
+        by_value: dict[str, list[int]] = {}
+        for j in range(len(plant.joints)):
+            by_value.setdefault(f"{kind.read(plant.model, plant, j):.6g}", []).append(j)
+        for members in by_value.values():
+            words = {plant.joints[j].partition("_")[0] for j in members}
+            shared = words.pop() if len(words) == 1 else plant.joints[members[0]]
+            groups[shared if shared not in groups else plant.joints[members[0]]] = members
+        return groups
+    for j, joint in enumerate(plant.joints):
+        label = {"joint": joint, "servo": motors.get(joint, "all"), "all": "all"}[tie]
+        groups.setdefault(label, []).append(j)
+    return groups

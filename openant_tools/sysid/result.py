@@ -20,6 +20,8 @@ from openant_tools.sysid.report import fit_report
 __all__ = ["write_fit", "write_robot"]
 
 CALIBRATED = "calibrated.xml"
+#: where a joint's name stands in robot.toml, for what belongs to the body or to what it stands on
+BODY = "body"
 
 
 def write_fit(result: Identification, out: Path) -> list[Path]:
@@ -80,7 +82,7 @@ def write_robot(result: Identification, folder: RobotFolder) -> None:
     provenance = {"model": source()}
     for value in result.values:
         kind = value.name.partition(".")[0]
-        for joint in value.joints:
+        for joint in value.joints or (BODY,):
             # What stayed at its prior is written too: it must not be an older fit's value that is read beside this model.
             path = f"identified.{kind}.{joint}"
             values[path] = _rounded(value.value)

@@ -1,0 +1,45 @@
+"""A robot's masses and what it stands on, in a compiled model: which numbers they are, and how they change together."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.model.plant import Plant, world_bodies
+
+__all__ = ["deciding_geoms", "link_bodies", "scale_mass", "torso_body"]
+
+Ints = NDArray[np.int64]
+
+
+def link_bodies(model: mujoco.MjModel, plant: Plant, j: int) -> Ints:
+    """The bodies that joint j moves as one piece: its own, and those fixed to it."""
+    own = int(model.jnt_bodyid[model.dof_jntid[plant.dof[j]]])
+    return np.flatnonzero(model.body_weldid == model.body_weldid[own]).astype(np.int64)
+
+
+def torso_body(model: mujoco.MjModel, plant: Plant) -> int:
+    """The body that carries all others of the robot: the one with the free joint, on the floor."""
+    first = int(model.jnt_bodyid[model.dof_jntid[plant.dof[0]]])
+    return int(model.body_rootid[first])
+
+
+def scale_mass(model: mujoco.MjModel, bodies: Ints, factor: float) -> None:
+    """Make bodies denser: mass and inertia together, so that the inertia stays one that a solid of this shape can have."""
+    model.body_mass[bodies] *= factor
+    model.body_inertia[bodies] *= factor
+
+
+def deciding_geoms(model: mujoco.MjModel) -> Ints:
+    """The geoms whose friction and softness decide what happens at the floor.
+
+    Of two geoms the one of higher priority decides alone; of equal priority, both (MuJoCo's rule). So these are the world's
+    where they have priority over all of the robot's, else all that may touch anything.
+    """
+    of_world = np.isin(model.geom_bodyid, list(world_bodies(model)))
+    touches = (model.geom_contype | model.geom_conaffinity) != 0
+    robot = touches & ~of_world
+    highest = int(model.geom_priority[robot].max(initial=0))
+    alone = of_world & (model.geom_priority > highest)
+    return np.flatnonzero(alone if alone.any() else robot | (of_world & touches)).astype(np.int64)
