@@ -77,8 +77,12 @@ class Dataset:
 
     @property
     def fitted(self) -> Rollouts:
-        """What the fit compares: full runs on the stand; on the floor, where contact makes long runs chaotic, the horizon."""
-        return self.full if self.plant.setup is Setup.STAND else self.horizon
+        """What the fit compares: full runs, but on the floor, where contact makes long runs chaotic, the horizon.
+
+        A robot whose base nobody measured cannot be put back on its feet in mid-gait: such runs are compared whole too.
+        """
+        placed = all(np.isfinite(run.column("base.x")).any() for run in self.runs)
+        return self.horizon if self.plant.setup is Setup.FLOOR and placed else self.full
 
     def simulate(
         self, parameters: Sequence[Parameter], us: Sequence[Array], rollouts: Rollouts | None = None
