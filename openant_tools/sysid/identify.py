@@ -41,6 +41,9 @@ DEFAULT_KINDS = (
     ACTION_DELAY,
 )
 
+#: and with them, where a robot stood on the floor
+ON_FLOOR = ("floor_friction", "contact_softness")
+
 #: share of the posterior precision that must come from the data for a value to be called identifiable: the interval is
 #: then less than half as wide as the prior's
 IDENTIFIABLE = 0.75
@@ -290,7 +293,8 @@ def _own_model(run: Run) -> Path | None:
 def _applicable(kinds: Sequence[str] | None, plant: Plant, runs: Sequence[Run]) -> list[str]:
     """The kinds to fit. Which of damping and velocity gain: the one that stands in the model, for together they cannot be
     told apart while torque neither saturates nor is switched off. The electrical share of damping shows only without
-    torque."""
+    torque, what decides at the floor only on it. (The torso's mass is a torque scale to a standing robot: it must be asked
+    for.)"""
     if kinds is not None:
         unknown = [kind for kind in kinds if kind not in KINDS]
         if unknown:
@@ -311,6 +315,8 @@ def _applicable(kinds: Sequence[str] | None, plant: Plant, runs: Sequence[Run]) 
         if kind == "electrical_damping" and not limp:
             continue
         out.append(kind)
+    if plant.free_joint is not None and any(setup_of(run.facts.setup) is Setup.FLOOR for run in runs):
+        out += ON_FLOOR
     return out
 
 
