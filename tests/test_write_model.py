@@ -27,7 +27,9 @@ SERVO = plants.SERVO
 
 def moved(source: Path, kinds: Sequence[str], u: float = 1.0, joints: Sequence[str] | None = None) -> Any:
     """The model of a file with these kinds of parameters moved by `u` prior deviations in these joints (default: all)."""
-    plant = load_plant(source, setup=Setup.FLOOR, electrical="electrical_damping" in kinds)
+    plant = load_plant(
+        source, setup=Setup.FLOOR, electrical="electrical_damping" in kinds, lagging="actuator_lag" in kinds
+    )
     chosen: list[Parameter] = choose(plant, kinds)
     assert chosen
     return apply(plant, chosen, np.array([u if joints is None or p.label in joints else 0.0 for p in chosen]))
@@ -297,6 +299,105 @@ def test_a_delay_comes_with_the_buffer_it_needs(tmp_path: Path) -> None:
     written = mujoco.MjModel.from_xml_path(str(out))
     assert written.actuator_delay[0] == pytest.approx(0.0234)
     assert written.actuator_history[0, 0] * written.opt.timestep > 0.0234
+
+
+WALKER = """\
+<mujoco>
+  <compiler angle="radian"/>
+  <default>
+    <geom density="700" solref="0.02 1.2"/>
+    <default class="foot"><geom friction="0.8 0.02 0.01" mass="0.05"/></default>
+  </default>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 1" FLOOR/>
+    <geom type="box" size="0.1 0.1 0.1" pos="2 0 0.1"/>
+    <body name="torso" pos="0 0 0.4">
+      <freejoint/>
+      <geom size="0.07"/>
+      <geom name="decor" size="0.09" mass="0" contype="0" conaffinity="0"/>
+      <body pos="0.1 0 0">
+        <joint name="left" axis="0 1 0" damping="0.1"/>
+        <frame pos="0 0 -0.1"><geom size="0.03"/><body><geom class="foot" size="0.02" pos="0 0 -0.1"/></body></frame>
+      </body>
+      <body pos="-0.1 0 0">
+        <inertial pos="0 0 -0.1" mass="0.2" fullinertia="1e-3 1e-3 1e-3 1e-5 0 0"/>
+        <joint name="right" axis="0 1 0" damping="0.1"/>
+        <geom size="0.03" pos="0 0 -0.1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="left" joint="left" kp="8" forcerange="-2 2"/>
+    <position name="right" joint="right" kp="8" forcerange="-2 2"/>
+  </actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("inertia", ["auto", "true"])
+def test_masses_change_where_the_file_states_them(inertia: str, tmp_path: Path) -> None:
+    """In a geom's mass, its density, its class, or the inertial: and the inertia with them."""
+    text = WALKER.replace("FLOOR", "").replace('angle="radian"', f'angle="radian" inertiafromgeom="{inertia}"')
+    source = plants.write(tmp_path / "walker.xml", text)
+    variant = moved(source, ["link_mass", "torso_mass"], 1.7)
+    given = mujoco.MjModel.from_xml_string(text)
+    assert np.isclose(variant.body_mass[1], given.body_mass[1] * math.exp(0.05 * 1.7))
+    assert (variant.body_mass[2:] > given.body_mass[2:]).all()
+    assert np.allclose(
+        variant.body_inertia[1:].T / given.body_inertia[1:].T, variant.body_mass[1:] / given.body_mass[1:]
+    )
+    out = write_model(source, variant, tmp_path / "out.xml")
+    same_physics(mujoco.MjModel.from_xml_path(str(out)), variant)
+    assert out.read_text().count('mass="0"') == 1, "decoration weighs nothing, as before"
+
+
+@pytest.mark.parametrize("floor", ["", 'friction="0.5"', 'priority="1" friction="0.5" solimp="0.7 0.9 0.02"'])
+def test_friction_and_softness_are_written_where_they_decide(floor: str, tmp_path: Path) -> None:
+    source = plants.write(tmp_path / "walker.xml", WALKER.replace("FLOOR", floor))
+    variant = moved(source, ["floor_friction", "contact_softness", "contact_impedance"], 0.4)
+    out = write_model(source, variant, tmp_path / "out.xml")
+    same_physics(mujoco.MjModel.from_xml_path(str(out)), variant)
+    elements = set(changed(source, out))
+    assert "geom decor" not in elements
+    if "priority" in floor:
+        assert elements == {"geom floor"}
+
+
+def test_geoms_that_cannot_be_told_apart_are_refused(tmp_path: Path) -> None:
+    part = '<replicate count="2" offset="0 0.2 0"><body><geom size="0.01" mass="0.01"/></body></replicate>'
+    source = plants.write(
+        tmp_path / "many.xml", plants.pendulum().replace('<geom name="rod"', f'{part}<geom name="rod"')
+    )
+    with pytest.raises(BadInput, match="some body or geom is not written out in the file"):
+        write_model(source, moved(source, ["link_mass"]), tmp_path / "out.xml")
+    assert not (tmp_path / "out.xml").exists()
+    same_physics(
+        mujoco.MjModel.from_xml_path(str(write_model(source, moved(source, ["stiffness"]), tmp_path / "out.xml"))),
+        moved(source, ["stiffness"]),
+    )
+
+
+@pytest.mark.parametrize(
+    "servo",
+    [
+        f'<position {SERVO} kp="8" forcerange="-1 1"/>',
+        f'<position {SERVO} kp="8" timeconst="0.02"/>',
+        f'<general {SERVO} gainprm="8" biastype="affine" biasprm="0 -8 -0.2"/>',
+    ],
+)
+def test_a_lag_is_written_as_the_filter_of_the_servo(servo: str, tmp_path: Path) -> None:
+    source = plants.write(tmp_path / "servo.xml", plants.pendulum(servo))
+    variant = moved(source, ["actuator_lag", "stiffness"], 1.3)
+    lag = 0.02 * math.exp(0.3 * 1.3) if "timeconst" in servo else 0.02 * 1.3
+    written = mujoco.MjModel.from_xml_path(str(write_model(source, variant, tmp_path / "out.xml")))
+    assert written.actuator_dynprm[0, 0] == pytest.approx(lag)
+    same_physics(written, variant)
+
+
+def test_without_lag_a_filtered_servo_is_the_given_one(tmp_path: Path) -> None:
+    source = plants.write(tmp_path / "servo.xml", plants.pendulum())
+    out = write_model(source, moved(source, ["actuator_lag"], 0.0), tmp_path / "out.xml")
+    assert changed(source, out) == {}
 
 
 # --- files in pieces ---------------------------------------------------------------------------------------------------
