@@ -48,7 +48,10 @@ def test_every_protocol_stays_in_bounds_and_begins_and_ends_at_rest_at_home(
     assert (commands <= SPACE.high + 1e-9).all()
 
 
-@pytest.mark.parametrize("name", [name for name in PROTOCOLS if name not in ("stand", "steps")])
+SUDDEN = ("full", "stand", "steps", "saturating-steps", "square", "releases", "drops")
+
+
+@pytest.mark.parametrize("name", [name for name in PROTOCOLS if name not in SUDDEN])
 def test_smooth_protocols_are_slow_enough_to_follow(name: str) -> None:
     commands = protocol(name).commands(SPACE, RATE, 3)
     assert np.abs(np.diff(commands, axis=0)).max() * RATE < 1.3 * SPACE.speed + 0.5
@@ -73,7 +76,7 @@ def test_the_same_seed_plays_the_same() -> None:
 
 
 def test_what_cannot_be_played_is_refused() -> None:
-    with pytest.raises(BadInput, match=r"no protocol 'chrip' → use one of stand, chirp"):
+    with pytest.raises(BadInput, match=r"no protocol 'chrip' → use one of full, stand, chirp"):
         protocol("chrip")
     with pytest.raises(BadInput, match=r"2\.0 s is too short"):
         protocol("stand", 2.0)

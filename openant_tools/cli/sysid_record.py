@@ -1,4 +1,4 @@
-"""`openant sysid record`: excite the robot on its stand and record it."""
+"""`openant sysid record`: excite the robot, on its stand and on the floor, and record it."""
 
 from __future__ import annotations
 
@@ -11,17 +11,32 @@ from typing import TYPE_CHECKING
 import click
 
 from openant_tools.cli.options import robot_option
-from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option, virtual_robot
+from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, placed, virtual_option, virtual_robot
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from openant_tools.robot.folder import RobotFolder
+    from openant_tools.sysid.protocols import Protocol
+    from openant_tools.sysid.record import Recorded, Take
 
 __all__ = ["record", "robot_of"]
 
+#: `protocols.FULL`, without loading it for every --help
+DEFAULT_PROTOCOL = "full"
+
 
 @click.command()
-@click.option("--protocol", "name", default="stand", show_default=True, help="What to play; see --list.")
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), required=True, metavar="RUN.mcap")
+@click.option("--protocol", "name", metavar="NAME", help=f"What to play; see --list.  [default: {DEFAULT_PROTOCOL}]")
+@click.option(
+    "--plan",
+    "plan_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Play what `openant sysid plan --out` wrote.",
+)
+@click.option("--list", "listing", is_flag=True, is_eager=True, help="List the protocols and how far each joint goes.")
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="RUN.mcap", help="What to make.")
 @virtual_option
 @click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one U2D2 that is plugged in.")
 @robot_option
@@ -29,13 +44,26 @@ __all__ = ["record", "robot_of"]
 @click.option("--seed", default=0, show_default=True, help="Chance of the protocol; the same seed plays the same.")
 @click.option("--seconds", type=float, metavar="S", help="How long to play. Default: the protocol's own time.")
 @click.option("--repeat", "repeats", type=click.IntRange(1), default=1, show_default=True, help="Play it so often.")
-@click.option("--setup", type=click.Choice(["stand", "floor"]), default="stand", show_default=True)
+@click.option("--hold-out-seed", type=int, metavar="SEED", help="Record it with this seed, too, to judge a fit by.")
+@click.option(
+    "--hot",
+    "hot_s",
+    type=click.FloatRange(min=0),
+    is_flag=False,
+    flag_value=60.0,
+    default=0.0,
+    metavar="[S]",
+    help="Work for S (60) seconds or until a servo is 10 K warmer, and repeat it hot.",
+)
+@click.option("--setup", type=click.Choice(["stand", "floor"]), help="Only what is played there. Default: all of it.")
 @click.option("--imu/--no-imu", default=None, help="Record the IMU too. Default: on the floor.")
 @click.option("--camera/--no-camera", default=None, help="Record the pose too. Default: on the floor, if there is one.")
 @click.option("--yes", is_flag=True, help="The robot may move: do not ask. Needed where no terminal is attached.")
 def record(
-    name: str,
-    out: Path,
+    name: str | None,
+    plan_file: Path | None,
+    listing: bool,
+    out: Path | None,
     virtual_source: str | None,
     port: str | None,
     robot: Path | None,
@@ -43,79 +71,168 @@ def record(
     seed: int,
     seconds: float | None,
     repeats: int,
-    setup: str,
+    hold_out_seed: int | None,
+    hot_s: float,
+    setup: str | None,
     imu: bool | None,
     camera: bool | None,
     yes: bool,
 ) -> None:
     """Play an excitation on the robot and record it.
 
-    The robot hangs on its stand, legs free. It goes slowly to its home pose, plays, and lets go. Ctrl-C stops it with
-    torque off and keeps what was recorded.
+    On the stand the legs hang free. The robot goes slowly to its home pose, plays, and lets go. A protocol that goes on
+    on the floor asks for the robot to be put there, and turned. Ctrl-C stops it with torque off and keeps what was recorded.
 
     \b
-      openant sysid record --protocol stand --out run.mcap --robot my-ant
+      openant sysid record --out run.mcap --robot my-ant --repeat 2 --hold-out-seed 1
       openant sysid record --virtual --protocol chirp --seconds 15 --out run.mcap --yes
+      openant sysid record --list
     """
     from rich.console import Console
+
+    from openant_tools.errors import BadInput
+    from openant_tools.recording.writer import recording_path
+    from openant_tools.sysid.protocols import protocols
+    from openant_tools.sysid.record import takes
+
+    if listing:
+        _list(robot)
+        return
+    if out is None:
+        raise BadInput("no name for the recording", remedy="name it with --out RUN.mcap")
+    if plan_file is not None:
+        from openant_tools.sysid.plan_file import read_plan
+
+        if name is not None or seconds is not None:
+            raise BadInput("a plan says what to play", remedy="leave out --protocol and --seconds")
+        played = tuple(one for one in read_plan(plan_file) if setup in (None, one.setup))
+        if not played:
+            raise BadInput(f"the plan has nothing for the {setup}", where=plan_file, remedy="leave out --setup")
+    else:
+        played = protocols(name or DEFAULT_PROTOCOL, seconds, setup)
+    wanted = takes(recording_path(out), played, seed, repeats=repeats, hold_out_seed=hold_out_seed, hot_s=hot_s)
+    for take in wanted:
+        if take.path.exists():
+            raise BadInput("there is a recording already", where=take.path, remedy="record under another name")
+    folder = robot_of(robot, needed=virtual_source is None)
+    console = Console(stderr=True)
+    placements = [
+        [take for take in wanted if (take.protocol.setup, take.protocol.heading_rad) == place]
+        for place in dict.fromkeys((take.protocol.setup, take.protocol.heading_rad) for take in wanted)
+    ]
+    # A virtual robot that is started here is put where it is needed; any other, and a real one, by hands.
+    started_here = virtual_source is not None and (
+        virtual_source == VIRTUAL_DEFAULT or virtual_source.endswith(".toml")
+    )
+    for k, place in enumerate(placements):
+        protocol = place[0].protocol
+        if k and not started_here:
+            if yes or not sys.stdin.isatty():
+                rest = "; ".join(_where(later[0].protocol) for later in placements[k:])
+                console.print(
+                    f"left out, since nobody is asked to move the robot: {rest}; record it with --setup floor"
+                )
+                break
+            click.confirm(f"Put the robot {_where(protocol)}. Ready?", abort=True, err=True)
+        with contextlib.ExitStack() as stack:
+            source = virtual_source
+            if source is not None and started_here:
+                source = stack.enter_context(placed(source, protocol.setup, protocol.heading_rad))
+            done = _record_here(stack, console, place, source, port, folder, rate_hz, imu, camera, yes or k > 0)
+        for recorded in done:
+            click.echo(f"{recorded.path}  {recorded.cycles} cycles")
+
+
+def _where(protocol: Protocol) -> str:
+    from math import degrees
+
+    if protocol.setup == "stand":
+        return "on its stand, legs free"
+    heading = (
+        f", turned left by {degrees(protocol.heading_rad):.0f}° from where it looked" if protocol.heading_rad else ""
+    )
+    return f"on the floor, with room around it{heading}"
+
+
+def _record_here(
+    stack: contextlib.ExitStack,
+    console: Console,
+    wanted: list[Take],
+    virtual_source: str | None,
+    port: str | None,
+    folder: RobotFolder | None,
+    rate_hz: float,
+    imu: bool | None,
+    camera: bool | None,
+    yes: bool,
+) -> list[Recorded]:
+    """Connect to the robot where it is, and record."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from openant_tools.comms.setup import camera_of_robot, config_of_robot, config_of_unknown_robot, imu_of_robot
-    from openant_tools.errors import BadInput
-    from openant_tools.recording.writer import recording_path
-    from openant_tools.sysid.protocols import protocol
-    from openant_tools.sysid.record import record_protocol, repeat_paths
+    from openant_tools.sysid.record import record_takes
 
-    played = protocol(name, seconds)
-    out = recording_path(out)
-    for path in repeat_paths(out, repeats):
-        if path.exists():
-            raise BadInput("there is a recording already", where=path, remedy="record under another name")
-    folder = robot_of(robot, needed=virtual_source is None)
-    console = Console(stderr=True)
-    with contextlib.ExitStack() as stack:
-        control = imu_port = camera_source = None
-        if virtual_source is not None:
-            # One that is ours alone need not wait for real time.
-            clock = "stepped" if virtual_source == VIRTUAL_DEFAULT else None
-            found = stack.enter_context(virtual_robot(virtual_source, clock=clock))
-            port, control, imu_port = port or found["bus"], found["control"], found["imu"]
-            camera_source = found["camera"]
-        described = None if folder is None else folder.config()
-        floor = setup == "floor"
-        more = {
-            "rate_hz": rate_hz,
-            "imu": imu_of_robot(described, imu_port) if (floor if imu is None else imu) else None,
-            "camera": camera_of_robot(described, camera_source) if (floor if camera is None else camera) else None,
-        }
-        if described is not None:
-            config = config_of_robot(described, port, control=control, **more)
-        else:
-            assert port is not None
-            config = config_of_unknown_robot(port, control, **more)
-        console.print(
-            f"{played.name}: {played.words}; {played.seconds:.0f} s"
-            + (f", {repeats} times" if repeats > 1 else "")
-            + f". All {len(config.servos)} joints move on {config.port}; the robot must hang free on its {setup}."
-        )
-        _ask(yes)
-        columns = TextColumn("{task.description:18}"), BarColumn(), TextColumn("{task.percentage:3.0f} %")
-        bar = stack.enter_context(Progress(*columns, TimeElapsedColumn(), console=console, transient=True))
-        task = bar.add_task("connecting", total=1.0)
-        done = record_protocol(
-            config,
-            played,
-            out,
-            seed=seed,
-            repeats=repeats,
-            setup=setup,
-            robot_toml=None if folder is None else folder.config_file.read_text(),
-            progress=lambda words, share: bar.update(task, description=words, completed=share),
-            journal=None if folder is None else folder.journal,
-            notice=lambda text: bar.console.print(text, highlight=False),
-        )
-    for recorded in done:
-        click.echo(f"{recorded.path}  {recorded.cycles} cycles")
+    control = imu_port = camera_source = None
+    if virtual_source is not None:
+        # One that is ours alone need not wait for real time.
+        clock = "stepped" if virtual_source == VIRTUAL_DEFAULT else None
+        found = stack.enter_context(virtual_robot(virtual_source, clock=clock))
+        port, control, imu_port = port or found["bus"], found["control"], found["imu"]
+        camera_source = found["camera"]
+    described = None if folder is None else folder.config()
+    floor = wanted[0].protocol.setup == "floor"
+    more = {
+        "rate_hz": rate_hz,
+        "imu": imu_of_robot(described, imu_port) if (floor if imu is None else imu) else None,
+        "camera": camera_of_robot(described, camera_source) if (floor if camera is None else camera) else None,
+    }
+    if described is not None:
+        config = config_of_robot(described, port, control=control, **more)
+    else:
+        assert port is not None
+        config = config_of_unknown_robot(port, control, **more)
+    first = wanted[0].protocol
+    console.print(
+        f"{first.name}: {first.words}; {sum(take.protocol.seconds for take in wanted):.0f} s"
+        + (f" in {len(wanted)} recordings" if len(wanted) > 1 else "")
+        + f". All {len(config.servos)} joints move on {config.port}; the robot must be {_where(first)}."
+    )
+    _ask(yes)
+    columns = TextColumn("{task.description:18}"), BarColumn(), TextColumn("{task.percentage:3.0f} %")
+    bar = stack.enter_context(Progress(*columns, TimeElapsedColumn(), console=console, transient=True))
+    task = bar.add_task("connecting", total=1.0)
+    return record_takes(
+        config,
+        wanted,
+        robot_toml=None if folder is None else folder.config_file.read_text(),
+        progress=lambda words, share: bar.update(task, description=words, completed=share),
+        journal=None if folder is None else folder.journal,
+        notice=lambda text: bar.console.print(text, highlight=False),
+    )
+
+
+def _list(robot: Path | None) -> None:
+    """Names, times, and how far each joint is commanded within this robot's limits."""
+    from openant_tools.sysid.protocols import PROTOCOLS, CommandSpace, protocols
+
+    folder = robot_of(robot, needed=False)
+    limits = None
+    if folder is not None:
+        limits = {motor.joint: (motor.min_rad, motor.max_rad) for motor in folder.config().motors.values()}
+    space = CommandSpace.around_home(limits)
+    for name, (words, _) in PROTOCOLS.items():
+        click.echo(f"{name:17} {words}" + ("  (default)" if name == DEFAULT_PROTOCOL else ""))
+        for one in protocols(name):
+            reach = {"hip": (0.0, 0.0), "knee": (0.0, 0.0)}
+            moved = one.commands(space, 50.0) - one.space(space).home
+            for kind in reach:
+                columns = [k for k, joint in enumerate(space.joints) if joint.startswith(kind)]
+                reach[kind] = float(moved[:, columns].min()), float(moved[:, columns].max())
+            where = one.setup + (f" at {one.heading_rad * 57.29578:.0f}°" if one.heading_rad else "")
+            click.echo(
+                f"{'':17} {where:13} {one.seconds:4.0f} s   from home: "
+                + "   ".join(f"{kind} {low:+.2f} … {high:+.2f} rad" for kind, (low, high) in reach.items())
+            )
 
 
 def robot_of(robot: Path | None, *, needed: bool) -> RobotFolder | None:

@@ -16,7 +16,7 @@ import click
 
 from openant_tools.errors import BadInput, HardwareFault
 
-__all__ = ["VIRTUAL_DEFAULT", "virtual_option", "virtual_robot"]
+__all__ = ["VIRTUAL_DEFAULT", "placed", "virtual_option", "virtual_robot"]
 
 #: what `--virtual` without a value stands for
 VIRTUAL_DEFAULT = "default"
@@ -65,6 +65,46 @@ def virtual_robot(source: str, *, clock: str | None = None) -> Iterator[Mapping[
                 except subprocess.TimeoutExpired:
                     process.kill()
                     process.wait()
+
+
+@contextlib.contextmanager
+def placed(source: str, setup: str, heading_rad: float) -> Iterator[str]:
+    """The source of a virtual robot like that of `source` (a scenario, or the default), but standing elsewhere.
+
+    A source that stands there already is given back as it is; so is a sealed one, which says where it stands itself.
+    """
+    import tomlkit
+
+    text = "" if source == VIRTUAL_DEFAULT else _text(Path(source))
+    try:
+        document = tomlkit.parse(text)
+    except tomlkit.exceptions.TOMLKitError:
+        yield source  # the robot itself says what is wrong with it
+        return
+    robot = document.setdefault("robot", tomlkit.table())
+    stands = isinstance(robot, dict) and (
+        (robot.get("setup", "stand"), robot.get("heading_rad", 0.0)) == (setup, heading_rad)
+        or (setup == "stand" and robot.get("setup", "stand") == "stand")
+    )
+    if stands or not isinstance(robot, dict) or "sealed" in document:
+        yield source
+        return
+    robot["setup"], robot["heading_rad"] = setup, heading_rad
+    if "eeprom" in robot:
+        robot["eeprom"] = str(Path(source).resolve().parent / str(robot["eeprom"]))
+    if source == VIRTUAL_DEFAULT:
+        document["clock"] = {"mode": "stepped"}
+    with tempfile.TemporaryDirectory(prefix="openant-placed-") as folder:
+        path = Path(folder) / (Path(source).name if source != VIRTUAL_DEFAULT else f"{setup}.toml")
+        path.write_text(tomlkit.dumps(document))
+        yield str(path)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return ""  # the robot itself says what is wrong with it
 
 
 def _await(process: subprocess.Popen[bytes], ready: Path, log: str) -> None:

@@ -32,7 +32,7 @@ from openant_tools.comms.faults import Cause
 from openant_tools.comms.guards import Trip, Watch
 from openant_tools.comms.line import PortGone, SerialLine
 from openant_tools.comms.messages import EngineConfig
-from openant_tools.comms.motion import Motion, hold, play, ramp
+from openant_tools.comms.motion import Motion, catch, hold, play, ramp
 from openant_tools.comms.ports import WANTED_LATENCY_MS, Host, udev_rule
 from openant_tools.comms.ring import ERR_CODES, Ring
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Block, Servo, Servos
@@ -91,6 +91,7 @@ class Engine:
         self._torque = False
         self._motions: deque[Motion] = deque()
         self._goal: Array | None = None
+        self._limp = np.zeros(len(config.servos), bool)
         self._counts: list[int] | None = None
         self._waiting: list[tuple[int, Motion]] = []
         self._recorder: RecordingWriter | None = None
@@ -297,6 +298,7 @@ class Engine:
     def _torque_off(self) -> None:
         """Release every servo, again and again until each has confirmed or time is up: the line may be bad."""
         self._torque = False
+        self._limp[:] = False
         self._motions.clear()
         self._goal = self._counts = None
         if self._lost:
@@ -377,6 +379,14 @@ class Engine:
         if self._torque and self._motions:
             motion = self._motions[0]
             self._goal = motion.step(cycles)
+            if (motion.limp_now != self._limp).any():
+                try:
+                    self._goal = self._release_and_catch(motion)
+                except PortGone:
+                    raise
+                except HardwareFault as error:
+                    self._stopped(Trip(error.what, error.remedy or ""))
+                    return
             self._counts = self._servos.goal_counts(self._goal.tolist())
             if motion.ended:
                 ended = self._motions.popleft()
@@ -396,6 +406,27 @@ class Engine:
                 self._stopped(self._explained(trip))
         if ended is not None:
             self._motion_ended(ended)
+
+    def _release_and_catch(self, motion: Motion) -> Array:
+        """Switch the torque of single joints as a motion says; its row, in which a caught joint's goal is where it hangs."""
+        servos, joints = self._servos, self._servos.joints
+        before, self._limp = self._limp, motion.limp_now.copy()
+        loose = [joint for joint, was, now in zip(joints, before, self._limp, strict=True) if now and not was]
+        if loose:
+            # All at once, since each answer costs a fraction of a cycle; who did not hear it is told alone.
+            servos.write_all("torque_enable", dict.fromkeys(loose, 0))
+            servos.set_torque(False, servos.still_on(loose))
+        caught = [joint for joint, was, now in zip(joints, before, self._limp, strict=True) if was and not now]
+        if caught:
+            here = servos.read_all("present_position", caught)
+            servos.write_all("goal_position", here)
+            servos.set_torque(True, caught)
+            for joint, counts in here.items():
+                k, servo = joints.index(joint), servos[joint]
+                angle = servo.to_joint(counts * servo.model.registers["present_position"].scale)
+                catch(motion.commands, motion.done - 1, k, angle, self.config.rate_hz)
+        row: Array = motion.commands[motion.done - 1]
+        return row
 
     def _stood_still(self, seconds: float) -> Trip | None:
         """Whether the servos' watchdog has stopped the motion behind our back, since this process was held up."""
@@ -517,7 +548,8 @@ class Engine:
         n = len(recorded)
         goals: list[int | None] = [None] * n if self._counts is None else list(self._counts)
         try:
-            self._recorder.cycle(Cycle(t, goals, cmd_t, wake, recorded, [self._torque] * n))
+            torque = [self._torque and not limp for limp in self._limp.tolist()]
+            self._recorder.cycle(Cycle(t, goals, cmd_t, wake, recorded, torque))
         except RecordingStopped as error:
             self._recording_failed(error)
 
@@ -648,7 +680,10 @@ class Engine:
             motions = [ramp(self._goal, command.target, rate)]
         else:
             self._within_limits(command.commands)
-            motions = play(self._goal, command.commands, rate, command.name)
+            limp = command.limp
+            if limp is not None and (limp.shape != command.commands.shape or limp[[0, -1]].any()):
+                raise BadInput("a motion must begin and end with the torque of all joints on")
+            motions = play(self._goal, command.commands, rate, command.name, limp)
         self._motions.extend(motions)
         self._waiting.append((number, motions[-1]))
 

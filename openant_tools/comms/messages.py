@@ -101,10 +101,16 @@ class Ramp:
 
 @dataclass(frozen=True)
 class Play:
-    """Play commands (n, joints) rad at the loop's rate, after a ramp to the first; `Finished` follows."""
+    """Play commands (n, joints) rad at the loop's rate, after a ramp to the first; `Finished` follows.
+
+    Attributes:
+        limp: (n, joints), where a joint's torque is to be off; not in the first row nor the last. When its torque comes
+            back, its goal starts where it hangs and goes to what is commanded no faster than a ramp.
+    """
 
     commands: NDArray[np.float64]
     name: str = "motion"
+    limp: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["RAMP_SPEED_RAD_S", "Motion", "hold", "play", "ramp"]
+__all__ = ["RAMP_SPEED_RAD_S", "Motion", "catch", "hold", "play", "ramp"]
 
 Array = NDArray[np.float64]
 
@@ -26,11 +26,13 @@ class Motion:
         name: for messages and progress.
         commands: (n, joints) rad.
         done: rows played so far.
+        limp: (n, joints), where torque is off; None where it is on throughout.
     """
 
     name: str
     commands: Array
     done: int = 0
+    limp: NDArray[np.bool_] | None = None
 
     @property
     def ended(self) -> bool:
@@ -42,6 +44,14 @@ class Motion:
         row: Array = self.commands[self.done - 1]
         return row
 
+    @property
+    def limp_now(self) -> NDArray[np.bool_]:
+        """(joints,), which joints have no torque in the row that `step` gave last."""
+        if self.limp is None:
+            return np.zeros(self.commands.shape[1], bool)
+        row: NDArray[np.bool_] = self.limp[max(self.done - 1, 0)]
+        return row
+
 
 def ramp(
     start: Array, end: Array, rate_hz: float, *, speed_rad_s: float = RAMP_SPEED_RAD_S, name: str = "ramp"
@@ -49,8 +59,7 @@ def ramp(
     """Minimum jerk from `start` to `end` (joints,), all joints arriving together, none faster than `speed_rad_s`."""
     distance = float(np.abs(end - start).max())
     seconds = max(_PEAK_OVER_MEAN * distance / speed_rad_s, SHORTEST_RAMP_S)
-    s = np.arange(1, round(seconds * rate_hz) + 1) / round(seconds * rate_hz)
-    share = s**3 * (10 - 15 * s + 6 * s**2)
+    share = _minimum_jerk(np.arange(1, round(seconds * rate_hz) + 1) / round(seconds * rate_hz))
     return Motion("ramp", start + share[:, None] * (end - start))
 
 
@@ -59,9 +68,24 @@ def hold(position: Array, seconds: float, rate_hz: float) -> Motion:
     return Motion("hold", np.repeat(position[None, :], max(1, round(seconds * rate_hz)), axis=0))
 
 
-def play(start: Array, commands: Array, rate_hz: float, name: str) -> list[Motion]:
+def play(
+    start: Array, commands: Array, rate_hz: float, name: str, limp: NDArray[np.bool_] | None = None
+) -> list[Motion]:
     """`commands` (n, joints), preceded by a ramp from where the robot is, unless it is there already."""
     motions = []
     if float(np.abs(commands[0] - start).max()) > RAMP_SPEED_RAD_S / rate_hz:
         motions.append(ramp(start, commands[0], rate_hz))
-    return [*motions, Motion(name, commands)]
+    return [*motions, Motion(name, commands.copy(), limp=limp)]
+
+
+def catch(commands: Array, row: int, joint: int, angle: float, rate_hz: float) -> None:
+    """Let a joint's `commands` (n, joints) start at `angle` in `row` and come back to themselves by a ramp, in place."""
+    apart = angle - float(commands[row, joint])
+    seconds = max(_PEAK_OVER_MEAN * abs(apart) / RAMP_SPEED_RAD_S, SHORTEST_RAMP_S)
+    rows = np.arange(min(len(commands) - row, round(seconds * rate_hz)))
+    commands[row + rows, joint] += apart * (1 - _minimum_jerk(rows / (seconds * rate_hz)))
+
+
+def _minimum_jerk(share: Array) -> Array:
+    out: Array = share**3 * (10 - 15 * share + 6 * share**2)
+    return out

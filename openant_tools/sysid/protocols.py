@@ -1,272 +1,121 @@
-"""Excitations as data: what a robot on its stand is asked to do so that its parameters can be told.
+"""The library of protocols: which motions are recorded under which name, on the stand and on the floor.
 
-A protocol is a row of segments; each begins and ends at rest in the middle of the allowed range, and the whole begins
-and ends at rest in the home pose. All that chance decides comes from one seed, so that a repeat plays the same.
+A protocol is what one recording holds: segments from rest at home to rest at home. What tells effects apart best takes
+several, on the stand and on the floor in two headings (`FULL`); `protocols` gives them in the order in which they are played.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol as Interface
 
 import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
-from openant_tools.robot.joints import JOINTS
-from openant_tools.robot.kit import ANGLE_LIMIT_RAD, HOME_RAD
+from openant_tools.sysid.excitation import (
+    Around,
+    Chirp,
+    CommandSpace,
+    Holds,
+    InTurn,
+    Multisine,
+    Releases,
+    Segment,
+    Sine,
+    SlowReversals,
+    Square,
+    Steps,
+    smooth,
+)
+from openant_tools.sysid.floor_motion import Gait, LegLifts, PushUps, Scrub, Twitch, WeightShifts
 
-__all__ = [
-    "PROTOCOLS",
-    "Chirp",
-    "CommandSpace",
-    "Holds",
-    "Multisine",
-    "Protocol",
-    "Rest",
-    "Segment",
-    "SlowReversals",
-    "Steps",
-    "protocol",
-]
+__all__ = ["FULL", "PROTOCOLS", "CommandSpace", "Part", "Protocol", "protocol", "protocols"]
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
-#: Shares of the way round a circle that are as far apart as can be for any number of joints.
-GOLDEN = (5**0.5 - 1) / 2
-#: s in which an excitation fades in and out.
-FADE_S = 0.5
 #: from home to the middle of the range and back, s, with a rest behind each
 APPROACH_S, APPROACH_REST_S = 0.8, 0.3
-
-
-@dataclass(frozen=True)
-class CommandSpace:
-    """Where commands may go.
-
-    Attributes:
-        joints: names, in order.
-        home: (joints,) rad, where it begins and ends.
-        low, high: (joints,) rad, bounds of all commands.
-        speed: rad/s, fastest command of smooth segments.
-    """
-
-    joints: tuple[str, ...]
-    home: Array
-    low: Array
-    high: Array
-    speed: float = 3.0
-
-    @property
-    def centre(self) -> Array:
-        return (self.low + self.high) / 2
-
-    @property
-    def half(self) -> Array:
-        return (self.high - self.low) / 2
-
-    @classmethod
-    def around_home(
-        cls,
-        limits_rad: Mapping[str, tuple[float, float]] | None = None,
-        joints: Sequence[str] = tuple(JOINTS),
-        *,
-        reach_rad: float = 0.6,
-        margin_rad: float = 0.05,
-    ) -> CommandSpace:
-        """Within `reach_rad` of the home pose and `margin_rad` inside the limits (default: the kit's)."""
-        limits = dict(limits_rad or {})
-        for joint in joints:
-            angle = ANGLE_LIMIT_RAD[JOINTS[joint].kind]
-            limits.setdefault(joint, (-angle, angle))
-        home = np.array([HOME_RAD[JOINTS[joint].kind] for joint in joints])
-        low = np.array([limits[joint][0] + margin_rad for joint in joints])
-        high = np.array([limits[joint][1] - margin_rad for joint in joints])
-        narrow = [joint for joint, a, b, h in zip(joints, low, high, home, strict=True) if not a <= h <= b]
-        if narrow:
-            raise BadInput(
-                f"the limits of {', '.join(narrow)} leave no room around the home pose",
-                remedy="widen min_rad and max_rad in robot.toml",
-            )
-        return cls(tuple(joints), home, np.maximum(low, home - reach_rad), np.minimum(high, home + reach_rad))
-
-
-class Segment(Interface):
-    """One piece of a protocol.
-
-    Attributes:
-        seconds: how long it takes.
-    """
-
-    @property
-    def seconds(self) -> float: ...
-
-    def offsets(self, t: Array, space: CommandSpace, chance: np.random.Generator) -> Array:
-        """Commands relative to the middle, (n, joints) rad, at times `t` (n,) s since it began; zero at both ends."""
-        ...
-
-
-@dataclass(frozen=True)
-class Rest:
-    """Nothing moves."""
-
-    seconds: float
-
-    def offsets(self, t: Array, space: CommandSpace, chance: np.random.Generator) -> Array:
-        return np.zeros((len(t), len(space.joints)))
-
-
-@dataclass(frozen=True)
-class Chirp:
-    """A sine whose frequency rises from `low_hz` to `high_hz` exponentially; its speed is bounded by the space's.
-
-    x(t) = a(t) sin(2π f₀ (kᵗ − 1)/ln k + φ), k = (f₁/f₀)^(1/T), a(t) = min(share · half range, speed / (2π f(t))).
-    Each joint has a phase φ and, within ±15 %, frequencies of its own, so that no two move alike.
-    """
-
-    seconds: float
-    low_hz: float = 0.2
-    high_hz: float = 4.0
-    share: float = 0.8
-
-    def offsets(self, t: Array, space: CommandSpace, chance: np.random.Generator) -> Array:
-        joints = np.arange(len(space.joints))
-        pace = 1.0 + 0.3 * ((GOLDEN * (joints + 1)) % 1.0 - 0.5)
-        rate = np.log(self.high_hz / self.low_hz) / self.seconds
-        frequency = self.low_hz * np.exp(rate * t)[:, None] * pace
-        angle = 2 * np.pi * (frequency - self.low_hz * pace) / rate + 2 * np.pi * GOLDEN * joints
-        amplitude = np.minimum(self.share * space.half, space.speed / (2 * np.pi * frequency))
-        out: Array = amplitude * np.sin(angle) * _fade(t, self.seconds)[:, None]
-        return out
-
-
-@dataclass(frozen=True)
-class Steps:
-    """Sudden changes of one joint after another, `every_s` apart for each joint, no larger than `largest_rad`."""
-
-    seconds: float
-    every_s: float = 1.0
-    largest_rad: float = 0.35
-    share: float = 0.9
-
-    def offsets(self, t: Array, space: CommandSpace, chance: np.random.Generator) -> Array:
-        n = len(space.joints)
-        out = np.zeros((len(t), n))
-        for k in range(n):
-            at, level = self.every_s * ((GOLDEN * (k + 1)) % 1.0), 0.0
-            reach = self.share * space.half[k]
-            while at < self.seconds - self.every_s / 2:
-                new = float(np.clip(chance.uniform(-reach, reach), level - self.largest_rad, level + self.largest_rad))
-                level = new
-                out[t >= at, k] = level
-                at += self.every_s * chance.uniform(0.7, 1.3)
-        # The last change of every joint leads back to the middle, gently.
-        last = max(self.seconds - self.every_s / 2, 0.0)
-        back = 1.0 - _smooth((t - last) / max(self.seconds - last - 0.1, 1e-9))
-        return out * back[:, None]
-
-
-@dataclass(frozen=True)
-class Holds:
-    """Smooth ways between poses of chance that are held: what stiffness, gravity and zeros are read from."""
-
-    seconds: float
-    move_s: float = 0.5
-    hold_s: float = 0.8
-    share: float = 0.9
-
-    def offsets(self, t: Array, space: CommandSpace, chance: np.random.Generator) -> Array:
-        poses = max(1, int((self.seconds - self.move_s) / (self.move_s + self.hold_s)))
-        period = (self.seconds - self.move_s) / poses
-        levels = chance.uniform(-1, 1, (poses, len(space.joints))) * self.share * space.half
-        levels = np.vstack([np.zeros(len(space.joints)), levels, np.zeros(len(space.joints))])
-        out = np.zeros((len(t), len(space.joints)))
-        for k in range(poses + 1):
-            out += _smooth((t - k * period) / self.move_s)[:, None] * (levels[k + 1] - levels[k])
-        return out
-
-
-@dataclass(frozen=True)
-class SlowReversals:
-    """A slow triangle about the middle: friction and play show at its corners and nowhere else."""
-
-    seconds: float
-    speed_rad_s: float = 0.15
-    amplitude_rad: float = 0.12
-
-    def offsets(self, t: Array, space: CommandSpace, chance: np.random.Generator) -> Array:
-        amplitude = np.minimum(self.amplitude_rad, 0.9 * space.half)
-        # A whole number of periods, joint by joint, so that it ends where it began.
-        periods = np.maximum(1, np.round(self.seconds * self.speed_rad_s / (4 * amplitude)))
-        phase = np.clip(t / self.seconds, 0, 1)[:, None] * periods
-        triangle = 2 * np.abs(2 * ((phase + 0.25) % 1) - 1) - 1
-        out: Array = -amplitude * triangle
-        return out
-
-
-@dataclass(frozen=True)
-class Multisine:
-    """Several sines at once, at random phases: all frequencies all the time."""
-
-    seconds: float
-    low_hz: float = 0.2
-    high_hz: float = 5.0
-    lines: int = 12
-    share: float = 0.8
-
-    def offsets(self, t: Array, space: CommandSpace, chance: np.random.Generator) -> Array:
-        frequencies = np.geomspace(self.low_hz, self.high_hz, self.lines)
-        phases = chance.uniform(0, 2 * np.pi, (self.lines, len(space.joints)))
-        waves = np.sin(2 * np.pi * frequencies[:, None, None] * t[None, :, None] + phases[:, None, :])
-        # Equal speed per line, then scaled so that neither range nor speed is passed.
-        summed = np.einsum("l,lnj->nj", 1 / frequencies, waves)
-        speed = np.abs(np.diff(summed, axis=0)).max(0) / max(float(np.diff(t).mean()), 1e-9)
-        scale = np.minimum(self.share * space.half / np.abs(summed).max(0), space.speed / speed)
-        out: Array = scale * summed * _fade(t, self.seconds)[:, None]
-        return out
+#: the protocol that is played where none is named
+FULL = "full"
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """What is played, from rest at home to rest at home.
+    """What one recording holds, from rest at home to rest at home.
 
     Attributes:
         name: what `--protocol` calls it, and the run's facts.
         words: one line for people.
         segments: in order.
+        setup: "stand" or "floor".
+        heading_rad: of the robot on the floor at the start.
     """
 
     name: str
     words: str
     segments: tuple[Segment, ...]
+    setup: str = "stand"
+    heading_rad: float = 0.0
 
     @property
     def seconds(self) -> float:
-        return sum(segment.seconds for segment in self.segments) + 2 * (APPROACH_S + APPROACH_REST_S)
+        return sum(segment.seconds for segment in self.segments) + 2 * self._approach_s
+
+    @property
+    def _approach_s(self) -> float:
+        # On its feet a robot is in the middle already.
+        return APPROACH_REST_S if self.setup == "floor" else APPROACH_S + APPROACH_REST_S
+
+    def space(self, space: CommandSpace) -> CommandSpace:
+        """What of a space the protocol uses: on the floor only what lies evenly about the stand."""
+        return space.standing() if self.setup == "floor" else space
 
     def commands(self, space: CommandSpace, rate_hz: float, seed: int = 0) -> Array:
         """(n, joints) rad at `rate_hz`; the same for the same seed."""
         chance = np.random.default_rng(seed)
-        n = round((APPROACH_S + APPROACH_REST_S) * rate_hz)
-        approach = _smooth(np.arange(n) / (APPROACH_S * rate_hz))[:, None] * (space.centre - space.home) + space.home
+        used = self.space(space)
+        n = round(self._approach_s * rate_hz)
+        approach = smooth(np.arange(n) / (APPROACH_S * rate_hz))[:, None] * (used.centre - used.home) + used.home
         parts = [approach]
         for segment in self.segments:
-            t = np.arange(round(segment.seconds * rate_hz)) / rate_hz
-            parts.append(space.centre + segment.offsets(t, space, chance))
+            parts.append(used.centre + segment.offsets(self._times(segment, rate_hz), used, chance))
         parts.append(approach[::-1])
-        return np.clip(np.vstack(parts), np.minimum(space.low, space.home), np.maximum(space.high, space.home))
+        return np.clip(np.vstack(parts), np.minimum(used.low, used.home), np.maximum(used.high, used.home))
+
+    def limp(self, space: CommandSpace, rate_hz: float) -> Bools:
+        """(n, joints), where torque is off: in the rows of `commands`."""
+        used = self.space(space)
+        still = np.zeros((round(self._approach_s * rate_hz), len(used.joints)), bool)
+        parts = [segment.limp(self._times(segment, rate_hz), used) for segment in self.segments]
+        return np.vstack([still, *parts, still])
+
+    def starts(self) -> list[float]:
+        """When each segment begins, s."""
+        at = np.cumsum([self._approach_s, *(segment.seconds for segment in self.segments)])
+        return [float(value) for value in at[:-1]]
+
+    @staticmethod
+    def _times(segment: Segment, rate_hz: float) -> Array:
+        times: Array = np.arange(round(segment.seconds * rate_hz)) / rate_hz
+        return times
 
 
-def _smooth(share: Array) -> Array:
-    """Minimum jerk from 0 to 1 over share 0…1."""
-    s = np.clip(share, 0.0, 1.0)
-    return s**3 * (10 - 15 * s + 6 * s**2)
+@dataclass(frozen=True)
+class Part:
+    """One recording of a protocol of the library.
 
+    Attributes:
+        seconds: how long it is played unless said otherwise.
+        segments: what fills a given time.
+    """
 
-def _fade(t: Array, seconds: float) -> Array:
-    fade = min(FADE_S, seconds / 4)
-    return _smooth(t / fade) * _smooth((seconds - t) / fade)
+    seconds: float
+    segments: Callable[[float], tuple[Segment, ...]]
+    setup: str = "stand"
+    heading_rad: float = 0.0
 
 
 def _stand(seconds: float) -> tuple[Segment, ...]:
@@ -278,25 +127,141 @@ def _stand(seconds: float) -> tuple[Segment, ...]:
     )
 
 
-#: name → (one line for people, default seconds, segments that fill a time)
-PROTOCOLS: Mapping[str, tuple[str, float, Callable[[float], tuple[Segment, ...]]]] = {
-    "stand": ("chirp, steps, holds and slow reversals: everything a first fit needs", 24.0, _stand),
-    "chirp": ("a sine of rising frequency: inertia, damping, delay", 12.0, lambda s: (Chirp(s),)),
-    "steps": ("sudden changes, joint after joint: delay, torque limit", 12.0, lambda s: (Steps(s),)),
-    "holds": ("poses that are held: stiffness, gravity, zeros", 12.0, lambda s: (Holds(s),)),
-    "multisine": ("many sines at once: all frequencies all the time", 12.0, lambda s: (Multisine(s),)),
-    "slow-reversals": ("a slow triangle: friction, play", 12.0, lambda s: (SlowReversals(s),)),
+def _air(seconds: float) -> tuple[Segment, ...]:
+    return (
+        Multisine(0.22 * seconds),
+        Steps(0.22 * seconds, every_s=0.8, largest_rad=SATURATING_RAD),
+        SlowReversals(0.19 * seconds),
+        Holds(0.2 * seconds),
+        Releases(0.17 * seconds),
+    )
+
+
+def _floor(seconds: float) -> tuple[Segment, ...]:
+    return (
+        WeightShifts(0.19 * seconds),
+        LegLifts(0.4 * seconds),
+        Scrub(0.19 * seconds),
+        Gait(0.22 * seconds),
+    )
+
+
+#: Several times the error at which any servo of a kit gives all its torque (0.1 rad at an XM430, half duty).
+SATURATING_RAD = 1.0
+SHIFTS = "the body leans one way after another, in two headings: tilt from cable, softness"
+
+#: name → one line for people, and its recordings
+PROTOCOLS: Mapping[str, tuple[str, tuple[Part, ...]]] = {
+    # Runs and times after a comparison on simulated robots (runs of about 36 s): in the air a mix with holds; on the floor
+    # shifts in two headings, lifts, scrub and gait. Hops and push-ups are left out: impacts differ between simulators.
+    FULL: (
+        "what tells effects apart best: on the stand, then on the floor in two headings",
+        (
+            Part(20.0, _air),
+            Part(16.0, _floor, "floor"),
+            Part(4.0, lambda s: (WeightShifts(s),), "floor", math.pi / 2),
+        ),
+    ),
+    "stand": ("chirp, steps, holds and slow reversals: everything a first fit needs", (Part(24.0, _stand),)),
+    "chirp": ("a sine of rising frequency: inertia, damping, delay", (Part(12.0, lambda s: (Chirp(s),)),)),
+    "steps": ("sudden changes, joint after joint: delay, torque limit", (Part(12.0, lambda s: (Steps(s),)),)),
+    "saturating-steps": (
+        "large random steps at the torque limit: torque and speed limit, damping",
+        (Part(12.0, lambda s: (Steps(s, every_s=0.9, largest_rad=SATURATING_RAD),)),),
+    ),
+    "holds": ("poses that are held: stiffness, gravity, zeros", (Part(12.0, lambda s: (Holds(s),)),)),
+    "long-holds": (
+        "poses held for long under gravity: creep, warmth, zeros",
+        (Part(20.0, lambda s: (Holds(s, move_s=0.6, hold_s=3.0),)),),
+    ),
+    "multisine": ("many sines at once: all frequencies all the time", (Part(12.0, lambda s: (Multisine(s),)),)),
+    "sine": (
+        "sine tracking, slow then fast: lag and delay by eye",
+        (Part(12.0, lambda s: (Sine(s / 2, hz=0.5), Sine(s / 2, hz=2.0, share=0.3))),),
+    ),
+    "square": ("square tracking: delay and rise time by eye", (Part(12.0, lambda s: (Square(s),)),)),
+    "slow-reversals": ("a slow triangle: friction, play", (Part(12.0, lambda s: (SlowReversals(s),)),)),
+    "releases": (
+        "torque off in mid-swing, the leg coasts and is caught: friction without the motor's brake",
+        (Part(14.0, lambda s: (Releases(s),)),),
+    ),
+    "drops": (
+        "torque off in a pose that was held, the leg falls and is caught: mass, friction",
+        (Part(14.0, lambda s: (Releases(s, share=0.8, limp_s=1.0, from_rest=True),)),),
+    ),
+    "one-by-one": (
+        "each joint alone, then all together: what they share, such as the supply",
+        (Part(30.0, lambda s: (InTurn(0.8 * s, Multisine(1.0, low_hz=0.5)), Multisine(0.2 * s, low_hz=0.5))),),
+    ),
+    "poses": (
+        "many sines about three poses: load on the gears",
+        (Part(21.0, lambda s: tuple(Around(s / 3, Multisine(1.0, low_hz=0.5), (x,)) for x in (-0.5, 0.0, 0.5))),),
+    ),
+    "shifts": (
+        SHIFTS,
+        (
+            Part(8.0, lambda s: (WeightShifts(s, holds=8),), "floor"),
+            Part(8.0, lambda s: (WeightShifts(s, holds=8),), "floor", math.pi / 2),
+        ),
+    ),
+    "lifts": (
+        "one leg after another off the floor: mass, friction, softness",
+        (Part(10.0, lambda s: (LegLifts(s),), "floor"),),
+    ),
+    "scrub": (
+        "hips pull against each other until feet slip: floor friction",
+        (Part(8.0, lambda s: (Scrub(s),), "floor"),),
+    ),
+    "gait": ("a trot on the floor: everything at once", (Part(8.0, lambda s: (Gait(s),), "floor"),)),
+    "push-ups": ("all knees together: payload, stiffness under load", (Part(8.0, lambda s: (PushUps(s),), "floor"),)),
+    "twitch": (
+        "fast and small on the floor: contacts must not let it travel",
+        (Part(6.0, lambda s: (Twitch(s),), "floor"),),
+    ),
 }
 SHORTEST_S = 5.0
 
 
+def protocols(name: str, seconds: float | None = None, setup: str | None = None) -> tuple[Protocol, ...]:
+    """The recordings of a protocol of the library, of about `seconds` in all.
+
+    Args:
+        setup: only those on the "stand" or on the "floor".
+
+    Raises:
+        BadInput: an unknown name, too short a time, or none in that setup.
+    """
+    words, parts = _entry(name)
+    chosen = tuple(part for part in parts if setup in (None, part.setup))
+    if not chosen:
+        other = parts[0].setup
+        raise BadInput(f"{name} is played on the {other}, not on the {setup}", remedy=f"leave out --setup {setup}")
+    return _filled(name, words, chosen, seconds)
+
+
 def protocol(name: str, seconds: float | None = None) -> Protocol:
-    """A protocol by name, of about `seconds` in all; raises BadInput for an unknown name or too short a time."""
+    """The first recording of a protocol alone, of about `seconds`; see `protocols`."""
+    words, parts = _entry(name)
+    return _filled(name, words, parts[:1], seconds)[0]
+
+
+def _entry(name: str) -> tuple[str, tuple[Part, ...]]:
     try:
-        words, default, segments = PROTOCOLS[name]
+        return PROTOCOLS[name]
     except KeyError:
         raise BadInput(f"there is no protocol {name!r}", remedy=f"use one of {', '.join(PROTOCOLS)}") from None
+
+
+def _filled(name: str, words: str, parts: tuple[Part, ...], seconds: float | None) -> tuple[Protocol, ...]:
+    default = sum(part.seconds for part in parts)
     total = default if seconds is None else seconds
-    if not total >= SHORTEST_S:
-        raise BadInput(f"{total} s is too short for {name}", remedy=f"give it {SHORTEST_S:.0f} s or more")
-    return Protocol(name, words, segments(total - 2 * (APPROACH_S + APPROACH_REST_S)))
+    # In a row of recordings the shortest must still hold its motion.
+    shortest = SHORTEST_S if len(parts) == 1 else max(SHORTEST_S, default / 2)
+    if not (total >= shortest and math.isfinite(total)):
+        raise BadInput(f"{total} s is too short for {name}", remedy=f"give it {shortest:.0f} s or more")
+    played = []
+    for part in parts:
+        empty = Protocol(name, words, (), part.setup, part.heading_rad)
+        segments = part.segments(part.seconds * total / default - empty.seconds)
+        played.append(Protocol(name, words, segments, part.setup, part.heading_rad))
+    return tuple(played)

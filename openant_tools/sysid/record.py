@@ -1,25 +1,53 @@
-"""Record an excitation: torque on, home, play, home, torque off; whatever happens, a valid file of what was played."""
+"""Record excitations: torque on, home, play, home, torque off; whatever happens, a valid file of what was played."""
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.journal import append_writes
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.recording.run import Facts
-from openant_tools.sysid.protocols import CommandSpace, Protocol
+from openant_tools.sysid.excitation import CommandSpace, Multisine
+from openant_tools.sysid.protocols import Protocol
 
-__all__ = ["Recorded", "record_protocol", "repeat_paths"]
+__all__ = ["Recorded", "Take", "record_takes", "takes"]
 
 #: The legs swing after the ramp to the start; the recording begins when they are still.
 SETTLE_S = 0.5
 _VOLTS = "present_input_voltage"  # 0.1 V a count
+_TEMPERATURE = "present_temperature"  # °C
+#: Work between a cold run and its hot repeat: how long in one go, and the rise (K) at which it is enough.
+WORK_S = 10.0
+HOT_RISE_K = 10
+
+
+@dataclass(frozen=True)
+class Take:
+    """One recording to be made.
+
+    Attributes:
+        seed: of all that chance decides in the protocol.
+        repeat_of: the name of the recording that this one repeats.
+        work_s: s of work before it, so that it is a hot repeat.
+        held_out: recorded to judge a fit by, not to be fitted.
+    """
+
+    path: Path
+    protocol: Protocol
+    seed: int
+    repeat_of: str | None = None
+    work_s: float = 0.0
+    held_out: bool = False
 
 
 @dataclass(frozen=True)
@@ -28,34 +56,59 @@ class Recorded:
 
     path: Path
     cycles: int
-    notices: tuple[str, ...] = ()
 
 
-def repeat_paths(out: Path, repeats: int) -> list[Path]:
-    """`out`, then `out-2`, `out-3` … beside it."""
-    return [out, *(out.with_name(f"{out.stem}-{k}{out.suffix}") for k in range(2, repeats + 1))]
-
-
-def record_protocol(
-    config: EngineConfig,
-    protocol: Protocol,
+def takes(
     out: Path,
-    *,
+    protocols: Sequence[Protocol],
     seed: int = 0,
+    *,
     repeats: int = 1,
-    setup: str = "stand",
+    hold_out_seed: int | None = None,
+    hot_s: float = 0.0,
+) -> list[Take]:
+    """What to record: each protocol `repeats` times, once more hot, and once with another seed to judge by.
+
+    The first protocol goes to `out`, others beside it: `-floor` for those on the floor, with the heading in degrees where it
+    is not 0; repeats are `-2`, `-3` …, a hot one `-hot`, the one to be held out `-held-out`.
+    """
+    made = []
+    for k, protocol in enumerate(protocols):
+        place = ""
+        if k:
+            place = f"-{protocol.setup}"
+            if protocol.heading_rad:
+                place += f"-{math.degrees(protocol.heading_rad):.0f}"
+
+        def path(what: str, place: str = place) -> Path:
+            return out.with_name(f"{out.stem}{place}{what}{out.suffix}")
+
+        first = path("")
+        made += [
+            Take(path(f"-{n}" if n > 1 else ""), protocol, seed, first.stem if n > 1 else None)
+            for n in range(1, repeats + 1)
+        ]
+        if hold_out_seed is not None:
+            made.append(Take(path("-held-out"), protocol, hold_out_seed, held_out=True))
+        if hot_s and protocol.setup == "stand":
+            made.append(Take(path("-hot"), protocol, seed, first.stem, hot_s))
+    return made
+
+
+def record_takes(
+    config: EngineConfig,
+    wanted: Sequence[Take],
+    *,
     robot_toml: str | None = None,
     progress: Callable[[str, float], None] = lambda words, share: None,
     notice: Callable[[str], None] = lambda text: None,
     journal: Path | None = None,
 ) -> list[Recorded]:
-    """Play a protocol `repeats` times and record each.
+    """Record one take after another, of a robot that stays where it is.
 
     Args:
         config: the robot, see `comms.setup`.
-        out: the recording; repeats stand beside it as `-2`, `-3` ….
-        setup: "stand" or "floor", into the facts.
-        robot_toml: the robot's configuration as text, kept inside the recording.
+        robot_toml: the robot's configuration as text, kept inside the recordings.
         progress: called with what is being done and the share of all that is done.
         notice: called with what the user should know.
         journal: file that every write to a servo's permanent memory is added to.
@@ -65,36 +118,84 @@ def record_protocol(
         KeyboardInterrupt: torque is off and the recording closed when it arrives.
     """
     space = CommandSpace.around_home(dict(config.limits_rad), [servo.joint for servo in config.servos])
-    commands = protocol.commands(space, config.rate_hz, seed)
-    seconds = len(commands) / config.rate_hz
+    total = sum(take.protocol.seconds + take.work_s for take in wanted)
     done: list[Recorded] = []
+    past = 0.0
     with EngineProcess(config) as engine:
         for event in engine.events():
             notice(_words(event))
         if journal is not None:
             append_writes(journal, engine.description["eeprom_writes"], "sysid record")
+        found = np.asarray(engine.description["position"], float)
         engine.ask(messages.Torque(True))
-        for k, path in enumerate(repeat_paths(out, repeats)):
-            progress("to the home pose", k / repeats)
-            engine.ask(messages.Ramp(commands[0]))
+
+        def play(protocol: Protocol, seed: int, words: str) -> None:
+            commands, limp = protocol.commands(space, config.rate_hz, seed), protocol.limp(space, config.rate_hz)
+            motion = messages.Play(commands, protocol.name, limp if limp.any() else None)
+            for share in _while_playing(engine, engine.start(motion), len(commands) / config.rate_hz, notice):
+                progress(words, (past + share * protocol.seconds) / total)
+
+        for take in wanted:
+            protocol, extra = take.protocol, dict[str, Any]()
+            if take.work_s:
+                extra["work_s"], extra["rise_k"] = _work(engine, take.work_s, play, notice)
+                past += take.work_s
+            progress("to the home pose", past / total)
+            engine.ask(messages.Ramp(protocol.commands(space, config.rate_hz, take.seed)[0]))
             engine.ask(messages.Hold(SETTLE_S))
             facts = Facts(
                 joints=space.joints,
-                setup=setup,
+                setup=protocol.setup,
                 protocol=protocol.name,
-                repeat_of=out.stem if k else None,
+                repeat_of=take.repeat_of,
+                heading_rad=protocol.heading_rad if protocol.setup == "floor" else None,
                 supply_v=round(statistics.fmean(engine.ask(messages.ReadRegister(_VOLTS)).values()) * 0.1, 2),
-                extra={"protocol_seed": seed, "rate_hz": config.rate_hz},
+                extra={
+                    "protocol_seed": take.seed,
+                    "rate_hz": config.rate_hz,
+                    "held_out": take.held_out,
+                    "segments": [
+                        {
+                            "kind": type(segment).__name__,
+                            "start_s": round(start, 3),
+                            "seconds": round(segment.seconds, 3),
+                        }
+                        for start, segment in zip(protocol.starts(), protocol.segments, strict=True)
+                    ],
+                    **extra,
+                },
             )
-            engine.ask(messages.Record(str(path), facts, robot_toml))
-            playing = engine.start(messages.Play(commands, protocol.name))
-            for share in _while_playing(engine, playing, seconds, notice):
-                progress(protocol.name, (k + share) / repeats)
+            engine.ask(messages.Record(str(take.path), facts, robot_toml))
+            play(protocol, take.seed, take.path.stem)
             written, cycles = engine.ask(messages.StopRecording())
             done.append(Recorded(Path(written), cycles))
+            past += protocol.seconds
+        if wanted[-1].protocol.setup == "floor":
+            # Standing, it would fall when it is let go: back to how it lay.
+            limits = np.array([config.limits_rad.get(joint, (-np.inf, np.inf)) for joint in space.joints])
+            engine.ask(messages.Ramp(np.clip(found, limits[:, 0], limits[:, 1])))
         engine.ask(messages.Torque(False))
         progress("done", 1.0)
     return done
+
+
+def _work(
+    engine: EngineProcess,
+    seconds: float,
+    play: Callable[[Protocol, int, str], None],
+    notice: Callable[[str], None],
+) -> tuple[float, int]:
+    """Move for `seconds`, or until a servo is warmer by HOT_RISE_K: (s, K) of what came of it."""
+    before = engine.ask(messages.ReadRegister(_TEMPERATURE))
+    worked, rise, joint = 0.0, 0, ""
+    while worked < seconds and rise < HOT_RISE_K:
+        piece = Protocol("work", "", (Multisine(max(1.0, min(WORK_S, seconds - worked))),))
+        play(piece, round(worked), "warming up")
+        worked += piece.seconds
+        now = engine.ask(messages.ReadRegister(_TEMPERATURE))
+        joint, rise = max(((name, now[name] - before[name]) for name in now), key=lambda pair: pair[1])
+    notice(f"{worked:.0f} s of work: {joint} is {rise} K warmer")
+    return worked, rise
 
 
 def _while_playing(
