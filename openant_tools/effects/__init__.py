@@ -1,0 +1,1 @@
+"""The effect catalogue: one module an effect, registered by being there (`catalogue`)."""
