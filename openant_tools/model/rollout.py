@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -131,14 +131,28 @@ class Rollouts:
             delays: (variants, joints) s by which each joint's commands act later than they were sent, on top of what the
                 model's own actuators delay. Continuous, where MuJoCo's buffers know nothing between none and one step.
         """
+        nv, total, nj = len(models or [self.plant.model]), self.rows[-1].stop, len(self.plant.joints)
+        pos, vel = np.full((nv, total, nj), np.nan), np.full((nv, total, nj), np.nan)
+        for rows, there, speed in self.stream(models, delays):
+            pos[:, rows], vel[:, rows] = there, speed
+        return Trajectories(pos, vel, self.rows)
+
+    def stream(
+        self, models: Sequence[mujoco.MjModel] | None = None, delays: Array | None = None
+    ) -> Iterator[tuple[slice, Array, Array]]:
+        """The same, piece by piece, for those who reduce the pieces at once: memory does not follow the runs' length.
+
+        Yields:
+            a slice of consecutive rows among those of all runs, and (variants, rows, joints) positions and velocities
+            there. Each row comes once, in no promised order; rows before the first complete one of a run never.
+        """
         variants = [self.lean(model) for model in (models or [self.plant.model])]
         segments, nv = self._segments, len(variants)
         plant = self.plant
         batch = self._batch(nv)
         batch.state[:] = np.repeat([segment.state for segment in segments], nv, axis=0)
         lengths = np.array([len(segment.control) for segment in segments])
-        total, nj = self.rows[-1].stop, len(plant.joints)
-        pos, vel = np.full((nv, total, nj), np.nan), np.full((nv, total, nj), np.nan)
+        nj = len(plant.joints)
 
         batch.set_models([model for _ in segments for model in variants])
         changes = {step for segment in segments for step in segment.torque_off}
@@ -172,12 +186,15 @@ class Rollouts:
             qvel = np.concatenate([last_vel[:active, :, None], qvel], axis=2)
             for s in range(active):
                 segment = segments[s]
-                here = (segment.step >= begin) & (segment.step < end)
-                k, f = segment.step[here] - begin, segment.fraction[here][:, None]
-                pos[:, segment.row[here]] = qpos[s][:, k] * (1 - f) + qpos[s][:, k + 1] * f
-                vel[:, segment.row[here]] = qvel[s][:, k] * (1 - f) + qvel[s][:, k + 1] * f
+                first, stop = np.searchsorted(segment.step, [begin, end])
+                if first == stop:
+                    continue
+                k, f = segment.step[first:stop] - begin, segment.fraction[first:stop][:, None]
+                rows = slice(int(segment.row[first]), int(segment.row[first] + stop - first))
+                pos = qpos[s][:, k] * (1 - f) + qpos[s][:, k + 1] * f
+                vel = qvel[s][:, k] * (1 - f) + qvel[s][:, k + 1] * f
+                yield rows, pos, vel
             last_pos[:active], last_vel[:active] = qpos[:, :, -1], qvel[:, :, -1]
-        return Trajectories(pos, vel, self.rows)
 
     def delay(self, control: Array, delays: Array, begin: int) -> None:
         """Shift the commands in `control` (segments, variants, steps, nu), which starts at step `begin`, in place."""

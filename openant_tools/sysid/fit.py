@@ -6,37 +6,53 @@ not white noise: a model error lasts for as long as the motion that shows it, so
 joint s² is the mean squared residual at the estimate times the integrated autocorrelation time in samples (2τ), found by
 iteration. With a perfect model that is the sensor's noise, sample by sample; with an imperfect one it tempers the
 likelihood by itself, and intervals widen as they must.
+
+Rollouts are all of the cost. A Jacobian takes a dozen of them and is therefore used for several steps, as long as what it
+promises is what comes; weights are renewed at every step, which takes none.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import lsq_linear, nnls
+from scipy.stats import norm
 
 from openant_tools.model.gap import HORIZON_S, Gap, gap
 from openant_tools.model.plant import Plant, Setup
 from openant_tools.model.rollout import Rollouts, Trajectories
 from openant_tools.recording.run import Run
-from openant_tools.sysid.parameter import KINDS, Parameter, apply, delays
+from openant_tools.sysid.parameter import ACTION_DELAY, KINDS, Parameter, apply, delays
 from openant_tools.sysid.quality import quantum
 
 __all__ = ["Dataset", "Estimate", "Problem", "autocorrelation_time"]
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 Progress = Callable[[str, float], None]
 
 #: finite-difference step in prior deviations: far above rounding and the solver's tolerance, far below curvature
 STEP = 0.1
-#: rounds of fit and re-weighting; weights settle in two to three
-ROUNDS = 4
-#: Gauss-Newton steps before the first weights, which come from the given model's errors, are replaced
-EARLY_STEPS = 3
+#: steps at most, in each part of a descent
+MOST_STEPS = 20
+#: prior deviations: the longest first step, and how far from where it was taken a Jacobian is believed
+REACH, STALE = 3.0, 1.5
+#: so near the Jacobian's own place, prior deviations, it is as good as one taken anew
+SAME_PLACE = 0.15
+#: squared length of a step in posterior deviations, per parameter, below which a descent has arrived: near, and for good
+NEAR, ARRIVED = 0.05, 0.002
+#: shares of the promised gain: below the first a step is taken back; a Jacobian that keeps less than the second is stale
+WORSE, BROKEN = 0.05, 0.4
+#: a residual this small, in deviations that the encoder alone makes, has nothing in it that a second descent could find
+CLEAN = 1.5
 #: one effective sample per this many seconds where fits are compared whose residuals are model error
 TEMPER_S = 0.5
 #: priors weigh this much where the data lead alone: only against directions of which the data say nothing
@@ -47,6 +63,12 @@ WHITE, SHORT_LIVED = 1.5, 10
 DECISIVE = 1.0
 #: half of the ±2 ms within which delays count as calibrated (effects.md)
 TIMING_STD_S = 1e-3
+#: delays (s) from which a fit starts where they explain the data far better than none
+DELAYS_S = (0.02, 0.04, 0.06)
+#: a block of the resampling is this many autocorrelation times long, and at least so many seconds; fewer blocks tell nothing
+BLOCK_TIMES, BLOCK_S, FEWEST_BLOCKS = 5.0, 1.0, 8
+#: chance of calling two halves of good data contradictory, over all parameters of a fit
+FALSE_ALARM = 1e-3
 
 
 @dataclass(frozen=True)
@@ -57,23 +79,25 @@ class Dataset:
         plant: the model as given, set up as these runs were made.
         runs: the recordings.
         measured: (rows, joints) rad, the runs' positions one after another.
+        nthread: of the rollouts; 0 takes all cores.
     """
 
     plant: Plant
     runs: tuple[Run, ...]
-    full: Rollouts
-    horizon: Rollouts
     measured: Array
+    nthread: int = 0
 
     @classmethod
     def prepare(cls, plant: Plant, runs: Sequence[Run], nthread: int = 0) -> Dataset:
-        return cls(
-            plant=plant,
-            runs=tuple(runs),
-            full=Rollouts(plant, runs, None, nthread),
-            horizon=Rollouts(plant, runs, HORIZON_S, nthread),
-            measured=np.concatenate([run.signal("pos", plant.joints) for run in runs]),
-        )
+        return cls(plant, tuple(runs), np.concatenate([run.signal("pos", plant.joints) for run in runs]), nthread)
+
+    @cached_property
+    def full(self) -> Rollouts:
+        return Rollouts(self.plant, self.runs, None, self.nthread)
+
+    @cached_property
+    def horizon(self) -> Rollouts:
+        return Rollouts(self.plant, self.runs, HORIZON_S, self.nthread)
 
     @property
     def fitted(self) -> Rollouts:
@@ -88,9 +112,20 @@ class Dataset:
         self, parameters: Sequence[Parameter], us: Sequence[Array], rollouts: Rollouts | None = None
     ) -> Trajectories:
         """What the model would have done with the parameters at each u, (parameters,), by default as the fit compares."""
+        return (rollouts or self.fitted)(*self._variants(parameters, us))
+
+    def stream(
+        self, parameters: Sequence[Parameter], us: Sequence[Array], rollouts: Rollouts | None = None
+    ) -> Iterator[tuple[slice, Array, Array]]:
+        """`simulate` piece by piece, so that no more than a piece of it is held: rows, positions, velocities."""
+        return (rollouts or self.fitted).stream(*self._variants(parameters, us))
+
+    def _variants(
+        self, parameters: Sequence[Parameter], us: Sequence[Array]
+    ) -> tuple[list[mujoco.MjModel], Array | None]:
         models = [apply(self.plant, parameters, u) for u in us]
         late = np.array([delays(self.plant, parameters, u) for u in us])
-        return (rollouts or self.fitted)(models, late if late.any() else None)
+        return models, late if late.any() else None
 
 
 @dataclass
@@ -101,23 +136,31 @@ class Estimate:
         parameters: what was estimated.
         u: (parameters,) in prior deviations.
         covariance: (parameters, parameters) of u, the prior included.
+        precision: (parameters, parameters) of u, what the data alone say.
         centre: (parameters,) the middle of the prior.
         low, high: (parameters,) the physical bounds of u.
         information: (parameters,) share of each parameter's posterior precision that the data gave: 0 prior only, 1 data.
+        halves: (2, parameters) of u, what each half of the data alone would say (to first order); NaN where there is one.
+        contradictory: (parameters,) whether the two halves differ by more than chance.
         noise: (joints,) rad, standard deviation of the residual per joint, of all datasets.
         correlation_s: (joints,) s, integrated autocorrelation time of the residual.
+        stamp_error_s: s, standard deviation by which the rows' time stamps miss the moments of sampling, row by row.
         converged: whether the optimiser met its tolerances.
     """
 
     parameters: tuple[Parameter, ...]
     u: Array
     covariance: Array
+    precision: Array
     centre: Array
     low: Array
     high: Array
     information: Array
+    halves: Array
+    contradictory: Bools
     noise: Array
     correlation_s: Array
+    stamp_error_s: float
     converged: bool
     evaluations: int
 
@@ -144,6 +187,41 @@ def autocorrelation_time(residual: Array, limit: int) -> float:
     return float(max(1.0, 1.0 + 2.0 * rho[1:end].sum()))
 
 
+@dataclass(frozen=True)
+class _Point:
+    """What the model does at one u: (rows, joints) measured minus simulated, rad, NaN where missing; and its speed, rad/s."""
+
+    u: Array
+    residual: Array
+    velocity: Array
+
+
+@dataclass(frozen=True)
+class _Tangent:
+    """Derivatives of the residuals at u, (colours, rows, joints): parameters that share no joint share a colour."""
+
+    u: Array
+    change: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class _Descent:
+    """Where a descent ended, and the derivatives there."""
+
+    point: _Point
+    tangent: _Tangent
+    converged: bool
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """Rows of one run with torque, or without: for each joint; and the run's median sample time (s)."""
+
+    rows: tuple[Ints, ...]
+    driven: bool
+    period: float
+
+
 @dataclass
 class Problem:
     """A least-squares problem: parameters, the data they are judged by, and the weights of those data.
@@ -163,11 +241,21 @@ class Problem:
     def __post_init__(self) -> None:
         nj = len(self.datasets[0].plant.joints)
         self._stretches = self._find_stretches()
-        self._has_limp = any(not driven for _, driven, _ in self._stretches)
+        self._has_limp = any(not stretch.driven for stretch in self._stretches)
         self._weight: Array = np.ones((sum(len(data.measured) for data in self.datasets), nj))
-        self.noise, self.correlation_s = np.zeros(nj), np.zeros(nj)
+        self.noise, self.correlation_s, self.stamp_error_s = np.zeros(nj), np.zeros(nj), 0.0
         self._valley = np.array([KINDS[parameter.kind].valley for parameter in self.parameters], bool)
         self._colours = _colours(self.datasets, self.parameters)
+        #: for each joint, the parameters that move it and their colours
+        self._movers: list[tuple[Ints, Ints]] = []
+        for j in range(nj):
+            pairs = [
+                (p, c)
+                for c, (members, masks) in enumerate(self._colours)
+                for p, mask in zip(members, masks, strict=True)
+                if mask[j]
+            ]
+            self._movers.append((np.array([p for p, _ in pairs], np.int64), np.array([c for _, c in pairs], np.int64)))
         low, high = [], []
         for parameter in self.parameters:
             kind = KINDS[parameter.kind]
@@ -180,13 +268,6 @@ class Problem:
             high.append(min(end[1] for end in ends))
         self.low, self.high = np.array(low), np.array(high)
         self.centre = np.array([parameter.centre for parameter in self.parameters])
-
-    def residual(self, us: Sequence[Array]) -> Array:
-        """(variants, rows, joints) rad, measured minus simulated; NaN where something is missing."""
-        self.evaluations += len(us)
-        return np.concatenate(
-            [data.measured[None] - data.simulate(self.parameters, us).pos for data in self.datasets], axis=1
-        )
 
     def gaps(self, u: Array, datasets: Sequence[Dataset] | None = None) -> Gap:
         """The gap of the model at u on these datasets (default: the problem's own), at both horizons."""
@@ -207,190 +288,412 @@ class Problem:
         first = np.clip(self.centre if start is None else start, self.low, self.high)
         starts = [first]
         if start is None:
-            ends = np.where(np.isfinite(self.low), self.low, first)
+            starts = [self._with_delays(first)]
             if self._valley.any():
-                starts.append(np.where(self._valley, ends, first))
-        best: tuple[float, Estimate] | None = None
-        for k, u in enumerate(starts):
+                ends = np.where(np.isfinite(self.low), self.low, starts[0])
+                starts.append(np.where(self._valley, ends, starts[0]))
+        told = 0.0
 
-            def report(done: float, part: int = k) -> None:
-                if progress:
-                    progress("fitting", (part + done) / len(starts))
+        def tell(what: str) -> None:
+            # How many steps a descent takes nobody knows beforehand; what is left halves every dozen.
+            nonlocal told
+            told += (1.0 - told) * 0.06
+            if progress:
+                progress(what, told)
 
-            estimate = self._descend(u, report)
-            score = self._score(estimate.u)
+        best: tuple[float, _Descent] | None = None
+        for u in starts:
+            found = self._descend(u, lambda: tell("fitting"))
+            score = self._score(found.point)
             if best is None or score < best[0]:
-                best = score, estimate
+                best = score, found
         assert best is not None
-        score, estimate = best
-        period = max(period for _, _, period in self._stretches)
-        if (estimate.correlation_s < WHITE * period).all():
-            return estimate
-        again = self._descend(self._by_data_alone(estimate.u), lambda done: None)
-        short_lived = bool((again.correlation_s < SHORT_LIVED * period).all())
-        if short_lived and again.correlation_s.mean() < estimate.correlation_s.mean():
-            return again
-        return again if self._score(again.u) < score - DECISIVE else estimate
+        score, found = best
+        self._reweigh(found.point)
+        times = self.correlation_s
+        period = max(stretch.period for stretch in self._stretches)
+        if ((times >= WHITE * period) & (self.noise > CLEAN * self.floor)).any():
+            led = self._by_data_alone(found, lambda: tell("following the data alone"))
+            if led is not None:
+                again = self._descend(led, lambda: tell("fitting once more"))
+                self._reweigh(again.point)
+                short_lived = bool((self.correlation_s < SHORT_LIVED * period).all())
+                better = short_lived and self.correlation_s.mean() < times.mean()
+                if better or self._score(again.point) < score - DECISIVE:
+                    found = again
+        return self._estimate(found)
 
-    def _by_data_alone(self, u: Array) -> Array:
-        """Where the data lead from u with the priors all but ignored, as if all that is left were the sensors' noise."""
+    def _with_delays(self, u: Array) -> Array:
+        """u with the delays among DELAYS_S that leave less than half of what none leaves, joint by joint.
+
+        Where a motion is fast a delay of more than a quarter of its period lies in another valley.
+        """
+        delayed = [p for p, parameter in enumerate(self.parameters) if parameter.kind == ACTION_DELAY]
+        if not delayed:
+            return u
+        tried = [u]
+        for delay in DELAYS_S:
+            moved = u.copy()
+            for p in delayed:
+                moved[p] = np.clip(delay / self.parameters[p].std, self.low[p], self.high[p])
+            tried.append(moved)
+        left = np.nansum(self._residuals(tried) ** 2, axis=1)  # (tried, joints)
+        out = u.copy()
+        for p in delayed:
+            squares = left[:, list(self.parameters[p].joints)].sum(axis=1)
+            best = int(np.argmin(squares))
+            if squares[best] < 0.5 * squares[0]:
+                out[p] = tried[best][p]
+        return out
+
+    def _residuals(self, us: Sequence[Array]) -> Array:
+        """(variants, rows, joints) rad, measured minus simulated; NaN where something is missing."""
+        self.evaluations += len(us)
+        return np.concatenate(
+            [data.measured[None] - data.simulate(self.parameters, us).pos for data in self.datasets], axis=1
+        )
+
+    def _look(self, u: Array) -> _Point:
+        self.evaluations += 1
+        simulated = [data.simulate(self.parameters, [u]) for data in self.datasets]
+        measured = [data.measured for data in self.datasets]
+        residual = [there - made.pos[0] for there, made in zip(measured, simulated, strict=True)]
+        return _Point(u, np.concatenate(residual), np.concatenate([made.vel[0] for made in simulated]))
+
+    def _by_data_alone(self, found: _Descent, tell: Callable[[], None]) -> Array | None:
+        """Where the data lead with the priors all but ignored, as if all that is left were the sensors' noise.
+
+        None where a second descent could not win: the derivatives already there promise no step worth the name.
+        """
         self._weight = np.broadcast_to(1.0 / self.floor, self._weight.shape)
         self._prior_weight = LOOSE
         try:
-            return self._least_squares(u, 40)[0]
+            precision, gradient = self._normal(found.tangent, found.point)
+            step = self._step(precision, gradient, found.point.u, math.inf, np.zeros(len(gradient), bool))
+            if np.abs(step).max(initial=0.0) < STALE:
+                moved = found.point.residual + self._along(found.tangent, step)
+                promised = self._score(replace(found.point, u=found.point.u + step, residual=moved))
+                if promised > self._score(found.point) - DECISIVE:
+                    return None
+            return self._approach(found.point, tell, reweigh=False, tangent=found.tangent).point.u
         finally:
             self._prior_weight = 1.0
 
-    def _least_squares(self, u: Array, most: int, *, polish: bool = False) -> tuple[Array, bool]:
-        """The minimum near u under the present weights, and whether it was reached within `most` evaluations.
-
-        Args:
-            polish: with derivatives from both sides, and from u as it is.
-        """
-        if not polish:
-            # Off the bounds: on them a derivative points one way only and a least-squares step may stick there.
-            margin = np.minimum(0.05, (self.high - self.low) / 4)
-            u = np.clip(u, self.low + margin, self.high - margin)
-        solution = least_squares(
-            self._vector,
-            u,
-            lambda u: self._jacobian(u, central=polish),
-            bounds=(self.low, self.high),
-            method="dogbox",
-            x_scale="jac",
-            xtol=1e-4,
-            ftol=1e-4,
-            max_nfev=most,
-        )
-        return np.asarray(solution.x, np.float64), bool(solution.success)
-
-    def _descend(self, u: Array, progress: Callable[[float], None]) -> Estimate:
+    def _descend(self, u: Array, tell: Callable[[], None]) -> _Descent:
         """The estimate reached from one start."""
-        converged = False
+        point = self._look(u)
+        tell()
         # A servo works with torque on. What a falling leg adds is taken as far as it agrees with what the driven one
         # shows: the driven stretches are fitted alone first, and the others enter with the weight that this leaves them.
-        for rounds, driven_only in ((2, True), (ROUNDS, False)) if self._has_limp else ((ROUNDS, False),):
-            for round_ in range(rounds):
-                self._reweigh(self.residual([u])[0], driven_only)
-                before = u
-                # No need to reach the bottom of a cost whose weights are about to change.
-                u, converged = self._least_squares(u, EARLY_STEPS if round_ < rounds - 2 else 25)
-                if driven_only:
-                    # Nothing in driven stretches tells these; their prior alone must not move them out of the valley.
-                    u = np.where(self._valley, before, u)
-                progress((round_ + 1) / rounds)
-                if np.abs(u - before).max(initial=0.0) < 0.05:
-                    break
+        if self._has_limp:
+            # Nothing in driven stretches tells the valleys; their prior alone must not move them out of theirs.
+            point = self._approach(point, tell, enough=NEAR, driven_only=True, held=self._valley).point
+        near = self._approach(point, tell, enough=NEAR)
         # Differences to one side are good enough to get near. Where parameters almost undo each other (all torques a
         # per cent larger) they are not: there the minimum and the intervals come from both sides.
-        u, converged = self._least_squares(u, 25, polish=True)
-        self._reweigh(self.residual([u])[0])
-        jacobian = self._jacobian(u, central=True)[: -len(u)]
-        covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian + np.eye(len(u))), np.float64)
+        return self._approach(near.point, tell, central=True)
+
+    def _approach(
+        self,
+        point: _Point,
+        tell: Callable[[], None],
+        *,
+        enough: float = ARRIVED,
+        central: bool = False,
+        reweigh: bool = True,
+        driven_only: bool = False,
+        held: Bools | None = None,
+        tangent: _Tangent | None = None,
+    ) -> _Descent:
+        """Gauss–Newton in a box, with derivatives that are kept as long as they keep what they promise.
+
+        Args:
+            enough: squared length of a step, in posterior deviations and per parameter, that is not worth taking.
+            central: derivatives from both sides.
+            reweigh: weigh anew by what is left before every step.
+            driven_only: leave out what was recorded without torque.
+            held: parameters that stay where they are.
+            tangent: derivatives that are there already.
+        """
+        held = np.zeros(len(point.u), bool) if held is None else held
+        reach = REACH
+        for _ in range(MOST_STEPS):
+            if reweigh:
+                self._reweigh(point, driven_only)
+            if tangent is None:
+                tangent = self._tangent(point, central)
+                tell()
+            precision, gradient = self._normal(tangent, point)
+            step = self._step(precision, gradient, point.u, reach, held)
+            away = float(np.abs(point.u - tangent.u).max(initial=0.0))
+            if step @ precision @ step < enough * len(step):
+                if away < SAME_PLACE or enough > ARRIVED:
+                    return _Descent(point, tangent, True)
+                tangent = None
+                continue
+            there = self._look(point.u + step)
+            tell()
+            promised = -float(gradient @ step + 0.5 * step @ precision @ step)
+            kept = (self._cost(point) - self._cost(there)) / max(promised, 1e-300)
+            self._correct(tangent, step, there.residual - point.residual)
+            if kept > WORSE:
+                point = there
+                reach = max(reach, 2 * float(np.abs(step).max())) if kept > BROKEN else reach
+            elif away == 0.0:
+                if promised < DECISIVE:
+                    return _Descent(point, tangent, True)
+                reach = 0.3 * float(np.abs(step).max())
+                continue
+            if kept < BROKEN or np.abs(point.u - tangent.u).max() > STALE:
+                tangent = None
+        return _Descent(point, tangent or self._tangent(point, central), False)
+
+    def _step(self, precision: Array, gradient: Array, u: Array, reach: float, held: Bools) -> Array:
+        """The best step of the quadratic with this Hessian and gradient, within bounds and `reach`."""
+        out = np.zeros(len(u))
+        free = ~held & (self.high > self.low)
+        if not free.any():
+            return out
+        root = np.linalg.cholesky(precision[np.ix_(free, free)])
+        low = np.clip(self.low[free] - u[free], -reach, 0.0)
+        high = np.clip(self.high[free] - u[free], 0.0, reach)
+        plain = -np.linalg.solve(precision[np.ix_(free, free)], gradient[free])
+        if (plain >= low).all() and (plain <= high).all():
+            out[free] = plain
+        else:
+            low, high = np.minimum(low, -1e-12), np.maximum(high, 1e-12)
+            target = -np.linalg.solve(root, gradient[free])
+            out[free] = lsq_linear(root.T, target, (low, high), method="bvls").x
+        return np.clip(u + out, self.low, self.high) - u
+
+    def _cost(self, point: _Point) -> float:
+        weighted = self._weight * point.residual
+        prior = self._prior_weight * (point.u - self.centre)
+        return 0.5 * float(np.nansum(weighted**2) + prior @ prior)
+
+    def _normal(self, tangent: _Tangent, point: _Point, rows: Bools | None = None) -> tuple[Array, Array]:
+        """Hessian (parameters, parameters) and gradient of the cost, the prior included; of some rows where they are named."""
+        n = len(self.parameters)
+        hessian = self._prior_weight**2 * np.eye(n)
+        gradient = self._prior_weight**2 * (point.u - self.centre)
+        for j, (p, _) in enumerate(self._movers):
+            moves = self._moves(tangent, j)
+            weight = self._weight[:, j] if rows is None else self._weight[:, j] * rows
+            weighted = moves * weight
+            hessian[np.ix_(p, p)] += weighted @ weighted.T
+            gradient[p] += weighted @ (weight * np.nan_to_num(point.residual[:, j]))
+        return hessian, gradient
+
+    def _moves(self, tangent: _Tangent, j: int) -> Array:
+        """(movers, rows): how joint j's residual moves with each parameter that moves it."""
+        return tangent.change[self._movers[j][1], :, j].astype(np.float64)
+
+    def _along(self, tangent: _Tangent, step: Array) -> Array:
+        """(rows, joints): what a step does to the residuals, to first order."""
+        return np.stack([step[p] @ self._moves(tangent, j) for j, (p, _) in enumerate(self._movers)], axis=1)
+
+    def _correct(self, tangent: _Tangent, step: Array, moved: Array) -> None:
+        """Let derivatives hold for a step just taken and for what it did, and change no more (Broyden 1965), in place."""
+        for j, (p, colour) in enumerate(self._movers):
+            along = step[p]
+            if along @ along > 0:
+                missing = np.nan_to_num(moved[:, j]) - along @ tangent.change[colour, :, j]
+                tangent.change[colour, :, j] += np.outer(along / (along @ along), missing)
+
+    def _estimate(self, found: _Descent) -> Estimate:
+        point, tangent = found.point, found.tangent
+        u, n = point.u, len(point.u)
+        self._reweigh(point)
+        precision, _ = self._normal(tangent, point)
+        covariance = np.asarray(np.linalg.inv(precision), np.float64)
         # A parameter at its bound cannot give way to what is left open; the others must hold all of it.
         free = (u > self.low + 1e-6) & (u < self.high - 1e-6)
-        moved = jacobian[:, free]
-        left_open = np.concatenate([self._timing(u), self._time_step(u)[:, None]], axis=1)
-        open_ = np.zeros((len(u), left_open.shape[1]))
-        open_[free] = np.linalg.solve(moved.T @ moved + np.eye(int(free.sum())), moved.T @ left_open)
+        give = np.zeros((n, n))
+        give[np.ix_(free, free)] = np.linalg.inv(precision[np.ix_(free, free)])
+        open_ = give @ self._left_open(tangent, point)
+        wider = self._wider_by_blocks(tangent, point, covariance, give)
+        halves, contradictory = self._halves(tangent, point, free)
         return Estimate(
             parameters=tuple(self.parameters),
             u=u,
-            covariance=covariance + open_ @ open_.T,
+            covariance=np.outer(wider, wider) * covariance + open_ @ open_.T,
+            precision=precision - np.eye(n),
             centre=self.centre,
             low=self.low,
             high=self.high,
             # What the data, all other parameters free, say about each: 1 − posterior variance over prior variance.
             information=1.0 - np.diag(covariance),
+            halves=halves,
+            contradictory=contradictory,
             noise=self.noise,
             correlation_s=self.correlation_s,
-            converged=converged,
+            stamp_error_s=self.stamp_error_s,
+            converged=found.converged,
             evaluations=self.evaluations,
         )
 
-    def _timing(self, u: Array) -> Array:
-        """(residuals, joints): what one standard deviation of each joint's unknown sampling time does to the residuals.
+    def _left_open(self, tangent: _Tangent, point: _Point) -> Array:
+        """(parameters, causes): how one standard deviation of what no residual can show pulls at each parameter."""
+        late, finer = self._late(point) * self._weight**2, self._time_step(point) * self._weight**2
+        out = np.zeros((len(self.parameters), late.shape[1] + 1))
+        for j, (p, _) in enumerate(self._movers):
+            moves = self._moves(tangent, j)
+            out[p, j] = moves @ late[:, j]
+            out[p, -1] += moves @ finer[:, j]
+        return out
+
+    def _late(self, point: _Point) -> Array:
+        """(rows, joints) rad: what one standard deviation of each joint's unknown sampling time does to its position.
 
         A bus log's `t` is when the read begins; a servo samples at some moment before the last byte of its answer. What
         the stamps leave open, the intervals of the parameters must hold: a millisecond is several per cent of a servo's
         lag. The moment is taken as anywhere in the round trip where that is logged; and a servo acts on a command, and
         notes where it is, once in a period of its own.
         """
-        columns = []
+        late = np.full(point.velocity.shape, TIMING_STD_S)
+        offset = 0
         for data in self.datasets:
-            vel = data.simulate(self.parameters, [u]).vel[0]
-            late = np.full(vel.shape, TIMING_STD_S)
             for run, part in zip(data.runs, data.fitted.rows, strict=True):
                 for j, joint in enumerate(data.plant.joints):
                     rtt = run.column(f"rtt.{joint}")
                     if np.isfinite(rtt).any():
-                        late[part, j] = math.hypot(TIMING_STD_S, np.nanmedian(rtt) / math.sqrt(3))
-            columns.append(np.nan_to_num(vel * late))
-        moved = np.concatenate(columns) * self._weight
-        out = np.zeros((moved.size, moved.shape[1]))
-        for j in range(moved.shape[1]):
-            column = np.zeros_like(moved)
-            column[:, j] = moved[:, j]
-            out[:, j] = column.ravel()
-        return out
+                        spread = math.hypot(TIMING_STD_S, np.nanmedian(rtt) / math.sqrt(3))
+                        late[offset + part.start : offset + part.stop, j] = spread
+            offset += len(data.measured)
+        moved: Array = np.nan_to_num(point.velocity * late)
+        return moved
 
-    def _time_step(self, u: Array) -> Array:
-        """(residuals,): what the model's own time step does to the residuals, by Richardson's rule from half of it.
+    def _time_step(self, point: _Point) -> Array:
+        """(rows, joints) rad: what the model's own time step does to positions, by Richardson's rule from half of it.
 
         A step h of an implicit integrator brakes a joint of damping D as if it had h·D more inertia, among the like: the
         values that fit best are those of the model with its step, and the robot's own may lie that far off.
         """
         out = []
+        offset = 0
         for data in self.datasets:
+            rows = slice(offset, offset + len(data.measured))
+            offset = rows.stop
             model = copy.copy(data.plant.model)
             if model.nhistory:
                 out.append(np.zeros_like(data.measured))  # buffers hold a number of steps, too few at half of one
                 continue
             model.opt.timestep /= 2
-            plant = replace(data.plant, model=model)
-            horizon = data.fitted.horizon
-            finer = replace(data, plant=plant, full=Rollouts(plant, data.runs, horizon, data.fitted.nthread))
-            whole, half = (
-                one.simulate(self.parameters, [u], roll).pos[0] for one, roll in ((data, None), (finer, finer.full))
-            )
-            out.append(2.0 * np.nan_to_num(half - whole))
-        return (np.concatenate(out) * self._weight).ravel()
+            finer = replace(data, plant=replace(data.plant, model=model))
+            half = finer.simulate(self.parameters, [point.u], finer.fitted).pos[0]
+            self.evaluations += 2
+            out.append(2.0 * np.nan_to_num(half - (data.measured - point.residual[rows])))
+        return np.concatenate(out)
 
-    def _score(self, u: Array) -> float:
+    def _wider_by_blocks(self, tangent: _Tangent, point: _Point, covariance: Array, give: Array) -> Array:
+        """(parameters,) how many times wider intervals are if each block of the runs counts as one observation, at least 1.
+
+        The cluster-robust covariance (Liang and Zeger 1986; the limit of a bootstrap over blocks, linearised): what the
+        blocks' gradients differ by is what chance and model error together make of the estimate. It needs no model of
+        the residual, but blocks enough; with few it errs towards narrow, so that it may widen intervals only.
+        """
+        block = self._blocks()
+        count = int(block.max()) + 1
+        if count < FEWEST_BLOCKS:
+            return np.ones(len(self.parameters))
+        pulls = np.zeros((len(self.parameters), count))
+        starts = np.flatnonzero(np.diff(block, prepend=-1))
+        for j, (p, _) in enumerate(self._movers):
+            pulled: Array = self._moves(tangent, j) * (self._weight[:, j] ** 2 * np.nan_to_num(point.residual[:, j]))
+            pulls[p] += np.add.reduceat(pulled, starts, axis=1)
+        # Each block has given its part to the fit, which took as many degrees of freedom as move one joint.
+        used = max((len(p) for p, _ in self._movers), default=0)
+        pulls *= math.sqrt(count / max(count - used, count / 2))
+        moved = give @ pulls
+        robust = np.einsum("pb,pb->p", moved, moved) + np.einsum("pq,pq->p", give, give)
+        wider: Array = np.sqrt(np.maximum(1.0, robust / np.diag(covariance)))
+        return wider
+
+    def _blocks(self) -> Ints:
+        """(rows,) number of each row's block, in order; a block is a part of one run."""
+        seconds = max(BLOCK_S, BLOCK_TIMES * float(self.correlation_s.max(initial=0.0)))
+        out, count = [], 0
+        for run in (run for data in self.datasets for run in data.runs):
+            parts = max(1, round(run.duration_s / seconds))
+            part = np.minimum((run.t - run.t[0]) / max(run.duration_s, 1e-9) * parts, parts - 1).astype(np.int64)
+            part = np.unique(part, return_inverse=True)[1]
+            out.append(part + count)
+            count += int(part.max()) + 1
+        return np.concatenate(out)
+
+    def _halves(self, tangent: _Tangent, point: _Point, free: Bools) -> tuple[Array, Bools]:
+        """What the first half of the runs (of a single one, its first half) and the second say, and where they differ.
+
+        To first order from where both together end, each with the prior. They differ by more than chance where chance
+        as the residuals' size and memory make it would do so once in 1 / FALSE_ALARM fits.
+        """
+        n = len(point.u)
+        ends = np.cumsum([len(run.t) for data in self.datasets for run in data.runs])
+        middle = int(ends[len(ends) // 2 - 1]) if len(ends) > 1 else int(ends[0]) // 2
+        first = np.arange(len(self._weight)) < middle
+        halves = np.full((2, n), np.nan)
+        variance = np.zeros((n, n))
+        shrunk = []
+        for k, rows in enumerate((first, ~first)):
+            precision, gradient = (part[..., free] for part in self._normal(tangent, point, rows))
+            inverse = np.linalg.inv(precision[free])
+            halves[k, free] = point.u[free] - inverse @ gradient
+            # Of the data alone; the prior draws each half as far as that half leaves it room.
+            variance[np.ix_(free, free)] += inverse - inverse @ inverse
+            shrunk.append(inverse)
+        apart = shrunk[0] - shrunk[1]
+        variance[np.ix_(free, free)] += apart @ apart
+        deviation = np.sqrt(np.maximum(np.diag(variance), 1e-12))
+        limit = norm.isf(FALSE_ALARM / 2 / max(1, int(free.sum())))
+        contradictory = np.zeros(n, bool)
+        contradictory[free] = np.abs(halves[0] - halves[1])[free] > limit * deviation[free]
+        return np.clip(halves, self.low, self.high), contradictory
+
+    def _score(self, point: _Point) -> float:
         """−log posterior with each stretch's own unknown noise, one effective sample per TEMPER_S: compares starts."""
-        residual = self.residual([u])[0]
-        score = 0.5 * float(np.sum((u - self.centre) ** 2))
-        for stretch, _, period in self._stretches:
-            for j, rows in enumerate(stretch):
-                part = residual[rows, j]
+        score = 0.5 * float(np.sum((point.u - self.centre) ** 2))
+        for stretch in self._stretches:
+            for j, rows in enumerate(stretch.rows):
+                part = point.residual[rows, j]
                 n = int(np.isfinite(part).sum())
                 if n:
                     variance = max(float(np.nanmean(part**2)), self.floor[j] ** 2)
-                    score += 0.5 * n * period / TEMPER_S * math.log(variance)
+                    score += 0.5 * n * stretch.period / TEMPER_S * math.log(variance)
         return score
 
-    def _reweigh(self, residual: Array, driven_only: bool = False) -> None:
-        """Weigh each joint's stretches by the size and the autocorrelation of their own residuals."""
+    def _reweigh(self, point: _Point, driven_only: bool = False) -> None:
+        """Weigh each joint's stretches by the size and the autocorrelation of their own residuals.
+
+        Where a joint moves fast its stamp's error is an error of position: such rows weigh less.
+        """
+        residual = point.residual
         self._weight = np.zeros_like(residual)
-        squares, samples, times = np.zeros(residual.shape[1]), np.zeros(residual.shape[1]), np.zeros(residual.shape[1])
-        for stretch, driven, period in self._stretches:
-            if driven_only and not driven:
+        joints = residual.shape[1]
+        squares, samples, times = np.zeros(joints), np.zeros(joints), np.zeros(joints)
+        stamps, stamped = 0.0, 0
+        for stretch in self._stretches:
+            if driven_only and not stretch.driven:
                 continue
-            for j, rows in enumerate(stretch):
+            for j, rows in enumerate(stretch.rows):
                 part = residual[rows, j]
                 n = int(np.isfinite(part).sum())
                 if not n:
                     continue
-                variance = max(float(np.nanmean(part**2)), self.floor[j] ** 2)
-                inflation = autocorrelation_time(part, limit=len(part) // 2)
-                self._weight[rows, j] = 1.0 / math.sqrt(variance * inflation)
-                squares[j] += n * variance
+                white, stamp = stamp_error(part, point.velocity[rows, j], self.floor[j])
+                expected = np.sqrt(white**2 + (stamp * np.nan_to_num(point.velocity[rows, j])) ** 2)
+                relative = part / expected
+                variance = max(float(np.nanmean(relative**2)), (self.floor[j] / white) ** 2)
+                inflation = autocorrelation_time(relative, limit=len(part) // 2)
+                self._weight[rows, j] = 1.0 / (expected * math.sqrt(variance * inflation))
+                squares[j] += n * max(float(np.nanmean(part**2)), self.floor[j] ** 2)
                 samples[j] += n
-                times[j] += n * inflation * period
+                times[j] += n * inflation * stretch.period
+                stamps, stamped = stamps + n * stamp**2, stamped + n
         self.noise = np.sqrt(squares / np.maximum(samples, 1))
         self.correlation_s = times / np.maximum(samples, 1)
+        self.stamp_error_s = math.sqrt(stamps / max(stamped, 1))
 
-    def _find_stretches(self) -> list[tuple[list[NDArray[np.int64]], bool, float]]:
+    def _find_stretches(self) -> list[_Stretch]:
         """For each run, with torque and without: the rows of each joint, and the run's median sample time (s).
 
         A model's errors differ from motion to motion, and most of all between driving and falling: a servo without torque
@@ -406,36 +709,66 @@ class Problem:
                 period = float(np.median(np.diff(run.t)))
                 for driven, state in ((True, on), (False, ~on)):
                     if state.any():
-                        out.append(([rows[state[:, j]] for j in range(len(joints))], driven, period))
+                        out.append(_Stretch(tuple(rows[state[:, j]] for j in range(len(joints))), driven, period))
             offset += len(data.measured)
         return out
 
-    def _vector(self, u: Array) -> Array:
-        weighted = np.nan_to_num(self.residual([u])[0]) * self._weight
-        return np.concatenate([weighted.ravel(), self._prior_weight * (u - self.centre)])
-
-    def _jacobian(self, u: Array, central: bool) -> Array:
+    def _tangent(self, point: _Point, central: bool) -> _Tangent:
         # Forward where the bound allows, else backward; where both, the other side too.
+        u = point.u
         up, down = u + STEP <= self.high, u - STEP >= self.low
         ahead = np.where(up, STEP, -STEP)
         behind = np.where(up & down, -STEP, 0.0) if central else np.zeros(len(u))
-        variants = [u]
+        variants = []
         for step in (ahead, behind) if central else (ahead,):
             for members, _ in self._colours:
                 moved = u.copy()
                 moved[members] += step[members]
                 variants.append(moved)
-        base, *residuals = self.residual(variants) * self._weight
-        out = np.zeros((base.size + len(u), len(u)))
+        self.evaluations += len(variants)
         n = len(self._colours)
-        for c, (members, joints) in enumerate(self._colours):
-            change = np.nan_to_num(residuals[c] - (residuals[n + c] if central else base))
-            for p, affected in zip(members, joints, strict=True):
-                column = np.zeros_like(base)
-                column[:, affected] = change[:, affected] / (ahead[p] - behind[p])
-                out[: base.size, p] = column.ravel()
-        out[base.size :] = self._prior_weight * np.eye(len(u))
-        return out
+        apart = np.ones((n, point.residual.shape[1]))
+        for c, (members, masks) in enumerate(self._colours):
+            for p, affected in zip(members, masks, strict=True):
+                apart[c, affected] = ahead[p] - behind[p]
+        change = np.zeros((n, *point.residual.shape), np.float32)
+        offset = 0
+        for data in self.datasets:
+            for rows, pos, _ in data.stream(self.parameters, variants):
+                here = slice(rows.start + offset, rows.stop + offset)
+                base = pos[n:] if central else (data.measured[rows] - point.residual[here])[None]
+                # The residual is measured minus simulated, so that it falls as the position rises.
+                change[:, here] = np.nan_to_num((base - pos[:n]) / apart[:, None, :])
+            offset += len(data.measured)
+        change[:, ~np.isfinite(point.residual)] = 0.0
+        return _Tangent(u, change)
+
+
+def stamp_error(residual: Array, velocity: Array, floor: float) -> tuple[float, float]:
+    """(rad, s): the white part of a residual, and the deviation of its time stamps from the moments of sampling.
+
+    A stamp that is off by δ shows as velocity · δ. From neighbouring rows' differences, which a lasting model error hardly
+    enters: their variance is white² + velocity² stamp², a line that is fitted twice, the second time weighted by itself.
+    """
+    ok = np.isfinite(residual) & np.isfinite(velocity)
+    r, v = residual[ok], velocity[ok]
+    if len(r) < 20:
+        return max(floor, float(np.sqrt(np.mean(r**2))) if len(r) else floor), 0.0
+    jumps = np.diff(r) ** 2 / 2
+    # A jump of many times the usual is a contact or a step that comes early: no jitter.
+    fast = (v[1:] ** 2 + v[:-1] ** 2) / 2
+    jumps = np.minimum(jumps, 100 * max(float(np.median(jumps)), floor**2))
+    weight = np.full(len(jumps), 1.0)
+    white, slope = floor**2, 0.0
+    for _ in range(3):
+        scale = max(float(fast.max()), 1e-12)
+        lines = np.stack([np.ones_like(fast), fast / scale], axis=1) * weight[:, None]
+        (white, slope), _ = nnls(lines, jumps * weight)
+        slope /= scale
+        white = max(white, floor**2)
+        weight = 1.0 / (white + slope * fast)
+        weight /= weight.max()
+    return math.sqrt(white), math.sqrt(slope)
 
 
 def gaps(datasets: Sequence[Dataset], parameters: Sequence[Parameter], us: Sequence[Array]) -> list[Gap]:

@@ -370,6 +370,8 @@ def _judge(
     kept = np.ones(len(parameters), bool)
     after = _pooled(trials, parameters, [kept], undetermined)[0]
     while kept.any():
+        # What is kept must pay too.
+        beats = after.horizon < before.horizon and after.full < before.full and _score(after, before) < -WORTH
         groups = [
             np.array([bool(kept[k]) and p.kind == kind for k, p in enumerate(parameters)])
             for kind in dict.fromkeys(p.kind for p in parameters)
@@ -382,7 +384,6 @@ def _judge(
         options = [kept & ~group for group in groups if group.any()]
         results = _pooled(trials, parameters, options, undetermined)
         best = min(range(len(options)), key=lambda k: _score(results[k], before))
-        beats = after.horizon < before.horizon and after.full < before.full
         if beats and _score(results[best], before) > _score(after, before) - WORTH:
             break
         kept, after = options[best], results[best]
