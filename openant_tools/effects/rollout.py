@@ -80,17 +80,18 @@ def rollout(
         for step in segment.torque_off:
             flips.setdefault(step, []).append(s)
     control: Array = np.empty(0)
+    before = servos.state
     for step in range(longest):
         active = int((lengths > step).sum())
         if step % CHUNK == 0:
             control = _controls(rollouts, active, nv, step, min(step + CHUNK, longest), delays)
         for s in flips.get(step, ()):
             servos.switch(slice(s * nv, (s + 1) * nv), segments[s].torque_off[step])
-        before = servos.state
-        servos.step(
-            control[: active * nv, step % CHUNK], None if supply is None else supply.share(step), laws, active * nv
-        )
-        samples.take(step, before, servos.state)
+        volts = None if supply is None else supply.share(step)
+        servos.step(before, control[: active * nv, step % CHUNK], volts, laws, active * nv)
+        after = servos.state
+        samples.take(step, before, after)
+        before = after
     return Trajectories(samples.pos, samples.vel, rollouts.rows)
 
 
@@ -141,19 +142,29 @@ class _Samples:
         self._segment = whose[order]
         self._row = np.concatenate([segment.row for segment in segments])[order]
         self._fraction = np.concatenate([segment.fraction for segment in segments])[order]
-        shape = (nv, rollouts.rows[-1].stop, nj)
-        self.pos, self.vel, self._nv = np.full(shape, np.nan), np.full(shape, np.nan), nv
+        shape = (rollouts.rows[-1].stop, nv, nj)
+        self._pos, self._vel = np.full(shape, np.nan), np.full(shape, np.nan)
+        self._by_segment = len(segments), nv, nj
+
+    @property
+    def pos(self) -> Array:
+        """(variants, rows, joints) rad."""
+        return np.ascontiguousarray(self._pos.swapaxes(0, 1))
+
+    @property
+    def vel(self) -> Array:
+        """(variants, rows, joints) rad/s."""
+        return np.ascontiguousarray(self._vel.swapaxes(0, 1))
 
     def take(self, step: int, before: tuple[Array, Array], after: tuple[Array, Array]) -> None:
         """Note the rows between the states (positions, velocities) before and after a step."""
         here = slice(self._edges[step], self._edges[step + 1])
         if here.start == here.stop:
             return
-        segment, row, share = self._segment[here], self._row[here], self._fraction[here][:, None]
-        for out, a, b in ((self.pos, before[0], after[0]), (self.vel, before[1], after[1])):
-            for v in range(self._nv):
-                who = segment * self._nv + v
-                out[v, row] = a[who] * (1 - share) + b[who] * share
+        segment, row, share = self._segment[here], self._row[here], self._fraction[here][:, None, None]
+        for out, a, b in ((self._pos, before[0], after[0]), (self._vel, before[1], after[1])):
+            first, second = a.reshape(self._by_segment)[segment], b.reshape(self._by_segment)[segment]
+            out[row] = first * (1 - share) + second * share
 
 
 class _Servos:
@@ -207,17 +218,23 @@ class _Servos:
         self._on[rows] = ~off
         self._group[rows, self.plant.actuator] = np.where(off, TORQUE_OFF_GROUP, self._own_group[rows])
 
-    def step(self, control: Array, supply: Array | None, laws: Sequence[Law], active: int) -> None:
-        """One step of the first `active` simulations with these controls (active, nu), at these shares of the supply."""
+    def step(
+        self, state: tuple[Array, Array], control: Array, supply: Array | None, laws: Sequence[Law], active: int
+    ) -> None:
+        """One step of the first `active` simulations.
+
+        Args:
+            state: what `state` says now. control: (active, nu). supply: (n, joints) shares of the nominal one, None for 1.
+            laws: what acts before the step.
+        """
         plant, rest = self.plant, self._rest
         self._ctrl[:active] = control
-        position, velocity = self.state
         share = 1.0 if supply is None else supply
         view = Step(
             dt=plant.timestep,
             time=np.full(self._n, self._steps * plant.timestep),
-            position=position,
-            velocity=velocity,
+            position=state[0],
+            velocity=state[1],
             load=self._bias[:, plant.dof],
             on=self._on,
             setpoint=self._ctrl[:, plant.ctrl],
