@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.files import write_text
+from openant_tools.model.attribute import Attribute, Stated
 from openant_tools.model.plant import (
     KD,
     KP,
@@ -40,7 +42,13 @@ ASSET_FOLDERS = {"meshdir": ("mesh", "hfield", "skin", "flexcomp"), "texturedir"
 
 
 def write_model(
-    source: Path, variant: mujoco.MjModel, out: Path, *, joints: Sequence[str] | None = None, note: str | None = None
+    source: Path,
+    variant: mujoco.MjModel,
+    out: Path,
+    *,
+    joints: Sequence[str] | None = None,
+    note: str | None = None,
+    stated: Stated | None = None,
 ) -> Path:
     """Write `source` with the servo values of `variant` to `out`, with sensors `pos.J` and `vel.J` (formats, section 5).
 
@@ -52,6 +60,7 @@ def write_model(
         out: the file to write, atomically.
         joints: the servo joints; default all.
         note: a line for the comment at the top.
+        stated: attributes of the file that the variant was compiled with other values of.
 
     Raises:
         BadInput: the source cannot be read, or keeps a joint where it cannot be edited.
@@ -62,28 +71,21 @@ def write_model(
     root = tree.getroot()
     _name_from_main(root, source.parent, taken_in)
     _repoint_assets(root, source.parent, out.parent)
-    degrees = _in_degrees(root)
-    ratios = {}
-    for j, name in enumerate(plant.joints):
-        joint = next((e for e in root.iter("joint") if e.get("name") == name and _in_world(e)), None)
-        if joint is None:
-            raise _not_written_out(f"the joint {name!r}", source)
-        actuator = _actuator_element(root, plant, j)
-        _write_joint(joint, plant, variant, j, degrees)
-        if is_motor(variant, int(plant.actuator[j])) and not is_motor(plant.model, int(plant.actuator[j])):
-            _write_motor(actuator, variant, int(plant.actuator[j]))
-        elif _write_actuator(actuator, plant, variant, j):
-            ratios[j] = actuator
-        _write_delay(actuator, plant, variant, j)
-    _write_bodies(root, plant, variant)
-    _write_contacts(root, plant, variant)
-    _append_sensors(root, plant.joints)
-    if note:
-        root.insert(0, etree.Comment(f" {note.replace('--', '−−')} "))
-        root[0].tail = root.text or "\n  "
     # MuJoCo decides what the file means before it takes its place; beside it, because folders of assets are relative.
     trial = out.with_name(f".{out.name}.trial.xml")
     try:
+        if stated:
+            _write_stated(root, stated, source)
+            write_text(trial, _text(tree))
+            plant = replace(load_plant(trial, joints, Setup.FLOOR), path=source)
+        spec = mujoco.MjSpec.from_file(str(trial if stated else source))
+        ratios = _write_servos(root, plant, variant)
+        _write_bodies(root, plant, variant, spec)
+        _write_contacts(root, plant, variant)
+        _append_sensors(root, plant.joints)
+        if note:
+            root.insert(0, etree.Comment(f" {note.replace('--', '−−')} "))
+            root[0].tail = root.text or "\n  "
         write_text(trial, _text(tree))
         if ratios:
             _set_damping_ratios(ratios, trial, plant, variant)
@@ -93,6 +95,66 @@ def write_model(
         trial.unlink(missing_ok=True)
     write_text(out, _text(tree))
     return out
+
+
+def _write_servos(root: etree._Element, plant: Plant, variant: mujoco.MjModel) -> dict[int, etree._Element]:
+    """Set what differs in joints and actuators; returns those whose velocity gain must yet be given as a damping ratio."""
+    degrees = _in_degrees(root)
+    ratios = {}
+    for j, name in enumerate(plant.joints):
+        joint = next((e for e in root.iter("joint") if e.get("name") == name and _in_world(e)), None)
+        if joint is None:
+            raise _not_written_out(f"the joint {name!r}", plant.path)
+        actuator = _actuator_element(root, plant, j)
+        _write_joint(joint, plant, variant, j, degrees)
+        if is_motor(variant, int(plant.actuator[j])) and not is_motor(plant.model, int(plant.actuator[j])):
+            _write_motor(actuator, variant, int(plant.actuator[j]))
+        elif _write_actuator(actuator, plant, variant, j):
+            ratios[j] = actuator
+        _write_delay(actuator, plant, variant, j)
+    return ratios
+
+
+#: where elements of a kind stand, and their tags there; None for any
+_SECTIONS: dict[str, tuple[str, tuple[str, ...] | None]] = {
+    "joint": ("worldbody", ("joint", "freejoint")),
+    "geom": ("worldbody", ("geom",)),
+    "body": ("worldbody", ("body",)),
+    "inertial": ("worldbody", ("body",)),
+    "site": ("worldbody", ("site",)),
+    "actuator": ("actuator", None),
+    "tendon": ("tendon", None),
+    "pair": ("contact", ("pair",)),
+    "equality": ("equality", None),
+}
+
+
+def _write_stated(root: etree._Element, values: Stated, source: Path) -> None:
+    """Set attributes as they stand in the file, with as many numbers as it gives, or as are needed."""
+    for attribute, numbers in values.items():
+        element = _stated_element(root, attribute)
+        if element is None:
+            raise _not_written_out(f"the {attribute}", source)
+        given = len(str(element.get(attribute.attribute, "")).split())
+        needed = len(np.trim_zeros(np.array(numbers), "b"))
+        element.set(attribute.attribute, _numbers(numbers[: max(given, needed, 1)]))
+
+
+def _stated_element(root: etree._Element, attribute: Attribute) -> etree._Element | None:
+    if attribute.element == "option":
+        # The last <option> counts, attribute by attribute.
+        found = list(root.iter("option"))
+        if not found:
+            found = [etree.Element("option")]
+            found[0].tail = "\n  "
+            root.insert(0, found[0])
+        return next((e for e in found[::-1] if e.get(attribute.attribute)), found[-1])
+    section, tags = _SECTIONS[attribute.element]
+    for part in root.iter(section):
+        for element in part.iter() if section == "worldbody" else part:
+            if element.get("name") == attribute.name and (tags is None or element.tag in tags):
+                return element if attribute.element != "inertial" else element.find("inertial")
+    return None
 
 
 def _not_written_out(what: str, source: Path) -> BadInput:
@@ -339,13 +401,12 @@ def _write_delay(element: etree._Element, plant: Plant, variant: mujoco.MjModel,
     element.set("interp", "linear")
 
 
-def _write_bodies(root: etree._Element, plant: Plant, variant: mujoco.MjModel) -> None:
+def _write_bodies(root: etree._Element, plant: Plant, variant: mujoco.MjModel, spec: mujoco.MjSpec) -> None:
     """Make the bodies denser whose mass differs: where the file states it, in the inertial or in the geoms."""
     given = plant.model
     heavier = np.flatnonzero(~np.isclose(variant.body_mass, given.body_mass, rtol=1e-12, atol=0.0))
     if not len(heavier):
         return
-    spec = mujoco.MjSpec.from_file(str(plant.path))
     bodies, geoms = _in_order(root, plant)
     for body in heavier:
         factor = float(variant.body_mass[body] / given.body_mass[body])

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.model.attribute import Stated, set_stated
 
 __all__ = ["Plant", "Setup", "is_filtered", "is_motor", "load_plant", "position_servos", "setup_of", "world_bodies"]
 
@@ -42,6 +43,15 @@ def setup_of(words: str | None) -> Setup:
 
 
 @dataclass(frozen=True)
+class Form:
+    """What `load_plant` made of the servos, so that a model of the same layout can be had again."""
+
+    electrical: bool = False
+    delayed: bool = False
+    lagging: bool = False
+
+
+@dataclass(frozen=True)
 class Plant:
     """A compiled model and where its position servos are in it.
 
@@ -54,6 +64,7 @@ class Plant:
         ctrl: (joints,) address of that actuator's position setpoint in `ctrl`.
         tree: (joints,) kinematic tree of each joint; joints of different trees do not move each other on the stand.
         path: the file the model was read from.
+        form: what was made of its servos.
     """
 
     model: mujoco.MjModel
@@ -65,6 +76,7 @@ class Plant:
     ctrl: Ints
     tree: Ints
     path: Path
+    form: Form = Form()
 
     @property
     def timestep(self) -> float:
@@ -75,6 +87,25 @@ class Plant:
         """The id of the free joint of the base, None on the stand or where the model has none."""
         free = np.flatnonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
         return int(free[0]) if len(free) else None
+
+    def restated(self, values: Stated) -> mujoco.MjModel:
+        """The model with other values in some attributes of its file: compiled anew, of the same layout.
+
+        Raises:
+            BadInput: MuJoCo cannot compile it with these.
+        """
+        form = self.form
+        again = load_plant(
+            self.path,
+            self.joints,
+            self.setup,
+            electrical=form.electrical,
+            delayed=form.delayed,
+            lagging=form.lagging,
+            stated=values,
+        )
+        again.model.opt.timestep = self.timestep  # which a plant may have changed since it was loaded
+        return again.model
 
     def with_torque_off(self, model: mujoco.MjModel, off: NDArray[np.bool_]) -> mujoco.MjModel:
         """A copy of `model` (same layout as the plant's) in which the joints marked in `off` have no torque."""
@@ -94,6 +125,7 @@ def load_plant(
     electrical: bool = False,
     delayed: bool = False,
     lagging: bool = False,
+    stated: Stated | None = None,
 ) -> Plant:
     """Read an MJCF and set it up.
 
@@ -107,6 +139,7 @@ def load_plant(
             itself stays what the model says.
         lagging: filter the setpoint of every servo that can have it (`filter_form`), with no lag as yet. What is filtered
             does not become a DC motor: MuJoCo's has no filter.
+        stated: attributes of the file that are to have other values.
 
     Raises:
         BadInput: the file is missing or MuJoCo cannot load it, it has no position-controlled joint, or it lacks one of
@@ -117,6 +150,7 @@ def load_plant(
         raise BadInput("no such model file", where=path, remedy="name an MJCF with --model MODEL.xml")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
+        set_stated(spec, stated or {})
         original = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         words = " ".join(str(error).split())
@@ -163,6 +197,7 @@ def load_plant(
         ctrl=model.actuator_ctrladr[actuator].astype(np.int64),
         tree=model.dof_treeid[dof].astype(np.int64),
         path=path,
+        form=Form(electrical, delayed, lagging),
     )
 
 

@@ -244,7 +244,7 @@ class Problem:
         self._has_limp = any(not stretch.driven for stretch in self._stretches)
         self._weight: Array = np.ones((sum(len(data.measured) for data in self.datasets), nj))
         self.noise, self.correlation_s, self.stamp_error_s = np.zeros(nj), np.zeros(nj), 0.0
-        self._valley = np.array([KINDS[parameter.kind].valley for parameter in self.parameters], bool)
+        self._valley = np.array([parameter.definition.valley for parameter in self.parameters], bool)
         self._colours = _colours(self.datasets, self.parameters)
         #: for each joint, the parameters that move it and their colours
         self._movers: list[tuple[Ints, Ints]] = []
@@ -258,7 +258,7 @@ class Problem:
             self._movers.append((np.array([p for p, _ in pairs], np.int64), np.array([c for _, c in pairs], np.int64)))
         low, high = [], []
         for parameter in self.parameters:
-            kind = KINDS[parameter.kind]
+            kind = parameter.definition
             ends = [
                 parameter.bounds(kind.read(data.plant.model, data.plant, j))
                 for data in self.datasets

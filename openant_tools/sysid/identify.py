@@ -17,15 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.model.attribute import Attribute
 from openant_tools.model.gap import HORIZON_S, Gap, gap, share_closed
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.recording.run import Run
+from openant_tools.sysid.declared import Declaration, declared_parameters
 from openant_tools.sysid.fit import Dataset, Estimate, Problem, gaps, sensor_floor
 from openant_tools.sysid.kinds import ACTUATOR_LAG, SPEED_LIMIT
-from openant_tools.sysid.parameter import ACTION_DELAY, KINDS, Parameter, apply, buffered, choose, delays
+from openant_tools.sysid.parameter import ACTION_DELAY, KINDS, Parameter, apply, buffered, choose, delays, restatements
 from openant_tools.sysid.quality import check_runs
 
-__all__ = ["DEFAULT_KINDS", "Identification", "Value", "calibrated", "identify"]
+__all__ = ["DEFAULT_KINDS", "Identification", "Value", "calibrated", "identify", "restated"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -172,6 +174,7 @@ def identify(
     joints: Sequence[str] | None = None,
     kinds: Sequence[str] | None = None,
     tie: str = "joint",
+    declared: Declaration | None = None,
     progress: Progress | None = None,
 ) -> Identification:
     """Fit `model` to `runs` and judge the result on `hold_out`, or by leaving out runs in turn.
@@ -181,8 +184,9 @@ def identify(
         model: the MJCF whose values are the priors and into which the result goes.
         hold_out: runs that the fit must not see.
         joints: which joints to fit; default every position-controlled joint that all runs command and measure.
-        kinds: keys of KINDS; default DEFAULT_KINDS as far as they apply.
+        kinds: keys of KINDS; default what `declared` asks for, else DEFAULT_KINDS as far as they apply.
         tie: `joint` (each its own values), `servo` (one value for all joints of a servo model) or `all`.
+        declared: parameters that a user declared, fitted besides.
         progress: called with what is being done and the share that is done.
 
     Raises:
@@ -196,7 +200,9 @@ def identify(
         raise BadInput("a held-out run is also fitted", remedy="hold out runs that are not among those to fit")
     joints = _joints_in_common(everything, model, joints)
     check_runs(everything, load_plant(model, joints, Setup.FLOOR))
-    wanted = _applicable(kinds, load_plant(model, joints, Setup.FLOOR), everything)
+    wanted = _applicable(
+        declared.kinds if kinds is None and declared else kinds, load_plant(model, joints, Setup.FLOOR), everything
+    )
 
     def datasets(of: Sequence[Run]) -> list[Dataset]:
         return _datasets(of, model, joints, wanted)
@@ -205,6 +211,7 @@ def identify(
     plant = data[0].plant
     motors = {k: v for run in everything for k, v in run.facts.motors.items()}
     chosen = choose(plant, wanted, tie, motors)
+    chosen += declared_parameters(plant, declared) if declared else []
     floor = np.maximum(sensor_floor(runs, joints), 1e-6)
 
     problem = Problem(data, chosen, floor)
@@ -418,8 +425,8 @@ def _pooled(
 
 
 def _value(parameter: Parameter, plant: Plant, estimate: Estimate, k: int, kept: bool, u: float) -> Value:
-    nominal = KINDS[parameter.kind].read(plant.model, plant, parameter.joints[0])
-    low, high = KINDS[parameter.kind].low, KINDS[parameter.kind].high
+    kind = parameter.definition
+    nominal = kind.read(plant.model, plant, parameter.joints[0])
     deviation = TWO_SIDED_95 * math.sqrt(estimate.covariance[k, k])
     information = float(estimate.information[k])
     centre = u if kept else estimate.u[k]
@@ -431,12 +438,12 @@ def _value(parameter: Parameter, plant: Plant, estimate: Estimate, k: int, kept:
         verdict = "identifiable" if information >= IDENTIFIABLE else "weak"
     return Value(
         name=parameter.name,
-        unit=KINDS[parameter.kind].unit,
-        joints=() if KINDS[parameter.kind].body else tuple(plant.joints[j] for j in parameter.joints),
+        unit=kind.unit,
+        joints=() if kind.body else tuple(plant.joints[j] for j in parameter.joints),
         given=nominal,
         value=parameter.value(nominal, u),
-        low=float(np.clip(parameter.value(nominal, centre - deviation), low, high)),
-        high=float(np.clip(parameter.value(nominal, centre + deviation), low, high)),
+        low=float(np.clip(parameter.value(nominal, centre - deviation), kind.low, kind.high)),
+        high=float(np.clip(parameter.value(nominal, centre + deviation), kind.low, kind.high)),
         verdict=verdict,
         information=information,
     )
@@ -491,3 +498,8 @@ def calibrated(identification: Identification, setup: Setup = Setup.FLOOR) -> mu
     if ACTION_DELAY in moved:
         buffered(plant, model, delays(plant, identification.parameters, identification.u))
     return model
+
+
+def restated(identification: Identification) -> dict[Attribute, tuple[float, ...]]:
+    """What the attributes that were declared are in the identified model's file, where they moved."""
+    return restatements(identification.model, identification.parameters, identification.u)

@@ -12,15 +12,31 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.model.attribute import Attribute, stated
 from openant_tools.model.plant import Plant
 from openant_tools.sysid.kinds import ACTION_DELAY, KINDS, Kind, torque_limit, usual_torque
 
-__all__ = ["ACTION_DELAY", "KINDS", "Kind", "Parameter", "apply", "buffered", "choose", "delays", "effect_values"]
+__all__ = [
+    "ACTION_DELAY",
+    "KINDS",
+    "Kind",
+    "Parameter",
+    "Place",
+    "apply",
+    "buffered",
+    "choose",
+    "delays",
+    "effect_values",
+    "given_numbers",
+    "restatements",
+]
 
 Array = NDArray[np.float64]
 
@@ -35,6 +51,8 @@ class Parameter:
         joints: indices into the plant's joints.
         relative: whether u scales the model's value (else it is added).
         std: the prior's standard deviation, of log(value) if relative, else in the kind's unit.
+        declared: the kind, where a user declared it (`declared.py`).
+        places: of what was declared, the attributes that change together, and which of an attribute's numbers.
     """
 
     kind: str
@@ -42,10 +60,16 @@ class Parameter:
     joints: tuple[int, ...]
     relative: bool
     std: float
+    declared: Kind | None = None
+    places: tuple[Place, ...] = ()
 
     @property
     def name(self) -> str:
         return f"{self.kind}.{self.label}"
+
+    @property
+    def definition(self) -> Kind:
+        return self.declared or KINDS[self.kind]
 
     def value(self, nominal: float, u: float) -> float:
         """The physical value that the internal number u stands for, given the model's own."""
@@ -53,7 +77,7 @@ class Parameter:
 
     def bounds(self, nominal: float) -> tuple[float, float]:
         """The internal numbers between which the value stays physical."""
-        kind = KINDS[self.kind]
+        kind = self.definition
         if self.relative:
             low = math.log(kind.low / nominal) / self.std if kind.low > 0 else -math.inf
             return low, math.log(kind.high / nominal) / self.std if math.isfinite(kind.high) else math.inf
@@ -62,16 +86,17 @@ class Parameter:
     @property
     def centre(self) -> float:
         """Where the prior has its middle: 0, the given model's value, unless physics knows better."""
-        prior = KINDS[self.kind].prior
+        prior = self.definition.prior
         return 0.0 if prior is None else prior / self.std
 
 
 def apply(plant: Plant, parameters: Sequence[Parameter], u: Array) -> mujoco.MjModel:
     """A copy of the plant's model with every parameter at its u."""
-    model = copy.copy(plant.model)
+    values = restatements(plant.path, parameters, u)
+    model = copy.copy(_restated(plant, tuple(values.items())) if values else plant.model)
     constants = False
     for parameter, value in zip(parameters, u, strict=True):
-        kind = KINDS[parameter.kind]
+        kind = parameter.definition
         for j in parameter.joints:
             nominal = kind.read(plant.model, plant, j)
             kind.write(model, plant, j, parameter.value(nominal, float(value)))
@@ -81,11 +106,58 @@ def apply(plant: Plant, parameters: Sequence[Parameter], u: Array) -> mujoco.MjM
     return model
 
 
+@dataclass(frozen=True)
+class Place:
+    """Numbers of one attribute that a declared parameter changes: all of them, or those at `index`."""
+
+    attribute: Attribute
+    index: tuple[int, ...] | None = None
+
+    def numbers(self, values: tuple[float, ...]) -> tuple[float, ...]:
+        return values if self.index is None else tuple(values[k] for k in self.index)
+
+
+def restatements(path: Path, parameters: Sequence[Parameter], u: Array) -> dict[Attribute, tuple[float, ...]]:
+    """What the attributes that were declared are, in the file at `path`, with the parameters at u; those that moved."""
+    out: dict[Attribute, tuple[float, ...]] = {}
+    for parameter, value in zip(parameters, u, strict=True):
+        for place in parameter.places if value else ():
+            numbers = list(out.get(place.attribute) or given_numbers(path, place.attribute))
+            for k in range(len(numbers)) if place.index is None else place.index:
+                numbers[k] = parameter.value(numbers[k], float(value))
+            out[place.attribute] = tuple(numbers)
+    return out
+
+
+@lru_cache(maxsize=4)
+def _spec(path: Path, written: int) -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_file(str(path))
+
+
+def given_numbers(path: Path, attribute: Attribute) -> tuple[float, ...]:
+    """An attribute's numbers in a file."""
+    return stated(_spec(path, path.stat().st_mtime_ns), attribute, path)
+
+
+_compiled: dict[tuple[object, ...], mujoco.MjModel] = {}
+#: variants of one Jacobian mostly share what was declared: only its own columns are compiled anew
+COMPILED_KEPT = 64
+
+
+def _restated(plant: Plant, values: tuple[tuple[Attribute, tuple[float, ...]], ...]) -> mujoco.MjModel:
+    key = (plant.path, plant.path.stat().st_mtime_ns, plant.joints, plant.setup, plant.form, plant.timestep, values)
+    if key not in _compiled:
+        while len(_compiled) >= COMPILED_KEPT:
+            del _compiled[next(iter(_compiled))]
+        _compiled[key] = plant.restated(dict(values))
+    return _compiled[key]
+
+
 def effect_values(plant: Plant, parameters: Sequence[Parameter], u: Array) -> dict[tuple[str, str], Array]:
     """(effect, its parameter) → (joints,) of the effects that act between steps, with the parameters at u."""
     out: dict[tuple[str, str], Array] = {}
     for parameter, value in zip(parameters, u, strict=True):
-        key = KINDS[parameter.kind].effect
+        key = parameter.definition.effect
         if key is not None:
             out.setdefault(key, np.zeros(len(plant.joints)))[list(parameter.joints)] = parameter.std * value
     return {key: value for key, value in out.items() if value.any()}

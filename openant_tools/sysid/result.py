@@ -14,14 +14,12 @@ from openant_tools.files import write_text
 from openant_tools.model.mjcf import write_model
 from openant_tools.robot.config import Provenance
 from openant_tools.robot.folder import RobotFolder
-from openant_tools.sysid.identify import Identification, calibrated
+from openant_tools.sysid.identify import Identification, calibrated, restated
 from openant_tools.sysid.report import fit_report
 
 __all__ = ["write_fit", "write_robot"]
 
 CALIBRATED = "calibrated.xml"
-#: where a joint's name stands in robot.toml, for what belongs to the body or to what it stands on
-BODY = "body"
 
 
 def write_fit(result: Identification, out: Path) -> list[Path]:
@@ -32,7 +30,7 @@ def write_fit(result: Identification, out: Path) -> list[Path]:
     runs = ", ".join(run.name for data in result.datasets for run in data.runs)
     note = f"Calibrated by `openant sysid fit` on {datetime.date.today()} from {result.model.name} and {runs}"
     with _together(out, (CALIBRATED, "fit.json", "report.html")) as (model, figures, report):
-        write_model(result.model, calibrated(result), model, joints=result.joints, note=note)
+        write_model(result.model, calibrated(result), model, joints=result.joints, note=note, stated=restated(result))
         write_text(figures, json.dumps(result.as_json(), indent=1, ensure_ascii=False) + "\n")
         fit_report(result).write(report)
     return [out / CALIBRATED, out / "fit.json", out / "report.html"]
@@ -70,6 +68,7 @@ def write_robot(result: Identification, folder: RobotFolder) -> None:
         folder.path / CALIBRATED,
         joints=result.joints,
         note="Written by `openant sysid fit`",
+        stated=restated(result),
     )
     runs = [run for data in result.datasets for run in data.runs]
     recording = folder.relative(runs[0].path) if runs[0].path else runs[0].name
@@ -81,8 +80,8 @@ def write_robot(result: Identification, folder: RobotFolder) -> None:
     values: dict[str, object] = {"model": CALIBRATED}
     provenance = {"model": source()}
     for value in result.values:
-        kind = value.name.partition(".")[0]
-        for joint in value.joints or (BODY,):
+        kind, _, label = value.name.partition(".")
+        for joint in value.joints or (label,):
             # What stayed at its prior is written too: it must not be an older fit's value that is read beside this model.
             path = f"identified.{kind}.{joint}"
             values[path] = _rounded(value.value)
