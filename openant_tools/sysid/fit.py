@@ -25,11 +25,12 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear, nnls
 from scipy.stats import norm
 
+from openant_tools.effects.rollout import rollout
 from openant_tools.model.gap import HORIZON_S, Gap, gap
 from openant_tools.model.plant import Plant, Setup
 from openant_tools.model.rollout import Rollouts, Trajectories
 from openant_tools.recording.run import Run
-from openant_tools.sysid.parameter import ACTION_DELAY, KINDS, Parameter, apply, delays
+from openant_tools.sysid.parameter import ACTION_DELAY, Parameter, apply, delays, effect_values
 from openant_tools.sysid.quality import quantum
 
 __all__ = ["Dataset", "Estimate", "Problem", "autocorrelation_time"]
@@ -80,16 +81,19 @@ class Dataset:
         runs: the recordings.
         measured: (rows, joints) rad, the runs' positions one after another.
         nthread: of the rollouts; 0 takes all cores.
+        measured_supply: gains and torque limits follow the voltage that the runs logged.
     """
 
     plant: Plant
     runs: tuple[Run, ...]
     measured: Array
     nthread: int = 0
+    measured_supply: bool = False
 
     @classmethod
-    def prepare(cls, plant: Plant, runs: Sequence[Run], nthread: int = 0) -> Dataset:
-        return cls(plant, tuple(runs), np.concatenate([run.signal("pos", plant.joints) for run in runs]), nthread)
+    def prepare(cls, plant: Plant, runs: Sequence[Run], nthread: int = 0, *, measured_supply: bool = False) -> Dataset:
+        measured = np.concatenate([run.signal("pos", plant.joints) for run in runs])
+        return cls(plant, tuple(runs), measured, nthread, measured_supply)
 
     @cached_property
     def full(self) -> Rollouts:
@@ -112,13 +116,22 @@ class Dataset:
         self, parameters: Sequence[Parameter], us: Sequence[Array], rollouts: Rollouts | None = None
     ) -> Trajectories:
         """What the model would have done with the parameters at each u, (parameters,), by default as the fit compares."""
-        return (rollouts or self.fitted)(*self._variants(parameters, us))
+        rollouts = rollouts or self.fitted
+        models, late = self._variants(parameters, us)
+        effects = [effect_values(self.plant, parameters, u) for u in us]
+        if self.measured_supply or any(effects):
+            return rollout(rollouts, models, effects, late, measured_supply=self.measured_supply)
+        return rollouts(models, late)
 
     def stream(
         self, parameters: Sequence[Parameter], us: Sequence[Array], rollouts: Rollouts | None = None
     ) -> Iterator[tuple[slice, Array, Array]]:
         """`simulate` piece by piece, so that no more than a piece of it is held: rows, positions, velocities."""
-        return (rollouts or self.fitted).stream(*self._variants(parameters, us))
+        rollouts = rollouts or self.fitted
+        if self.measured_supply or any(effect_values(self.plant, parameters, u) for u in us):
+            whole = self.simulate(parameters, us, rollouts)  # effects act step by step on all runs at once
+            return iter([(slice(0, whole.pos.shape[1]), whole.pos, whole.vel)])
+        return rollouts.stream(*self._variants(parameters, us))
 
     def _variants(
         self, parameters: Sequence[Parameter], us: Sequence[Array]
