@@ -109,7 +109,7 @@ class Meter:
             return call(rollouts, *rest, **options)
 
         Batch.rollout = timed
-        Rollouts.__call__ = counted  # type: ignore[method-assign]
+        Rollouts.__call__ = counted  # type: ignore[method-assign, assignment]
 
 
 def cpu_s() -> float:
