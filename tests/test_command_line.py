@@ -211,7 +211,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("cut.mcap", (), ("cut.mcap",)),
         ("missing.csv", (), ("missing.csv", "no such file")),
         ("swing.csv", ("--joint", "elbow"), ("arm.xml", "no position-controlled joint 'elbow'", "joint")),
-        ("swing.csv", ("--parameter", "mass"), ("no such parameter: mass", "stiffness")),
+        ("swing.csv", ("--kind", "mass"), ("no such parameter: mass", "stiffness")),
         ("swing.csv", ("--hold-out", "swing.csv"), ("held-out run is also fitted",)),
         ("swing.csv", ("--model", "broken.xml"), ("broken.xml", "MuJoCo cannot load it")),
         ("swing.csv", ("--model", "unknown.xml"), ("unknown.xml", "MuJoCo cannot load it", "fricton")),
@@ -266,7 +266,7 @@ def test_other_commands_refuse_in_one_line_too(bench: Path, arguments: tuple[str
 def test_on_a_full_disk_a_fit_leaves_no_part_of_itself(bench: Path, tmp_path: Path, largest: int) -> None:
     """At first nothing fits, then the small files do and the report does not."""
     out = tmp_path / "fit"
-    result = openant("sysid", "fit", bench / "swing.csv", "--model", bench / "arm.xml", "--parameter", "damping",
+    result = openant("sysid", "fit", bench / "swing.csv", "--model", bench / "arm.xml", "--kind", "damping",
                      "--out", out, largest_file=largest)  # fmt: skip
     line = refusal(result)
     assert str(out) in line

@@ -25,8 +25,13 @@ __all__ = ["fit"]
     "--hold-out", multiple=True, type=click.Path(path_type=Path), metavar="RUN", help="Judge on this run. Repeatable."
 )
 @click.option("--joint", "joints", multiple=True, metavar="NAME", help="Fit this joint only. Repeatable.")
+@click.option("--kind", "kinds", multiple=True, metavar="KIND", help="Fit this kind of parameter only. Repeatable.")
 @click.option(
-    "--parameter", "kinds", multiple=True, metavar="KIND", help="Fit this kind of parameter only. Repeatable."
+    "--parameters",
+    "declared",
+    type=click.Path(path_type=Path),
+    metavar="FILE.toml",
+    help="Fit what this file declares, too.",
 )
 @click.option(
     "--tie",
@@ -43,6 +48,7 @@ def fit(
     hold_out: tuple[Path, ...],
     joints: tuple[str, ...],
     kinds: tuple[str, ...],
+    declared: Path | None,
     tie: str,
     robot: Path | None,
 ) -> int:
@@ -55,14 +61,18 @@ def fit(
       openant sysid fit run1.mcap run2.mcap --hold-out run3.mcap --robot my-ant --out fit
       openant sysid fit swing.parquet --model pendulum.xml --out fit
 
-    Kinds of parameters: stiffness, velocity_gain, damping, electrical_damping, armature, coulomb_friction, zero_offset,
-    action_delay, torque_limit. Exit code 1: nothing beats the given model.
+    Kinds of parameters, by default: stiffness, damping (or velocity_gain, whichever the model has), armature,
+    coulomb_friction, zero_offset, action_delay; electrical_damping where torque was off for a while; floor_friction and
+    contact_softness where the robot stood on the floor. Others by name: actuator_lag, torque_limit, speed_limit, link_mass,
+    torso_mass, contact_impedance. Anything else in an MJCF with --parameters (docs/identify.md). Exit code 1: nothing beats
+    the given model.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from openant_tools.recording.tables import read_run
     from openant_tools.robot.folder import RobotFolder
+    from openant_tools.sysid.declared import read_declarations
     from openant_tools.sysid.identify import identify
     from openant_tools.sysid.result import write_fit, write_robot
 
@@ -82,6 +92,7 @@ def fit(
             joints=joints or None,
             kinds=kinds or None,
             tie=tie,
+            declared=None if declared is None else read_declarations(declared),
             progress=lambda what, done: bar.update(task, description=what, completed=done),
         )
         bar.update(task, description="writing the report", completed=1.0)
