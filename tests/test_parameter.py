@@ -406,6 +406,6 @@ def test_a_number_that_the_file_does_not_state_is_refused(model: Path, tmp_path:
 def test_a_missing_file_of_parameters_leaves_no_folder(model: Path, tmp_path: Path) -> None:
     write_table(record(MODEL, "a", seconds=2.0), tmp_path / "a.csv")
     words = [str(tmp_path / "a.csv"), "--model", str(model), "--out", str(tmp_path / "fit")]
-    with pytest.raises(BadInput, match="no such file of parameters → name one with --parameters FILE.toml"):
+    with pytest.raises(BadInput, match=r"no such file of parameters → name one with --parameters FILE.toml"):
         fit.main([*words, "--parameters", str(tmp_path / "none.toml")], standalone_mode=False)
     assert not (tmp_path / "fit").exists()
