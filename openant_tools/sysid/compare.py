@@ -257,7 +257,7 @@ def _difference(name: str, a: Estimate, b: Estimate, name_a: str, name_b: str) -
     if not (facing > 0 and math.isfinite(facing)):
         return refused("their intervals are empty")
     p = math.erfc(TWO_SIDED_95 * abs(difference) / facing / math.sqrt(2))
-    weak = [whose for estimate, whose in ((a, name_a), (b, name_b)) if estimate.verdict == "weak"]
+    weak = [whose for estimate, whose in ((a, name_a), (b, name_b)) if estimate.verdict in ("weak", "tied")]
     why = (
         f"weak in {' and '.join(weak)}: it leans on its prior, so that a change shows smaller than it is"
         if weak

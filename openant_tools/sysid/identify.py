@@ -7,7 +7,7 @@ its prior; whatever does not beat the given model on held-out runs, at the short
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,8 @@ from openant_tools.sysid.declared import Declaration, declared_parameters
 from openant_tools.sysid.fit import Dataset, Estimate, Problem, gaps, sensor_floor
 from openant_tools.sysid.kinds import ACTUATOR_LAG, SPEED_LIMIT
 from openant_tools.sysid.parameter import ACTION_DELAY, KINDS, Parameter, apply, buffered, choose, delays, restatements
-from openant_tools.sysid.quality import check_runs
+from openant_tools.sysid.quality import Telemetry, check_runs, without_errors
+from openant_tools.sysid.verdict import Verdict, Word, experiment, verdicts
 
 __all__ = ["DEFAULT_KINDS", "Identification", "Value", "calibrated", "identify", "restated"]
 
@@ -46,13 +47,12 @@ DEFAULT_KINDS = (
 #: and with them, where a robot stood on the floor
 ON_FLOOR = ("floor_friction", "contact_softness")
 
-#: share of the posterior precision that must come from the data for a value to be called identifiable: the interval is
-#: then less than half as wide as the prior's
-IDENTIFIABLE = 0.75
-#: below this share the data say nothing, and the value stays at its prior
-UNDETERMINED = 0.1
 #: going back must pay this much on held-out runs (relative, over both horizons): less is luck
 WORTH = 0.01
+#: share of a run's samples that may be missing without a word
+MISSING = 0.01
+#: s; a row's time stamp may be off by this much without a word
+STAMP_ERROR_S = 0.5e-3
 #: 95 % of a normal distribution
 TWO_SIDED_95 = 1.96
 
@@ -68,9 +68,12 @@ class Value:
         given: the value in the given model (of the first joint where several are tied).
         value: the value in the written model.
         low, high: 95 % interval of the estimate; where the value fell back, of what the data would have said.
-        verdict: `identifiable`, `weak` (between data and prior), `undetermined` (left at its prior) or `fell back`
-            (it did not beat the given model on held-out runs).
+        verdict: `identifiable`, `weak` (between data and prior), `tied` (the data tell it only together with another),
+            `undetermined` (left at its prior) or `fell back` (it did not beat the given model on held-out runs).
         information: share of the precision that the data gave, 0…1.
+        tied_to: the other parameter's name, where it is tied.
+        record_next: what to record so that it becomes identifiable; empty where it is, or where nothing is known.
+        halves: what each half of the data alone says, where they contradict each other; the interval holds both.
     """
 
     name: str
@@ -80,12 +83,20 @@ class Value:
     value: float
     low: float
     high: float
-    verdict: str
+    verdict: Word
     information: float
+    tied_to: str | None = None
+    record_next: str = ""
+    halves: tuple[float, float] | None = None
 
     @property
     def accepted(self) -> bool:
-        return self.verdict in ("identifiable", "weak")
+        return self.verdict in ("identifiable", "weak", "tied")
+
+    @property
+    def words(self) -> str:
+        """The verdict for reading."""
+        return f"tied to {self.tied_to}" if self.tied_to else self.verdict
 
 
 @dataclass(frozen=True)
@@ -102,6 +113,7 @@ class Identification:
         in_turn: whether runs were left out in turn, each judged by a fit to the others.
         noise: joint → rad, residual deviation of the fit.
         correlation_s: joint → s, how long a residual remembers itself; far above the sample time it is model error.
+        stamp_error_s: s, standard deviation by which time stamps miss the moments of sampling, row by row.
         u: (parameters,) of the written model, for `models`.
         notes: what a reader should know.
     """
@@ -116,6 +128,7 @@ class Identification:
     in_turn: bool
     noise: Mapping[str, float]
     correlation_s: Mapping[str, float]
+    stamp_error_s: float
     parameters: tuple[Parameter, ...]
     u: Array
     covariance: Array
@@ -148,6 +161,9 @@ class Identification:
                     "given": value.given,
                     "joints": list(value.joints),
                     "information": value.information,
+                    "tied_to": value.tied_to,
+                    "record_next": value.record_next,
+                    "halves": None if value.halves is None else list(value.halves),
                 }
                 for value in self.values
             },
@@ -162,6 +178,7 @@ class Identification:
             "accepted": list(self.accepted),
             "noise_rad": dict(self.noise),
             "residual_correlation_s": dict(self.correlation_s),
+            "stamp_error_s": self.stamp_error_s,
             "notes": list(self.notes),
         }
 
@@ -199,6 +216,9 @@ def identify(
     if same:
         raise BadInput("a held-out run is also fitted", remedy="hold out runs that are not among those to fit")
     joints = _joints_in_common(everything, model, joints)
+    cleaned = [without_errors(run, joints) for run in everything]
+    everything, telemetry = [run for run, _ in cleaned], [found for _, found in cleaned]
+    runs, hold_out = everything[: len(runs)], everything[len(runs) :]
     check_runs(everything, load_plant(model, joints, Setup.FLOOR))
     wanted = _applicable(
         declared.kinds if kinds is None and declared else kinds, load_plant(model, joints, Setup.FLOOR), everything
@@ -229,17 +249,21 @@ def identify(
         trials = []
         for k, (train, test) in enumerate(folds):
             fold = Problem(datasets(train), chosen, floor)
-            trials.append((fold.solve(progress=share(1 + k)), datasets(test)))
+            # Where all runs lead is near where most of them do; that it is only the start says nothing of the run left out.
+            trials.append((fold.solve(estimate.u, progress=share(1 + k)), datasets(test)))
 
-    undetermined = estimate.information < UNDETERMINED
+    untied = verdicts(estimate, np.ones(len(chosen), bool))
+    undetermined = np.array([verdict.word == "undetermined" for verdict in untied], bool)
     kept, before, after = _judge(trials, chosen, undetermined)
     u = np.where(kept, _conditional(estimate, ~kept), 0.0)
     u[undetermined & kept] = problem.centre[undetermined & kept]
     tests = [run for _, test in folds for run in test]
+    found = verdicts(estimate, kept)
+    values = tuple(_value(p, plant, estimate, k, found[k], float(u[k])) for k, p in enumerate(chosen))
     return Identification(
         model=model,
         joints=tuple(joints),
-        values=tuple(_value(p, plant, estimate, k, bool(kept[k]), u[k]) for k, p in enumerate(chosen)),
+        values=values,
         before=before,
         after=after,
         floor=_floor([*runs, *hold_out], joints),
@@ -247,12 +271,13 @@ def identify(
         in_turn=not hold_out,
         noise=dict(zip(joints, estimate.noise.tolist(), strict=True)),
         correlation_s=dict(zip(joints, estimate.correlation_s.tolist(), strict=True)),
+        stamp_error_s=estimate.stamp_error_s,
         parameters=tuple(chosen),
         u=u,
         covariance=estimate.covariance,
         datasets=tuple(data),
         held_out=tuple(judged or data),
-        notes=_notes(estimate, joints, runs),
+        notes=(*_telemetry_notes(everything, telemetry), *_notes(estimate, joints, runs, values)),
     )
 
 
@@ -424,28 +449,32 @@ def _pooled(
     return [Gap(*np.sqrt(row / count)) for row in squares]
 
 
-def _value(parameter: Parameter, plant: Plant, estimate: Estimate, k: int, kept: bool, u: float) -> Value:
+def _value(parameter: Parameter, plant: Plant, estimate: Estimate, k: int, verdict: Verdict, u: float) -> Value:
     kind = parameter.definition
     nominal = kind.read(plant.model, plant, parameter.joints[0])
     deviation = TWO_SIDED_95 * math.sqrt(estimate.covariance[k, k])
-    information = float(estimate.information[k])
-    centre = u if kept else estimate.u[k]
-    if not kept:
-        verdict = "fell back"
-    elif information < UNDETERMINED:
-        verdict = "undetermined"
-    else:
-        verdict = "identifiable" if information >= IDENTIFIABLE else "weak"
+    centre = float(estimate.u[k]) if verdict.word == "fell back" else u
+    ends = [centre - deviation, centre + deviation]
+    halves = None
+    if verdict.contradictory:
+        ends += estimate.halves[:, k].tolist()
+        first, second = (parameter.value(nominal, half) for half in estimate.halves[:, k].tolist())
+        halves = (first, second)
+    other = None if verdict.tied_to is None else estimate.parameters[verdict.tied_to]
+    wanting = verdict.word in ("weak", "tied", "undetermined")
     return Value(
         name=parameter.name,
         unit=kind.unit,
         joints=() if kind.body else tuple(plant.joints[j] for j in parameter.joints),
         given=nominal,
         value=parameter.value(nominal, u),
-        low=float(np.clip(parameter.value(nominal, centre - deviation), kind.low, kind.high)),
-        high=float(np.clip(parameter.value(nominal, centre + deviation), kind.low, kind.high)),
-        verdict=verdict,
-        information=information,
+        low=float(np.clip(parameter.value(nominal, min(ends)), kind.low, kind.high)),
+        high=float(np.clip(parameter.value(nominal, max(ends)), kind.low, kind.high)),
+        verdict=verdict.word,
+        information=float(estimate.information[k]),
+        tied_to=None if other is None else other.name,
+        record_next=experiment(parameter.kind, None if other is None else other.kind) if wanting else "",
+        halves=halves,
     )
 
 
@@ -469,8 +498,43 @@ def _floor(runs: Sequence[Run], joints: Sequence[str]) -> float:
     return float(np.sqrt(np.mean(sensor_floor(runs, joints) ** 2)))
 
 
-def _notes(estimate: Estimate, joints: Sequence[str], runs: Sequence[Run]) -> tuple[str, ...]:
+def _telemetry_notes(runs: Sequence[Run], telemetry: Sequence[Telemetry]) -> Iterator[str]:
+    """What was left out as no measurement, and whose it was."""
+    spiked = [
+        f"{n} of pos.{joint} in {run.name}"
+        for run, found in zip(runs, telemetry, strict=True)
+        for joint, n in found.glitches.items()
+    ]
+    if spiked:
+        yield f"Samples that stand alone far from their neighbours are errors of telemetry and left out: {', '.join(spiked)}."
+    lost = [
+        f"{100 * n / len(run.t):.0f} % of pos.{joint} in {run.name}"
+        for run, found in zip(runs, telemetry, strict=True)
+        for joint, n in found.missing.items()
+        if n > MISSING * len(run.t)
+    ]
+    if lost:
+        yield f"Samples are missing: {', '.join(lost)}. `openant comms diagnose` names why."
+
+
+def _notes(estimate: Estimate, joints: Sequence[str], runs: Sequence[Run], values: Sequence[Value]) -> tuple[str, ...]:
     notes = []
+    torn = [
+        f"{value.name} ({value.halves[0]:.4g} and {value.halves[1]:.4g} {value.unit})"
+        for value in values
+        if value.halves
+    ]
+    if torn:
+        notes.append(
+            f"Two halves of the data contradict each other about {', '.join(torn)}: the robot changed between them, or the "
+            "model lacks what they differ in. One value for both is no average to rely on; the interval holds both. Fit the "
+            "halves apart and see `openant sysid compare`."
+        )
+    if estimate.stamp_error_s > STAMP_ERROR_S:
+        notes.append(
+            f"Time stamps miss the moments of sampling by {1e3 * estimate.stamp_error_s:.1f} ms (standard deviation, row by "
+            "row). Fast motion counts for less because of it."
+        )
     if not estimate.converged:
         notes.append("The optimiser stopped before its tolerance was met: read the values with care.")
     period = float(np.median(np.concatenate([np.diff(run.t) for run in runs])))

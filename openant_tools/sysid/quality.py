@@ -6,7 +6,8 @@ Each check names the run, the joint and what to do. All are about commands and p
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from openant_tools.recording.run import Run
 from openant_tools.robot.registers import PWM_FULL
 from openant_tools.sysid.kinds import KINDS, torque_limit
 
-__all__ = ["check_runs", "quantum"]
+__all__ = ["Telemetry", "check_runs", "quantum", "without_errors"]
 
 Array = NDArray[np.float64]
 
@@ -31,6 +32,71 @@ SATURATED = 0.9
 FOLLOWS, LOOSE = 0.9, 0.5
 #: rad beyond a joint's range that a soft stop and a zero offset may explain
 BEYOND_STOP_RAD = 0.5
+#: a sample lies outside of both neighbours by more than so many steps of the encoder, or times of what such distances
+#: usually are, to be an error of telemetry
+GLITCH_QUANTA, GLITCH_TIMES = 8, 8.0
+#: what a glitch leaves of itself in the line through its neighbours' own neighbours: a motion leaves far more
+GLITCH_ALONE = 0.25
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """What was left out of a run before it was fitted: joint → samples.
+
+    Attributes:
+        glitches: positions that stand alone, far from where the joint was just before and just after.
+        missing: positions that were not read: `ok` is 0, or there is none.
+    """
+
+    glitches: Mapping[str, int]
+    missing: Mapping[str, int]
+
+
+def without_errors(run: Run, joints: Sequence[str]) -> tuple[Run, Telemetry]:
+    """The run with positions that are none taken out (NaN): what was not read, and single-sample spikes.
+
+    A joint cannot go far and be back within two samples. A spike lies beyond both neighbours, and without it they lie on a
+    smooth line; a true peak bends that line as well, a late sample lies between its neighbours.
+    """
+    columns = dict(run.columns)
+    glitches, missing = {}, {}
+    for joint in joints:
+        pos = run.column(f"pos.{joint}").copy()
+        pos[run.column(f"ok.{joint}") == 0] = np.nan
+        lost = int((~np.isfinite(pos)).sum())
+        spikes = _spikes(run.t, pos, quantum(run, joint))
+        pos[spikes] = np.nan
+        if lost or len(spikes):
+            columns[f"pos.{joint}"] = pos
+            glitches[joint], missing[joint] = len(spikes), lost
+    return replace(run, columns=columns), Telemetry(
+        {joint: n for joint, n in glitches.items() if n}, {joint: n for joint, n in missing.items() if n}
+    )
+
+
+def _spikes(t: Array, pos: Array, step: float) -> NDArray[np.int64]:
+    """Rows of samples that stand alone."""
+    rows = np.flatnonzero(np.isfinite(pos))
+    if len(rows) < 7:
+        return rows[:0]
+    t, x = t[rows], pos[rows]
+
+    def off(i: NDArray[np.int64], before: int, after: int) -> Array:
+        """How far samples i are from the line between those so many places before and after them."""
+        a, b = i - before, i + after
+        share = (t[i] - t[a]) / (t[b] - t[a])
+        out: Array = x[i] - (1 - share) * x[a] - share * x[b]
+        return out
+
+    inner = np.arange(2, len(x) - 2)
+    alone = off(inner, 1, 1)
+    low, high = np.minimum(x[inner - 1], x[inner + 1]), np.maximum(x[inner - 1], x[inner + 1])
+    beyond = np.maximum(x[inner] - high, low - x[inner])
+    limit = max(GLITCH_QUANTA * step, GLITCH_TIMES * 1.4826 * float(np.median(np.abs(alone))))
+    left = np.maximum(np.abs(off(inner - 1, 1, 2)), np.abs(off(inner + 1, 2, 1)))
+    spike = (beyond > limit) & (left < GLITCH_ALONE * np.abs(alone) + 2 * step)
+    found: NDArray[np.int64] = rows[inner[spike]]
+    return found
 
 
 def quantum(run: Run, joint: str) -> float:

@@ -29,11 +29,18 @@ HORIZONS_S = (0.1, 0.2, 0.5, 1.0, 2.0)
 #: seconds shown around the worst moment of a joint
 WINDOW_S = 3.0
 
-_TONE: dict[str, Tone] = {"identifiable": "good", "weak": "warn", "undetermined": "", "fell back": "bad"}
+_TONE: dict[str, Tone] = {
+    "identifiable": "good",
+    "weak": "warn",
+    "tied": "warn",
+    "undetermined": "",
+    "fell back": "bad",
+}
 
 VERDICTS = """
 - **identifiable**: the data gave most of the value; the interval is theirs.
 - **weak**: between data and prior; more or other motion would settle it.
+- **tied**: the data tell it only together with the other that is named; knowing one would settle both.
 - **undetermined**: the data say nothing about it; it stays at its prior.
 - **fell back**: it did not beat the given model on held-out runs; the given value stays. The interval is of what the data would have said.
 """
@@ -72,6 +79,14 @@ def fit_report(result: Identification) -> Report:
     report.text("*From* and *to* are the ends of the 95 % interval." + VERDICTS)
     for note in result.notes:
         report.text(note)
+    wanted: dict[str, list[str]] = {}
+    for value in result.values:
+        if value.record_next:
+            wanted.setdefault(value.record_next, []).append(f"{value.name} ({value.words})")
+    if wanted:
+        report.section("What to record next").table(
+            ["protocol", "it would settle"], [[what, ", ".join(names)] for what, names in wanted.items()]
+        )
     report.section("Measured against simulated")
     for data in result.held_out:
         report.add(*_joints(result, data))
@@ -113,7 +128,7 @@ def _row(value: Value) -> list[object]:
         f"{value.low:.4g}",
         f"{value.high:.4g}",
         value.unit,
-        Mark(value.verdict, _TONE[value.verdict]),
+        Mark(value.words, _TONE[value.verdict]),
     ]
 
 
