@@ -104,7 +104,7 @@ def fit(
     width = max(len(value.name) for value in result.values)
     for value in result.values:
         click.echo(
-            f"{value.name:{width}}  {value.value:10.5g}  [{value.low:.4g}, {value.high:.4g}] {value.unit:10} {value.verdict}"
+            f"{value.name:{width}}  {value.value:10.5g}  [{value.low:.4g}, {value.high:.4g}] {value.unit:10} {value.words}"
         )
     judged = "runs left out in turn" if result.in_turn else "held-out runs"
     click.echo(

@@ -26,9 +26,18 @@ from openant_tools.sysid.fit import Dataset, Estimate, Problem, gaps, sensor_flo
 from openant_tools.sysid.kinds import ACTUATOR_LAG, SPEED_LIMIT
 from openant_tools.sysid.parameter import ACTION_DELAY, KINDS, Parameter, apply, buffered, choose, delays, restatements
 from openant_tools.sysid.quality import Telemetry, check_runs, without_errors
-from openant_tools.sysid.verdict import Verdict, Word, experiment, verdicts
+from openant_tools.sysid.verdict import IDENTIFIABLE, UNDETERMINED, Verdict, Word, experiment, verdicts
 
-__all__ = ["DEFAULT_KINDS", "Identification", "Value", "calibrated", "identify", "restated"]
+__all__ = [
+    "DEFAULT_KINDS",
+    "IDENTIFIABLE",
+    "UNDETERMINED",
+    "Identification",
+    "Value",
+    "calibrated",
+    "identify",
+    "restated",
+]
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
