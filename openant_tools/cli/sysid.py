@@ -7,6 +7,7 @@ import click
 from openant_tools.cli.sysid_bench import scale, tilt, torque
 from openant_tools.cli.sysid_compare import compare
 from openant_tools.cli.sysid_fit import fit
+from openant_tools.cli.sysid_plan import plan
 from openant_tools.cli.sysid_record import record
 
 __all__ = ["sysid"]
@@ -17,6 +18,7 @@ def sysid() -> None:
     """Record excitations of the robot and fit a calibrated model to them."""
 
 
+sysid.add_command(plan)
 sysid.add_command(record)
 sysid.add_command(fit)
 for command in (compare, torque, scale, tilt):

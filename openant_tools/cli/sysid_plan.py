@@ -1,0 +1,246 @@
+"""`openant sysid plan`: what recordings will tell, before anything moves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from openant_tools.cli.options import json_option, report_option, robot_option
+from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, robot_of
+
+if TYPE_CHECKING:
+    from openant_tools.sysid.plan import Plan
+
+__all__ = ["plan"]
+
+
+@click.command()
+@click.option(
+    "--protocol", "name", metavar="NAME", help=f"What to simulate; see `record --list`.  [default: {DEFAULT_PROTOCOL}]"
+)
+@click.option("--plan", "plan_file", type=click.Path(path_type=Path), metavar="FILE", help="Simulate such a file.")
+@click.option(
+    "--model",
+    type=click.Path(path_type=Path),
+    metavar="M.xml",
+    help="Default: the robot's model, else the standard kit's.",
+)
+@robot_option
+@click.option(
+    "--kinds", multiple=True, metavar="KIND", help="Parameters of interest. Repeatable. Default: a fit's own."
+)
+@click.option(
+    "--tie",
+    type=click.Choice(["joint", "servo", "all"]),
+    default="joint",
+    show_default=True,
+    help="One value a joint, one a servo model, or one for all.",
+)
+@click.option("--setup", type=click.Choice(["stand", "floor"]), help="Only what is played there. Default: all of it.")
+@click.option("--seconds", type=float, metavar="S", help="How long to play. Default: the protocol's own time.")
+@click.option(
+    "--rate",
+    "rate_hz",
+    type=click.FloatRange(10, 1000),
+    default=100.0,
+    show_default=True,
+    metavar="HZ",
+    help="Commands and reads a second.",
+)
+@click.option("--seed", default=0, show_default=True, help="Chance of the protocol, and of what --optimise draws.")
+@click.option(
+    "--noise",
+    "noise_mrad",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="MRAD",
+    help="What a fit will leave on the stand.  [default: 1.5, as the virtual robot; real ones leave 3 to 20]",
+)
+@click.option(
+    "--memory",
+    "memory_s",
+    type=click.FloatRange(min=0),
+    metavar="S",
+    help="For how long such an error lasts.  [default: 0.05]",
+)
+@click.option(
+    "--optimise", is_flag=True, help="Choose the motions on the stand so that they tell most in the same time."
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Write the plan, for `record --plan`.",
+)
+@json_option
+@report_option
+def plan(
+    name: str | None,
+    plan_file: Path | None,
+    model: Path | None,
+    robot: Path | None,
+    kinds: tuple[str, ...],
+    tie: str,
+    setup: str | None,
+    seconds: float | None,
+    rate_hz: float,
+    seed: int,
+    noise_mrad: float | None,
+    memory_s: float | None,
+    optimise: bool,
+    out: Path | None,
+    json_file: Path | None,
+    report: Path | None,
+) -> int:
+    """Simulate recordings before they are made: what each parameter's interval will be, and how hard the robot works.
+
+    With --optimise the motions on the stand are chosen anew: of many random ones within the robot's limits, those that
+    together determine the parameters best (D-optimal).
+
+    \b
+      openant sysid plan --robot my-ant --report plan
+      openant sysid plan --robot my-ant --optimise --setup stand --out best.toml
+      openant sysid record --plan best.toml --out run.mcap --robot my-ant
+
+    Exit code 1: it must not be played, since the robot would touch itself or fall.
+    """
+    import json
+
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from openant_tools.errors import BadInput
+    from openant_tools.files import write_text
+    from openant_tools.sysid.design import design
+    from openant_tools.sysid.plan import Planned, Residual, make_plan
+    from openant_tools.sysid.plan_file import read_plan, write_plan
+    from openant_tools.sysid.plan_report import plan_report
+    from openant_tools.sysid.protocols import CommandSpace, protocols
+
+    folder = robot_of(robot, needed=False)
+    described = None if folder is None else folder.config()
+    limits = None if described is None else {m.joint: (m.min_rad, m.max_rad) for m in described.motors.values()}
+    if model is None:
+        if folder is None:
+            from openant_tools.robot.mjcf import nominal_model_path
+
+            model = nominal_model_path()
+        else:
+            model = folder.model_path(described)
+    if plan_file is not None:
+        if name is not None or seconds is not None:
+            raise BadInput("a plan file says what to play", remedy="leave out --protocol and --seconds")
+        played = tuple(one for one in read_plan(plan_file) if setup in (None, one.setup))
+        if not played:
+            raise BadInput(f"the plan has nothing for the {setup}", where=plan_file, remedy="leave out --setup")
+    else:
+        played = protocols(name or DEFAULT_PROTOCOL, seconds, setup)
+    assumed = Residual()
+    asked = Planned(
+        model,
+        CommandSpace.around_home(limits),
+        rate_hz,
+        seed,
+        kinds or None,
+        tie,
+        {} if described is None else {m.joint: m.servo.name for m in described.motors.values()},
+        Residual(
+            rad=assumed.rad if noise_mrad is None else 1e-3 * noise_mrad,
+            memory_s=assumed.memory_s if memory_s is None else memory_s,
+        ),
+    )
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    notes = []
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("planning", total=1.0)
+
+        def step(what: str, done: float) -> None:
+            bar.update(task, description=what, completed=done)
+
+        result = make_plan(asked, played, step)
+        if optimise:
+            stand = [one for one in played if one.setup == "stand"]
+            if not stand:
+                raise BadInput("there is nothing on the stand to optimise", remedy="leave out --setup floor")
+            found = design(asked, sum(one.seconds for one in stand), step)
+            better = make_plan(asked, (found.protocol, *(one for one in played if one.setup == "floor")), step)
+            gain = better.nats - result.nats
+            of = stand[0].name
+            if gain > 0 and not better.objections:
+                notes.append(
+                    f"of {found.considered} motions ({found.refused} refused), {len(found.protocol.segments)} were chosen: "
+                    f"intervals narrower by {100 * _narrower(result, better):.0f} % in the mean than of {of}"
+                )
+                result = better
+            else:
+                notes.append(f"none of {found.considered} motions together say more than {of}: it stays")
+    _print(result)
+    for note in notes:
+        click.echo(note)
+    for note in result.notes:
+        click.echo(note)
+    for objection in result.objections:
+        click.echo(f"do not play it: {objection}")
+    if out is not None:
+        made = tuple(one.protocol for one in result.forecasts)
+        write_plan(
+            out, made, f"made by `openant sysid plan` for {model.name}; play it with `openant sysid record --plan`"
+        )
+        click.echo(f"wrote {out}", err=True)
+    if json_file is not None:
+        write_text(json_file, json.dumps(result.as_json(), indent=1, ensure_ascii=False) + "\n")
+    if report is not None:
+        click.echo(f"wrote {plan_report(result).write_folder(report)}", err=True)
+    return 1 if result.objections else 0
+
+
+def _narrower(before: Plan, after: Plan) -> float:
+    """By what share intervals shrink, geometric mean over the parameters that both know of."""
+    import math
+
+    widths = {one.name: one.high - one.low for one in before.expectations}
+    ratios = [
+        math.log((one.high - one.low) / widths[one.name])
+        for one in after.expectations
+        if widths.get(one.name, 0.0) > 0 and one.high > one.low
+    ]
+    return 1 - math.exp(sum(ratios) / len(ratios)) if ratios else 0.0
+
+
+def _print(result: Plan) -> None:
+    from math import degrees
+
+    for one in result.forecasts:
+        protocol = one.protocol
+        heading = f" at {degrees(protocol.heading_rad):.0f}°" if protocol.heading_rad else ""
+        fast = max(one.peaks, key=lambda peak: peak.speed_rad_s / peak.no_load_rad_s)
+        strong = max(one.peaks, key=lambda peak: peak.saturated)
+        moves = (
+            f"; leans {degrees(one.lean_rad):.0f}°, goes {100 * one.travel_m:.0f} cm"
+            if protocol.setup == "floor"
+            else ""
+        )
+        near = f"{1e3 * one.clearance_m:.0f} mm ({', '.join(one.nearest)})" if one.nearest else "far"
+        click.echo(
+            f"{protocol.name}, {protocol.setup}{heading}: {protocol.seconds:.0f} s; fastest {fast.joint} {fast.speed_rad_s:.1f} "
+            f"of {fast.no_load_rad_s:.1f} rad/s; {strong.joint} {100 * strong.saturated:.0f} % at its torque limit, largest "
+            f"{max(peak.torque_nm for peak in one.peaks):.2f} N·m; nearest to itself {near}{moves}"
+        )
+    width = max(len(one.name) for one in result.expectations)
+    click.echo(f"{'':{width}}  {'expected':>9}  {'95 % interval':21}  {'prior':21}")
+    for value in result.expectations:
+        tied = f" {value.tied_to} ({value.correlation:+.2f})" if value.verdict == "tied" else ""
+        click.echo(
+            f"{value.name:{width}}  {value.nominal:9.4g}  {f'[{value.low:.4g}, {value.high:.4g}]':21}  "
+            f"{f'[{value.prior_low:.4g}, {value.prior_high:.4g}]':21}  {value.unit:10} {value.verdict}{' to' if tied else ''}{tied}"
+        )
+    counts = {
+        verdict: sum(one.verdict == verdict for one in result.expectations)
+        for verdict in ("identifiable", "tied", "weak")
+    }
+    click.echo(
+        f"{counts['identifiable']} of {len(result.expectations)} identifiable, {counts['weak']} weak, {counts['tied']} tied, in "
+        f"{result.seconds:.0f} s; if a fit leaves {1e3 * result.asked.residual.rad:g} mrad"
+    )
