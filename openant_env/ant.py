@@ -25,6 +25,7 @@ from openant_env.observations import ORDERS, layout
 from openant_env.rendering import Painter
 from openant_env.robots import DT_S, SimulatedRobot, simulated_robot
 from openant_env.tasks import BackAndForth, make_task
+from openant_tools.effects.acting import Acting
 from openant_tools.errors import BadInput
 from openant_tools.model.rollout import fill_setpoints
 
@@ -114,6 +115,7 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         # MuJoCo would start a simulation that has come apart afresh without a word.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.data = mujoco.MjData(self.model)
+        self._acting = Acting(self._plant, self.data, self.robot.effects) if self.robot.effects else None
         self.dt = self.robot.dt_s if dt is None else float(dt)
         self._substeps = _whole_steps(self.dt, self.model.opt.timestep, self.robot.model_path)
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self.dt))}
@@ -200,7 +202,7 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         data.qpos[self._free_qpos : self._free_qpos + 3] = (0.0, 0.0, START_HEIGHT_M)
         data.qpos[self._plant.qpos] = rest
         fill_setpoints(self._plant, data, rest)
-        mujoco.mj_step(model, data, nstep=max(1, round(SETTLE_S / model.opt.timestep)))
+        self._advance(max(1, round(SETTLE_S / model.opt.timestep)))
         at_rest = np.abs(data.qvel).max() < RESTLESS  # false for NaN
         if not at_rest or self._torso_rotation[8] < 0.0:
             raise BadInput(
@@ -256,6 +258,12 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         hx, hy = _unit(self._torso_rotation[0], self._torso_rotation[3])
         return self._observe(hx, hy), self._info(torso_x, torso_y, hx, hy)
 
+    def _advance(self, steps: int) -> None:
+        if self._acting is None:
+            mujoco.mj_step(self.model, self.data, nstep=steps)
+        else:
+            self._acting.step(steps)
+
     def step(self, action: NDArray[Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Command the joints for `dt` seconds.
 
@@ -282,7 +290,7 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         if not math.isfinite(command.dot(command)):
             raise BadInput(f"an action is not finite: {action}", remedy="look for NaN in the agent's networks")
         self._ctrl[self._setpoints] = command
-        mujoco.mj_step(self.model, self.data, nstep=self._substeps)
+        self._advance(self._substeps)
         self._seconds += self.dt
 
         x, y, z = self._torso_position.tolist()

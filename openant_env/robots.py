@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import mujoco
@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_env.observations import Layout
+from openant_tools.effects.acting import values_of
+from openant_tools.effects.rollout import EffectValues
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.robot.config import ACTION_PRESETS, ActionRange, Effect
@@ -44,6 +46,7 @@ class SimulatedRobot:
         dt_s: s, the length of a step unless someone asks for another.
         measured_bounds: name of an observation → (low, high), as far as they were measured.
         folder: the robot's folder, None for the nominal one.
+        effects: what acts beside the model.
     """
 
     model_path: Path
@@ -53,6 +56,7 @@ class SimulatedRobot:
     dt_s: float
     measured_bounds: Mapping[str, tuple[float, float]]
     folder: Path | None
+    effects: EffectValues = field(default_factory=dict)
     joints: tuple[str, ...] = tuple(JOINTS)
 
     def load(self) -> Plant:
@@ -121,7 +125,8 @@ def simulated_robot(
         raise BadInput("a robot's folder says itself which kit it is", where=robot, remedy="leave kit out")
     folder = RobotFolder.at(robot)
     config = folder.config()
-    _refuse_effects([effect for effect in config.effects if effect.enabled], effects, folder)
+    present = [effect for effect in config.effects if effect.enabled]
+    acting = values_of(_chosen(present, effects, folder), tuple(JOINTS), folder.config_file)
     motors = [config.motors[joint] for joint in JOINTS]
     return SimulatedRobot(
         model_path=folder.model_path(config),
@@ -131,26 +136,20 @@ def simulated_robot(
         dt_s=config.timing.dt_s,
         measured_bounds=config.observation,
         folder=folder.path,
+        effects=acting,
     )
 
 
-def _refuse_effects(present: Sequence[Effect], wanted: bool | Sequence[str], folder: RobotFolder) -> None:
-    """Entries of robot.toml are what the MJCF cannot carry; leaving them out takes someone's word."""
-    if wanted is False:
-        return
+def _chosen(present: Sequence[Effect], wanted: bool | Sequence[str], folder: RobotFolder) -> list[Effect]:
+    """The entries of robot.toml that are to act."""
+    if isinstance(wanted, bool):
+        return list(present) if wanted else []
     names = {effect.effect for effect in present}
-    if not isinstance(wanted, bool):
-        strangers = sorted(set(wanted) - names)
-        if strangers:
-            raise BadInput(
-                f"no enabled effect is called {strangers[0]}",
-                where=folder.config_file,
-                remedy=f"it has {', '.join(sorted(names)) or 'none'}",
-            )
-        names &= set(wanted)
-    if names:
+    strangers = sorted(set(wanted) - names)
+    if strangers:
         raise BadInput(
-            f"the effect{'s' if len(names) > 1 else ''} {', '.join(sorted(names))} cannot act in this simulation yet",
+            f"no enabled effect is called {strangers[0]}",
             where=folder.config_file,
-            remedy="simulate without: effects=False, `--no-effects`, or enabled = false in the file",
+            remedy=f"it has {', '.join(sorted(names)) or 'none'}",
         )
+    return [effect for effect in present if effect.effect in wanted]

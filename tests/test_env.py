@@ -360,13 +360,13 @@ def test_an_argument_that_cannot_be_is_refused_in_one_line(options, words):
 
 def test_effects_that_do_not_act_yet_are_refused_by_name_unless_left_out(robot):
     robot.update(
-        effects=[Effect("load_friction", ("knee_fl",), {"coefficient": 0.1}), Effect("voltage_sag", enabled=False)]
+        effects=[Effect("thermal_derating", ("knee_fl",), {"gain": 0.1}), Effect("voltage_sag", enabled=False)]
     )
-    with pytest.raises(BadInput, match=r"robot\.toml: the effect load_friction cannot act .* `--no-effects`"):
+    with pytest.raises(BadInput, match=r"robot\.toml: the effect thermal_derating cannot act .* `--no-effects`"):
         make(robot=robot.path)
-    with pytest.raises(BadInput, match="the effect load_friction cannot act"):
-        make(robot=robot.path, effects=["load_friction"])
-    with pytest.raises(BadInput, match="no enabled effect is called voltage_sag → it has load_friction"):
+    with pytest.raises(BadInput, match="the effect thermal_derating cannot act"):
+        make(robot=robot.path, effects=["thermal_derating"])
+    with pytest.raises(BadInput, match="no enabled effect is called voltage_sag → it has thermal_derating"):
         make(robot=robot.path, effects=["voltage_sag"])
     make(robot=robot.path, effects=False)
     make(robot=robot.path, effects=[])
@@ -441,3 +441,21 @@ def test_names_of_an_observation_are_those_of_run_tables():
     model = mujoco.MjModel.from_xml_path(str(nominal_model_path()))
     assert all(model.sensor(name).id >= 0 for name in names[:16])
     assert Path(nominal_model_path()).is_file()
+
+
+def test_effects_of_the_robots_file_act(robot):
+    """Loaded gears move another way; knees that are not named, and a robot without the entry, as before."""
+
+    def walk() -> np.ndarray:
+        env = make(robot=robot.path)
+        env.reset(seed=3)
+        rng = np.random.default_rng(0)
+        return np.array([env.step(rng.uniform(-1, 1, 8))[0] for _ in range(20)])
+
+    before = walk()
+    robot.update(effects=[Effect("load_friction", ("knee_fl",), {"coefficient": 0.3})])
+    rubbed = walk()
+    assert np.abs(rubbed - before).max() > 0.01
+    np.testing.assert_array_equal(rubbed, walk())
+    robot.update(effects=[])
+    np.testing.assert_array_equal(before, walk())

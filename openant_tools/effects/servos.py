@@ -1,0 +1,177 @@
+"""Servos of compiled models, laid open for laws: the same for a batch of simulations and for a single one."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from mujoco.batch import MODEL_FIELDS, Batch
+from numpy.typing import NDArray
+
+from openant_tools.effects.step import Law, Step
+from openant_tools.model.plant import KD, KP, MOTOR_CONSTANT, RESISTANCE, TORQUE_OFF_GROUP, VMAX, Plant, is_motor
+
+__all__ = ["Servos", "batch_of", "single"]
+
+Array = NDArray[np.float64]
+#: setpoint filters of a position servo (`timeconst`): the servo follows their state instead of its control
+FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Live arrays of n models and their states; the first axis is the simulation's."""
+
+    qpos: Array
+    qvel: Array
+    act: Array
+    ctrl: Array
+    qfrc_applied: Array
+    qfrc_bias: Array
+    actuator_group: NDArray[np.int32]
+    actuator_gainprm: Array
+    actuator_biasprm: Array
+    actuator_forcerange: Array
+    dof_frictionloss: Array
+
+
+class Servos:
+    """The joints of n simulations of one plant, and what laws do to them.
+
+    Args:
+        plant: whose servos.
+        base: the model that all share, but for the fields.
+        fields: what the laws read and write.
+    """
+
+    def __init__(self, plant: Plant, base: mujoco.MjModel, fields: Fields) -> None:
+        self.plant, self._fields, self._n = plant, fields, len(fields.qpos)
+        i = plant.actuator
+        self._motor = np.array([is_motor(base, int(k)) for k in i])
+        self._limited = np.array([bool(base.actuator_forcelimited[k]) for k in i])
+        fixed = int(mujoco.mjtGain.mjGAIN_FIXED)
+        self._fixed = np.array([int(base.actuator_gaintype[k]) == fixed for k in i])
+        self._filtered = np.array([int(base.actuator_dyntype[k]) in FILTERS for k in i])
+        self._act = np.where(self._filtered, base.actuator_actadr[i], 0)
+        self._group = fields.actuator_group[:, i].copy()
+        self._on = np.ones((self._n, len(i)), bool)
+        self._rest = self._read()
+        self._changed = dict.fromkeys(("stiffness", "velocity_gain", "limit"), False)
+
+    @property
+    def state(self) -> tuple[Array, Array]:
+        """Positions (rad) and velocities (rad/s) now, (n, joints) each."""
+        return self._fields.qpos[:, self.plant.qpos], self._fields.qvel[:, self.plant.dof]
+
+    def switch(self, rows: slice, off: NDArray[np.bool_]) -> None:
+        """Torque off at the joints marked, on at the others, in these simulations."""
+        self._on[rows] = ~off
+        self._fields.actuator_group[rows, self.plant.actuator] = np.where(off, TORQUE_OFF_GROUP, self._group[rows])
+
+    def prepare(
+        self, laws: Sequence[Law], time: Array, state: tuple[Array, Array], supply: Array | None = None
+    ) -> None:
+        """Let the laws act on what the next step is computed from.
+
+        Args:
+            laws: in the order in which they act.
+            time: (n,) s since the start.
+            state: what `state` says now.
+            supply: (n, joints) shares of the nominal voltage; None for all of it.
+        """
+        plant, rest, fields = self.plant, self._rest, self._fields
+        share = 1.0 if supply is None else supply
+        setpoint = fields.ctrl[:, plant.ctrl]
+        view = Step(
+            dt=plant.timestep,
+            time=time,
+            position=state[0],
+            velocity=state[1],
+            load=fields.qfrc_bias[:, plant.dof],
+            on=self._on,
+            setpoint=np.where(self._filtered, fields.act[:, self._act], setpoint) if self._filtered.any() else setpoint,
+            stiffness=rest["stiffness"] * share,
+            velocity_gain=rest["velocity_gain"] * share,
+            limit=rest["limit"] * share,
+            back_emf=rest["back_emf"],
+            friction=rest["friction"].copy(),
+            torque=np.zeros(rest["friction"].shape),
+        )
+        for law in laws:
+            law(view)
+        fields.ctrl[:, plant.ctrl] = np.where(self._filtered, setpoint, view.setpoint)
+        fields.dof_frictionloss[:, plant.dof] = view.friction
+        fields.qfrc_applied[:, plant.dof] = view.torque
+        changed = {"stiffness": view.stiffness, "velocity_gain": view.velocity_gain, "limit": view.limit}
+        for name, value in changed.items():
+            if self._changed[name] or not np.array_equal(value, rest[name]):
+                self._changed[name] = True
+                for j in range(len(plant.joints)):
+                    self._put(name, j, value[:, j])
+
+    def _read(self) -> dict[str, Array]:
+        i, motor, fields = self.plant.actuator, self._motor, self._fields
+        gain, bias, force = (
+            fields.actuator_gainprm[:, i],
+            fields.actuator_biasprm[:, i],
+            fields.actuator_forcerange[:, i, 1],
+        )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            back_emf = np.where(motor, gain[..., MOTOR_CONSTANT] ** 2 / gain[..., RESISTANCE], 0.0)
+            stall = gain[..., MOTOR_CONSTANT] * gain[..., VMAX] / gain[..., RESISTANCE]
+        return {
+            "stiffness": np.where(motor, gain[..., KP], -bias[..., 1]),
+            "velocity_gain": np.where(motor, gain[..., KD] - back_emf, -bias[..., 2]),
+            "limit": np.where(motor, stall, np.where(self._limited, force, np.inf)),
+            "back_emf": back_emf,
+            "friction": fields.dof_frictionloss[:, self.plant.dof].copy(),
+        }
+
+    def _put(self, name: str, j: int, value: Array) -> None:
+        """Write one number of joint j's servo into the models of all simulations."""
+        i, motor = int(self.plant.actuator[j]), self._motor[j]
+        gain, bias = self._fields.actuator_gainprm[:, i], self._fields.actuator_biasprm[:, i]
+        if name == "stiffness":
+            if motor:
+                gain[:, KP] = value
+            else:
+                if self._fixed[j]:
+                    gain[:, 0] *= value / -bias[:, 1]
+                bias[:, 1] = -value
+        elif name == "velocity_gain":
+            if motor:
+                gain[:, KD] = value + self._rest["back_emf"][:, j]
+            else:
+                bias[:, 2] = -value
+        elif motor:
+            gain[:, VMAX] = value * gain[:, RESISTANCE] / gain[:, MOTOR_CONSTANT]
+        elif self._limited[j]:
+            self._fields.actuator_forcerange[:, i] = np.stack([-value, value], axis=1)
+
+
+def batch_of(plant: Plant, models: Sequence[mujoco.MjModel], copies: int, nthread: int = 0) -> tuple[Batch, Servos]:
+    """`copies` simulations of each of `models` (variants of the plant's), the variants of each copy side by side."""
+    base = copy.copy(models[0])
+    base.opt.disableactuator |= 1 << TORQUE_OFF_GROUP
+    batch = Batch(base, copies * len(models), nthread)
+    for name in sorted(MODEL_FIELDS):
+        if not hasattr(base, name):
+            continue  # options
+        values = np.array([getattr(model, name) for model in models])
+        if len(models) > 1 and (values != values[0]).any():
+            field = batch.expand(name)
+            field[:] = np.tile(values.reshape(len(models), *field.shape[1:]), (copies, *[1] * (field.ndim - 1)))
+    states = {name: batch.bind(name) for name in ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "qfrc_bias")}
+    changed = ("actuator_group", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "dof_frictionloss")
+    fields = Fields(**states, **{name: batch.expand(name) for name in changed})
+    return batch, Servos(plant, base, fields)
+
+
+def single(plant: Plant, model: mujoco.MjModel, data: mujoco.MjData) -> Servos:
+    """One simulation; the laws write into `model` itself."""
+    states = {name: getattr(data, name)[None] for name in ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "qfrc_bias")}
+    changed = ("actuator_group", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "dof_frictionloss")
+    return Servos(plant, model, Fields(**states, **{name: getattr(model, name)[None] for name in changed}))

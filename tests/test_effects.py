@@ -1,0 +1,166 @@
+"""Effects between steps: that they change nothing where they are absent, act as they say, and act alike everywhere."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from plants import drive, pendulum, sweep, write
+
+from openant_tools.effects.acting import Acting, values_of
+from openant_tools.effects.catalogue import catalogue, effect
+from openant_tools.effects.rollout import rollout
+from openant_tools.errors import BadInput
+from openant_tools.model.plant import Plant, Setup, load_plant
+from openant_tools.model.rollout import Rollouts
+from openant_tools.recording.run import Facts, Run
+from openant_tools.robot.config import Effect as Entry
+from openant_tools.robot.joints import JOINT_NAMES
+from openant_tools.robot.mjcf import nominal_model_path
+
+#: a size of each parameter that shows
+SHOWING = {
+    ("asymmetric_friction", "positive_nm"): 0.2,
+    ("cogging", "amplitude_nm"): 0.2,
+    ("dead_zone", "width_rad"): 0.1,
+    ("load_friction", "coefficient"): 0.3,
+    ("stribeck_friction", "static_nm"): 0.2,
+    ("viscous_nonlinear", "coefficients"): 0.05,
+    ("voltage_sag", "resistance_ohm"): 2.0,
+}
+
+
+def recorded(plant: Plant, seconds: float = 2.0, limp: bool = False) -> Run:
+    """What the plant itself does, its first joint without torque from some time on if wanted."""
+    t, joints = np.arange(0.0, seconds, 0.01), plant.joints
+    torque = np.ones((len(t), len(joints)))
+    torque[t > 1.2, 0] = 0.0 if limp else 1.0
+    columns = drive(copy.copy(plant.model), joints, t, sweep(t, len(joints), 0.4), torque=torque)
+    return Run("drive", Facts(joints=joints), t, columns)
+
+
+@pytest.fixture
+def servo(tmp_path: Path) -> Plant:
+    return load_plant(write(tmp_path / "pendulum.xml", pendulum()))
+
+
+@pytest.mark.parametrize("horizon", [None, 0.5])
+@pytest.mark.parametrize("kind", ["pendulum", "motor", "ant"])
+def test_without_effects_every_sample_is_that_of_the_plain_rollout(
+    kind: str, horizon: float | None, tmp_path: Path
+) -> None:
+    path = nominal_model_path("standard") if kind == "ant" else write(tmp_path / "pendulum.xml", pendulum())
+    plant = load_plant(path, JOINT_NAMES if kind == "ant" else None, Setup.STAND, electrical=kind == "motor")
+    rollouts = Rollouts(plant, [recorded(plant, limp=True), recorded(plant, 1.3)], horizon)
+    stiffer = rollouts.lean(plant.model)
+    stiffer.opt.disableflags = plant.model.opt.disableflags
+    stiffer.dof_damping[plant.dof] *= 1.3
+    delays = np.array([np.zeros(len(plant.joints)), np.full(len(plant.joints), 0.013)])
+    plain = rollouts([plant.model, stiffer], delays)
+    stepped = rollout(rollouts, [plant.model, stiffer], [{}, {}], delays)
+    # Delayed commands are averaged in other portions, which moves the last digit.
+    np.testing.assert_allclose(stepped.pos, plain.pos, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(stepped.vel, plain.vel, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("key", SHOWING, ids=lambda key: key[0])
+def test_one_simulation_steps_as_a_batch_does(key: tuple[str, str], servo: Plant) -> None:
+    """An environment behaves as the fit and the diagnosis have simulated, to the last bit."""
+    run = recorded(servo, 1.0)
+    rollouts = Rollouts(servo, [run])
+    values = {key: np.array([SHOWING[key]])}
+    batch = rollout(rollouts, [servo.model] * 2, [values, {}])
+    assert np.abs(batch.pos[0] - batch.pos[1]).max() > 1e-3, "the effect does not show"
+
+    model = rollouts.lean(servo.model)
+    data = mujoco.MjData(model)
+    segment = rollouts.segments[0]
+    mujoco.mj_setState(model, data, segment.state, int(mujoco.mjtState.mjSTATE_INTEGRATION))
+    mujoco.mj_forward(model, data)
+    acting = Acting(Plant(**{**vars(servo), "model": model}), data, values)
+    path = [data.qpos[0]]
+    for control in segment.control:
+        data.ctrl[:] = control
+        acting.step(1)
+        path.append(data.qpos[0])
+    at = np.array(path)
+    sampled = at[segment.step] * (1 - segment.fraction) + at[segment.step + 1] * segment.fraction
+    np.testing.assert_array_equal(sampled, batch.pos[0, :, 0])
+
+
+def held_up(servo: Plant, values: dict[tuple[str, str], float]) -> float:
+    """rad by which the servo sags under its load when it comes from below and stays."""
+    t = np.arange(0.0, 3.0, 0.01)
+    command = np.where(t < 0.1, 0.0, 1.0)
+    run = Run("step", Facts(joints=servo.joints), t, {"cmd.joint": command, "pos.joint": np.zeros_like(t)})
+    found = rollout(Rollouts(servo, [run]), [servo.model], [{key: np.array([value]) for key, value in values.items()}])
+    return float(1.0 - found.pos[0, -1, 0])
+
+
+def test_loaded_gears_hold_what_the_motor_does_not(servo: Plant) -> None:
+    """At rest, coming from below: kp · sag = load + friction, friction ≤ c · kp · sag. So sag grows by up to 1 / (1 − c)."""
+    free = held_up(servo, {})
+    rubbed = held_up(servo, {("load_friction", "coefficient"): 0.3})
+    assert free < rubbed <= 1.02 * free / 0.7
+
+
+def test_a_dead_zone_leaves_its_half_width_open(servo: Plant) -> None:
+    assert held_up(servo, {("dead_zone", "width_rad"): 0.1}) - held_up(servo, {}) == pytest.approx(0.05, abs=0.01)
+
+
+def test_gains_follow_the_logged_voltage(servo: Plant) -> None:
+    """With the nominal supply everywhere nothing changes; with half of it the servo sags twice as far."""
+    t = np.arange(0.0, 3.0, 0.01)
+
+    def sag(volts: float) -> float:
+        columns = {
+            "cmd.joint": np.full_like(t, 0.8),
+            "pos.joint": np.zeros_like(t),
+            "volt.joint": np.full_like(t, volts),
+        }
+        run = Run("hold", Facts(joints=servo.joints, supply_v=12.0), t, columns)
+        found = rollout(Rollouts(servo, [run]), [servo.model], [{}], measured_supply=True)
+        return float(0.8 - found.pos[0, -1, 0])
+
+    model = servo.model
+    friction = float(model.dof_frictionloss[0]) / 8.0
+    assert sag(6.0) + friction == pytest.approx(2 * (sag(12.0) + friction), rel=0.15)
+
+
+def test_every_effect_says_what_it_is() -> None:
+    assert {name for name, _ in SHOWING} == set(catalogue())
+    for one in catalogue().values():
+        assert one.words
+        assert one.quantities
+    with pytest.raises(BadInput, match="no effect is called 'load_fricton' → did you mean 'load_friction'"):
+        effect("load_fricton")
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        (Entry("thermal_derating", "all", {}), "thermal_derating cannot act in this simulation yet"),
+        (Entry("load_friction", "all", {"share": 0.1}), "load_friction has no parameter 'share' → it has coefficient"),
+        (Entry("load_friction", "all", {"coefficient": "much"}), "load_friction.coefficient is no number: 'much'"),
+        (Entry("load_friction", "all", {"coefficient": -0.1}), "= -0.1 .* is not physical → it lies between 0 and 0.9"),
+    ],
+)
+def test_entries_that_mean_nothing_are_named(entry: Entry, words: str) -> None:
+    with pytest.raises(BadInput, match=words):
+        values_of([entry], ["a", "b"])
+
+
+def test_entries_act_where_they_say() -> None:
+    entries = [
+        Entry("load_friction", ("b",), {"coefficient": 0.1}),
+        Entry("dead_zone", "all", {"width_rad": 0.02}),
+        Entry("cogging", "all", {"amplitude_nm": 1.0}, enabled=False),
+    ]
+    values = values_of(entries, ["a", "b"])
+    assert {key: value.tolist() for key, value in values.items()} == {
+        ("load_friction", "coefficient"): [0.0, 0.1],
+        ("dead_zone", "width_rad"): [0.02, 0.02],
+    }
