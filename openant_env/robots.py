@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_env.observations import Layout
-from openant_tools.effects.acting import values_of
+from openant_tools.effects.entries import values_of
 from openant_tools.effects.rollout import EffectValues
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, load_plant

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import copy
+import tomllib
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
-from plants import drive, pendulum, sweep, write
+from plants import ENCODER_RAD, drive, pendulum, sweep, write
 
-from openant_tools.effects.acting import Acting, values_of
+from openant_tools.effects.acting import Acting
 from openant_tools.effects.catalogue import catalogue, effect
+from openant_tools.effects.entries import as_toml, entries_of, values_of
 from openant_tools.effects.rollout import rollout
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, load_plant
@@ -20,6 +22,8 @@ from openant_tools.recording.run import Facts, Run
 from openant_tools.robot.config import Effect as Entry
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
+from openant_tools.sysid.identify import identify
+from openant_tools.sysid.result import write_fit
 
 #: a size of each parameter that shows
 SHOWING = {
@@ -164,3 +168,62 @@ def test_entries_act_where_they_say() -> None:
         ("load_friction", "coefficient"): [0.0, 0.1],
         ("dead_zone", "width_rad"): [0.02, 0.02],
     }
+
+
+def rubbing_pendulum(t: np.ndarray, command: np.ndarray, coefficient: float) -> np.ndarray:
+    """Positions (n,) of the pendulum of `plants` with 0.2 ms steps and friction as a torque budget: nothing of MuJoCo."""
+    inertia, weight = 0.006 + 0.3 * 0.01 + 0.4 * 0.3 * 0.04**2 + 0.02 * 0.1**2 / 3, 9.81 * (0.3 * 0.1 + 0.02 * 0.05)
+    h, q, v, out = 2e-4, float(command[0]), 0.0, []
+    for k in range(len(t)):
+        out.append(q)
+        for _ in range(round(0.01 / h)):
+            motor = float(np.clip(8.0 * (command[k] - q), -1.5, 1.5))
+            load = weight * np.sin(q)
+            budget = 0.03 + coefficient * max(abs(motor), abs(load))
+            free = motor - load - 0.12 * v
+            stop = -(inertia * v / h + free)  # what would bring it to rest within this step
+            v += h * (free + float(np.clip(stop, -budget, budget))) / inertia
+            q += h * v
+    return np.array(out)
+
+
+def test_load_friction_of_another_simulation_is_identified_and_written(tmp_path: Path) -> None:
+    path = write(tmp_path / "pendulum.xml", pendulum())
+    t = np.arange(0.0, 5.0, 0.01)
+    runs = []
+    for k in range(3):
+        command = sweep(t, 1 + k, 0.9)[:, -1:]
+        position = rubbing_pendulum(t, command[:, 0], 0.25)
+        position = np.round(position / ENCODER_RAD) * ENCODER_RAD
+        runs.append(Run(f"run{k}", Facts(joints=("joint",)), t, {"cmd.joint": command[:, 0], "pos.joint": position}))
+    plain = identify(runs[:2], path, runs[2:])
+    result = identify(runs[:2], path, runs[2:], also=["load_friction"])
+    assert result.after.full < 0.6 * plain.after.full
+    value = next(value for value in result.values if value.name == "load_friction.joint")
+    assert value.accepted
+    # Another law of friction at rest: near, if not within an interval that knows this one only.
+    assert value.value == pytest.approx(0.25, abs=0.06)
+
+    written = write_fit(result, tmp_path / "fit")
+    assert tmp_path / "fit" / "calibrated.effects.toml" in written
+    entries = tomllib.loads((tmp_path / "fit" / "calibrated.effects.toml").read_text())["effect"]
+    assert entries == [
+        {"effect": "load_friction", "joints": ["joint"], "enabled": True,
+         "parameters": {"coefficient": pytest.approx(value.value, rel=1e-5)}}
+    ]  # fmt: skip
+
+
+def test_entries_and_values_say_the_same() -> None:
+    joints = ["a", "b", "c"]
+    values = {
+        ("dead_zone", "width_rad"): np.array([0.02, 0.0, 0.02]),
+        ("load_friction", "coefficient"): np.full(3, 0.1),
+    }
+    entries = entries_of(values, joints)
+    assert [(entry.effect, entry.joints) for entry in entries] == [
+        ("dead_zone", ("a", "c")),
+        ("load_friction", ("a", "b", "c")),
+    ]
+    again = values_of(entries, joints)
+    assert {key: value.tolist() for key, value in again.items()} == {k: v.tolist() for k, v in values.items()}
+    assert "dead_zone" in as_toml(entries)

@@ -26,6 +26,8 @@ __all__ = ["fit"]
 )
 @click.option("--joint", "joints", multiple=True, metavar="NAME", help="Fit this joint only. Repeatable.")
 @click.option("--kind", "kinds", multiple=True, metavar="KIND", help="Fit this kind of parameter only. Repeatable.")
+@click.option("--also", multiple=True, metavar="KIND", help="Fit this kind besides the default ones. Repeatable.")
+@click.option("--measured-supply", is_flag=True, help="Gains and torque limits follow the logged voltage.")
 @click.option(
     "--parameters",
     "declared",
@@ -48,6 +50,8 @@ def fit(
     hold_out: tuple[Path, ...],
     joints: tuple[str, ...],
     kinds: tuple[str, ...],
+    also: tuple[str, ...],
+    measured_supply: bool,
     declared: Path | None,
     tie: str,
     robot: Path | None,
@@ -64,7 +68,8 @@ def fit(
     Kinds of parameters, by default: stiffness, damping (or velocity_gain, whichever the model has), armature,
     coulomb_friction, zero_offset, action_delay; electrical_damping where torque was off for a while; floor_friction and
     contact_softness where the robot stood on the floor. Others by name: actuator_lag, torque_limit, speed_limit, link_mass,
-    torso_mass, contact_impedance. Anything else in an MJCF with --parameters (docs/identify.md). Exit code 1: nothing beats
+    torso_mass, contact_impedance; and what MuJoCo has no feature for (load_friction, stribeck_friction_static_nm, dead_zone,
+    voltage_sag …), which is written to calibrated.effects.toml and into robot.toml, and acts in the environment. Anything else in an MJCF with --parameters (docs/identify.md). Exit code 1: nothing beats
     the given model.
     """
     from rich.console import Console
@@ -91,6 +96,8 @@ def fit(
             held_out,
             joints=joints or None,
             kinds=kinds or None,
+            also=also,
+            measured_supply=measured_supply,
             tie=tie,
             declared=None if declared is None else read_declarations(declared),
             progress=lambda what, done: bar.update(task, description=what, completed=done),

@@ -24,7 +24,17 @@ from openant_tools.recording.run import Run
 from openant_tools.sysid.declared import Declaration, declared_parameters
 from openant_tools.sysid.fit import Dataset, Estimate, Problem, gaps, sensor_floor
 from openant_tools.sysid.kinds import ACTUATOR_LAG, SPEED_LIMIT
-from openant_tools.sysid.parameter import ACTION_DELAY, KINDS, Parameter, apply, buffered, choose, delays, restatements
+from openant_tools.sysid.parameter import (
+    ACTION_DELAY,
+    KINDS,
+    Parameter,
+    apply,
+    buffered,
+    choose,
+    delays,
+    effect_values,
+    restatements,
+)  # fmt: skip
 from openant_tools.sysid.quality import Telemetry, check_runs, without_errors
 from openant_tools.sysid.verdict import IDENTIFIABLE, UNDETERMINED, Verdict, Word, experiment, verdicts
 
@@ -149,6 +159,11 @@ class Identification:
     def accepted(self) -> tuple[str, ...]:
         return tuple(value.name for value in self.values if value.accepted)
 
+    @property
+    def effects(self) -> dict[tuple[str, str], Array]:
+        """(effect, its parameter) → (joints,) of what acts between the steps of the written model."""
+        return effect_values(self.datasets[0].plant, self.parameters, self.u)
+
     def as_json(self) -> dict[str, Any]:
         """`fit.json` (formats, section 6)."""
 
@@ -199,8 +214,10 @@ def identify(
     *,
     joints: Sequence[str] | None = None,
     kinds: Sequence[str] | None = None,
+    also: Sequence[str] = (),
     tie: str = "joint",
     declared: Declaration | None = None,
+    measured_supply: bool = False,
     progress: Progress | None = None,
 ) -> Identification:
     """Fit `model` to `runs` and judge the result on `hold_out`, or by leaving out runs in turn.
@@ -211,8 +228,10 @@ def identify(
         hold_out: runs that the fit must not see.
         joints: which joints to fit; default every position-controlled joint that all runs command and measure.
         kinds: keys of KINDS; default what `declared` asks for, else DEFAULT_KINDS as far as they apply.
+        also: keys of KINDS besides the default ones.
         tie: `joint` (each its own values), `servo` (one value for all joints of a servo model) or `all`.
         declared: parameters that a user declared, fitted besides.
+        measured_supply: gains and torque limits follow the voltage that the runs logged, in the given model too.
         progress: called with what is being done and the share that is done.
 
     Raises:
@@ -229,12 +248,18 @@ def identify(
     everything, telemetry = [run for run, _ in cleaned], [found for _, found in cleaned]
     runs, hold_out = everything[: len(runs)], everything[len(runs) :]
     check_runs(everything, load_plant(model, joints, Setup.FLOOR))
-    wanted = _applicable(
-        declared.kinds if kinds is None and declared else kinds, load_plant(model, joints, Setup.FLOOR), everything
-    )
+    floored = load_plant(model, joints, Setup.FLOOR)
+    wanted = _applicable(declared.kinds if kinds is None and declared else kinds, floored, everything)
+    if also:
+        wanted = _applicable([*wanted, *also], floored, everything)
+    if measured_supply and not any(run.facts.supply_v and run.has("volt", [joints[0]]) for run in everything):
+        raise BadInput(
+            "no run has both a logged voltage (volt.*) and its nominal supply (supply_v)",
+            remedy="leave --measured-supply out, or say supply_v in the run's facts",
+        )
 
     def datasets(of: Sequence[Run]) -> list[Dataset]:
-        return _datasets(of, model, joints, wanted)
+        return _datasets(of, model, joints, wanted, measured_supply)
 
     data, judged = datasets(runs), datasets(hold_out)
     plant = data[0].plant
@@ -312,7 +337,9 @@ def _joints_in_common(runs: Sequence[Run], model: Path, wanted: Sequence[str] | 
     return common
 
 
-def _datasets(runs: Sequence[Run], model: Path, joints: Sequence[str], kinds: Sequence[str]) -> list[Dataset]:
+def _datasets(
+    runs: Sequence[Run], model: Path, joints: Sequence[str], kinds: Sequence[str], measured_supply: bool
+) -> list[Dataset]:
     """One dataset per model and setup; runs that name their own model are simulated with it."""
     groups: dict[tuple[Path, Setup], list[Run]] = {}
     for run in runs:
@@ -321,6 +348,7 @@ def _datasets(runs: Sequence[Run], model: Path, joints: Sequence[str], kinds: Se
         Dataset.prepare(
             load_plant(path, joints, setup, electrical="electrical_damping" in kinds, lagging=ACTUATOR_LAG in kinds),
             members,
+            measured_supply=measured_supply,
         )
         for (path, setup), members in groups.items()
     ]

@@ -10,16 +10,20 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from openant_tools.effects.entries import as_toml, entries_of
 from openant_tools.files import write_text
 from openant_tools.model.mjcf import write_model
 from openant_tools.robot.config import Provenance
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.sysid.identify import Identification, calibrated, restated
+from openant_tools.sysid.kinds import KINDS
 from openant_tools.sysid.report import fit_report
 
 __all__ = ["write_fit", "write_robot"]
 
 CALIBRATED = "calibrated.xml"
+#: beside it: what MuJoCo has no feature for
+EFFECTS = "calibrated.effects.toml"
 
 
 def write_fit(result: Identification, out: Path) -> list[Path]:
@@ -29,11 +33,15 @@ def write_fit(result: Identification, out: Path) -> list[Path]:
     """
     runs = ", ".join(run.name for data in result.datasets for run in data.runs)
     note = f"Calibrated by `openant sysid fit` on {datetime.date.today()} from {result.model.name} and {runs}"
-    with _together(out, (CALIBRATED, "fit.json", "report.html")) as (model, figures, report):
+    entries = entries_of(result.effects, result.joints)
+    names = (CALIBRATED, "fit.json", "report.html", *([EFFECTS] if entries else []))
+    with _together(out, names) as (model, figures, report, *effects):
         write_model(result.model, calibrated(result), model, joints=result.joints, note=note, stated=restated(result))
         write_text(figures, json.dumps(result.as_json(), indent=1, ensure_ascii=False) + "\n")
         fit_report(result).write(report)
-    return [out / CALIBRATED, out / "fit.json", out / "report.html"]
+        for path in effects:
+            write_text(path, as_toml(entries, note))
+    return [out / name for name in names]
 
 
 @contextmanager
@@ -95,7 +103,10 @@ def write_robot(result: Identification, folder: RobotFolder) -> None:
         folder.findings / f"sysid-fit-{now:%Y%m%dT%H%M%SZ}.json",
         json.dumps(finding, indent=1, ensure_ascii=False) + "\n",
     )
-    folder.update(values, provenance=provenance)
+    found = entries_of(result.effects, result.joints)
+    fitted = {kind.effect[0] for kind in (KINDS[p.kind] for p in result.parameters if p.kind in KINDS) if kind.effect}
+    others = [entry for entry in folder.config().effects if entry.effect not in fitted]
+    folder.update(values, provenance=provenance, effects=[*others, *found])
 
 
 def _rounded(value: float) -> float:
