@@ -17,11 +17,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openant_tools.cli.comms import comms
-from openant_tools.cli.sysid_record import record
+from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, record
 from openant_tools.errors import BadInput
 from openant_tools.recording.reader import read_recording
 from openant_tools.robot.joints import JOINT_NAMES
-from openant_tools.sysid.protocols import PROTOCOLS, CommandSpace, protocol
+from openant_tools.sysid.excitation import Around, InTurn, Multisine, Releases
+from openant_tools.sysid.floor_motion import LegLifts, Scrub, Twitch, WeightShifts
+from openant_tools.sysid.plan_file import read_plan, write_plan
+from openant_tools.sysid.protocols import FULL, PROTOCOLS, CommandSpace, Protocol, protocol, protocols
+from openant_tools.sysid.record import takes
 
 RATE = 100.0
 SPACE = CommandSpace.around_home()
@@ -84,6 +88,137 @@ def test_what_cannot_be_played_is_refused() -> None:
         CommandSpace.around_home({"knee_fl": (-0.5, 0.5)})
 
 
+def test_the_default_tells_most_apart_in_about_40_s_on_stand_and_floor() -> None:
+    parts = protocols(FULL)
+    assert DEFAULT_PROTOCOL == FULL
+    assert [(part.setup, round(part.heading_rad, 3)) for part in parts] == [
+        ("stand", 0.0),
+        ("floor", 0.0),
+        ("floor", 1.571),
+    ]
+    assert sum(part.seconds for part in parts) == pytest.approx(40, abs=1)
+    assert [part.setup for part in protocols(FULL, setup="stand")] == ["stand"]
+    with pytest.raises(BadInput, match="chirp is played on the stand, not on the floor → leave out --setup floor"):
+        protocols("chirp", setup="floor")
+
+
+def test_one_joint_alone_means_alone() -> None:
+    segment = InTurn(16.0, Multisine(1.0, low_hz=0.5))
+    moved = segment.offsets(np.arange(1600) / RATE, SPACE, np.random.default_rng(0)) != 0
+    assert moved.sum(1).max() == 1
+    assert (moved.sum(0) > 150).all()
+
+
+def test_around_moves_the_middle_and_stays_inside() -> None:
+    segment = Around(6.0, Multisine(1.0), (0.5,))
+    offsets = segment.offsets(np.arange(600) / RATE, SPACE, np.random.default_rng(0))
+    assert offsets[100:500].mean(0) == pytest.approx(0.5 * SPACE.half, abs=0.1)
+    assert (np.abs(offsets) <= SPACE.half).all()
+    with pytest.raises(BadInput, match="a middle for 3 joints, where 8 move"):
+        Around(6.0, Multisine(1.0), (0.1, 0.2, 0.3)).offsets(np.arange(10) / RATE, SPACE, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("name", ["releases", "drops"])
+def test_torque_is_off_for_a_while_and_never_at_the_ends(name: str) -> None:
+    made = protocol(name)
+    limp = made.limp(SPACE, RATE)
+    assert limp.shape == made.commands(SPACE, RATE).shape
+    assert 0.1 < limp.mean() < 0.4
+    assert not limp[:100].any()
+    assert not limp[-100:].any()
+
+
+def test_weight_shifts_and_scrub_push_the_body_nowhere() -> None:
+    t, chance = np.arange(400) / RATE, np.random.default_rng(1)
+    shifts = WeightShifts(4.0).offsets(t, SPACE.standing(), chance)
+    assert np.abs(shifts.sum(1)).max() < 1e-9  # what gives way on one side is raised on the other
+    scrub = Scrub(4.0).offsets(t, SPACE.standing(), chance)
+    assert np.abs(scrub.sum(1)).max() < 1e-9
+    legs = {name: scrub[:, k] for k, name in enumerate(SPACE.joints)}
+    assert legs["hip_fl"] == pytest.approx(-legs["hip_fr"])
+    assert legs["hip_fl"] == pytest.approx(legs["hip_rr"])
+
+
+def test_a_lifted_leg_has_both_neighbours_turned_towards_it() -> None:
+    offsets = LegLifts(8.0).offsets(np.arange(800) / RATE, SPACE.standing(), np.random.default_rng(0))
+    middle = dict(zip(SPACE.joints, offsets[500], strict=True))  # the third leg, front left
+    assert middle["knee_fl"] > 0.2
+    assert (middle["hip_rl"], middle["hip_fr"]) == (pytest.approx(-0.25), pytest.approx(0.25))
+    assert sum(abs(value) > 1e-6 for value in middle.values()) == 3
+
+
+def test_motions_on_the_floor_need_an_ant() -> None:
+    space = CommandSpace(("shoulder",), np.zeros(1), -np.ones(1), np.ones(1))
+    with pytest.raises(BadInput, match="need the eight joints of an Open Ant"):
+        protocol("gait").commands(space, RATE)
+
+
+def test_names_tell_repeat_floor_hot_and_held_out_apart() -> None:
+    made = takes(Path("a.mcap"), protocols(FULL), 3, repeats=2, hold_out_seed=9, hot_s=60.0)
+    assert [take.path.name for take in made] == [
+        "a.mcap", "a-2.mcap", "a-held-out.mcap", "a-hot.mcap",
+        "a-floor.mcap", "a-floor-2.mcap", "a-floor-held-out.mcap",
+        "a-floor-90.mcap", "a-floor-90-2.mcap", "a-floor-90-held-out.mcap",
+    ]  # fmt: skip
+    by_name = {take.path.stem: take for take in made}
+    assert by_name["a-2"].repeat_of == by_name["a-hot"].repeat_of == "a"
+    assert by_name["a-floor-90-2"].repeat_of == "a-floor-90"
+    assert (by_name["a-held-out"].seed, by_name["a-held-out"].held_out, by_name["a-2"].seed) == (9, True, 3)
+    assert by_name["a-hot"].work_s == 60.0
+
+
+# ---- plans as files ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(PROTOCOLS))
+def test_every_protocol_survives_being_written_as_a_plan(name: str, tmp_path: Path) -> None:
+    write_plan(tmp_path / "plan.toml", protocols(name), "a test")
+    for read, made in zip(read_plan(tmp_path / "plan.toml"), protocols(name), strict=True):
+        assert (read.setup, read.heading_rad) == (made.setup, pytest.approx(made.heading_rad))
+        assert len(read.segments) == len(made.segments)
+        assert read.seconds == pytest.approx(made.seconds, abs=0.01)
+        a, b = read.commands(SPACE, RATE, 1), made.commands(SPACE, RATE, 1)
+        n = min(len(a), len(b))
+        # Times are written to a tenth of a millisecond: a step may come a sample later.
+        assert np.mean(np.abs(a[:n] - b[:n]) > 0.02) < 0.02
+
+
+GOOD_PLAN = 'schema = "openant.plan/1"\n[[recording]]\nsetup = "stand"\n[[recording.segment]]\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("schema = ", "is not TOML"),
+        ("a = 1", "is no plan: its schema is not 'openant.plan/1' → make one with `openant sysid plan --out`"),
+        ('schema = "openant.plan/1"', r"has no \[\[recording\]\]"),
+        ('schema = "openant.plan/1"\n[[recording]]\nsetup = "moon"', "recording 1: `setup` is not stand or floor"),
+        ('schema = "openant.plan/1"\n[[recording]]\nsetup = "stand"', r"has no \[\[recording.segment\]\]"),
+        (GOOD_PLAN + 'kind = "Chrip"\nseconds = 3', "segment 1: there is no motion 'Chrip' → did you mean 'Chirp'"),
+        (GOOD_PLAN + 'kind = "Chirp"', "Chirp lacks `seconds`"),
+        (GOOD_PLAN + 'kind = "Chirp"\nseconds = 3\nlow = 3', "Chirp knows no 'low' → use seconds, low_hz"),
+        (GOOD_PLAN + 'kind = "Chirp"\nseconds = nan', "`seconds` is not a number"),
+        (GOOD_PLAN + 'kind = "Chirp"\nseconds = 3\nshare = 1.4', "`share` is 1.4, not a share between 0 and 1"),
+        (GOOD_PLAN + 'kind = "Chirp"\nseconds = 3\nlow_hz = -1', "`low_hz` is -1, it must be more than 0"),
+        (GOOD_PLAN + 'kind = "Chirp"\nseconds = 3000', "takes 3002 s → keep it below 600 s"),
+        (GOOD_PLAN + 'kind = "Multisine"\nseconds = 3\nlines = 0', "`lines` is not a whole number from 1 on"),
+        (GOOD_PLAN + 'kind = "Gait"\nseconds = 3', "has a motion for the floor on the stand"),
+        (GOOD_PLAN + 'kind = "InTurn"\nseconds = 3', "InTurn lacks `of`"),
+        (GOOD_PLAN + 'kind = "Around"\nseconds = 3\nshares = [2.0]\nof = {kind = "Rest", seconds = 1}', "not shares between"),
+    ],
+)  # fmt: skip
+def test_a_bad_plan_says_where_and_what(text: str, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "plan.toml"
+    path.write_text(text)
+    with pytest.raises(BadInput, match=words):
+        read_plan(path)
+
+
+def test_a_missing_plan_says_so(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="No such file or directory → name a plan file"):
+        read_plan(tmp_path / "none.toml")
+
+
 # ---- sysid record ------------------------------------------------------------------------------------------------
 
 
@@ -122,6 +257,57 @@ def test_a_virtual_robot_is_recorded_and_the_recording_says_what_was_played(tmp_
     # At rest at both ends, and following in between.
     assert np.abs(first.signal("vel")[:5]).max() < 0.1
     assert np.sqrt(np.mean((first.signal("pos") - commands) ** 2)) < 0.2
+
+
+def test_a_plan_is_played_with_legs_released_and_caught_then_on_the_floor(tmp_path: Path) -> None:
+    stand = Protocol("mine", "", (Releases(3.0, speed_rad_s=2.0),))
+    floor = Protocol("mine", "", (Twitch(2.0),), "floor", np.pi / 2)
+    write_plan(tmp_path / "plan.toml", (stand, floor), "a test")
+    arguments = ["--virtual", "--plan", str(tmp_path / "plan.toml"), "--out", str(tmp_path / "run.mcap"), "--yes"]
+    result = CliRunner().invoke(record, [*arguments, "--no-camera"])
+    assert result.exit_code == 0, result.output
+    run = read_recording(tmp_path / "run.mcap").run
+    torque = run.signal("torque")
+    off = torque[:, 2] == 0
+    assert 0.5 < off.sum() / RATE < 0.9
+    assert np.array_equal(torque, np.repeat(torque[:, :1], 8, axis=1))
+    assert np.abs(run.signal("pwm")[off][1:]).max() == 0
+    # Caught where it hangs: the first command with torque is the position, and then no jump.
+    first = int(np.flatnonzero(off)[-1]) + 1
+    cmd, pos = run.signal("cmd"), run.signal("pos")
+    assert np.abs(cmd[first] - pos[first - 1]).max() < 0.01
+    assert np.abs(np.diff(cmd[first:], axis=0)).max() < 1.3 / RATE
+    # It coasted on, farther than a servo that stops.
+    assert (np.abs(pos[first - 1] - pos[np.flatnonzero(off)[0]])[::2] > 0.05).all()
+    facts = read_recording(tmp_path / "run-floor-90.mcap").run.facts
+    assert (facts.setup, facts.protocol, facts.heading_rad) == ("floor", "mine", pytest.approx(np.pi / 2))
+    assert facts.extra["segments"] == [{"kind": "Twitch", "start_s": 0.3, "seconds": 2.0}]
+
+
+def test_the_list_says_what_is_played_where() -> None:
+    result = CliRunner().invoke(record, ["--list"])
+    assert result.exit_code == 0
+    assert "(default)" in result.output.splitlines()[0]
+    for name in PROTOCOLS:
+        assert f"\n{name} " in f"\n{result.output}"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--yes"], "no name for the recording → name it with --out"),
+        (["--out", "a.mcap", "--plan", "p.toml", "--protocol", "chirp"], "a plan says what to play → leave out"),
+        (
+            ["--out", "a.mcap", "--protocol", "gait", "--setup", "stand"],
+            "gait is played on the floor, not on the stand",
+        ),
+        (["--out", "a.mcap", "--seconds", "9"], "9.0 s is too short for full → give it 20 s or more"),
+    ],
+)
+def test_what_cannot_be_recorded_is_refused(arguments: list[str], words: str) -> None:
+    result = CliRunner().invoke(record, ["--virtual", *arguments])
+    assert isinstance(result.exception, BadInput)
+    assert words in str(result.exception)
 
 
 def test_without_a_word_nothing_moves(tmp_path: Path) -> None:

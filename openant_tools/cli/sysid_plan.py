@@ -136,6 +136,9 @@ def plan(
             raise BadInput(f"the plan has nothing for the {setup}", where=plan_file, remedy="leave out --setup")
     else:
         played = protocols(name or DEFAULT_PROTOCOL, seconds, setup)
+    stand = [one for one in played if one.setup == "stand"]
+    if optimise and not stand:
+        raise BadInput("there is nothing on the stand to optimise", remedy="leave out --optimise, or --setup floor")
     assumed = Residual()
     asked = Planned(
         model,
@@ -161,9 +164,6 @@ def plan(
 
         result = make_plan(asked, played, step)
         if optimise:
-            stand = [one for one in played if one.setup == "stand"]
-            if not stand:
-                raise BadInput("there is nothing on the stand to optimise", remedy="leave out --setup floor")
             found = design(asked, sum(one.seconds for one in stand), step)
             better = make_plan(asked, (found.protocol, *(one for one in played if one.setup == "floor")), step)
             gain = better.nats - result.nats

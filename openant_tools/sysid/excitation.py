@@ -243,20 +243,23 @@ class Sine(Segment):
 
 @dataclass(frozen=True)
 class Square(Segment):
-    """Up and down between two levels, every second joint the other way: delay and rise time as one looks at them by eye."""
+    """Up and down between two levels, every second joint the other way: delay and rise time as one looks at them by eye.
+
+    The joints do not step at the same moment: eight servos that start at once draw more than the supply gives.
+    """
 
     hz: float = 0.5
     amplitude_rad: float = 0.15
 
     def offsets(self, t: Array, space: CommandSpace, chance: np.random.Generator) -> Array:
         amplitude = np.minimum(self.amplitude_rad, 0.9 * space.half)
+        joints = np.arange(len(space.joints))
         periods = max(1, round(self.seconds * self.hz))
-        # A quarter period of rest at both ends, so that it begins and ends in the middle.
-        turn = t / self.seconds * periods
-        high = (turn % 1.0 >= 0.25) & (turn % 1.0 < 0.5)
-        low = (turn % 1.0 >= 0.5) & (turn % 1.0 < 0.75)
-        sign = np.where(np.arange(len(space.joints)) % 2, -1.0, 1.0)
-        out: Array = (high.astype(float) - low)[:, None] * sign * amplitude
+        # Rest, up, down, rest, each a quarter period, less what a joint comes later than the first.
+        turn = (t / self.seconds * periods)[:, None] - 0.2 * ((GOLDEN * (joints + 1)) % 1.0)
+        level = ((turn % 1.0 >= 0.25) & (turn % 1.0 < 0.5)).astype(float)
+        level -= (turn % 1.0 >= 0.5) & (turn % 1.0 < 0.75)
+        out: Array = np.where(turn < 0, 0.0, level) * np.where(joints % 2, -1.0, 1.0) * amplitude
         return out
 
 
