@@ -47,6 +47,7 @@ STEP_S, TRUE_STEP_S = 0.002, 0.00025
 HALF_TOLERANCE = {"stiffness": 0.075, "damping": 0.125, "armature": 0.15}
 GIVEN = {"stiffness": 8.0, "damping": 0.12, "armature": 0.006, "coulomb_friction": 0.03}
 #: robots of which a third has no more delay than the row's own
+NOISE_RAD, JITTER_S = (1e-4, 6e-4), 1e-3
 LONGEST_DELAY_S, ZERO_STD_RAD, SAMPLING_STD_S = 0.025, math.radians(0.5), 0.001
 
 PENDULUM = """
@@ -151,11 +152,11 @@ def record(model: mujoco.MjModel, truth: Mapping[str, Mapping[str, float]], seco
             steps = math.ceil((events[k + 1] - at) / TRUE_STEP_S - 1e-9)
             model.opt.timestep = (events[k + 1] - at) / steps
             mujoco.mj_step(model, data, steps)
-    noise, jitter = chance.uniform(1e-4, 6e-4), chance.uniform(0.0, 1e-3)
+    noise, jitter = chance.uniform(*NOISE_RAD), chance.uniform(0.0, JITTER_S)
     position = np.round((position + noise * chance.standard_normal(position.shape)) / ENCODER_RAD) * ENCODER_RAD
     stamps = t + chance.uniform(-jitter, jitter, len(t))
     columns = {f"cmd.{j}": command[:, k] for k, j in enumerate(joints)}
-    columns |= {f"pos.{j}": position[:, k] for k, j in enumerate(joints)} | {"cmd_t": np.maximum(t, stamps)}
+    columns |= {f"pos.{j}": position[:, k] for k, j in enumerate(joints)}
     return Run("run", Facts(joints, setup="stand", resolution={"pos": ENCODER_RAD}), stamps, columns)
 
 
