@@ -243,11 +243,14 @@ def test_without_torque_off_nothing_is_said_about_back_emf(model: Path) -> None:
 
 
 def test_tied_joints_share_a_value(tmp_path: Path) -> None:
-    """Two arms of the same servo: one value for both, whose interval is narrower than one arm's alone."""
+    """Two arms of the same servo: one value for both, whose interval is narrower than one arm's alone.
+
+    In small steps: what a model's step leaves open, both arms share.
+    """
     arm = '<joint name="{0}" axis="0 1 0" damping="0.12" armature="0.006" frictionloss="0.03"/>'
     body = f'<body pos="0 {{1}} 0">{arm}<geom size="0.03" mass="0.3" pos="0 0 -0.1"/></body>'
     text = f"""\
-<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/>
+<mujoco><compiler angle="radian"/><option timestep="0.0005" integrator="implicitfast"/>
   <worldbody>{body.format("left", 0)}{body.format("right", 1)}</worldbody>
   <actuator>
     <position name="left" joint="left" kp="8" forcerange="-2 2"/>
