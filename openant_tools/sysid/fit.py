@@ -41,8 +41,9 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Progress = Callable[[str, float], None]
 
-#: finite-difference step in prior deviations: far above rounding and the solver's tolerance, far below curvature
-STEP = 0.1
+#: finite-difference step in prior deviations: far above rounding and the solver's tolerance, and small enough that two
+#: parameters which move a robot alike have columns alike (at 0.1 their curvature told them apart)
+STEP = 0.03
 #: steps at most, in each part of a descent
 MOST_STEPS = 20
 #: prior deviations: the longest first step, and how far from where it was taken a Jacobian is believed

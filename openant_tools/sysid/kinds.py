@@ -274,9 +274,12 @@ def _write_impedance(model: mujoco.MjModel, plant: Plant, j: int, value: float) 
     model.geom_solimp[deciding_geoms(model), 0] *= value / _read_impedance(model, plant, j)
 
 
-def usual_torque(plant: Plant, j: int) -> float:
-    """A torque scale (N·m) for a joint without a limit: what its stiffness gives at a tenth of a radian of error."""
-    return 0.1 * _read_stiffness(plant.model, plant, j)
+def usual_torque(model: mujoco.MjModel, plant: Plant, j: int) -> float:
+    """A torque scale (N·m) for a joint: its limit, or what its stiffness asks for at USUAL_ERROR_RAD where that is less.
+
+    A force range that no error of this servo ever reaches says nothing of its friction.
+    """
+    return min(torque_limit(model, plant, j), USUAL_ERROR_RAD * _read_stiffness(model, plant, j))
 
 
 def _carried(model: mujoco.MjModel, plant: Plant) -> bool:
@@ -300,6 +303,8 @@ TORSO_STD = 0.05
 IMPEDANCE_STD = 0.15
 #: What brakes a DC servo beyond its friction is back-EMF, which vanishes with the torque: a share near 1, this uncertain.
 ELECTRICAL_STD = 0.3
+#: rad; a position error at which small servos have long saturated
+USUAL_ERROR_RAD = 0.3
 #: Friction of a small geared servo is of the order of a tenth of its stall torque; a model that has none says nothing
 #: about it, so its prior is that wide.
 FRICTION_SHARE = 0.1

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from openant_tools.model.attribute import Attribute, stated
 from openant_tools.model.plant import Plant
-from openant_tools.sysid.kinds import ACTION_DELAY, KINDS, Kind, torque_limit, usual_torque
+from openant_tools.sysid.kinds import ACTION_DELAY, KINDS, Kind, usual_torque
 
 __all__ = [
     "ACTION_DELAY",
@@ -198,15 +198,7 @@ def choose(
             if not all(kind.holds(plant.model, plant, j) for j in joints):
                 continue
             nominals = [kind.read(plant.model, plant, j) for j in joints]
-            limits = [torque_limit(plant.model, plant, j) for j in joints]
-            limit = float(
-                np.mean(
-                    [
-                        value if math.isfinite(value) else usual_torque(plant, j)
-                        for j, value in zip(joints, limits, strict=True)
-                    ]
-                )
-            )
+            limit = float(np.mean([usual_torque(plant.model, plant, j) for j in joints]))
             relative = kind.relative_std is not None and all(value > 0 for value in nominals)
             std = kind.relative_std if relative and kind.relative_std is not None else kind.absolute_std(limit)
             chosen.append(Parameter(name, label, tuple(joints), relative, std))
