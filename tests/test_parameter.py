@@ -92,6 +92,26 @@ def test_a_speed_limit_and_damping_are_two_words_for_one_thing(model: Path) -> N
         fitted(MODEL, model, ["damping", "speed_limit"])
 
 
+@pytest.mark.parametrize("saturates", [False, True])
+def test_velocity_gain_and_damping_are_apart_only_where_torque_saturates(saturates: bool, tmp_path: Path) -> None:
+    """Within the limit only their sum brakes; at the limit the velocity gain, which is clipped with it, does not."""
+    given = MODEL.replace('kp="8"', 'kp="8" kv="0.1"').replace("-1.5 1.5", "-1.2 1.2" if saturates else "-20 20")
+    model = plants.write(tmp_path / "both.xml", given)
+    robot = given.replace('kv="0.1"', 'kv="0.13"').replace('damping="0.12"', 'damping="0.1"')
+    kinds = ["stiffness", "velocity_gain", "damping", "coulomb_friction"]
+    result = fitted(robot, model, kinds, reach=1.2 if saturates else 0.4)
+    gain, damping = value(result, "velocity_gain.joint"), value(result, "damping.joint")
+    if saturates:
+        assert {gain.verdict, damping.verdict} == {"identifiable"}
+        assert gain.value == pytest.approx(0.13, rel=0.15)
+        assert damping.value == pytest.approx(0.1, rel=0.05)
+    else:
+        assert {gain.verdict, damping.verdict} == {"tied"}
+        assert (gain.tied_to, damping.tied_to) == (damping.name, gain.name)
+        assert "saturating-steps" in gain.record_next
+        assert gain.value + damping.value == pytest.approx(0.23, rel=0.05)
+
+
 def test_a_heavier_link_is_found_with_its_inertia(model: Path) -> None:
     robot = MODEL.replace('mass="0.3"', 'mass="0.321"').replace('mass="0.02"', 'mass="0.0214"')
     result = fitted(robot, model, ["stiffness", "damping", "coulomb_friction", "link_mass"])
