@@ -35,7 +35,7 @@ from openant_tools.sysid.parameter import (
     effect_values,
     restatements,
 )  # fmt: skip
-from openant_tools.sysid.quality import Telemetry, check_runs, without_errors
+from openant_tools.sysid.quality import Telemetry, check_model, check_runs, without_errors
 from openant_tools.sysid.verdict import IDENTIFIABLE, UNDETERMINED, Verdict, Word, experiment, verdicts
 
 __all__ = [
@@ -262,6 +262,10 @@ def identify(
         return _datasets(of, model, joints, wanted, measured_supply)
 
     data, judged = datasets(runs), datasets(hold_out)
+    for one in (*data, *judged):
+        given = one.simulate((), [np.zeros(0)]).pos[0]
+        for run, rows in zip(one.runs, one.fitted.rows, strict=True):
+            check_model(run, one.plant, given[rows])
     plant = data[0].plant
     motors = {k: v for run in everything for k, v in run.facts.motors.items()}
     chosen = choose(plant, wanted, tie, motors)

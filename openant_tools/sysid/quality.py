@@ -18,7 +18,7 @@ from openant_tools.recording.run import Run
 from openant_tools.robot.registers import PWM_FULL
 from openant_tools.sysid.kinds import KINDS, torque_limit
 
-__all__ = ["Telemetry", "check_runs", "quantum", "without_errors"]
+__all__ = ["Telemetry", "check_model", "check_runs", "quantum", "without_errors"]
 
 Array = NDArray[np.float64]
 
@@ -30,6 +30,12 @@ MOVES_QUANTA = 5
 SATURATED = 0.9
 #: a position follows a command if they correlate above this, and does not below LOOSE
 FOLLOWS, LOOSE = 0.9, 0.5
+#: a position that swings this much more or less than the command that it follows is in another unit
+OTHER_UNIT = 10.0
+#: rad; where a model sets no range, a joint that reads more than two turns is in another unit
+MOST_RAD = 4 * math.pi
+#: rad; a joint that is commanded less says nothing about whether the model is that of this robot
+TELLING_RAD = 0.1
 #: rad beyond a joint's range that a soft stop and a zero offset may explain
 BEYOND_STOP_RAD = 0.5
 #: a sample lies outside of both neighbours by more than so many steps of the encoder, or times of what such distances
@@ -148,6 +154,7 @@ def _problems(run: Run, plant: Plant, pos: Array, cmd: Array, moves: Sequence[bo
                 f"pos.{joint} is around {np.nanmedian(pos[:, j]):.2f} rad, outside the model's range {low:.2f} … {high:.2f}",
                 "check its unit (rad), its zero, and whether this is the model of this robot",
             )
+    yield from _other_units(plant, pos, cmd, moves)
     yield from _crossed(plant, pos, cmd, moves)
     for j, joint in enumerate(plant.joints):
         share = _saturated(run, plant, j, pos[:, j], cmd[:, j])
@@ -155,6 +162,63 @@ def _problems(run: Run, plant: Plant, pos: Array, cmd: Array, moves: Sequence[bo
             yield (
                 f"{joint} works at its torque limit in {100 * share:.0f} % of the samples",
                 "record smaller or slower motions: a saturated servo shows its limit and nothing else",
+            )
+
+
+def _other_units(plant: Plant, pos: Array, cmd: Array, moves: Sequence[bool]) -> Iterator[tuple[str, str]]:
+    """Positions or commands in degrees or counts, where no range of the model shows it."""
+    for j, joint in enumerate(plant.joints):
+        if moves[j] and _correlation(cmd[:, j], pos[:, j]) > FOLLOWS:
+            both = np.isfinite(cmd[:, j]) & np.isfinite(pos[:, j])
+            ratio = float(np.std(pos[both, j]) / np.std(cmd[both, j]))
+            if not 1 / OTHER_UNIT < ratio < OTHER_UNIT:
+                names = ("pos", "cmd") if ratio > 1 else ("cmd", "pos")
+                yield (
+                    f"{names[0]}.{joint} swings {max(ratio, 1 / ratio):.0f} times as far as {names[1]}.{joint}: they are in "
+                    "different units",
+                    "give both in rad (1 rad is 57.3 degrees)",
+                )
+        if not math.isfinite(_range(plant, j)[1]):
+            for name, values in (("pos", pos[:, j]), ("cmd", cmd[:, j])):
+                furthest = float(np.nanmax(np.abs(values), initial=0.0, where=np.isfinite(values)))
+                if furthest > MOST_RAD:
+                    yield (
+                        f"{name}.{joint} reaches {furthest:.0f}, which is {furthest / (2 * math.pi):.0f} turns in rad",
+                        "check its unit (rad); if the joint does turn that far, give it a range in the model",
+                    )
+
+
+def check_model(run: Run, plant: Plant, simulated: Array) -> None:
+    """Refuse a model that does not move as the robot did at all: a fit of it would answer with numbers that mean nothing.
+
+    Args:
+        simulated: (rows, joints) rad, what the given model did with the run's commands.
+
+    Raises:
+        BadInput: the simulation fails, or a joint's error varies more than its position does.
+    """
+    where = str(run.path or run.name)
+    pos, cmd = run.signal("pos", plant.joints), run.signal("cmd", plant.joints)
+    for j, joint in enumerate(plant.joints):
+        told = np.isfinite(pos[:, j])
+        first = int(np.argmax(np.isfinite(simulated[:, j])))
+        told[:first] = False
+        if not np.isfinite(simulated[told, j]).all():
+            raise BadInput(
+                f"the model's simulation of {joint} fails with this run's commands",
+                where=where,
+                remedy="check the model: its time step may be too long for its stiffness",
+            )
+        on = told & (run.signal("torque", [joint], default=1.0)[:, 0] != 0)
+        if not on.any() or _span(cmd[on, j]) < TELLING_RAD or _span(pos[on, j]) < TELLING_RAD:
+            continue
+        varies, left = float(np.std(pos[on, j])), float(np.std(pos[on, j] - simulated[on, j]))
+        if left > varies:
+            raise BadInput(
+                f"{joint} moves otherwise than in the model altogether: it varies by {varies:.2f} rad, the model's error by "
+                f"{left:.2f} rad",
+                where=where,
+                remedy="check whether this is the model of this robot: its masses, gains, axes and zeros",
             )
 
 
