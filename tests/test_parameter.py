@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import write_table
+from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
 from openant_tools.sysid.declared import Declaration, declared_parameters, read_declarations
@@ -27,7 +29,7 @@ from openant_tools.sysid.identify import Identification, Value, calibrated, iden
 from openant_tools.sysid.kinds import KINDS
 from openant_tools.sysid.parameter import apply, choose, restatements
 from openant_tools.sysid.protocols import CommandSpace, protocol
-from openant_tools.sysid.result import write_fit
+from openant_tools.sysid.result import write_fit, write_robot
 
 #: the fit's step; what is recorded is stepped sixteen times as finely
 MODEL = plants.pendulum(option='timestep="0.002" integrator="implicitfast"')
@@ -189,6 +191,17 @@ def test_the_floor_is_written_and_nothing_else(on_floor: tuple[Path, Identificat
     differing = [b for a, b in zip(before, after, strict=True) if a != b]
     assert len(differing) == 1
     assert '<geom name="floor"' in differing[0]
+
+
+def test_what_belongs_to_the_body_stands_so_in_robot_toml(
+    on_floor: tuple[Path, Identification], tmp_path: Path
+) -> None:
+    _, result = on_floor
+    folder = create_robot(tmp_path / "ant", "standard")
+    write_robot(result, folder)
+    table = tomllib.loads(folder.config_file.read_text())
+    assert table["identified"] == {"floor_friction": {"body": pytest.approx(FLOOR_FRICTION, rel=0.05)}}
+    assert folder.check()[1] == []
 
 
 def test_the_floor_is_fitted_by_itself_where_a_robot_stood_on_it(on_floor: tuple[Path, Identification]) -> None:
