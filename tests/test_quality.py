@@ -5,14 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
+import plants
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, load_plant
+from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run
 from openant_tools.robot.mjcf import nominal_model_path
-from openant_tools.sysid.quality import check_runs
+from openant_tools.sysid.quality import check_model, check_runs, without_errors
 
 JOINTS = ("hip_rr", "knee_rr", "hip_fr", "knee_fr")
 QUANTUM = 2 * np.pi / 4096
@@ -85,6 +90,90 @@ def test_degrees_are_named(plant: Plant) -> None:
     message = refused(with_columns(pos__knee_fr=np.degrees(run.column("pos.knee_fr"))), plant)
     assert "pos.knee_fr is around -45" in message
     assert "unit (rad)" in message
+
+
+def test_units_are_named_where_the_model_sets_no_range(tmp_path: Path) -> None:
+    pendulum = load_plant(plants.write(tmp_path / "pendulum.xml", plants.pendulum()))
+    t = np.arange(0.0, 6.0, 0.02)
+    cmd, pos = 0.5 * np.sin(2 * t), np.round(0.5 * np.sin(2 * (t - 0.05)) / QUANTUM) * QUANTUM
+
+    def run(cmd: np.ndarray, pos: np.ndarray) -> Run:
+        return plants.run_of({"cmd.joint": cmd, "pos.joint": pos}, t, ["joint"])
+
+    check_runs([run(cmd, pos)], pendulum)
+    for scale, words in ((180 / np.pi, "swings 57 times as far"), (4096 / (2 * np.pi), r"swings 65\d times as far")):
+        with pytest.raises(
+            BadInput, match=rf"pos\.joint {words} as cmd\.joint: they are in different units → give both"
+        ):
+            check_runs([run(cmd, scale * pos)], pendulum)
+        with pytest.raises(BadInput, match=rf"cmd\.joint {words} as pos\.joint"):
+            check_runs([run(scale * cmd, pos)], pendulum)
+    with pytest.raises(BadInput, match=r"pos\.joint reaches 2\d, which is 5 turns in rad → check its unit"):
+        check_runs([run(np.degrees(cmd), np.degrees(pos))], pendulum)
+
+
+def test_a_model_of_another_robot_is_named(tmp_path: Path) -> None:
+    """Its arm is three hundred times too heavy for its servo, and hangs."""
+    own = load_plant(plants.write(tmp_path / "pendulum.xml", plants.pendulum()))
+    heavy = plants.pendulum().replace('mass="0.3"', 'mass="90"')
+    other = load_plant(plants.write(tmp_path / "heavy.xml", heavy))
+    t = np.arange(0.0, 5.0, 0.01)
+    columns = plants.drive(own.model, ["joint"], t, plants.sweep(t, 1, reach=1.2))
+    run = plants.run_of(columns, t, ["joint"], "swing")
+    check_model(run, own, Rollouts(own, [run])().pos[0])
+    with pytest.raises(
+        BadInput, match=r"swing: joint moves otherwise than in the model altogether: it varies by 0\.\d+ rad"
+    ):
+        check_model(run, other, Rollouts(other, [run])().pos[0])
+    with pytest.raises(
+        BadInput, match="the model's simulation of joint fails with this run's commands → check the model"
+    ):
+        check_model(run, own, np.full((len(t), 1), np.inf))
+
+
+def test_spikes_are_taken_out_and_nothing_else(plant: Plant) -> None:
+    run = good_run()
+    chance = np.random.default_rng(3)
+    rows = 20 + 7 * chance.permutation(38)[:12]
+    spoilt = run.column("pos.knee_fr").copy()
+    spoilt[rows] += chance.choice([-1, 1], 12) * chance.uniform(0.05, 3.0, 12)
+    cleaned, found = without_errors(with_columns(pos__knee_fr=spoilt), JOINTS)
+    assert dict(found.glitches) == {"knee_fr": 12}
+    assert dict(found.missing) == {}
+    assert np.array_equal(np.flatnonzero(np.isnan(cleaned.column("pos.knee_fr"))), np.sort(rows))
+    for joint in JOINTS[:3]:
+        assert np.array_equal(cleaned.column(f"pos.{joint}"), run.column(f"pos.{joint}"))
+
+
+@given(
+    gain=st.floats(2.0, 60.0),
+    reach=st.floats(0.05, 1.2),
+    rate=st.sampled_from([50.0, 100.0, 200.0]),
+    jitter=st.floats(0.0, 0.3),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=40, deadline=None)
+def test_no_true_motion_is_a_spike(gain: float, reach: float, rate: float, jitter: float, seed: int) -> None:
+    """Steps of a stiff and hardly damped servo, sampled with jitter by a coarse encoder."""
+    model = mujoco.MjModel.from_xml_string(
+        plants.pendulum(
+            f'<position {plants.SERVO} kp="{gain}" forcerange="-3 3"/>', joint='damping="0.02" armature="0.004"'
+        )
+    )
+    t = plants.jittering(2.0, rate, jitter / rate, seed)
+    command = reach * np.sign(np.sin(2 * np.pi * 1.3 * t))[:, None]
+    columns = plants.drive(model, ["joint"], t, command, noise=3e-4, quantum=plants.ENCODER_RAD, seed=seed)
+    _, found = without_errors(plants.run_of(columns, t, ["joint"]), ["joint"])
+    assert not found.glitches
+
+
+def test_what_was_not_read_is_no_position(plant: Plant) -> None:
+    """A failed read keeps the column's last value: `ok` tells."""
+    ok = np.ones(300)
+    ok[40:60] = 0
+    cleaned, found = without_errors(with_columns(ok__hip_fr=ok), JOINTS)
+    assert dict(found.missing) == {"hip_fr": 20}
+    assert np.isnan(cleaned.column("pos.hip_fr")[40:60]).all()
 
 
 def test_a_servo_that_is_saturated_throughout_is_named(plant: Plant) -> None:
