@@ -9,6 +9,7 @@ from openant_tools.cli.sysid_compare import compare
 from openant_tools.cli.sysid_fit import fit
 from openant_tools.cli.sysid_plan import plan
 from openant_tools.cli.sysid_record import record
+from openant_tools.cli.sysid_twitch import twitch
 
 __all__ = ["sysid"]
 
@@ -21,5 +22,5 @@ def sysid() -> None:
 sysid.add_command(plan)
 sysid.add_command(record)
 sysid.add_command(fit)
-for command in (compare, torque, scale, tilt):
+for command in (compare, torque, scale, tilt, twitch):
     sysid.add_command(command)

@@ -1,0 +1,111 @@
+"""How much of a real servo each law of friction explains: two gains fitted, the third held out, each in turn.
+
+Rungs: none, viscous, Coulomb, both, Stribeck, load-dependent; each with the nominal supply and with the logged voltage.
+The figure is the root mean square of measured minus simulated position over whole runs, pooled over the three gains
+held out; beside it what the same law leaves of runs that it was fitted to. Finished fits are kept in --cache, so that an
+interrupted run goes on where it was.
+
+    python benchmarks/friction_ladder.py ../shared/realdata/bam-xl330 [--rung load] [--cache FILE]
+
+The folder holds run tables, and beside each the model of its gain that its facts name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from openant_tools.files import write_text
+from openant_tools.model.plant import Setup, load_plant
+from openant_tools.recording.run import Run
+from openant_tools.recording.tables import read_run
+from openant_tools.sysid.fit import Dataset, Problem, gaps, sensor_floor
+from openant_tools.sysid.parameter import KINDS, choose
+
+#: what every rung fits: the servo's own numbers, and that its back-EMF ends with the torque
+SERVO = ("stiffness", "armature", "zero_offset", "electrical_damping")
+#: s; laws that act between steps take time by the step, and at 2 ms rms errors differ from those at 1 ms by under 1 %
+STEP_S = 0.002
+RUNGS = {
+    "none": (),
+    "viscous": ("damping",),
+    "Coulomb": ("coulomb_friction",),
+    "both": ("damping", "coulomb_friction"),
+    "Stribeck": ("damping", "coulomb_friction", "stribeck_friction_static_nm", "stribeck_friction_velocity_rad_s"),
+    "load": ("damping", "coulomb_friction", "load_friction"),
+}
+
+
+def by_model(runs: Sequence[Run], *, volts: bool) -> dict[Path, Dataset]:
+    """One dataset for each model that the runs name."""
+    groups: dict[Path, list[Run]] = {}
+    for run in runs:
+        assert run.model_path is not None, f"{run.name} names no model"
+        groups.setdefault(run.model_path, []).append(run)
+    datasets = {}
+    for path, members in sorted(groups.items()):
+        plant = load_plant(path, None, Setup.STAND, electrical=True)
+        plant.model.opt.timestep = max(STEP_S, plant.timestep)
+        datasets[path] = Dataset.prepare(plant, members, measured_supply=volts)
+    return datasets
+
+
+def fit(datasets: Sequence[Dataset], kinds: Sequence[str], start: dict[str, float]) -> dict[str, float]:
+    """Each kind's number in prior deviations, fitted to these datasets from a first guess."""
+    parameters = choose(datasets[0].plant, [kind for kind in KINDS if kind in (*SERVO, *kinds)])
+    runs = [run for data in datasets for run in data.runs]
+    floor = np.maximum(sensor_floor(runs, datasets[0].plant.joints), 1e-6)
+    problem = Problem(datasets, parameters, floor)
+    first = np.array([start.get(p.kind, c) for p, c in zip(parameters, problem.centre, strict=True)])
+    found = problem.solve(first if start else None)
+    return {p.kind: float(u) for p, u in zip(parameters, found.u, strict=True)}
+
+
+def error(datasets: Sequence[Dataset], kinds: Sequence[str], u: dict[str, float]) -> float:
+    """rad, full runs."""
+    parameters = choose(datasets[0].plant, [kind for kind in KINDS if kind in (*SERVO, *kinds)])
+    return float(gaps(datasets, parameters, [np.array([u[p.kind] for p in parameters])])[0].full)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--rung", action="append", choices=list(RUNGS))
+    parser.add_argument("--cache", type=Path, default=Path("friction_ladder.json"))
+    options = parser.parse_args()
+    runs = [read_run(path) for path in sorted(options.folder.glob("*.parquet"))]
+    cache = json.loads(options.cache.read_text()) if options.cache.exists() else {}
+
+    print(
+        "| rung | supply | fitted to all | " + " | ".join(p.stem for p in by_model(runs, volts=False)) + " | held out |"
+    )
+    print("|---|---|---|" + "---|" * (len(by_model(runs, volts=False)) + 1))
+    for rung in options.rung or RUNGS:
+        for volts in (False, True):
+            sets = by_model(runs, volts=volts)
+            row = []
+            for held in (None, *sets):
+                key = f"{rung}, {'logged' if volts else 'nominal'}, {held.stem if held else 'all'}"
+                if key not in cache:
+                    train = [data for path, data in sets.items() if path != held]
+                    # From where the rung below ended: the servo's own numbers change little.
+                    below = [k for k in cache if k.endswith(key.partition(", ")[2])]
+                    start = cache[below[-1]]["u"] if below else {}
+                    u = fit(train, RUNGS[rung], start)
+                    judged = list(sets.values()) if held is None else [sets[held]]
+                    cache[key] = {"u": u, "error": error(judged, RUNGS[rung], u)}
+                    write_text(options.cache, json.dumps(cache, indent=1) + "\n")
+                row.append(cache[key]["error"])
+            samples = np.array([np.isfinite(data.measured).sum() for data in sets.values()])
+            pooled = math.sqrt(float(np.average(np.square(row[1:]), weights=samples)))
+            cells = " | ".join(f"{value:.4f}" for value in (*row, pooled))
+            print(f"| {rung} | {'logged' if volts else 'nominal'} | {cells} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,65 @@
+"""`openant sysid twitch`: whether a simulated robot stays where it is when it twitches."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from openant_tools.cli.options import json_option, robot_option
+
+__all__ = ["twitch"]
+
+
+@click.command()
+@click.option(
+    "--model", type=click.Path(path_type=Path), metavar="M.xml", help="Default: the model of the robot's folder."
+)
+@robot_option
+@click.option("--seconds", type=click.FloatRange(1.0, 600.0), default=6.0, show_default=True, help="Of twitching.")
+@json_option
+def twitch(model: Path | None, robot: Path | None, seconds: float, json_file: Path | None) -> int:
+    """Twitch fast on the simulated floor and see whether the robot travels, as a real one would not.
+
+    Contacts that are too hard let a simulated robot slide by high-frequency commands, which an agent finds and a real floor
+    does not give. Exit code 1: it travels; the softness with which the paper's robot stays is tried and named.
+
+    \b
+      openant sysid twitch --robot my-ant
+      openant sysid twitch --model calibrated.xml
+    """
+    from openant_tools.cli.options import robot_folder
+    from openant_tools.files import write_text
+    from openant_tools.model.plant import Setup, load_plant
+    from openant_tools.robot.folder import RobotFolder
+    from openant_tools.robot.joints import JOINT_NAMES
+    from openant_tools.sysid.excitation import CommandSpace
+    from openant_tools.sysid.twitch import PAPER_SOLIMP, PAPER_SOLREF, STAYS_M_S, travel, with_paper_contacts
+
+    limits = None
+    if model is None:
+        folder = RobotFolder.at(robot_folder(robot, must_exist=True))
+        configuration = folder.config()
+        model = folder.model_path(configuration)
+        limits = {motor.joint: (motor.min_rad, motor.max_rad) for motor in configuration.motors.values()}
+    plant = load_plant(model, JOINT_NAMES, Setup.FLOOR)
+    space = CommandSpace.around_home(limits)
+    found = travel(plant, space, seconds=seconds)
+    result = {"model": str(model), "speed_m_s": found.speed, "turn_rad": found.turn_rad, "stays": found.stays}
+    click.echo(
+        f"{model}: twitching for {seconds:g} s moves it {1e3 * found.distance_m:.1f} mm ({1e3 * found.speed:.1f} mm/s) and "
+        f"turns it {found.turn_rad:+.2f} rad; below {1e3 * STAYS_M_S:g} mm/s it stays"
+    )
+    if not found.stays:
+        softer = travel(with_paper_contacts(plant), space, seconds=seconds)
+        result["speed_with_paper_contacts_m_s"] = softer.speed
+        values = " ".join(f"{value:g}" for value in PAPER_SOLREF), " ".join(f"{value:g}" for value in PAPER_SOLIMP[:3])
+        click.echo(
+            f'it travels: with solref="{values[0]}" solimp="{values[1]}" on floor and feet it moves '
+            f"{1e3 * softer.speed:.1f} mm/s"
+            + (", so set these" if softer.stays else ", too: look at friction, masses and the time step")
+        )
+    if json_file:
+        write_text(json_file, json.dumps(result, indent=1) + "\n")
+    return 0 if found.stays else 1
