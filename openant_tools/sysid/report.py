@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 
 #: horizons at which the error is shown, s; the full run comes last
 HORIZONS_S = (0.1, 0.2, 0.5, 1.0, 2.0)
+#: correlations beyond this are worth a line
+STRONG = 0.7
 #: seconds shown around the worst moment of a joint
 WINDOW_S = 3.0
 
@@ -87,6 +89,7 @@ def fit_report(result: Identification) -> Report:
         report.section("What to record next").table(
             ["protocol", "it would settle"], [[what, ", ".join(names)] for what, names in wanted.items()]
         )
+    _correlations(report, result)
     report.section("Measured against simulated")
     for data in result.held_out:
         report.add(*_joints(result, data))
@@ -100,6 +103,37 @@ def fit_report(result: Identification) -> Report:
         [[j, f"{1e3 * result.noise[j]:.2f}", f"{result.correlation_s[j]:.3f}"] for j in result.joints],
     )
     return report
+
+
+def _correlations(report: Report, result: Identification) -> None:
+    """Which values could trade against each other without the data minding."""
+    if len(result.values) < 2:
+        return
+    deviation = np.sqrt(np.diag(result.covariance))
+    correlation = result.covariance / np.outer(deviation, deviation)
+    names = [value.name for value in result.values]
+    section = report.section("Correlations").figure(
+        _matrix(correlation, names),
+        "How the errors of two values go together: where a square is strong, the data fix a combination of the two better "
+        "than either.",
+    )
+    upper = np.argwhere(np.triu(np.abs(correlation) > STRONG, 1))
+    if len(upper):
+        pairs = sorted(upper.tolist(), key=lambda pair: -abs(correlation[pair[0], pair[1]]))
+        rows = [[names[a], names[b], f"{correlation[a, b]:+.2f}"] for a, b in pairs[:12]]
+        section.table(["value", "goes with", "correlation"], rows)
+
+
+def _matrix(correlation: Array, names: Sequence[str]) -> MatplotlibFigure:
+    figure: MatplotlibFigure
+    size = max(3.0, 0.16 * len(names) + 1.8)
+    figure, axes = plots.figure(height=size)
+    image = axes.imshow(correlation, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
+    ticks = range(len(names))
+    axes.set_xticks(ticks, names, rotation=90, fontsize=6)
+    axes.set_yticks(ticks, names, fontsize=6)
+    figure.colorbar(image, ax=axes, label="correlation (1)", shrink=0.7)
+    return figure
 
 
 def _names(result: Identification) -> list[str]:
