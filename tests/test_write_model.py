@@ -363,6 +363,20 @@ def test_friction_and_softness_are_written_where_they_decide(floor: str, tmp_pat
         assert elements == {"geom floor"}
 
 
+@pytest.mark.parametrize("stated", ["", 'friction="0.9 0.9 0.01 0.001 0.001" solref="0.03 1" solimp="0.8 0.9 0.01"'])
+def test_a_pair_with_the_floor_is_written_too(stated: str, tmp_path: Path) -> None:
+    """Whether it states its friction, or has it from its geoms; a pair of the robot with itself stays."""
+    text = WALKER.replace("FLOOR", "").replace('<geom size="0.07"/>', '<geom name="belly" size="0.07"/>')
+    text = text.replace('<geom class="foot"', '<geom name="foot" class="foot"')
+    pairs = f'<contact><pair geom1="foot" geom2="floor" {stated}/><pair geom1="belly" geom2="foot" friction="0.3"/></contact>'
+    source = plants.write(tmp_path / "walker.xml", text.replace("<actuator>", f"{pairs}<actuator>"))
+    variant = moved(source, ["floor_friction", "contact_softness", "contact_impedance"], 0.4)
+    given = load_plant(source, setup=Setup.FLOOR).model
+    assert sorted(variant.pair_friction[:, 0] / given.pair_friction[:, 0]) == pytest.approx([1.0, math.exp(0.03)])
+    out = write_model(source, variant, tmp_path / "out.xml")
+    same_physics(mujoco.MjModel.from_xml_path(str(out)), variant)
+
+
 def test_geoms_that_cannot_be_told_apart_are_refused(tmp_path: Path) -> None:
     part = '<replicate count="2" offset="0 0.2 0"><body><geom size="0.01" mass="0.01"/></body></replicate>'
     source = plants.write(

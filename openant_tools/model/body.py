@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.model.plant import Plant, world_bodies
 
-__all__ = ["deciding_geoms", "link_bodies", "scale_mass", "torso_body"]
+__all__ = ["Contacts", "floor_contacts", "link_bodies", "scale_mass", "torso_body"]
 
 Ints = NDArray[np.int64]
 
@@ -31,15 +33,26 @@ def scale_mass(model: mujoco.MjModel, bodies: Ints, factor: float) -> None:
     model.body_inertia[bodies] *= factor
 
 
-def deciding_geoms(model: mujoco.MjModel) -> Ints:
-    """The geoms whose friction and softness decide what happens at the floor.
+@dataclass(frozen=True)
+class Contacts:
+    """What decides how the robot meets the world: ids of geoms, and of pairs."""
 
-    Of two geoms the one of higher priority decides alone; of equal priority, both (MuJoCo's rule). So these are the world's
-    where they have priority over all of the robot's, else all that may touch anything.
+    geoms: Ints
+    pairs: Ints
+
+
+def floor_contacts(model: mujoco.MjModel) -> Contacts:
+    """The geoms and pairs whose friction and softness decide what happens at the floor.
+
+    A <pair> decides for its two geoms. Else, of two geoms the one of higher priority decides alone, and of equal priority both
+    (MuJoCo's rules). So these are the pairs with the world, and the world's geoms where they have priority over all of the
+    robot's, else all that may touch anything.
     """
     of_world = np.isin(model.geom_bodyid, list(world_bodies(model)))
     touches = (model.geom_contype | model.geom_conaffinity) != 0
     robot = touches & ~of_world
     highest = int(model.geom_priority[robot].max(initial=0))
     alone = of_world & (model.geom_priority > highest)
-    return np.flatnonzero(alone if alone.any() else robot | (of_world & touches)).astype(np.int64)
+    geoms = np.flatnonzero(alone if alone.any() else robot | (of_world & touches)).astype(np.int64)
+    with_world = of_world[model.pair_geom1] | of_world[model.pair_geom2]
+    return Contacts(geoms, np.flatnonzero(with_world).astype(np.int64))

@@ -426,14 +426,23 @@ def _write_bodies(root: etree._Element, plant: Plant, variant: mujoco.MjModel, s
 
 def _write_contacts(root: etree._Element, plant: Plant, variant: mujoco.MjModel) -> None:
     given = plant.model
-    fields = (("friction", "geom_friction"), ("solref", "geom_solref"), ("solimp", "geom_solimp"))
-    for attribute, field in fields:
-        before, after = getattr(given, field), getattr(variant, field)
-        differing = np.flatnonzero(~np.isclose(before, after, rtol=1e-12, atol=1e-15).all(axis=1))
+    for attribute in ("friction", "solref", "solimp"):
+        differing = _differing(given, variant, f"geom_{attribute}")
         if len(differing):
             _, geoms = _in_order(root, plant)
             for k in differing:
-                geoms[k].set(attribute, _numbers(after[k]))
+                geoms[k].set(attribute, _numbers(getattr(variant, f"geom_{attribute}")[k]))
+        for k in _differing(given, variant, f"pair_{attribute}"):
+            names = {given.geom(int(given.pair_geom1[k])).name, given.geom(int(given.pair_geom2[k])).name}
+            found = [e for e in root.iter("pair") if {e.get("geom1"), e.get("geom2")} == names]
+            if len(found) != 1:
+                raise _not_written_out(f"the contact pair of {' and '.join(sorted(names))}", plant.path)
+            found[0].set(attribute, _numbers(getattr(variant, f"pair_{attribute}")[k]))
+
+
+def _differing(given: mujoco.MjModel, variant: mujoco.MjModel, field: str) -> NDArray[np.int64]:
+    before, after = getattr(given, field), getattr(variant, field)
+    return np.flatnonzero(~np.isclose(before, after, rtol=1e-12, atol=1e-15).all(axis=1)).astype(np.int64)
 
 
 def _in_order(root: etree._Element, plant: Plant) -> tuple[list[etree._Element], list[etree._Element]]:
@@ -532,4 +541,7 @@ _OF_BODIES = (
     ("the friction of a geom", "geom_friction"),
     ("the softness of a geom (solref)", "geom_solref"),
     ("the softness of a geom (solimp)", "geom_solimp"),
+    ("the friction of a pair", "pair_friction"),
+    ("the softness of a pair (solref)", "pair_solref"),
+    ("the softness of a pair (solimp)", "pair_solimp"),
 )

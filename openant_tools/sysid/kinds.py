@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.effects.catalogue import catalogue
-from openant_tools.model.body import deciding_geoms, link_bodies, scale_mass, torso_body
+from openant_tools.model.body import floor_contacts, link_bodies, scale_mass, torso_body
 from openant_tools.model.plant import (
     KD,
     KP,
@@ -247,31 +247,37 @@ def _write_torso_mass(model: mujoco.MjModel, plant: Plant, j: int, value: float)
     scale_mass(model, np.array([torso]), value / float(model.body_mass[torso]))
 
 
-def _read_floor_friction(model: mujoco.MjModel, plant: Plant, j: int) -> float:
-    return float(model.geom_friction[deciding_geoms(model), 0].max(initial=0.0))
+def _contact(field: str, columns: int) -> tuple[Callable[..., float], Callable[..., None]]:
+    """Reader and writer of the first number of a contact's field: the greatest of all; all are scaled alike.
+
+    Args:
+        field: as after `geom_` and `pair_`.
+        columns: how many of a pair's numbers mean the same (its friction has two sliding directions).
+    """
+
+    def numbers(model: mujoco.MjModel) -> tuple[Array, Array]:
+        contacts = floor_contacts(model)
+        # A negative time constant is a stiffness (`solref`): it is none, and stays.
+        geoms = np.asarray(getattr(model, f"geom_{field}"))[contacts.geoms, 0]
+        pairs = np.asarray(getattr(model, f"pair_{field}"))[contacts.pairs, 0]
+        return geoms, pairs
+
+    def read(model: mujoco.MjModel, plant: Plant, j: int) -> float:
+        return max(float(part.max(initial=0.0)) for part in numbers(model))
+
+    def write(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
+        contacts, factor = floor_contacts(model), value / read(model, plant, j)
+        geoms, pairs = numbers(model)
+        getattr(model, f"geom_{field}")[contacts.geoms, 0] *= np.where(geoms > 0, factor, 1.0)
+        for column in range(columns):
+            getattr(model, f"pair_{field}")[contacts.pairs, column] *= np.where(pairs > 0, factor, 1.0)
+
+    return read, write
 
 
-def _write_floor_friction(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
-    model.geom_friction[deciding_geoms(model), 0] *= value / _read_floor_friction(model, plant, j)
-
-
-def _read_softness(model: mujoco.MjModel, plant: Plant, j: int) -> float:
-    """s, the time constant; where `solref` is a stiffness and a damping (negative) there is none."""
-    return float(model.geom_solref[deciding_geoms(model), 0].max(initial=0.0))
-
-
-def _write_softness(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
-    geoms = deciding_geoms(model)
-    geoms = geoms[model.geom_solref[geoms, 0] > 0]
-    model.geom_solref[geoms, 0] *= value / _read_softness(model, plant, j)
-
-
-def _read_impedance(model: mujoco.MjModel, plant: Plant, j: int) -> float:
-    return float(model.geom_solimp[deciding_geoms(model), 0].max(initial=0.0))
-
-
-def _write_impedance(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
-    model.geom_solimp[deciding_geoms(model), 0] *= value / _read_impedance(model, plant, j)
+_read_floor_friction, _write_floor_friction = _contact("friction", 2)
+_read_softness, _write_softness = _contact("solref", 1)
+_read_impedance, _write_impedance = _contact("solimp", 1)
 
 
 def usual_torque(model: mujoco.MjModel, plant: Plant, j: int) -> float:
