@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -405,6 +406,14 @@ def test_a_bad_entry_gets_one_line_that_says_what_to_do(line: str, words: str, m
     assert words in message
     assert "mine.toml" in message
     assert "\n" not in message
+
+
+def test_a_run_whose_own_model_lacks_what_was_declared_is_named(model: Path, tmp_path: Path) -> None:
+    other = plants.write(tmp_path / "other.xml", MODEL.replace('name="bob"', 'name="weight"'))
+    runs = [record(MODEL, "a", seconds=2.0), record(MODEL, "b", 1, seconds=2.0)]
+    runs[1] = replace(runs[1], facts=replace(runs[1].facts, model=str(other)))
+    with pytest.raises(BadInput, match=r"other.xml: no geom is called 'bob' → there are bench, rod, weight"):
+        identify(runs, model, declared=declare(tmp_path, BOB))
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,7 @@ def stated(spec: mujoco.MjSpec, attribute: Attribute, where: Path | str = "") ->
 def set_stated(spec: mujoco.MjSpec, values: Stated) -> None:
     """Set attributes of a spec, before it is compiled."""
     for attribute, numbers in values.items():
-        owner, spelled = _owner(spec, attribute), _spelled(attribute)
+        owner, spelled = _owner(spec, attribute, ""), _spelled(attribute)
         if isinstance(getattr(owner, spelled), np.ndarray):
             getattr(owner, spelled)[:] = numbers
         else:
@@ -102,7 +102,7 @@ def set_stated(spec: mujoco.MjSpec, values: Stated) -> None:
 
 
 def _numbers(spec: mujoco.MjSpec, attribute: Attribute, where: Path | str) -> tuple[float, ...]:
-    owner, spelled = _owner(spec, attribute), _spelled(attribute)
+    owner, spelled = _owner(spec, attribute, where), _spelled(attribute)
     value = getattr(owner, spelled, None)
     numbers: tuple[float, ...]
     if isinstance(value, float):
@@ -130,10 +130,15 @@ def _is_real(value: Any) -> bool:
     return isinstance(value, float) or (isinstance(value, np.ndarray) and value.dtype.kind == "f")
 
 
-def _owner(spec: mujoco.MjSpec, attribute: Attribute) -> Any:
+def _owner(spec: mujoco.MjSpec, attribute: Attribute, where: Path | str) -> Any:
     if attribute.element == "option":
         return spec.option
-    return next(one for one in ELEMENTS[attribute.element](spec) if one.name == attribute.name)
+    named = ELEMENTS[attribute.element](spec)
+    for one in named:
+        if one.name == attribute.name:
+            return one
+    remedy = _near(attribute.name, [str(one.name) for one in named if one.name])
+    raise BadInput(f"no {attribute.element} is called {attribute.name!r}", where=where, remedy=remedy)
 
 
 def _spelled(attribute: Attribute) -> str:
