@@ -47,6 +47,8 @@ class Robot:
     zero_offset: float = 0.0
     delay_s: float = 0.0
     electrical: bool = False
+    #: how much more friction there is at rest than in motion, which no model here knows
+    stribeck: float = 0.0
 
     @property
     def values(self) -> Mapping[str, float]:
@@ -94,6 +96,9 @@ class Robot:
             model.actuator_group[0] = 30 if limp[k] else 0
             model.opt.disableactuator = 1 << 30
             model.dof_damping[0] = 0.0 if self.electrical and limp[k] else self.damping
+            if self.stribeck:
+                slow = math.exp(-((float(data.qvel[0]) / 0.4) ** 2))
+                model.dof_frictionloss[0] = self.coulomb_friction * (1 + self.stribeck * slow)
             if k + 1 < len(rows):
                 steps = math.ceil((rows[k + 1] - rows[k]) / 0.000125)
                 model.opt.timestep = (rows[k + 1] - rows[k]) / steps
@@ -382,6 +387,113 @@ def test_how_long_a_residual_remembers_itself() -> None:
     assert autocorrelation_time(np.full(100, 0.3), 50) > 30, "a bias is model error for ever"
     assert autocorrelation_time(np.zeros(100), 50) == 1.0
     assert autocorrelation_time(np.full(5, np.nan), 50) == 1.0
+
+
+# --- bad telemetry, and models that lack something ------------------------------------------------------------------------
+
+
+def spoilt(run: Run, seed: int) -> Run:
+    """Fifteen positions of a run that were misread, a tenth that was not read, and a tenth more that holds the last one."""
+    chance = np.random.default_rng(seed)
+    pos, ok = run.column("pos.joint").copy(), np.ones(len(run.t))
+    pos[chance.random(len(pos)) < 0.1] = np.nan
+    stale = np.flatnonzero(chance.random(len(pos)) < 0.1)
+    ok[stale], pos[stale] = 0, pos[stale - 1]
+    alone = 10 + 20 * np.arange(15)
+    pos[alone] = run.column("pos.joint")[alone] + chance.choice([-1, 1], 15) * chance.uniform(0.1, 3.0, 15)
+    ok[alone] = 1
+    return replace(run, columns={**run.columns, "pos.joint": pos, "ok.joint": ok})
+
+
+def test_misread_and_unread_positions_are_left_out_and_told(model: Path) -> None:
+    robot = Robot(7.3, 0.145, coulomb_friction=0.055)
+    runs = [robot.record("a"), robot.record("b", seed=1)]
+    result = identify([spoilt(runs[0], 5)], model, [spoilt(runs[1], 6)])
+    holds(result, robot.values)
+    assert value(result, "stiffness.joint").value == pytest.approx(7.3, rel=0.03)
+    assert result.after.full < 3 * FLOOR, "the held-out run's errors are left out too"
+    spikes, missing = result.notes[:2]
+    assert "errors of telemetry and left out" in spikes
+    assert int(spikes.split(": ")[1].split()[0]) >= 13, spikes
+    assert "Samples are missing" in missing
+    assert "openant comms diagnose" in missing
+
+
+def test_the_error_of_time_stamps_is_estimated(model: Path) -> None:
+    robot = Robot(7.3, 0.145, coulomb_friction=0.055)
+
+    def late(run: Run, seed: int) -> Run:
+        return replace(run, t=run.t + np.random.default_rng(seed).uniform(-0.003, 0.003, len(run.t)))
+
+    result = identify([late(robot.record("a", 6.0), 1)], model, [late(robot.record("b", seed=1), 2)])
+    holds(result, robot.values)
+    assert result.stamp_error_s == pytest.approx(0.006 / math.sqrt(12), rel=0.3)
+    assert any("Time stamps miss the moments of sampling by 1." in note for note in result.notes)
+    assert result.as_json()["stamp_error_s"] == result.stamp_error_s
+    still = identify([robot.record("a", 6.0)], model, [robot.record("b", seed=1)], kinds=["stiffness", "damping"])
+    assert still.stamp_error_s < 0.5e-3
+
+
+def test_intervals_widen_where_the_model_lacks_something(model: Path) -> None:
+    """A robot whose friction is thrice as high at rest: no value of the model's friction is right everywhere."""
+    plain_robot = Robot(7.3, 0.14, coulomb_friction=0.05)
+    stribeck = replace(plain_robot, stribeck=2.0)
+    kinds = ["stiffness", "damping", "armature", "coulomb_friction"]
+    right, wrong = (
+        identify([robot.record("a", 6.0)], model, [robot.record("b", seed=1)], kinds=kinds)
+        for robot in (plain_robot, stribeck)
+    )
+    for name in ("stiffness.joint", "damping.joint", "armature.joint", "coulomb_friction.joint"):
+        widths = [value(result, name).high - value(result, name).low for result in (right, wrong)]
+        assert widths[1] > 1.5 * widths[0], name
+    assert any("what is left there is model error" in note for note in wrong.notes)
+    friction = value(wrong, "coulomb_friction.joint")
+    assert 0.05 < friction.value < 0.15
+    stiffness = value(wrong, "stiffness.joint")
+    assert stiffness.low < 7.3 < stiffness.high
+
+
+def test_halves_of_the_data_that_disagree_raise_an_alarm(model: Path) -> None:
+    """Between two runs the robot's supply fell, and its stiffness with it."""
+    before, after = Robot(7.6, 0.14), Robot(6.8, 0.14)
+    kinds = ["stiffness", "damping", "coulomb_friction"]
+    torn = identify([before.record("a"), after.record("b", seed=1)], model, [before.record("c", seed=2)], kinds=kinds)
+    found = value(torn, "stiffness.joint")
+    assert found.halves is not None
+    assert found.halves == (pytest.approx(7.6, rel=0.03), pytest.approx(6.8, rel=0.03))
+    assert found.low <= min(found.halves) < max(found.halves) <= found.high
+    alarm = next(note for note in torn.notes if "contradict each other about" in note)
+    assert "stiffness.joint (7." in alarm
+    whole = identify([before.record("a"), before.record("b", seed=1)], model, [before.record("c", seed=2)], kinds=kinds)
+    assert all(one.halves is None for one in whole.values)
+
+
+def test_what_is_tied_is_named_with_the_experiment_that_unties_it(tmp_path: Path) -> None:
+    """Damping in the joint and in the servo are one, as long as torque is on and below its limit."""
+    text = MODEL.replace('kp="8"', 'kp="8" kv="0.1"')
+    assert text != MODEL
+    path = plants.write(tmp_path / "both.xml", text)
+    robot = plain.on_stand(path)
+    robot.dof_damping[:] = 0.15
+    runs = []
+    for k in range(2):
+        t = plants.jittering(4.0, 100.0, seed=k)
+        command = plants.sweep(t, 1, reach=0.12 + 0.02 * k)
+        columns = plants.drive(robot, ["joint"], t, command, noise=NOISE, quantum=plants.ENCODER_RAD, seed=k)
+        runs.append(plants.run_of(columns, t, ["joint"], f"run {k}"))
+    result = identify(runs[:1], path, runs[1:], kinds=["stiffness", "velocity_gain", "damping", "coulomb_friction"])
+    for one, other in (("velocity_gain", "damping"), ("damping", "velocity_gain")):
+        found = value(result, f"{one}.joint")
+        assert found.verdict == "tied"
+        assert found.words == f"tied to {other}.joint"
+        assert "saturating-steps" in found.record_next
+        assert "drops" in found.record_next
+        assert found.accepted
+    assert value(result, "stiffness.joint").tied_to is None
+    told = result.as_json()["parameters"]["damping.joint"]
+    assert told["tied_to"] == "velocity_gain.joint"
+    together = value(result, "damping.joint").value + value(result, "velocity_gain.joint").value
+    assert together == pytest.approx(0.25, rel=0.03)
 
 
 # --- bad input ---------------------------------------------------------------------------------------------------------

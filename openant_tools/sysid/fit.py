@@ -72,6 +72,8 @@ DELAYS_S = (0.02, 0.04, 0.06)
 BLOCK_TIMES, BLOCK_S, FEWEST_BLOCKS = 5.0, 0.5, 8
 #: chance of calling two halves of good data contradictory, over all parameters of a fit
 FALSE_ALARM = 1e-3
+#: rounds in which each half finds its own weights
+OWN_WEIGHTS = 4
 
 
 @dataclass(frozen=True)
@@ -647,29 +649,35 @@ class Problem:
     def _halves(self, tangent: _Tangent, point: _Point, free: Bools) -> tuple[Array, Bools]:
         """What the first half of the runs (of a single one, its first half) and the second say, and where they differ.
 
-        To first order from where both together end, each with the prior. They differ by more than chance where chance
-        as the residuals' size and memory make it would do so once in 1 / FALSE_ALARM fits.
+        Each half with the prior and with weights of its own, to first order from where both together end: a half that
+        disagrees counts for little in the whole, whose misfit to it is large. They differ by more than chance where
+        chance, as the residuals' size and memory make it, would do so once in 1 / FALSE_ALARM fits.
         """
         n = len(point.u)
         ends = np.cumsum([len(run.t) for data in self.datasets for run in data.runs])
         middle = int(ends[len(ends) // 2 - 1]) if len(ends) > 1 else int(ends[0]) // 2
         first = np.arange(len(self._weight)) < middle
         halves = np.full((2, n), np.nan)
-        variance = np.zeros((n, n))
-        shrunk = []
+        inverses = []
+        kept = self._weight, self.noise, self.correlation_s, self.stamp_error_s
+        inside = np.ix_(free, free)
         for k, rows in enumerate((first, ~first)):
-            precision, gradient = (part[..., free] for part in self._normal(tangent, point, rows))
-            inverse = np.linalg.inv(precision[free])
-            halves[k, free] = point.u[free] - inverse @ gradient
-            # Of the data alone; the prior draws each half as far as that half leaves it room.
-            variance[np.ix_(free, free)] += inverse - inverse @ inverse
-            shrunk.append(inverse)
-        apart = shrunk[0] - shrunk[1]
-        variance[np.ix_(free, free)] += apart @ apart
-        deviation = np.sqrt(np.maximum(np.diag(variance), 1e-12))
+            step = np.zeros(n)
+            for _ in range(OWN_WEIGHTS):
+                self._reweigh(replace(point, residual=point.residual + self._along(tangent, step)))
+                precision, gradient = self._normal(tangent, point, rows)
+                inverse = np.linalg.inv(precision[inside])
+                step[free] = -inverse @ gradient[free]
+            halves[k] = point.u + step
+            inverses.append(inverse)
+        self._weight, self.noise, self.correlation_s, self.stamp_error_s = kept
+        # Of the data alone, for the prior is in both; but it draws each half as far as that half leaves it room.
+        variance = sum(inverse - inverse @ inverse for inverse in inverses)
+        apart = inverses[0] - inverses[1]
+        deviation = np.sqrt(np.maximum(np.diag(variance + apart @ apart), 1e-12))
         limit = norm.isf(FALSE_ALARM / 2 / max(1, int(free.sum())))
         contradictory = np.zeros(n, bool)
-        contradictory[free] = np.abs(halves[0] - halves[1])[free] > limit * deviation[free]
+        contradictory[free] = np.abs(halves[0] - halves[1])[free] > limit * deviation
         return np.clip(halves, self.low, self.high), contradictory
 
     def _score(self, point: _Point) -> float:
