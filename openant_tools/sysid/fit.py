@@ -66,6 +66,8 @@ WHITE, SHORT_LIVED = 1.5, 10
 DECISIVE = 1.0
 #: half of the ±2 ms within which delays count as calibrated (effects.md)
 TIMING_STD_S = 1e-3
+#: share of the time step's effect that is taken as unknown: the rule is of first order
+RICHARDSON = 0.5
 #: delays (s) from which a fit starts where they explain the data far better than none
 DELAYS_S = (0.02, 0.04, 0.06)
 #: a block of the resampling is this many autocorrelation times long, and at least so many seconds; fewer blocks tell nothing
@@ -153,6 +155,7 @@ class Estimate:
         parameters: what was estimated.
         u: (parameters,) in prior deviations.
         covariance: (parameters, parameters) of u, the prior included.
+        step_shift: (parameters,) of u, by which a model with an infinitely small time step would be fitted otherwise.
         precision: (parameters, parameters) of u, what the data alone say.
         centre: (parameters,) the middle of the prior.
         low, high: (parameters,) the physical bounds of u.
@@ -168,6 +171,7 @@ class Estimate:
     parameters: tuple[Parameter, ...]
     u: Array
     covariance: Array
+    step_shift: Array
     precision: Array
     centre: Array
     low: Array
@@ -528,12 +532,16 @@ class Problem:
         give = np.zeros((n, n))
         give[np.ix_(free, free)] = np.linalg.inv(precision[np.ix_(free, free)])
         open_ = give @ self._left_open(tangent, point)
+        # What the step does has a direction: most of it is known, and the rest is as uncertain as the rule is rough.
+        step_shift = open_[:, -1].copy()
+        open_[:, -1] *= RICHARDSON
         wider = self._wider_by_blocks(tangent, point, covariance, free)
         halves, contradictory = self._halves(tangent, point, free)
         return Estimate(
             parameters=tuple(self.parameters),
             u=u,
             covariance=np.outer(wider, wider) * covariance + open_ @ open_.T,
+            step_shift=step_shift,
             precision=precision - np.eye(n),
             centre=self.centre,
             low=self.low,
@@ -550,7 +558,10 @@ class Problem:
         )
 
     def _left_open(self, tangent: _Tangent, point: _Point) -> Array:
-        """(parameters, causes): how one standard deviation of what no residual can show pulls at each parameter."""
+        """(parameters, causes): how what no residual can show pulls at each parameter.
+
+        One standard deviation of each joint's sampling time, and last all that the time step does.
+        """
         late, finer = self._late(point) * self._weight**2, self._time_step(point) * self._weight**2
         out = np.zeros((len(self.parameters), late.shape[1] + 1))
         for j, (p, _) in enumerate(self._movers):
@@ -584,7 +595,7 @@ class Problem:
         """(rows, joints) rad: what the model's own time step does to positions, by Richardson's rule from half of it.
 
         A step h of an implicit integrator brakes a joint of damping D as if it had h·D more inertia, among the like: the
-        values that fit best are those of the model with its step, and the robot's own may lie that far off.
+        values that fit best are those of the model with its step, and the robot's own lie about that far off.
         """
         out = []
         offset = 0

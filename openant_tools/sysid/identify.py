@@ -495,7 +495,8 @@ def _value(parameter: Parameter, plant: Plant, estimate: Estimate, k: int, verdi
     nominal = kind.read(plant.model, plant, parameter.joints[0])
     deviation = TWO_SIDED_95 * math.sqrt(estimate.covariance[k, k])
     centre = float(estimate.u[k]) if verdict.word == "fell back" else u
-    ends = [centre - deviation, centre + deviation]
+    # The value is the best for this model with its time step; the interval reaches to where the robot's own lies.
+    ends = [centre + shift + side for shift in (0.0, float(estimate.step_shift[k])) for side in (-deviation, deviation)]
     halves = None
     if verdict.contradictory:
         ends += estimate.halves[:, k].tolist()
