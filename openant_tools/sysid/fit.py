@@ -44,6 +44,8 @@ Progress = Callable[[str, float], None]
 #: finite-difference step in prior deviations: far above rounding and the solver's tolerance, and small enough that two
 #: parameters which move a robot alike have columns alike (at 0.1 their curvature told them apart)
 STEP = 0.03
+#: on the floor contacts chatter, and small differences are that: of joints, and of what belongs to body and floor
+FLOOR_STEP, FLOOR_STEP_OF_BODY = 0.1, 0.6
 #: steps at most, in each part of a descent
 MOST_STEPS = 20
 #: prior deviations: the longest first step, and how far from where it was taken a Jacobian is believed
@@ -267,6 +269,9 @@ class Problem:
         self.noise, self.correlation_s, self.stamp_error_s = np.zeros(nj), np.zeros(nj), 0.0
         self._valley = np.array([parameter.definition.valley for parameter in self.parameters], bool)
         self._colours = _colours(self.datasets, self.parameters)
+        on_floor = any(data.plant.setup is Setup.FLOOR for data in self.datasets)
+        chattering = [FLOOR_STEP_OF_BODY if p.definition.body else FLOOR_STEP for p in self.parameters]
+        self._differences = np.array(chattering if on_floor else [STEP] * len(self.parameters))
         #: for each joint, the parameters that move it and their colours
         self._movers: list[tuple[Ints, Ints]] = []
         for j in range(nj):
@@ -758,9 +763,10 @@ class Problem:
     def _tangent(self, point: _Point, central: bool) -> _Tangent:
         # Forward where the bound allows, else backward; where both, the other side too.
         u = point.u
-        up, down = u + STEP <= self.high, u - STEP >= self.low
-        ahead = np.where(up, STEP, -STEP)
-        behind = np.where(up & down, -STEP, 0.0) if central else np.zeros(len(u))
+        by = self._differences
+        up, down = u + by <= self.high, u - by >= self.low
+        ahead = np.where(up, by, -by)
+        behind = np.where(up & down, -by, 0.0) if central else np.zeros(len(u))
         variants = []
         for step in (ahead, behind) if central else (ahead,):
             for members, _ in self._colours:
