@@ -124,6 +124,64 @@ def test_recordings_hold_what_was_commanded_and_measured(stepped: dict[str, str]
     assert ["hip_fl", "knee_fl"] in run.facts.extra["chain"]
 
 
+def _swing(n: int = 120) -> tuple[np.ndarray, np.ndarray]:
+    """hip_fl swings from -0.25 to 0.25 rad and is let go in the middle for half a second; all else stays at home."""
+    s = np.clip(np.arange(n) / 40, 0, 1)
+    commands = np.repeat(HOME[None, :], n, axis=0)
+    commands[:, 4] += -0.25 + 0.5 * s**3 * (10 - 15 * s + 6 * s**2)
+    limp = np.zeros(commands.shape, bool)
+    limp[22:72, 4] = True
+    return commands, limp
+
+
+def test_one_joint_is_let_go_and_caught_where_it_hangs_while_the_others_hold(
+    stepped: dict[str, str], tmp_path: Path
+) -> None:
+    commands, limp = _swing()
+    with EngineProcess(config(stepped)) as engine:
+        engine.ask(messages.Torque(True))
+        engine.ask(messages.Ramp(commands[0]))
+        engine.ask(messages.Record(str(tmp_path / "run"), Facts(JOINT_NAMES, setup="stand")))
+        engine.ask(messages.Play(commands, "swing", limp))
+        path, _ = engine.ask(messages.StopRecording())
+        assert all(torques(stepped))
+    run = read_recording(path).run
+    torque, cmd, pos = run.signal("torque"), run.signal("cmd"), run.signal("pos")
+    off = torque[:, 4] == 0
+    assert off.sum() == pytest.approx(50, abs=2)
+    assert (np.delete(torque, 4, axis=1) == 1).all()
+    # The goal follows the leg, then leads it back gently.
+    assert np.abs(cmd[off, 4][1:] - pos[off, 4][:-1]).max() < 2 * np.pi / 4096
+    back = cmd[np.flatnonzero(off)[-1] :, 4]
+    assert np.abs(np.diff(back)).max() < 1.0 / 100 * 1.1
+    assert cmd[-1, 4] == pytest.approx(commands[-1, 4], abs=0.01)
+    assert np.abs(np.delete(pos - commands[:1], 4, axis=1)).max() < 0.05
+
+
+def test_a_leg_that_was_let_go_is_guarded_too(stepped: dict[str, str]) -> None:
+    commands, limp = _swing()
+    limits = dict.fromkeys(JOINT_NAMES, (-1.5, 1.5)) | {"hip_fl": (-0.3, 0.27)}
+    commands[23:, 4] = 0.0
+    limp[22:, 4], limp[-1, 4] = True, False
+    commands[:23, 4] = np.linspace(-0.25, 0.24, 23)
+    guarded = config(stepped, limits_rad=limits, guards=Guards(angle_margin_rad=0.0))
+    with EngineProcess(guarded) as engine:
+        engine.ask(messages.Torque(True))
+        engine.ask(messages.Ramp(commands[0]))
+        with pytest.raises(HardwareFault, match=r"hip_fl .* rad, outside its limits -0.30 to 0.27"):
+            engine.ask(messages.Play(commands, "swing", limp))
+        assert not any(torques(stepped))
+
+
+def test_a_motion_may_not_begin_nor_end_without_torque(stepped: dict[str, str]) -> None:
+    commands, limp = _swing()
+    limp[-1, 4] = True
+    with EngineProcess(config(stepped)) as engine:
+        engine.ask(messages.Torque(True))
+        with pytest.raises(HardwareFault, match="must begin and end with the torque of all joints on"):
+            engine.ask(messages.Play(commands, "swing", limp))
+
+
 @pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="limits of another process are Linux'")
 def test_a_full_disk_stops_the_motion_and_the_next_recording_goes_on(stepped: dict[str, str], tmp_path: Path) -> None:
     with EngineProcess(config(stepped)) as engine:

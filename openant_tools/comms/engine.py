@@ -92,6 +92,9 @@ class Engine:
         self._motions: deque[Motion] = deque()
         self._goal: Array | None = None
         self._limp = np.zeros(len(config.servos), bool)
+        self._let_go: list[str] = []
+        #: where the joints were in the last cycle of a motion that lets joints go, rad
+        self._angles = np.zeros(len(config.servos))
         self._counts: list[int] | None = None
         self._waiting: list[tuple[int, Motion]] = []
         self._recorder: RecordingWriter | None = None
@@ -298,7 +301,7 @@ class Engine:
     def _torque_off(self) -> None:
         """Release every servo, again and again until each has confirmed or time is up: the line may be bad."""
         self._torque = False
-        self._limp[:] = False
+        self._limp[:], self._let_go = False, []
         self._motions.clear()
         self._goal = self._counts = None
         if self._lost:
@@ -387,13 +390,20 @@ class Engine:
                 except HardwareFault as error:
                     self._stopped(Trip(error.what, error.remedy or ""))
                     return
+            if self._limp.any():
+                # The goal follows a leg that hangs free: whenever torque comes back, there is nothing to jump to.
+                self._goal = np.where(self._limp, self._angles, self._goal)
             self._counts = self._servos.goal_counts(self._goal.tolist())
             if motion.ended:
                 ended = self._motions.popleft()
         if self._torque and self._counts is not None:
             cmd_t = self._servos.write_goals(self._counts)
         answers = self._servos.read_blocks()
+        if self._torque and self._motions and self._motions[0].limp is not None:
+            self._note_angles(answers)
         t, before = self._bus.request_at, self._asked_at
+        if self._let_go:
+            self._make_sure(self._let_go)
         self._asked_at = t
         self._cycles += 1
         self._worst_wake = max(self._worst_wake, wake)
@@ -407,15 +417,30 @@ class Engine:
         if ended is not None:
             self._motion_ended(ended)
 
+    def _make_sure(self, let_go: list[str]) -> None:
+        """Joints that were let go must be without torque, or the recording lies."""
+        self._let_go = []
+        try:
+            self._servos.set_torque(False, self._servos.still_on(let_go))
+        except PortGone:
+            raise
+        except HardwareFault as error:
+            self._stopped(Trip(error.what, error.remedy or ""))
+
+    def _note_angles(self, answers: list[tuple[Answer, Block | None]]) -> None:
+        for k, (servo, (_, block)) in enumerate(zip(self._servos.servos, answers, strict=True)):
+            if block is not None:
+                self._angles[k] = servo.to_joint(block.position * servo.model.registers["present_position"].scale)
+
     def _release_and_catch(self, motion: Motion) -> Array:
         """Switch the torque of single joints as a motion says; its row, in which a caught joint's goal is where it hangs."""
         servos, joints = self._servos, self._servos.joints
         before, self._limp = self._limp, motion.limp_now.copy()
         loose = [joint for joint, was, now in zip(joints, before, self._limp, strict=True) if now and not was]
         if loose:
-            # All at once, since each answer costs a fraction of a cycle; who did not hear it is told alone.
+            # All at once, and just before the row that says so is read; who did not hear it is told alone after that.
             servos.write_all("torque_enable", dict.fromkeys(loose, 0))
-            servos.set_torque(False, servos.still_on(loose))
+            self._let_go = loose
         caught = [joint for joint, was, now in zip(joints, before, self._limp, strict=True) if was and not now]
         if caught:
             here = servos.read_all("present_position", caught)
@@ -665,6 +690,7 @@ class Engine:
             self._torque_off()
             raise
         self._goal = np.array(servos.joint_rad(self._counts))
+        self._angles = self._goal.copy()
         self._torque = True
         self._asked_at = self.clock.now()
         self._watch.reset(self._asked_at)

@@ -104,8 +104,8 @@ class Play:
     """Play commands (n, joints) rad at the loop's rate, after a ramp to the first; `Finished` follows.
 
     Attributes:
-        limp: (n, joints), where a joint's torque is to be off; not in the first row nor the last. When its torque comes
-            back, its goal starts where it hangs and goes to what is commanded no faster than a ramp.
+        limp: (n, joints), where a joint's torque is to be off; not in the first row nor the last. Its goal follows it
+            meanwhile; when its torque comes back, the goal starts there and goes to what is commanded no faster than a ramp.
     """
 
     commands: NDArray[np.float64]

@@ -137,6 +137,8 @@ def forecast(
     for row in range(n):
         for j in np.flatnonzero(limp[row - 1] & ~limp[row]) if row else ():
             catch(commands, row, int(j), float(data.qpos[plant.qpos[j]]), rate_hz)
+        if row:
+            commands[row] = np.where(limp[row], pos[row - 1], commands[row])
         here = variants.setdefault(limp[row].tobytes(), plant.with_torque_off(model, limp[row]))
         pos[row] = data.qpos[plant.qpos]
         data.ctrl[plant.ctrl] = commands[row]
@@ -179,6 +181,7 @@ class _Watch:
     """How near the robot's parts come to each other: its collision detection, with wider margins."""
 
     model: mujoco.MjModel
+    data: mujoco.MjData
     own: Bools
     torso: int
 
@@ -190,11 +193,11 @@ class _Watch:
         # The robot is what hangs together with its joints; the floor is body 0, but so is a torso on the stand.
         weld = wide.body_weldid[wide.geom_bodyid]
         own = (weld != 0) | (wide.geom_bodyid != 0)
-        return cls(wide, own, torso)
+        return cls(wide, mujoco.MjData(wide), own, torso)
 
     def look(self, data: mujoco.MjData) -> tuple[float, tuple[str, ...], bool]:
         """(smallest distance m, the parts, whether the torso is on the floor)."""
-        model, apart = self.model, mujoco.MjData(self.model)
+        model, apart = self.model, self.data
         apart.qpos[:] = data.qpos
         mujoco.mj_kinematics(model, apart)
         mujoco.mj_collision(model, apart)
