@@ -46,6 +46,8 @@ Progress = Callable[[str, float], None]
 STEP = 0.03
 #: on the floor contacts chatter, and small differences are that: of joints, and of what belongs to body and floor
 FLOOR_STEP, FLOOR_STEP_OF_BODY = 0.1, 0.6
+#: models about the estimate that are looked at for how contacts chatter
+CHATTER_LOOKS = 4
 #: steps at most, in each part of a descent
 MOST_STEPS = 20
 #: prior deviations: the longest first step, and how far from where it was taken a Jacobian is believed
@@ -269,9 +271,9 @@ class Problem:
         self.noise, self.correlation_s, self.stamp_error_s = np.zeros(nj), np.zeros(nj), 0.0
         self._valley = np.array([parameter.definition.valley for parameter in self.parameters], bool)
         self._colours = _colours(self.datasets, self.parameters)
-        on_floor = any(data.plant.setup is Setup.FLOOR for data in self.datasets)
+        self._on_floor = any(data.plant.setup is Setup.FLOOR for data in self.datasets)
         chattering = [FLOOR_STEP_OF_BODY if p.definition.body else FLOOR_STEP for p in self.parameters]
-        self._differences = np.array(chattering if on_floor else [STEP] * len(self.parameters))
+        self._differences = np.array(chattering if self._on_floor else [STEP] * len(self.parameters))
         #: for each joint, the parameters that move it and their colours
         self._movers: list[tuple[Ints, Ints]] = []
         for j in range(nj):
@@ -565,14 +567,31 @@ class Problem:
     def _left_open(self, tangent: _Tangent, point: _Point) -> Array:
         """(parameters, causes): how what no residual can show pulls at each parameter.
 
-        One standard deviation of each joint's sampling time, and last all that the time step does.
+        One standard deviation of each joint's sampling time, all that the time step does, and how contacts chatter.
         """
-        late, finer = self._late(point) * self._weight**2, self._time_step(point) * self._weight**2
-        out = np.zeros((len(self.parameters), late.shape[1] + 1))
+        late = self._late(point) * self._weight**2
+        shared = [part * self._weight**2 for part in (self._time_step(point), *self._chatter(tangent, point))]
+        out = np.zeros((len(self.parameters), late.shape[1] + len(shared)))
         for j, (p, _) in enumerate(self._movers):
             moves = self._moves(tangent, j)
             out[p, j] = moves @ late[:, j]
-            out[p, -1] += moves @ finer[:, j]
+            for k, part in enumerate(shared):
+                out[p, late.shape[1] + k] += moves @ part[:, j]
+        return out
+
+    def _chatter(self, tangent: _Tangent, point: _Point) -> list[Array]:
+        """(rows, joints) rad each: what models near the estimate do beyond the tangent, on the floor.
+
+        There a hair's difference lets a foot slip a moment earlier, and the rest of the run is another. A robot is such a model
+        too: no estimate is better than that.
+        """
+        if not self._on_floor:
+            return []
+        chance, out = np.random.default_rng(0), []
+        for _ in range(CHATTER_LOOKS):
+            moved = np.clip(point.u + self._differences * chance.standard_normal(len(point.u)), self.low, self.high)
+            beyond = self._look(moved).residual - point.residual - self._along(tangent, moved - point.u)
+            out.append(np.nan_to_num(beyond) / math.sqrt(CHATTER_LOOKS))
         return out
 
     def _late(self, point: _Point) -> Array:
