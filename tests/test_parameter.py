@@ -74,6 +74,11 @@ def test_a_lag_is_told_from_a_delay(model: Path, tmp_path: Path) -> None:
     assert result.after.full < 0.05 * result.before.full
     write_fit(result, tmp_path / "fit")
     assert 'timeconst="0.0' in (tmp_path / "fit" / "calibrated.xml").read_text()
+    # And the same figure in plain MuJoCo, from the written file and the table alone.
+    write_table(result.held_out[0].runs[0], tmp_path / "b.csv")
+    table = plain.read_table(tmp_path / "b.csv")
+    theirs = plain.play(plain.on_stand(tmp_path / "fit" / "calibrated.xml"), table, ["joint"])
+    assert plain.gap(table, theirs, ["joint"]) < 0.06 * result.before.full
 
 
 def test_a_filter_without_lag_is_the_given_model(model: Path) -> None:
