@@ -275,6 +275,21 @@ def test_a_silent_servo_stops_the_motion(live: dict[str, str]) -> None:
     wait_until(lambda: not any(on for k, on in enumerate(torques(live)) if JOINT_NAMES[k] != "knee_fl"))
 
 
+def test_a_servo_that_is_silent_just_when_a_motion_ends_stops_it_in_words(live: dict[str, str]) -> None:
+    control = VirtualControl(live["control"])
+    with EngineProcess(config(live)) as engine:
+        engine.ask(messages.Torque(True))
+        control.ask("unplug", joint="knee_fl")
+        try:
+            with pytest.raises(HardwareFault, match=r"knee_fl \(id 31\).* (does|did|has) not answer"):
+                engine.ask(messages.Hold(0.01))
+            assert engine.ask(messages.Statistics())["cycles"] > 0  # it lives on
+        finally:
+            control.ask("plug", joint="knee_fl")
+            control.close()
+    wait_until(lambda: answers(live))
+
+
 def test_two_servos_with_one_id_are_told_from_a_cable(live: dict[str, str]) -> None:
     """A common read stays silent from the first missing id on; asked one by one, the two give themselves away."""
     control = VirtualControl(live["control"])

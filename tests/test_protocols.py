@@ -301,6 +301,10 @@ def test_the_list_says_what_is_played_where() -> None:
             ["--out", "a.mcap", "--protocol", "gait", "--setup", "stand"],
             "gait is played on the floor, not on the stand",
         ),
+        (
+            ["--out", "a.mcap", "--seed", "4", "--hold-out-seed", "4"],
+            "with seed 4 the recording to hold out would play the same",
+        ),
         (["--out", "a.mcap", "--seconds", "9"], "9.0 s is too short for full → give it 20 s or more"),
     ],
 )

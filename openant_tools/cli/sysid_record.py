@@ -170,6 +170,7 @@ def _record_here(
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from openant_tools.comms.setup import camera_of_robot, config_of_robot, config_of_unknown_robot, imu_of_robot
+    from openant_tools.errors import HardwareFault
     from openant_tools.sysid.record import record_takes
 
     control = imu_port = camera_source = None
@@ -201,14 +202,20 @@ def _record_here(
     columns = TextColumn("{task.description:18}"), BarColumn(), TextColumn("{task.percentage:3.0f} %")
     bar = stack.enter_context(Progress(*columns, TimeElapsedColumn(), console=console, transient=True))
     task = bar.add_task("connecting", total=1.0)
-    return record_takes(
-        config,
-        wanted,
-        robot_toml=None if folder is None else folder.config_file.read_text(),
-        progress=lambda words, share: bar.update(task, description=words, completed=share),
-        journal=None if folder is None else folder.journal,
-        notice=lambda text: bar.console.print(text, highlight=False),
-    )
+    try:
+        return record_takes(
+            config,
+            wanted,
+            robot_toml=None if folder is None else folder.config_file.read_text(),
+            progress=lambda words, share: bar.update(task, description=words, completed=share),
+            journal=None if folder is None else folder.journal,
+            notice=lambda text: bar.console.print(text, highlight=False),
+        )
+    except (HardwareFault, KeyboardInterrupt):
+        kept = [str(take.path) for take in wanted if take.path.exists()]
+        if kept:
+            console.print(f"kept, the last one as far as it got: {', '.join(kept)}")
+        raise
 
 
 def _list(robot: Path | None) -> None:

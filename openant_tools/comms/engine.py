@@ -338,6 +338,9 @@ class Engine:
             except PortGone as error:
                 self._port_lost()
                 self._stopped(Trip(str(error.what), "look at the USB cable; the servos' watchdog stops them"))
+            except HardwareFault as error:
+                # A servo that had to answer did not, or refused: what its motion waits for will not come.
+                self._stopped(Trip(error.what, error.remedy or ""))
             self._flush()
             late = int((self.clock.now() - due) / self._period)
             self._overruns += late > 0
@@ -383,13 +386,7 @@ class Engine:
             motion = self._motions[0]
             self._goal = motion.step(cycles)
             if (motion.limp_now != self._limp).any():
-                try:
-                    self._goal = self._release_and_catch(motion)
-                except PortGone:
-                    raise
-                except HardwareFault as error:
-                    self._stopped(Trip(error.what, error.remedy or ""))
-                    return
+                self._goal = self._release_and_catch(motion)
             if self._limp.any():
                 # The goal follows a leg that hangs free: whenever torque comes back, there is nothing to jump to.
                 self._goal = np.where(self._limp, self._angles, self._goal)
@@ -420,12 +417,7 @@ class Engine:
     def _make_sure(self, let_go: list[str]) -> None:
         """Joints that were let go must be without torque, or the recording lies."""
         self._let_go = []
-        try:
-            self._servos.set_torque(False, self._servos.still_on(let_go))
-        except PortGone:
-            raise
-        except HardwareFault as error:
-            self._stopped(Trip(error.what, error.remedy or ""))
+        self._servos.set_torque(False, self._servos.still_on(let_go))
 
     def _note_angles(self, answers: list[tuple[Answer, Block | None]]) -> None:
         for k, (servo, (_, block)) in enumerate(zip(self._servos.servos, answers, strict=True)):
@@ -469,10 +461,11 @@ class Engine:
         )
 
     def _motion_ended(self, motion: Motion) -> None:
-        for entry in list(self._waiting):
-            if entry[1] is motion:
-                self._waiting.remove(entry)
-                self._say(messages.Reply(entry[0], value=self._measure()))
+        waiting = [entry for entry in self._waiting if entry[1] is motion]
+        here = self._measure() if waiting else None
+        for entry in waiting:
+            self._waiting.remove(entry)
+            self._say(messages.Reply(entry[0], value=here))
         self._say(messages.Finished(motion.name))
 
     def _explained(self, trip: Trip) -> Trip:

@@ -16,6 +16,7 @@ from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.journal import append_writes
 from openant_tools.comms.messages import EngineConfig
+from openant_tools.errors import BadInput
 from openant_tools.recording.run import Facts
 from openant_tools.sysid.excitation import CommandSpace, Multisine
 from openant_tools.sysid.protocols import Protocol
@@ -71,7 +72,15 @@ def takes(
 
     The first protocol goes to `out`, others beside it: `-floor` for those on the floor, with the heading in degrees where it
     is not 0; repeats are `-2`, `-3` …, a hot one `-hot`, the one to be held out `-held-out`.
+
+    Raises:
+        BadInput: what is to be held out would play the same.
     """
+    if hold_out_seed == seed:
+        raise BadInput(
+            f"with seed {seed} the recording to hold out would play the same",
+            remedy="give --hold-out-seed another number",
+        )
     made = []
     for k, protocol in enumerate(protocols):
         place = ""
