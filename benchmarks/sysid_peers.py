@@ -323,8 +323,9 @@ def known(cases: Sequence[Case]) -> None:
     print(f"|---|{'---|' * (len(names) + 3)}")
     given = rms([judged(case, case.plant.model) for case in cases])
     print(f"| given model |{' |' * (len(names) + 1)} {1e3 * given:.2f} | |", flush=True)
-    for name, estimator in (("Open Ant Tools", ours), ("mujoco.sysid", theirs)):
-        outcomes = [estimator(case) for case in cases]
+    # In turns, so that what else the machine does falls on both.
+    both = [(ours(case), theirs(case)) for case in cases]
+    for name, outcomes in zip(("Open Ant Tools", "mujoco.sysid"), zip(*both, strict=True), strict=True):
         errors = {
             kind: [
                 100 * (outcome.values[key] / true - 1)
