@@ -85,12 +85,14 @@ def _actuator_default(kind: Kind, kit: Kit) -> str:
     force = servo.stall_torque_at(kit.supply_v, PLATFORM_PWM_LIMIT)
     limit = ANGLE_LIMIT_RAD[kind]
     gain = servo.register("position_p_gain").default
+    derivative = servo.derivative_damping_nm_s_rad(None, kit.supply_v)
+    kv = f' kv="{_n(derivative)}"' if derivative else ""
     return f"""\
 <!-- {servo.name} at {_n(kit.supply_v)} V: stall {_n(servo.stall_torque_at(kit.supply_v))} N·m, P gain {gain} -->
 <default class="{kind}">
   <joint range="{_n(-limit, limit)}" damping="{_n(servo.electrical_damping_nm_s_rad)}" \
 armature="{_n(servo.armature_kg_m2)}" frictionloss="{_n(FRICTIONLOSS_NM)}"/>
-  <position kp="{_n(servo.stiffness_nm_rad(None, kit.supply_v))}" forcerange="{_n(-force, force)}"/>
+  <position kp="{_n(servo.stiffness_nm_rad(None, kit.supply_v))}"{kv} forcerange="{_n(-force, force)}"/>
 </default>
 """
 
@@ -160,8 +162,9 @@ markrgb="0.90 0.91 0.92" width="512" height="512"/>
   <default>
     <!-- Friction stands on the eight joints alone: as a default it would also hold back the free joint.
          Damping is what the motors' back-EMF brakes, stall torque over free speed. It is counted once, in the joint,
-         and the actuators' kv is 0: force range clips whatever is in the actuator, so that with the damping inside a
-         saturated servo would not slow down towards its speed limit. (A servo without torque brakes less than this.)
+         not in the actuator: force range clips whatever is in that, so that with the damping inside a saturated servo
+         would not slow down towards its speed limit. (A servo without torque brakes less than this.) An actuator's kv
+         is what the factory's D gain adds where it is not 0; duty, and so force range, does clip that.
          Force range is what the platform's PWM limit of {_n(100 * PLATFORM_PWM_LIMIT)} % leaves of the stall torque.
          kp is the factory's P gain in N·m/rad. Armature is an estimate: gear ratio² times a rotor of 1e-7 kg·m². -->
 {classes}

@@ -364,8 +364,8 @@ def _own_model(run: Run) -> Path | None:
 
 
 def _applicable(kinds: Sequence[str] | None, plant: Plant, runs: Sequence[Run]) -> list[str]:
-    """The kinds to fit. Which of damping and velocity gain: the one that stands in the model, for together they cannot be
-    told apart while torque neither saturates nor is switched off. The electrical share of damping shows only without
+    """The kinds to fit. Of damping and velocity gain what stands in the model: torque clips the one and not the other, and
+    while it neither saturates nor is switched off only their sum shows, which priors then share out. The electrical share of damping shows only without
     torque, what decides at the floor only on it. (The torso's mass is a torque scale to a standing robot: it must be asked
     for.)"""
     if kinds is not None:
@@ -383,8 +383,10 @@ def _applicable(kinds: Sequence[str] | None, plant: Plant, runs: Sequence[Run]) 
     limp = any((run.signal("torque", plant.joints, default=1.0) == 0).any() for run in runs)
     out = []
     for kind in DEFAULT_KINDS:
-        if kind == "damping" and in_joint == 0 and in_servo > 0:
-            kind = "velocity_gain"
+        if kind == "damping" and in_servo > 0:
+            out.append("velocity_gain")
+            if in_joint == 0:
+                continue
         if kind == "electrical_damping" and not limp:
             continue
         out.append(kind)
