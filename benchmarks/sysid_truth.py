@@ -41,8 +41,8 @@ Array = NDArray[np.float64]
 TARGET = (0.90, 0.98)
 ENCODER_RAD = 2 * math.pi / 4096
 ROWS_HZ, FITTED_S, JUDGED_S = 100.0, 5.0, 3.0
-#: steps of the fit's model and of the robot, s
-STEP_S, TRUE_STEP_S = 0.002, 0.00025
+#: steps of the fit's model (as the nominal Ant's) and of the robot, s
+STEP_S, TRUE_STEP_S = 0.001, 0.000125
 #: half tolerance of a build (effects.md), as log(value)
 HALF_TOLERANCE = {"stiffness": 0.075, "damping": 0.125, "armature": 0.15}
 GIVEN = {"stiffness": 8.0, "damping": 0.12, "armature": 0.006, "coulomb_friction": 0.03}

@@ -53,11 +53,13 @@ MOST_STEPS = 20
 #: prior deviations: the longest first step, and how far from where it was taken a Jacobian is believed
 REACH, STALE = 3.0, 1.5
 #: so near the Jacobian's own place, prior deviations, it is as good as one taken anew
-SAME_PLACE = 0.15
+SAME_PLACE = 0.3
 #: squared length of a step in posterior deviations, per parameter, below which a descent has arrived: near, and for good
 NEAR, ARRIVED = 0.05, 0.002
 #: shares of the promised gain: below the first a step is taken back; a Jacobian that keeps less than the second is stale
 WORSE, BROKEN = 0.05, 0.4
+#: nats per parameter that are not worth new derivatives; shorter steps in a row that are tried where none is any good
+TRIFLE, MOST_REFUSED = 0.05, 2
 #: a residual this small, in deviations that the encoder alone makes, has nothing in it that a second descent could find
 CLEAN = 1.5
 #: one effective sample per this many seconds where fits are compared whose residuals are model error
@@ -70,6 +72,8 @@ WHITE, SHORT_LIVED = 1.5, 10
 DECISIVE = 1.0
 #: half of the ±2 ms within which delays count as calibrated (effects.md)
 TIMING_STD_S = 1e-3
+#: s; the longest time step that first derivatives are taken with, where the model's own is at most half of it
+COARSEST_S = 0.0025
 #: share of the time step's effect that is taken as unknown: the rule is of first order
 RICHARDSON = 0.5
 #: delays (s) from which a fit starts where they explain the data far better than none
@@ -112,6 +116,19 @@ class Dataset:
     @cached_property
     def horizon(self) -> Rollouts:
         return Rollouts(self.plant, self.runs, HORIZON_S, self.nthread)
+
+    @cached_property
+    def coarse(self) -> Dataset:
+        """The same with twice the time step, where that is short enough: half the cost, and as good to find a direction."""
+        if 2 * self.plant.timestep > COARSEST_S or self.plant.model.nhistory:
+            return self
+        return self.stepped(2.0)
+
+    def stepped(self, times: float) -> Dataset:
+        """The same with so many times the time step."""
+        model = copy.copy(self.plant.model)
+        model.opt.timestep *= times
+        return replace(self, plant=replace(self.plant, model=model))
 
     @property
     def fitted(self) -> Rollouts:
@@ -444,15 +461,16 @@ class Problem:
             tangent: derivatives that are there already.
         """
         held = np.zeros(len(point.u), bool) if held is None else held
-        reach = REACH
+        coarse, damping, refused = not central, 0.0, 0
         for _ in range(MOST_STEPS):
             if reweigh:
                 self._reweigh(point, driven_only)
             if tangent is None:
-                tangent = self._tangent(point, central)
+                tangent = self._tangent(point, central, coarse)
                 tell()
             precision, gradient = self._normal(tangent, point)
-            step = self._step(precision, gradient, point.u, reach, held)
+            damped = precision + damping * np.diag(np.diag(precision))
+            step = self._step(damped, gradient, point.u, REACH, held)
             away = float(np.abs(point.u - tangent.u).max(initial=0.0))
             if step @ precision @ step < enough * len(step):
                 if away < SAME_PLACE or enough > ARRIVED:
@@ -463,18 +481,22 @@ class Problem:
             tell()
             promised = -float(gradient @ step + 0.5 * step @ precision @ step)
             kept = (self._cost(point) - self._cost(there)) / max(promised, 1e-300)
-            self._correct(tangent, step, there.residual - point.residual)
             if kept > WORSE:
+                self._correct(tangent, step, there.residual - point.residual)
                 point = there
-                reach = max(reach, 2 * float(np.abs(step).max())) if kept > BROKEN else reach
-            elif away == 0.0:
-                if promised < DECISIVE:
-                    return _Descent(point, tangent, True)
-                reach = 0.3 * float(np.abs(step).max())
+                damping, refused = damping / 10 if kept > BROKEN else damping, 0
+            if kept < BROKEN and promised < TRIFLE * len(step):
+                return _Descent(point, tangent, True)  # what friction makes of a hair's difference is all that is left
+            if kept <= WORSE and away == 0.0:
+                damping, refused = max(0.3, 5 * damping), refused + 1
+                if coarse:
+                    coarse, tangent = False, None
+                elif refused > MOST_REFUSED:
+                    return _Descent(point, tangent, False)
                 continue
             if kept < BROKEN or np.abs(point.u - tangent.u).max() > STALE:
                 tangent = None
-        return _Descent(point, tangent or self._tangent(point, central), False)
+        return _Descent(point, tangent or self._tangent(point, central, coarse), False)
 
     def _step(self, precision: Array, gradient: Array, u: Array, reach: float, held: Bools) -> Array:
         """The best step of the quadratic with this Hessian and gradient, within bounds and `reach`."""
@@ -540,8 +562,9 @@ class Problem:
         give[np.ix_(free, free)] = np.linalg.inv(precision[np.ix_(free, free)])
         open_ = give @ self._left_open(tangent, point)
         # What the step does has a direction: most of it is known, and the rest is as uncertain as the rule is rough.
-        step_shift = open_[:, -1].copy()
-        open_[:, -1] *= RICHARDSON
+        by_step = point.residual.shape[1]
+        step_shift = open_[:, by_step].copy()
+        open_[:, by_step] *= RICHARDSON
         wider = self._wider_by_blocks(tangent, point, covariance, free)
         halves, contradictory = self._halves(tangent, point, free)
         return Estimate(
@@ -626,13 +649,10 @@ class Problem:
         for data in self.datasets:
             rows = slice(offset, offset + len(data.measured))
             offset = rows.stop
-            model = copy.copy(data.plant.model)
-            if model.nhistory:
+            if data.plant.model.nhistory:
                 out.append(np.zeros_like(data.measured))  # buffers hold a number of steps, too few at half of one
                 continue
-            model.opt.timestep /= 2
-            finer = replace(data, plant=replace(data.plant, model=model))
-            half = finer.simulate(self.parameters, [point.u], finer.fitted).pos[0]
+            half = data.stepped(0.5).simulate(self.parameters, [point.u]).pos[0]
             self.evaluations += 2
             out.append(2.0 * np.nan_to_num(half - (data.measured - point.residual[rows])))
         return np.concatenate(out)
@@ -779,7 +799,7 @@ class Problem:
             offset += len(data.measured)
         return out
 
-    def _tangent(self, point: _Point, central: bool) -> _Tangent:
+    def _tangent(self, point: _Point, central: bool, coarse: bool) -> _Tangent:
         # Forward where the bound allows, else backward; where both, the other side too.
         u = point.u
         by = self._differences
@@ -792,8 +812,10 @@ class Problem:
                 moved = u.copy()
                 moved[members] += step[members]
                 variants.append(moved)
-        self.evaluations += len(variants)
         n = len(self._colours)
+        if coarse:
+            variants.append(u)  # what both differ from must be stepped alike
+        self.evaluations += len(variants)
         apart = np.ones((n, point.residual.shape[1]))
         for c, (members, masks) in enumerate(self._colours):
             for p, affected in zip(members, masks, strict=True):
@@ -801,9 +823,9 @@ class Problem:
         change = np.zeros((n, *point.residual.shape), np.float32)
         offset = 0
         for data in self.datasets:
-            for rows, pos, _ in data.stream(self.parameters, variants):
+            for rows, pos, _ in (data.coarse if coarse else data).stream(self.parameters, variants):
                 here = slice(rows.start + offset, rows.stop + offset)
-                base = pos[n:] if central else (data.measured[rows] - point.residual[here])[None]
+                base = pos[n:] if central or coarse else (data.measured[rows] - point.residual[here])[None]
                 # The residual is measured minus simulated, so that it falls as the position rises.
                 change[:, here] = np.nan_to_num((base - pos[:n]) / apart[:, None, :])
             offset += len(data.measured)
