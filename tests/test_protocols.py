@@ -26,6 +26,7 @@ from openant_tools.sysid.floor_motion import LegLifts, Scrub, Twitch, WeightShif
 from openant_tools.sysid.plan_file import read_plan, write_plan
 from openant_tools.sysid.protocols import FULL, PROTOCOLS, CommandSpace, Protocol, protocol, protocols
 from openant_tools.sysid.record import takes
+from openant_tools.sysid.tracking import tracking
 
 RATE = 100.0
 SPACE = CommandSpace.around_home()
@@ -281,7 +282,27 @@ def test_a_plan_is_played_with_legs_released_and_caught_then_on_the_floor(tmp_pa
     assert (np.abs(pos[first - 1] - pos[np.flatnonzero(off)[0]])[::2] > 0.05).all()
     facts = read_recording(tmp_path / "run-floor-90.mcap").run.facts
     assert (facts.setup, facts.protocol, facts.heading_rad) == ("floor", "mine", pytest.approx(np.pi / 2))
-    assert facts.extra["segments"] == [{"kind": "Twitch", "start_s": 0.3, "seconds": 2.0}]
+    assert facts.extra["segments"] == [
+        {"start_s": 0.3, "kind": "Twitch", "seconds": 2.0, "hz": 8.0, "amplitude_rad": 0.05}
+    ]
+
+
+def test_the_sine_protocol_shows_a_delay_of_one_step(tmp_path: Path) -> None:
+    """As the paper saw it at an XL430: with 50 commands a second, 20 ms later at every frequency."""
+    kit = '[robot]\nkit = "lite"\n[clock]\nmode = "stepped"\n'
+    delay = '[[effect]]\neffect = "action_delay"\njoints = "all"\nparameters = { delay_s = 0.02 }\n'
+    seen = []
+    for name, text in (("prompt", kit), ("late", kit + delay)):
+        (tmp_path / f"{name}.toml").write_text(text)
+        out = tmp_path / f"{name}.mcap"
+        arguments = ["--protocol", "sine", "--seconds", "8", "--rate", "50", "--out", str(out), "--yes"]
+        result = CliRunner().invoke(record, ["--virtual", str(tmp_path / f"{name}.toml"), *arguments])
+        assert result.exit_code == 0, result.output
+        assert "knee_fl follows later by" in result.output
+        seen.append(np.array([joint.late_s for joint in tracking(read_recording(out).run)]))
+    prompt, late = seen
+    assert prompt.shape == (8, 2)
+    assert late - prompt == pytest.approx(0.02, abs=2e-3)
 
 
 def test_the_list_says_what_is_played_where() -> None:

@@ -141,6 +141,20 @@ def record(
             done = _record_here(stack, console, place, source, port, folder, rate_hz, imu, camera, yes or k > 0)
         for recorded in done:
             click.echo(f"{recorded.path}  {recorded.cycles} cycles")
+            _print_tracking(recorded.path)
+
+
+def _print_tracking(path: Path) -> None:
+    """How late each joint follows, where sines were played."""
+    from openant_tools.recording.tables import read_run
+    from openant_tools.sysid.tracking import tracking
+
+    for joint in tracking(read_run(path)):
+        seen = ", ".join(
+            f"{1e3 * late:.1f} ms at {hz:g} Hz (gain {gain:.2f})"
+            for hz, late, gain in zip(joint.hz, joint.late_s, joint.gain, strict=True)
+        )
+        click.echo(f"  {joint.joint} follows later by {seen}")
 
 
 def _where(protocol: Protocol) -> str:

@@ -26,6 +26,7 @@ from openant_tools.sysid.forecast import Forecast, forecast
 from openant_tools.sysid.identify import DEFAULT_KINDS, IDENTIFIABLE, TWO_SIDED_95, UNDETERMINED
 from openant_tools.sysid.kinds import ELECTRICAL_DAMPING, KINDS
 from openant_tools.sysid.parameter import Parameter, apply, choose
+from openant_tools.sysid.plan_file import as_table
 from openant_tools.sysid.protocols import Protocol
 
 __all__ = ["Expectation", "Plan", "Planned", "Residual", "information", "make_plan", "marginal", "parameters_of"]
@@ -145,11 +146,7 @@ class Plan:
                     "heading_rad": one.protocol.heading_rad,
                     "seconds": one.protocol.seconds,
                     "segments": [
-                        {
-                            "kind": type(segment).__name__,
-                            "start_s": round(start, 3),
-                            "seconds": round(segment.seconds, 3),
-                        }
+                        {"start_s": round(start, 3), **as_table(segment)}
                         for start, segment in zip(one.protocol.starts(), one.protocol.segments, strict=True)
                     ],
                     "clearance_m": one.clearance_m,

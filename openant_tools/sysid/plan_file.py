@@ -18,7 +18,7 @@ from openant_tools.sysid import excitation, floor_motion
 from openant_tools.sysid.excitation import Segment
 from openant_tools.sysid.protocols import Protocol
 
-__all__ = ["SEGMENTS", "read_plan", "write_plan"]
+__all__ = ["SEGMENTS", "as_table", "read_plan", "write_plan"]
 
 SCHEMA = "openant.plan/1"
 
@@ -52,7 +52,11 @@ def write_plan(path: Path, protocols: tuple[Protocol, ...], comment: str) -> Non
         segments = tomlkit.aot()
         for segment in protocol.segments:
             table = tomlkit.table()
-            table.update(_plain(segment))
+            for key, value in as_table(segment).items():
+                inner = tomlkit.inline_table()
+                if isinstance(value, dict):
+                    inner.update(value)
+                table[key] = inner if isinstance(value, dict) else value
             segments.append(table)
         recording["segment"] = segments
         recordings.append(recording)
@@ -160,14 +164,13 @@ def _number(value: Any, key: str, where: str) -> float:
     return float(value)
 
 
-def _plain(segment: Segment) -> dict[str, Any]:
+def as_table(segment: Segment) -> dict[str, Any]:
+    """A segment as plain numbers, as it stands in a plan and in the facts of a recording."""
     out: dict[str, Any] = {"kind": type(segment).__name__}
     for field in fields(segment):
         value = getattr(segment, field.name)
         if isinstance(value, Segment):
-            inner = tomlkit.inline_table()
-            inner.update(_plain(value))
-            out[field.name] = inner
+            out[field.name] = as_table(value)
         elif isinstance(value, float):
             out[field.name] = round(value, 4)
         else:

@@ -19,6 +19,7 @@ from openant_tools.comms.messages import EngineConfig
 from openant_tools.errors import BadInput
 from openant_tools.recording.run import Facts
 from openant_tools.sysid.excitation import CommandSpace, Multisine
+from openant_tools.sysid.plan_file import as_table
 from openant_tools.sysid.protocols import Protocol
 
 __all__ = ["Recorded", "Take", "record_takes", "takes"]
@@ -164,11 +165,7 @@ def record_takes(
                     "rate_hz": config.rate_hz,
                     "held_out": take.held_out,
                     "segments": [
-                        {
-                            "kind": type(segment).__name__,
-                            "start_s": round(start, 3),
-                            "seconds": round(segment.seconds, 3),
-                        }
+                        {"start_s": round(start, 3), **as_table(segment)}
                         for start, segment in zip(protocol.starts(), protocol.segments, strict=True)
                     ],
                     **extra,
