@@ -15,6 +15,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from openant_tools.model.gap import gap
 from openant_tools.model.plant import load_plant
 from openant_tools.model.rollout import Rollouts
@@ -23,23 +25,27 @@ from openant_tools.recording.tables import read_run
 from openant_tools.sysid.identify import identify
 from openant_tools.sysid.result import write_fit
 
-#: a Feetech STS3215 that turns an SO-101 about its vertical axis, no gravity on it. Stiffness and damping: BAM's M1 figures of
-#: this servo at its default gain of 32 and 7.4 V, halved for the gain of 16 in the log; the arm's inertia about the axis is
-#: a guess of 0.02 kg·m² that a fit may book in the armature.
-ROTATION = """
-<mujoco model="so101_rotation">
+#: A Feetech STS3215 of an SO-101 about an axis without gravity. Stiffness and damping: BAM's M1 figures of this servo at its
+#: default gain of 32 and 7.4 V, halved for the gain of 16 in the log; what it turns (kg·m²) is a guess that a fit may book
+#: in the armature.
+TURNED_KG_M2 = {"Rotation": 0.02, "Wrist_Roll": 0.001}
+SO101 = """
+<mujoco model="so101_{joint}">
   <option timestep="0.005" integrator="implicitfast"/>
   <worldbody>
     <body name="arm">
-      <inertial pos="0 0 0" mass="0.5" diaginertia="0.02 0.02 0.02"/>
-      <joint name="Rotation" type="hinge" axis="0 0 1" armature="0.028" damping="0.61"/>
+      <inertial pos="0 0 0" mass="0.5" diaginertia="{turned} {turned} {turned}"/>
+      <joint name="{joint}" type="hinge" axis="0 0 1" armature="0.028" damping="0.61"/>
     </body>
   </worldbody>
   <actuator>
-    <position name="Rotation" joint="Rotation" kp="8.65" forcerange="-2.9 2.9"/>
+    <position name="{joint}" joint="{joint}" kp="8.65" forcerange="-2.9 2.9"/>
   </actuator>
 </mujoco>
 """
+
+#: rad; less is no motion
+MOVES_RAD = 0.05
 
 
 def full_error(run: Run, model: Path, joints: Sequence[str] | None) -> float:
@@ -52,7 +58,7 @@ def table(
     groups: dict[Path, list[Run]],
     work: Path,
     joints: Sequence[str] | None = None,
-    kinds: Sequence[str] | None = None,
+    also: Sequence[str] = (),
     together: bool = True,
 ) -> None:
     print(f"\n### {title}\n")
@@ -60,13 +66,13 @@ def table(
     print("|---|---|---|---|---|---|---|")
     for model, runs in groups.items():
         out = work / model.stem
-        result = identify(runs, model, joints=joints, kinds=kinds) if together else None
+        result = identify(runs, model, joints=joints, also=also) if together else None
         if result is not None:
             write_fit(result, out)
         for run in runs:
             others = [other for other in runs if other is not run]
             begun = time.monotonic()
-            single = identify(others, model, [run], joints=joints, kinds=kinds)
+            single = identify(others, model, [run], joints=joints, also=also)
             write_fit(single, out / run.name)
             given = full_error(run, model, joints)
             held_out = full_error(run, out / run.name / "calibrated.xml", joints)
@@ -99,15 +105,14 @@ def main() -> None:
             groups[run.model_path].append(run)
         table("bam-xl330, full-run position error", groups, options.work)
     if options.only != "bam-xl330":
-        model = options.work / "so101_rotation.xml"
-        model.parent.mkdir(parents=True, exist_ok=True)
-        model.write_text(ROTATION.strip())
-        runs = [read_run(path) for path in sorted((options.shared / "sage-so101").glob("*.parquet"))]
-        # Where the joint is not commanded to move there is nothing to identify.
-        runs = [
-            run for run in runs if float(run.column("cmd.Rotation").max() - run.column("cmd.Rotation").min()) > 0.05
-        ]
-        table("sage-so101, joint Rotation", {model: runs}, options.work, ["Rotation"], together=False)
+        recorded = [read_run(path) for path in sorted((options.shared / "sage-so101").glob("*.parquet"))]
+        for joint, turned in TURNED_KG_M2.items():
+            model = options.work / f"so101_{joint}.xml"
+            model.parent.mkdir(parents=True, exist_ok=True)
+            model.write_text(SO101.format(joint=joint, turned=turned).strip())
+            # Where the joint is not commanded to move there is nothing to identify.
+            runs = [run for run in recorded if np.ptp(run.column(f"cmd.{joint}")) > MOVES_RAD]
+            table(f"sage-so101, joint {joint}", {model: runs}, options.work, [joint], ["actuator_lag"], together=False)
 
 
 if __name__ == "__main__":
