@@ -14,6 +14,9 @@ import numpy as np
 import plain
 import plants
 import pytest
+import tomlkit
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from openant_tools.cli.sysid_fit import fit
 from openant_tools.errors import BadInput
@@ -391,6 +394,7 @@ def test_declared_and_known_kinds_change_the_same_file(tmp_path: Path) -> None:
         ('attribute = "mas"', "a geom has no number called 'mas' → did you mean 'mass'?"),
         ('attribute = "type"', "a geom has no number called 'type'"),
         ("index = 3", "mass has no number 3 → count from 0 to 0"),
+        (f"std = 1{400 * '0'}", "a number too large → give one below 1e308"),
         ("std = -1", "std is -1 → give the prior's standard deviation, above 0"),
         ('std = "wide"', "std is 'wide' → give a number"),
         ('mode = "multiply"', "mode is 'multiply' → choose 'scale' or 'add'"),
@@ -438,6 +442,47 @@ def test_a_run_whose_own_model_lacks_what_was_declared_is_named(model: Path, tmp
 def test_a_bad_file_of_parameters_is_refused(text: str, words: str, tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=words):
         declare(tmp_path, text)
+
+
+VALUES = st.one_of(
+    st.text(max_size=8), st.integers(), st.floats(), st.booleans(), st.lists(st.integers(-3, 3), max_size=3)
+)
+ENTRY = st.fixed_dictionaries(
+    {},
+    optional={
+        "name": VALUES | st.just("mine"),
+        "element": VALUES | st.sampled_from(["geom", "joint", "option", "inertial", "actuator"]),
+        "match": VALUES | st.just("*"),
+        "attribute": VALUES | st.sampled_from(["mass", "friction", "gravity", "damping", "pos", "axis"]),
+        "std": VALUES | st.floats(0.01, 1.0),
+        "index": VALUES,
+        "mode": VALUES | st.sampled_from(["add", "scale"]),
+        "low": VALUES,
+        "high": VALUES,
+        "tie": VALUES | st.sampled_from(["all", "each"]),
+        "unit": VALUES,
+    },
+)
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(entry=ENTRY)
+def test_whatever_stands_in_an_entry_is_fitted_or_refused_in_one_line(
+    entry: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.getbasetemp()
+    model = plants.write(folder / "any.xml", MODEL)
+    path = plants.write(folder / "any.toml", tomlkit.dumps({"parameter": [entry]}))
+    chosen, words = [], ""
+    try:
+        chosen = declared_parameters(load_plant(model), read_declarations(path))
+    except BadInput as refusal:
+        words = str(refusal)
+    assert bool(chosen) != bool(words)
+    assert len(words.splitlines()) <= 1
+    for parameter in chosen:
+        low, high = parameter.bounds(parameter.definition.read(load_plant(model).model, load_plant(model), 0))
+        assert low <= 0.0 <= high
 
 
 def test_a_number_that_the_file_does_not_state_is_refused(model: Path, tmp_path: Path) -> None:

@@ -157,7 +157,10 @@ def _entry(entry: Mapping[str, Any], number: int, path: Path) -> Declared:
     for key, known in (("mode", ("scale", "add")), ("tie", ("all", "each"))):
         if entry.get(key, known[0]) not in known:
             raise refuse(f"{key} is {entry[key]!r}", f"choose {known[0]!r} or {known[1]!r}")
-    std, low, high = (float(entry.get(k, d)) for k, d in (("std", 0), ("low", -math.inf), ("high", math.inf)))
+    try:
+        std, low, high = (float(entry.get(k, d)) for k, d in (("std", 0), ("low", -math.inf), ("high", math.inf)))
+    except OverflowError:
+        raise refuse("a number too large", "give one below 1e308") from None
     if not (math.isfinite(std) and std > 0):
         raise refuse(f"std is {entry['std']!r}", "give the prior's standard deviation, above 0")
     if not low < high:
