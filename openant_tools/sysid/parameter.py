@@ -97,7 +97,7 @@ def apply(plant: Plant, parameters: Sequence[Parameter], u: Array) -> mujoco.MjM
     constants = False
     for parameter, value in zip(parameters, u, strict=True):
         kind = parameter.definition
-        for j in parameter.joints:
+        for j in parameter.joints[:1] if kind.body else parameter.joints:
             nominal = kind.read(plant.model, plant, j)
             kind.write(model, plant, j, parameter.value(nominal, float(value)))
         constants |= kind.constants
