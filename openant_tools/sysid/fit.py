@@ -836,16 +836,16 @@ class Problem:
 def stamp_error(residual: Array, velocity: Array, floor: float) -> tuple[float, float]:
     """(rad, s): the white part of a residual, and the deviation of its time stamps from the moments of sampling.
 
-    A stamp that is off by δ shows as velocity · δ. From neighbouring rows' differences, which a lasting model error hardly
-    enters: their variance is white² + velocity² stamp², a line that is fitted twice, the second time weighted by itself.
+    A stamp that is off by δ shows as velocity · δ. From how far a residual lies off its neighbours, which a lasting model
+    error hardly enters: that varies by white² + velocity² stamp², a line that is fitted three times, weighted by itself.
     """
     ok = np.isfinite(residual) & np.isfinite(velocity)
     r, v = residual[ok], velocity[ok]
     if len(r) < 20:
         return max(floor, float(np.sqrt(np.mean(r**2))) if len(r) else floor), 0.0
-    jumps = np.diff(r) ** 2 / 2
+    jumps = np.diff(r, 2) ** 2 / 6
     # A jump of many times the usual is a contact or a step that comes early: no jitter.
-    fast = (v[1:] ** 2 + v[:-1] ** 2) / 2
+    fast = (v[2:] ** 2 + 4 * v[1:-1] ** 2 + v[:-2] ** 2) / 6
     jumps = np.minimum(jumps, 100 * max(float(np.median(jumps)), floor**2))
     weight = np.full(len(jumps), 1.0)
     white, slope = floor**2, 0.0
