@@ -204,6 +204,7 @@ GOOD_PLAN = 'schema = "openant.plan/1"\n[[recording]]\nsetup = "stand"\n[[record
         (GOOD_PLAN + 'kind = "Chirp"\nseconds = 3000', "takes 3002 s → keep it below 600 s"),
         (GOOD_PLAN + 'kind = "Multisine"\nseconds = 3\nlines = 0', "`lines` is not a whole number from 1 on"),
         (GOOD_PLAN + 'kind = "Gait"\nseconds = 3', "has a motion for the floor on the stand"),
+        (GOOD_PLAN.replace("stand", "floor") + 'kind = "Releases"\nseconds = 3', "lets go of legs that carry the robot"),
         (GOOD_PLAN + 'kind = "InTurn"\nseconds = 3', "InTurn lacks `of`"),
         (GOOD_PLAN + 'kind = "Around"\nseconds = 3\nshares = [2.0]\nof = {kind = "Rest", seconds = 1}', "not shares between"),
     ],
@@ -326,6 +327,8 @@ def test_the_list_says_what_is_played_where() -> None:
             ["--out", "a.mcap", "--seed", "4", "--hold-out-seed", "4"],
             "with seed 4 the recording to hold out would play the same",
         ),
+        (["--out", "a.mcap", "--rate", "nan"], "--rate is nan → give it a number"),
+        (["--out", "a.mcap", "--seconds", "1e9"], "1e+09 s is too long for full → record for 600 s at most"),
         (["--out", "a.mcap", "--seconds", "9"], "9.0 s is too short for full → give it 20 s or more"),
     ],
 )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from openant_tools.cli.options import json_option, report_option, robot_option
-from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, robot_of
+from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, RATES_HZ, finite, robot_of
 
 if TYPE_CHECKING:
     from openant_tools.sysid.plan import Plan
@@ -39,21 +39,31 @@ __all__ = ["plan"]
     help="One value a joint, one a servo model, or one for all.",
 )
 @click.option("--setup", type=click.Choice(["stand", "floor"]), help="Only what is played there. Default: all of it.")
-@click.option("--seconds", type=float, metavar="S", help="How long to play. Default: the protocol's own time.")
+@click.option(
+    "--seconds", type=float, callback=finite, metavar="S", help="How long to play. Default: the protocol's own time."
+)
 @click.option(
     "--rate",
     "rate_hz",
-    type=click.FloatRange(10, 1000),
+    type=RATES_HZ,
+    callback=finite,
     default=100.0,
     show_default=True,
     metavar="HZ",
     help="Commands and reads a second.",
 )
-@click.option("--seed", default=0, show_default=True, help="Chance of the protocol, and of what --optimise draws.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Chance of the protocol, and of what --optimise draws.",
+)
 @click.option(
     "--noise",
     "noise_mrad",
     type=click.FloatRange(min=0, min_open=True),
+    callback=finite,
     metavar="MRAD",
     help="What a fit will leave on the stand.  [default: 1.5, as the virtual robot; real ones leave 3 to 20]",
 )
@@ -61,6 +71,7 @@ __all__ = ["plan"]
     "--memory",
     "memory_s",
     type=click.FloatRange(min=0),
+    callback=finite,
     metavar="S",
     help="For how long such an error lasts.  [default: 0.05]",
 )

@@ -20,10 +20,25 @@ if TYPE_CHECKING:
     from openant_tools.sysid.protocols import Protocol
     from openant_tools.sysid.record import Recorded, Take
 
-__all__ = ["record", "robot_of"]
+__all__ = ["RATES_HZ", "finite", "record", "robot_of"]
 
 #: `protocols.FULL`, without loading it for every --help
 DEFAULT_PROTOCOL = "full"
+
+
+def finite(context: click.Context, option: click.Parameter, value: float | None) -> float | None:
+    """What click takes for a number need not be one: nan is within every range."""
+    from math import isfinite
+
+    from openant_tools.errors import BadInput
+
+    if value is not None and not isfinite(value):
+        raise BadInput(f"{option.opts[0]} is {value:g}", remedy="give it a number")
+    return value
+
+
+#: commands a second; a bus of eight servos at 1 Mbaud manages about 300
+RATES_HZ = click.FloatRange(10, 1000)
 
 
 @click.command()
@@ -40,15 +55,35 @@ DEFAULT_PROTOCOL = "full"
 @virtual_option
 @click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one U2D2 that is plugged in.")
 @robot_option
-@click.option("--rate", "rate_hz", default=100.0, show_default=True, metavar="HZ", help="Commands and reads a second.")
-@click.option("--seed", default=0, show_default=True, help="Chance of the protocol; the same seed plays the same.")
-@click.option("--seconds", type=float, metavar="S", help="How long to play. Default: the protocol's own time.")
+@click.option(
+    "--rate",
+    "rate_hz",
+    type=RATES_HZ,
+    callback=finite,
+    default=100.0,
+    show_default=True,
+    metavar="HZ",
+    help="Commands and reads a second.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Chance of the protocol; the same seed plays the same.",
+)
+@click.option(
+    "--seconds", type=float, callback=finite, metavar="S", help="How long to play. Default: the protocol's own time."
+)
 @click.option("--repeat", "repeats", type=click.IntRange(1), default=1, show_default=True, help="Play it so often.")
-@click.option("--hold-out-seed", type=int, metavar="SEED", help="Record it with this seed, too, to judge a fit by.")
+@click.option(
+    "--hold-out-seed", type=click.IntRange(0), metavar="SEED", help="Record it with this seed, too, to judge a fit by."
+)
 @click.option(
     "--hot",
     "hot_s",
-    type=click.FloatRange(min=0),
+    type=click.FloatRange(min=0, max=3600),
+    callback=finite,
     is_flag=False,
     flag_value=60.0,
     default=0.0,

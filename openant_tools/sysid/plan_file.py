@@ -16,7 +16,7 @@ from openant_tools.errors import BadInput
 from openant_tools.files import write_text
 from openant_tools.sysid import excitation, floor_motion
 from openant_tools.sysid.excitation import Segment
-from openant_tools.sysid.protocols import Protocol
+from openant_tools.sysid.protocols import LONGEST_S, Protocol
 
 __all__ = ["SEGMENTS", "as_table", "read_plan", "write_plan"]
 
@@ -32,8 +32,6 @@ SEGMENTS: Mapping[str, type[Segment]] = {
         floor_motion.PushUps, floor_motion.Twitch,
     )
 }  # fmt: skip
-#: s, longest recording that a plan may ask for: servos grow warm
-LONGEST_S = 600.0
 
 
 def write_plan(path: Path, protocols: tuple[Protocol, ...], comment: str) -> None:
@@ -100,6 +98,8 @@ def _recording(entry: Any, where: str, name: str, words: str) -> Protocol:
     read = tuple(_segment(table, f"{where}, segment {number}") for number, table in enumerate(segments, 1))
     if setup == "stand" and any(isinstance(segment, _FLOOR) for segment in read):
         raise BadInput("has a motion for the floor on the stand", where=where, remedy='write setup = "floor"')
+    if setup == "floor" and any(_releases(segment) for segment in read):
+        raise BadInput("lets go of legs that carry the robot", where=where, remedy='write setup = "stand"')
     made = Protocol(name, words, read, setup, heading)
     if made.seconds > LONGEST_S:
         raise BadInput(f"takes {made.seconds:.0f} s", where=where, remedy=f"keep it below {LONGEST_S:.0f} s")
@@ -110,6 +110,11 @@ _FLOOR = (
     floor_motion.WeightShifts, floor_motion.LegLifts, floor_motion.Scrub, floor_motion.Gait, floor_motion.PushUps,
     floor_motion.Twitch,
 )  # fmt: skip
+
+
+def _releases(segment: Segment) -> bool:
+    inner = getattr(segment, "of", None)
+    return isinstance(segment, excitation.Releases) or (inner is not None and _releases(inner))
 
 
 def _segment(table: Any, where: str) -> Segment:

@@ -220,6 +220,8 @@ PROTOCOLS: Mapping[str, tuple[str, tuple[Part, ...]]] = {
     ),
 }
 SHORTEST_S = 5.0
+#: s, of one recording: servos grow warm
+LONGEST_S = 600.0
 
 
 def protocols(name: str, seconds: float | None = None, setup: str | None = None) -> tuple[Protocol, ...]:
@@ -257,8 +259,12 @@ def _filled(name: str, words: str, parts: tuple[Part, ...], seconds: float | Non
     total = default if seconds is None else seconds
     # In a row of recordings the shortest must still hold its motion.
     shortest = SHORTEST_S if len(parts) == 1 else max(SHORTEST_S, default / 2)
-    if not (total >= shortest and math.isfinite(total)):
+    if not total >= shortest:
         raise BadInput(f"{total} s is too short for {name}", remedy=f"give it {shortest:.0f} s or more")
+    if total > LONGEST_S * len(parts):
+        raise BadInput(
+            f"{total:g} s is too long for {name}", remedy=f"record for {LONGEST_S:.0f} s at most, and repeat"
+        )
     played = []
     for part in parts:
         empty = Protocol(name, words, (), part.setup, part.heading_rad)
