@@ -50,7 +50,7 @@ VELOCITY_SPAN_S = 0.02
 #: parts that stay farther apart than this (m) in the measured motion do not touch in a simulation of it
 CLEARANCE_M = 0.01
 #: states kept at a time while a batch runs
-CHUNK_BYTES = 64 * 2**20
+CHUNK_BYTES = 16 * 2**20
 #: where an actuator of this kind keeps the rate limit of its setpoint (`slewmax`) in dynprm, MuJoCo 4
 SLEW_RATE = {int(mujoco.mjtDyn.mjDYN_PID): 1, int(mujoco.mjtDyn.mjDYN_DCMOTOR): 7}
 #: how long a robot without a measured base is left to settle on its feet before a floor run
