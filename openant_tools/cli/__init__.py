@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "comms": ("comms", "Robot", "The bus: scan, watch, measure."),
     "rec": ("rec", "Data", "Recordings: info, repair, export, import."),
     "sysid": ("sysid", "Data", "Record excitations and fit a calibrated model to them."),
+    "gap": ("gap", "Data", "How far a simulation is from its robot, and where."),
     "train": ("train", "Learning", "Train an agent to walk, in simulation."),
     "eval": ("eval", "Learning", "Play a trained agent and measure its reward per second."),
 }

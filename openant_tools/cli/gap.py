@@ -1,0 +1,77 @@
+"""`openant gap`: how far a simulation is from its robot, and where."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from openant_tools.cli.options import json_option, report_option, robot_option
+
+__all__ = ["gap"]
+
+
+@click.group()
+def gap() -> None:
+    """The gap between a robot and its simulation."""
+
+
+@gap.command()
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN…")
+@click.option(
+    "--model", type=click.Path(path_type=Path), metavar="M.xml", help="Default: the model of the robot's folder."
+)
+@click.option("--joint", "joints", multiple=True, metavar="NAME", help="Only this joint. Repeatable.")
+@click.option(
+    "--horizon", default="0.5", show_default=True, metavar="S", help="Seconds between re-initialisations, or `full`."
+)
+@robot_option
+@json_option
+@report_option
+def measure(
+    runs: tuple[Path, ...],
+    model: Path | None,
+    joints: tuple[str, ...],
+    horizon: str,
+    robot: Path | None,
+    json_file: Path | None,
+    report: Path | None,
+) -> None:
+    """Simulate RUNs with their own commands and say how far off the model is: per signal, joint and kind of motion.
+
+    \b
+      openant gap measure run.mcap --robot my-ant --report gap
+      openant gap measure swing.parquet --model pendulum.xml --horizon full
+    """
+    from openant_tools.cli.options import robot_folder
+    from openant_tools.errors import BadInput
+    from openant_tools.files import write_text
+    from openant_tools.gap.measure import UNITS
+    from openant_tools.gap.measure import measure as measured
+    from openant_tools.gap.measure_report import gap_report, sentence
+    from openant_tools.recording.tables import read_run
+    from openant_tools.robot.folder import RobotFolder
+
+    if model is None:
+        model = RobotFolder.at(robot_folder(robot)).model_path()
+    try:
+        seconds = None if horizon == "full" else float(horizon)
+    except ValueError:
+        seconds = -1.0
+    if seconds is not None and not 0.02 <= seconds < 1e6:
+        raise BadInput(f"--horizon {horizon} is no time", remedy="give seconds, 0.02 or more, or `full`")
+    found = measured([read_run(path) for path in runs], model, joints or None, seconds)
+    click.echo(sentence(found))
+    for signal, value in found.gaps.items():
+        click.echo(f"{signal}: {value:.5g} {UNITS[signal]}, floor {found.floors[signal]:.3g}")
+    click.echo("signal  joint          while        share    gap")
+    for place in found.places[:12]:
+        click.echo(
+            f"{place.signal:6}  {place.joint:13}  {place.regime:11}  {100 * place.share:4.1f} %  {place.gap:.4g} "
+            f"{UNITS[place.signal]}"
+        )
+    if json_file:
+        write_text(json_file, json.dumps(found.as_json(), indent=1) + "\n")
+    if report:
+        click.echo(f"wrote {gap_report(found).write_folder(report)}", err=True)

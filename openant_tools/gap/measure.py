@@ -1,0 +1,219 @@
+"""The gap as figures: per signal, joint and regime, above what no model could beat (formats, section 3)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.errors import BadInput
+from openant_tools.gap.regime import Regime, regimes
+from openant_tools.model.gap import excess, gap
+from openant_tools.model.plant import Plant, load_plant, setup_of
+from openant_tools.model.rollout import Rollouts
+from openant_tools.recording.run import Run
+from openant_tools.sysid.quality import quantum
+
+__all__ = ["Measurement", "Place", "Played", "measure"]
+
+Array = NDArray[np.float64]
+
+UNITS = {"pos": "rad", "vel": "rad/s"}
+
+
+@dataclass(frozen=True)
+class Played:
+    """One run, measured and simulated.
+
+    Attributes:
+        run: it.
+        measured, simulated: signal → (rows, joints).
+        regime: (rows, joints).
+    """
+
+    run: Run
+    measured: dict[str, Array]
+    simulated: dict[str, Array]
+    regime: NDArray[np.str_]
+
+
+@dataclass(frozen=True)
+class Place:
+    """A part of the gap.
+
+    Attributes:
+        share: of the signal's excess, summed over its squares.
+        gap: rms there, in the signal's unit.
+        seconds: how long the joint was in this regime.
+    """
+
+    signal: str
+    joint: str
+    regime: Regime
+    share: float
+    gap: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """The gap of a model on some runs.
+
+    Attributes:
+        horizon_s: between re-initialisations from measurement; None is never.
+        gaps, floors: signal → rms over all joints and samples, and what no model could beat.
+        from_repeats: whether the floor comes from repeats of the same commands, else from the sensors' resolution.
+        places: largest share first, signal by signal.
+    """
+
+    model: Path
+    joints: tuple[str, ...]
+    horizon_s: float | None
+    gaps: dict[str, float]
+    floors: dict[str, float]
+    from_repeats: bool
+    places: tuple[Place, ...]
+    played: tuple[Played, ...]
+
+    def excess(self, signal: str) -> float:
+        return excess(self.gaps[signal], self.floors[signal])
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "schema": "openant.gap-measure/1",
+            "model": str(self.model),
+            "runs": [played.run.name for played in self.played],
+            "horizon_s": self.horizon_s,
+            "floor_from": "repeats" if self.from_repeats else "resolution",
+            "signals": {
+                signal: {"gap": self.gaps[signal], "floor": self.floors[signal], "excess": self.excess(signal),
+                         "unit": UNITS[signal]}
+                for signal in self.gaps
+            },
+            "where": [
+                {"signal": place.signal, "joint": place.joint, "regime": str(place.regime), "share": place.share,
+                 "gap": place.gap, "seconds": place.seconds}
+                for place in self.places
+            ],
+        }  # fmt: skip
+
+
+def measure(
+    runs: Sequence[Run], model: Path, joints: Sequence[str] | None = None, horizon_s: float | None = 0.5
+) -> Measurement:
+    """Simulate runs with their own commands and say how far off they are, and where.
+
+    Args:
+        runs: recordings of robots of this model; each is simulated as it stood, on stand or floor.
+        joints: default every position servo of the model that all runs command and measure.
+        horizon_s: as `Measurement`.
+
+    Raises:
+        BadInput: no run, or none of the model's joints in it.
+    """
+    if not runs:
+        raise BadInput("no run was named", remedy="name at least one recording")
+    wanted = list(joints) if joints is not None else _joints(runs, model)
+    played = tuple(
+        _play(run, load_plant(run.model_path or model, wanted, setup_of(run.facts.setup)), horizon_s) for run in runs
+    )
+    floors, from_repeats = _floors(played, wanted)
+    gaps = {
+        signal: gap(
+            np.concatenate([one.measured[signal] for one in played]),
+            np.concatenate([one.simulated[signal] for one in played]),
+        )
+        for signal in UNITS
+    }
+    gaps = {signal: value for signal, value in gaps.items() if math.isfinite(value)}
+    places = [place for signal in gaps for place in _places(played, wanted, signal, floors[signal])]
+    return Measurement(
+        model, tuple(wanted), horizon_s, gaps, {signal: rms(floors[signal]) for signal in gaps}, from_repeats,
+        tuple(places), played,
+    )  # fmt: skip
+
+
+def rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _joints(runs: Sequence[Run], model: Path) -> list[str]:
+    plant = load_plant(model)
+    common = [
+        joint for joint in plant.joints if all(run.has("cmd", [joint]) and run.has("pos", [joint]) for run in runs)
+    ]
+    if not common:
+        raise BadInput(
+            f"the model's joints ({', '.join(plant.joints)}) are not those of the runs ({', '.join(runs[0].joints)})",
+            where=model,
+            remedy="give the model of this robot, with joints named as in the runs",
+        )
+    return common
+
+
+def _play(run: Run, plant: Plant, horizon_s: float | None) -> Played:
+    done = Rollouts(plant, [run], horizon_s)()
+    measured = {signal: run.signal(signal, plant.joints) for signal in UNITS}
+    return Played(run, measured, {"pos": done.pos[0], "vel": done.vel[0]}, regimes(run, plant))
+
+
+def _floors(played: Sequence[Played], joints: Sequence[str]) -> tuple[dict[str, Array], bool]:
+    """Signal → (joints,), and whether it comes from repeats."""
+    by_name = {one.run.name: one for one in played}
+    repeats = [(one, by_name[one.run.facts.repeat_of]) for one in played if one.run.facts.repeat_of in by_name]
+    floors = {}
+    for signal in UNITS:
+        squares = np.full((max(1, len(repeats)), len(joints)), np.nan)
+        for k, (again, once) in enumerate(repeats):
+            t = again.run.t - again.run.t[0] + once.run.t[0]
+            for j in range(len(joints)):
+                seen = np.isfinite(once.measured[signal][:, j])
+                if seen.sum() > 1:
+                    there = np.interp(t, once.run.t[seen], once.measured[signal][seen, j])
+                    # Two repeats differ by both their noises, so that each has half of the squared difference.
+                    squares[k, j] = gap(again.measured[signal][:, j], there) ** 2 / 2
+        by_resolution = np.array([_resolution(played, signal, joint, j) for j, joint in enumerate(joints)])
+        known = np.isfinite(squares)
+        mean = np.where(known, squares, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+        floors[signal] = np.where(known.any(axis=0), np.sqrt(mean), by_resolution)
+    return floors, bool(repeats)
+
+
+def _resolution(played: Sequence[Played], signal: str, joint: str, j: int) -> float:
+    """What rounding alone leaves: the coarsest step over √12."""
+    if signal == "pos":
+        return max(quantum(one.run, joint) for one in played) / math.sqrt(12)
+    steps = []
+    for one in played:
+        known = one.run.facts.resolution.get(f"{signal}.{joint}", one.run.facts.resolution.get(signal))
+        change = np.abs(np.diff(one.measured[signal][:, j]))
+        change = change[np.isfinite(change) & (change > 1e-9)]
+        steps.append(known if known is not None else float(change.min()) if len(change) else 0.0)
+    return max(steps) / math.sqrt(12)
+
+
+def _places(played: Sequence[Played], joints: Sequence[str], signal: str, floor: Array) -> list[Place]:
+    found = []
+    for j, joint in enumerate(joints):
+        for regime in Regime:
+            squares, seconds = [], 0.0
+            for one in played:
+                here = one.regime[:, j] == regime.value
+                error = (one.measured[signal][:, j] - one.simulated[signal][:, j])[here]
+                squares.append(error[np.isfinite(error)] ** 2)
+                seconds += float(np.median(np.diff(one.run.t))) * int(here.sum())
+            all_squares = np.concatenate(squares)
+            if len(all_squares):
+                beyond = max(0.0, float(all_squares.sum()) - len(all_squares) * float(floor[j]) ** 2)
+                found.append((joint, regime, beyond, math.sqrt(float(all_squares.mean())), seconds))
+    total = sum(beyond for _, _, beyond, _, _ in found)
+    places = [
+        Place(signal, joint, regime, beyond / total if total > 0 else 0.0, error, seconds)
+        for joint, regime, beyond, error, seconds in found
+    ]
+    return sorted(places, key=lambda place: -place.share)
