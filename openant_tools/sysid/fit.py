@@ -80,6 +80,8 @@ RICHARDSON = 0.5
 DELAYS_S = (0.02, 0.04, 0.06)
 #: a block of the resampling is this many autocorrelation times long, and at least so many seconds; fewer blocks tell nothing
 BLOCK_TIMES, BLOCK_S, FEWEST_BLOCKS = 5.0, 0.5, 8
+#: share of the rows with the base's whole pose from which a robot on the floor can be put where it was
+PLACED = 0.9
 #: chance of calling two halves of good data contradictory, over all parameters of a fit
 FALSE_ALARM = 1e-3
 #: rounds in which each half finds its own weights
@@ -134,10 +136,14 @@ class Dataset:
     def fitted(self) -> Rollouts:
         """What the fit compares: full runs, but on the floor, where contact makes long runs chaotic, the horizon.
 
-        A robot whose base nobody measured cannot be put back on its feet in mid-gait: such runs are compared whole too.
+        A robot whose base nobody measured, or a camera now and then, cannot be put back on its feet in mid-gait: such runs
+        are compared whole too.
         """
-        placed = all(np.isfinite(run.column("base.x")).any() for run in self.runs)
-        return self.horizon if self.plant.setup is Setup.FLOOR and placed else self.full
+        if self.plant.setup is not Setup.FLOOR:
+            return self.full
+        pose = [[run.column(f"base.{axis}") for axis in ("x", "y", "z", "qw")] for run in self.runs]
+        placed = min(float(np.isfinite(columns).all(axis=0).mean()) for columns in pose)
+        return self.horizon if placed > PLACED else self.full
 
     def simulate(
         self, parameters: Sequence[Parameter], us: Sequence[Array], rollouts: Rollouts | None = None
