@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 
 from openant_tools.cli.comms import comms
 from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, record
+from openant_tools.cli.virtual_for_command import placeable, placed
 from openant_tools.errors import BadInput
 from openant_tools.recording.reader import read_recording
 from openant_tools.robot.joints import JOINT_NAMES
@@ -304,6 +306,21 @@ def test_the_sine_protocol_shows_a_delay_of_one_step(tmp_path: Path) -> None:
     prompt, late = seen
     assert prompt.shape == (8, 2)
     assert late - prompt == pytest.approx(0.02, abs=2e-3)
+
+
+def test_a_virtual_robot_is_put_where_it_is_needed_unless_it_says_itself_where_it_is(tmp_path: Path) -> None:
+    (tmp_path / "ant.toml").write_text('seed = 4\n[robot]\nkit = "lite"\neeprom = "memory.json"\n')
+    with placed(str(tmp_path / "ant.toml"), "floor", 1.5) as source:
+        table = tomllib.loads(Path(source).read_text())
+    assert table["seed"] == 4
+    assert table["robot"] == {
+        "kit": "lite", "eeprom": str(tmp_path / "memory.json"), "setup": "floor", "heading_rad": 1.5,
+    }  # fmt: skip
+    with placed(str(tmp_path / "ant.toml"), "stand", 0.0) as source:
+        assert source == str(tmp_path / "ant.toml")
+    for name, text in (("loose.toml", '[robot]\nsetup = "loose"\n'), ("sealed.toml", 'sealed = "x"\n'), ("r.json", "")):
+        (tmp_path / name).write_text(text)
+        assert not placeable(str(tmp_path / name))
 
 
 def test_the_list_says_what_is_played_where() -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from openant_tools.cli.options import robot_option
-from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, placed, virtual_option, virtual_robot
+from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, placeable, placed, virtual_option, virtual_robot
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -155,13 +155,11 @@ def record(
         [take for take in wanted if (take.protocol.setup, take.protocol.heading_rad) == place]
         for place in dict.fromkeys((take.protocol.setup, take.protocol.heading_rad) for take in wanted)
     ]
-    # A virtual robot that is started here is put where it is needed; any other, and a real one, by hands.
-    started_here = virtual_source is not None and (
-        virtual_source == VIRTUAL_DEFAULT or virtual_source.endswith(".toml")
-    )
+    # A virtual robot that is started here is put where it is needed; any other, and a real one, needs hands.
+    moves_itself = virtual_source is not None and placeable(virtual_source)
     for k, place in enumerate(placements):
         protocol = place[0].protocol
-        if k and not started_here:
+        if k and not moves_itself:
             if yes or not sys.stdin.isatty():
                 rest = "; ".join(_where(later[0].protocol) for later in placements[k:])
                 console.print(
@@ -171,7 +169,7 @@ def record(
             click.confirm(f"Put the robot {_where(protocol)}. Ready?", abort=True, err=True)
         with contextlib.ExitStack() as stack:
             source = virtual_source
-            if source is not None and started_here:
+            if source is not None and moves_itself:
                 source = stack.enter_context(placed(source, protocol.setup, protocol.heading_rad))
             done = _record_here(stack, console, place, source, port, folder, rate_hz, imu, camera, yes or k > 0)
         for recorded in done:

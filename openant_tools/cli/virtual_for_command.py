@@ -13,10 +13,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import click
+import tomlkit
 
 from openant_tools.errors import BadInput, HardwareFault
 
-__all__ = ["VIRTUAL_DEFAULT", "placed", "virtual_option", "virtual_robot"]
+__all__ = ["VIRTUAL_DEFAULT", "placeable", "placed", "virtual_option", "virtual_robot"]
 
 #: what `--virtual` without a value stands for
 VIRTUAL_DEFAULT = "default"
@@ -67,26 +68,22 @@ def virtual_robot(source: str, *, clock: str | None = None) -> Iterator[Mapping[
                     process.wait()
 
 
+def placeable(source: str) -> bool:
+    """Whether a virtual robot is started for this command and may be put elsewhere: its scenario is open to us, and it
+    is not loose motors in a box."""
+    if source == VIRTUAL_DEFAULT:
+        return True
+    robot = _scenario(source).get("robot", {}) if source.endswith(".toml") else None
+    return isinstance(robot, dict) and robot.get("setup") != "loose" and "sealed" not in _scenario(source)
+
+
 @contextlib.contextmanager
 def placed(source: str, setup: str, heading_rad: float) -> Iterator[str]:
-    """The source of a virtual robot like that of `source` (a scenario, or the default), but standing elsewhere.
-
-    A source that stands there already is given back as it is; so is a sealed one, which says where it stands itself.
-    """
-    import tomlkit
-
-    text = "" if source == VIRTUAL_DEFAULT else _text(Path(source))
-    try:
-        document = tomlkit.parse(text)
-    except tomlkit.exceptions.TOMLKitError:
-        yield source  # the robot itself says what is wrong with it
-        return
+    """The source of a virtual robot like that of `source`, which is placeable, but standing elsewhere."""
+    document = tomlkit.document() if source == VIRTUAL_DEFAULT else _scenario(source)
     robot = document.setdefault("robot", tomlkit.table())
-    stands = isinstance(robot, dict) and (
-        (robot.get("setup", "stand"), robot.get("heading_rad", 0.0)) == (setup, heading_rad)
-        or (setup == "stand" and robot.get("setup", "stand") == "stand")
-    )
-    if stands or not isinstance(robot, dict) or "sealed" in document:
+    there = robot.get("setup", "stand")
+    if there == setup and (setup == "stand" or robot.get("heading_rad", 0.0) == heading_rad):
         yield source
         return
     robot["setup"], robot["heading_rad"] = setup, heading_rad
@@ -96,15 +93,16 @@ def placed(source: str, setup: str, heading_rad: float) -> Iterator[str]:
         document["clock"] = {"mode": "stepped"}
     with tempfile.TemporaryDirectory(prefix="openant-placed-") as folder:
         path = Path(folder) / (Path(source).name if source != VIRTUAL_DEFAULT else f"{setup}.toml")
-        path.write_text(tomlkit.dumps(document))
+        path.write_text(tomlkit.dumps(document), encoding="utf-8")
         yield str(path)
 
 
-def _text(path: Path) -> str:
+def _scenario(source: str) -> tomlkit.TOMLDocument:
+    """A scenario as it stands; empty where it cannot be read: the robot itself will say what is wrong with it."""
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        return ""  # the robot itself says what is wrong with it
+        return tomlkit.parse(Path(source).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomlkit.exceptions.TOMLKitError):
+        return tomlkit.document()
 
 
 def _await(process: subprocess.Popen[bytes], ready: Path, log: str) -> None:
@@ -112,7 +110,11 @@ def _await(process: subprocess.Popen[bytes], ready: Path, log: str) -> None:
     while not ready.is_file():
         if process.poll() is not None:
             words = Path(log).read_text().strip().splitlines()
-            raise HardwareFault(words[-1] if words else f"the virtual robot ended with status {process.returncode}")
+            raise HardwareFault(
+                words[-1].removeprefix("openant: ")
+                if words
+                else f"the virtual robot ended with status {process.returncode}"
+            )
         if time.monotonic() > give_up:
             raise HardwareFault(f"the virtual robot is not ready after {START_TIMEOUT_S:.0f} s")
         time.sleep(0.02)
