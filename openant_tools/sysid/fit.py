@@ -342,7 +342,9 @@ class Problem:
             starts = [self._with_delays(first)]
             if self._valley.any():
                 ends = np.where(np.isfinite(self.low), self.low, starts[0])
-                starts.append(np.where(self._valley, ends, starts[0]))
+                starts += [
+                    np.where(self._valley, ends * share + starts[0] * (1 - share), starts[0]) for share in (1.0, 0.5)
+                ]
         told = 0.0
 
         def tell(what: str) -> None:
@@ -352,14 +354,12 @@ class Problem:
             if progress:
                 progress(what, told)
 
-        best: tuple[float, _Descent] | None = None
-        for u in starts:
-            found = self._descend(u, lambda: tell("fitting"))
-            score = self._score(found.point)
-            if best is None or score < best[0]:
-                best = score, found
-        assert best is not None
-        score, found = best
+        descents = [self._descend(u, lambda: tell("fitting")) for u in starts]
+        scores = [self._score(found.point) for found in descents]
+        # Posteriors that are as good as each other are told apart by what they leave, in plain rad.
+        equal = [k for k, score in enumerate(scores) if score < min(scores) + DECISIVE]
+        chosen = min(equal, key=lambda k: float(np.nansum(descents[k].point.residual ** 2)))
+        score, found = scores[chosen], descents[chosen]
         self._reweigh(found.point)
         times = self.correlation_s
         period = max(stretch.period for stretch in self._stretches)
