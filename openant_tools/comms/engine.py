@@ -490,10 +490,12 @@ class Engine:
         silent, broken = list[str](), list[str]()
         for servo in self._servos.servos:
             seen = [answer for _ in range(3) for answer in self._bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, [servo.id])]
-            if any(answer.ok for answer in seen):
-                continue
-            heard = any(answer.cause in (Cause.CRC, Cause.SHORT) for answer in seen)
-            (broken if heard else silent).append(f"{servo.joint} (id {servo.id})")
+            causes = {answer.cause for answer in seen}
+            # Only what is the same every time is told: a busy host meets now this, now that.
+            if causes == {Cause.CRC}:
+                broken.append(f"{servo.joint} (id {servo.id})")
+            elif causes == {Cause.TIMEOUT}:
+                silent.append(f"{servo.joint} (id {servo.id})")
         if len(silent) == len(broken) == 1:
             id = broken[0].rpartition(" ")[2].rstrip(")")
             return replace(
