@@ -112,7 +112,8 @@ def main() -> None:
             model.write_text(SO101.format(joint=joint, turned=turned).strip())
             # Where the joint is not commanded to move there is nothing to identify.
             runs = [run for run in recorded if np.ptp(run.column(f"cmd.{joint}")) > MOVES_RAD]
-            table(f"sage-so101, joint {joint}", {model: runs}, options.work, [joint], ["actuator_lag"], together=False)
+            for words, also in (("delay", []), ("delay and lag", ["actuator_lag"])):
+                table(f"sage-so101, joint {joint}, {words}", {model: runs}, options.work, [joint], also, together=False)
 
 
 if __name__ == "__main__":
