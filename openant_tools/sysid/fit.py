@@ -781,9 +781,23 @@ class Problem:
                 samples[j] += n
                 times[j] += n * inflation * stretch.period
                 stamps, stamped = stamps + n * stamp**2, stamped + n
+        self._let_driven_lead()
         self.noise = np.sqrt(squares / np.maximum(samples, 1))
         self.correlation_s = times / np.maximum(samples, 1)
         self.stamp_error_s = math.sqrt(stamps / max(stamped, 1))
+
+    def _let_driven_lead(self) -> None:
+        """No row without torque counts for more than one of the least trusted driven stretch.
+
+        A leg that falls is followed well by a friction that a servo at work does not have; it must not decide for both.
+        """
+        for j in range(self._weight.shape[1]):
+            typical = [(stretch, float(np.median(self._weight[stretch.rows[j], j]))) for stretch in self._stretches
+                       if len(stretch.rows[j])]  # fmt: skip
+            driven = [weight for stretch, weight in typical if stretch.driven and weight > 0]
+            for stretch, weight in typical:
+                if driven and not stretch.driven and weight > min(driven):
+                    self._weight[stretch.rows[j], j] *= min(driven) / weight
 
     def _find_stretches(self) -> list[_Stretch]:
         """For each run, with torque and without: the rows of each joint, and the run's median sample time (s).
