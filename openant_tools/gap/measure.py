@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.gap.regime import Regime, regimes
+from openant_tools.model.floor import floors
 from openant_tools.model.gap import excess, gap
 from openant_tools.model.plant import Plant, load_plant, setup_of
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
-from openant_tools.sysid.quality import quantum
 
 __all__ = ["Measurement", "Place", "Played", "measure"]
 
@@ -122,7 +122,7 @@ def measure(
     played = tuple(
         _play(run, load_plant(run.model_path or model, wanted, setup_of(run.facts.setup)), horizon_s) for run in runs
     )
-    floors, from_repeats = _floors(played, wanted)
+    found = {signal: floors(runs, wanted, signal) for signal in UNITS}
     gaps = {
         signal: gap(
             np.concatenate([one.measured[signal] for one in played]),
@@ -131,9 +131,9 @@ def measure(
         for signal in UNITS
     }
     gaps = {signal: value for signal, value in gaps.items() if math.isfinite(value)}
-    places = [place for signal in gaps for place in _places(played, wanted, signal, floors[signal])]
+    places = [place for signal in gaps for place in _places(played, wanted, signal, found[signal][0])]
     return Measurement(
-        model, tuple(wanted), horizon_s, gaps, {signal: rms(floors[signal]) for signal in gaps}, from_repeats,
+        model, tuple(wanted), horizon_s, gaps, {signal: rms(found[signal][0]) for signal in gaps}, found["pos"][1],
         tuple(places), played,
     )  # fmt: skip
 
@@ -160,41 +160,6 @@ def _play(run: Run, plant: Plant, horizon_s: float | None) -> Played:
     done = Rollouts(plant, [run], horizon_s)()
     measured = {signal: run.signal(signal, plant.joints) for signal in UNITS}
     return Played(run, measured, {"pos": done.pos[0], "vel": done.vel[0]}, regimes(run, plant))
-
-
-def _floors(played: Sequence[Played], joints: Sequence[str]) -> tuple[dict[str, Array], bool]:
-    """Signal → (joints,), and whether it comes from repeats."""
-    by_name = {one.run.name: one for one in played}
-    repeats = [(one, by_name[one.run.facts.repeat_of]) for one in played if one.run.facts.repeat_of in by_name]
-    floors = {}
-    for signal in UNITS:
-        squares = np.full((max(1, len(repeats)), len(joints)), np.nan)
-        for k, (again, once) in enumerate(repeats):
-            t = again.run.t - again.run.t[0] + once.run.t[0]
-            for j in range(len(joints)):
-                seen = np.isfinite(once.measured[signal][:, j])
-                if seen.sum() > 1:
-                    there = np.interp(t, once.run.t[seen], once.measured[signal][seen, j])
-                    # Two repeats differ by both their noises, so that each has half of the squared difference.
-                    squares[k, j] = gap(again.measured[signal][:, j], there) ** 2 / 2
-        by_resolution = np.array([_resolution(played, signal, joint, j) for j, joint in enumerate(joints)])
-        known = np.isfinite(squares)
-        mean = np.where(known, squares, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-        floors[signal] = np.where(known.any(axis=0), np.sqrt(mean), by_resolution)
-    return floors, bool(repeats)
-
-
-def _resolution(played: Sequence[Played], signal: str, joint: str, j: int) -> float:
-    """What rounding alone leaves: the coarsest step over √12."""
-    if signal == "pos":
-        return max(quantum(one.run, joint) for one in played) / math.sqrt(12)
-    steps = []
-    for one in played:
-        known = one.run.facts.resolution.get(f"{signal}.{joint}", one.run.facts.resolution.get(signal))
-        change = np.abs(np.diff(one.measured[signal][:, j]))
-        change = change[np.isfinite(change) & (change > 1e-9)]
-        steps.append(known if known is not None else float(change.min()) if len(change) else 0.0)
-    return max(steps) / math.sqrt(12)
 
 
 def _places(played: Sequence[Played], joints: Sequence[str], signal: str, floor: Array) -> list[Place]:

@@ -27,12 +27,12 @@ from scipy.optimize import lsq_linear, nnls
 from scipy.stats import norm
 
 from openant_tools.effects.rollout import rollout
+from openant_tools.model.floor import resolution
 from openant_tools.model.gap import HORIZON_S, Gap, gap
 from openant_tools.model.plant import Plant, Setup
 from openant_tools.model.rollout import Rollouts, Trajectories
 from openant_tools.recording.run import Run
 from openant_tools.sysid.parameter import ACTION_DELAY, Parameter, apply, delays, effect_values
-from openant_tools.sysid.quality import quantum
 
 __all__ = ["Dataset", "Estimate", "Problem", "autocorrelation_time"]
 
@@ -922,4 +922,4 @@ def _colours(
 
 def sensor_floor(runs: Sequence[Run], joints: Sequence[str]) -> Array:
     """(joints,) rad, the deviation that the encoder's resolution alone gives: its coarsest quantum / √12."""
-    return np.array([max(quantum(run, joint) for run in runs) for joint in joints]) / math.sqrt(12)
+    return np.array([max(resolution(run, "pos", joint) for run in runs) for joint in joints]) / math.sqrt(12)

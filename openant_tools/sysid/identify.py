@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.model.attribute import Attribute
-from openant_tools.model.gap import HORIZON_S, Gap, gap, share_closed
+from openant_tools.model.floor import floors
+from openant_tools.model.gap import HORIZON_S, Gap, share_closed
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.recording.run import Run
 from openant_tools.sysid.declared import Declaration, declared_parameters
@@ -304,7 +305,7 @@ def identify(
         values=values,
         before=before,
         after=after,
-        floor=_floor([*runs, *hold_out], joints),
+        floor=float(np.sqrt(np.mean(floors([*runs, *hold_out], joints)[0] ** 2))),
         judged_on=tuple(run.name for run in (hold_out or tests)),
         in_turn=not hold_out,
         noise=dict(zip(joints, estimate.noise.tolist(), strict=True)),
@@ -520,26 +521,6 @@ def _value(parameter: Parameter, plant: Plant, estimate: Estimate, k: int, verdi
         record_next=experiment(parameter.kind, None if other is None else other.kind) if wanting else "",
         halves=halves,
     )
-
-
-def _floor(runs: Sequence[Run], joints: Sequence[str]) -> float:
-    """rad, what no model could beat: from repeats of the same commands where there are any, else from the resolution."""
-    by_name = {run.name: run for run in runs}
-    squares: list[float] = []
-    for run in runs:
-        first = by_name.get(run.facts.repeat_of or "")
-        if first is not None:
-            again = run.signal("pos", joints)
-            t = run.t - run.t[0] + first.t[0]
-            once = first.signal("pos", joints)
-            for j in range(len(joints)):
-                ok = np.isfinite(once[:, j])
-                if ok.sum() > 1:
-                    # Two repeats differ by both their noises, so that each has half of the squared difference.
-                    squares.append(gap(again[:, j], np.interp(t, first.t[ok], once[ok, j])) ** 2 / 2)
-    if squares:
-        return math.sqrt(float(np.mean(squares)))
-    return float(np.sqrt(np.mean(sensor_floor(runs, joints) ** 2)))
 
 
 def _telemetry_notes(runs: Sequence[Run], telemetry: Sequence[Telemetry]) -> Iterator[str]:

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.model.floor import resolution
 from openant_tools.model.plant import Plant
 from openant_tools.recording.run import Run
 from openant_tools.robot.registers import PWM_FULL
 from openant_tools.sysid.kinds import KINDS, torque_limit
 
-__all__ = ["Telemetry", "check_model", "check_runs", "quantum", "without_errors"]
+__all__ = ["Telemetry", "check_model", "check_runs", "without_errors"]
 
 Array = NDArray[np.float64]
 
@@ -72,7 +73,7 @@ def without_errors(run: Run, joints: Sequence[str]) -> tuple[Run, Telemetry]:
         pos = run.column(f"pos.{joint}").copy()
         pos[run.column(f"ok.{joint}") == 0] = np.nan
         lost = int((~np.isfinite(pos)).sum())
-        spikes = _spikes(run.t, pos, quantum(run, joint))
+        spikes = _spikes(run.t, pos, resolution(run, "pos", joint))
         pos[spikes] = np.nan
         if lost or len(spikes):
             columns[f"pos.{joint}"] = pos
@@ -107,16 +108,6 @@ def _spikes(t: Array, pos: Array, step: float) -> NDArray[np.int64]:
     return found
 
 
-def quantum(run: Run, joint: str) -> float:
-    """rad, the encoder's step: from the run's facts, else the smallest change in the data."""
-    known = run.facts.resolution.get(f"pos.{joint}", run.facts.resolution.get("pos"))
-    if known is not None:
-        return known
-    steps = np.abs(np.diff(run.column(f"pos.{joint}")))
-    steps = steps[np.isfinite(steps) & (steps > 1e-9)]
-    return float(steps.min()) if len(steps) else 0.0
-
-
 def check_runs(runs: Sequence[Run], plant: Plant) -> None:
     """Refuse runs that cannot determine what they are fitted for.
 
@@ -132,7 +123,9 @@ def check_runs(runs: Sequence[Run], plant: Plant) -> None:
                 f"too short to fit: {run.duration_s:.2f} s", where=where, remedy="record at least a few seconds"
             )
         pos, cmd = run.signal("pos", plant.joints), run.signal("cmd", plant.joints)
-        moves = [_span(pos[:, j]) > MOVES_QUANTA * quantum(run, joint) for j, joint in enumerate(plant.joints)]
+        moves = [
+            _span(pos[:, j]) > MOVES_QUANTA * resolution(run, "pos", joint) for j, joint in enumerate(plant.joints)
+        ]
         if not any(moves):
             raise BadInput("nothing moves in this run", where=where, remedy="record a protocol that moves the joints")
         for problem, remedy in _problems(run, plant, pos, cmd, moves):
@@ -143,7 +136,7 @@ def _problems(run: Run, plant: Plant, pos: Array, cmd: Array, moves: Sequence[bo
     for j, joint in enumerate(plant.joints):
         on = run.signal("torque", [joint], default=1.0)[:, 0] != 0
         commanded = _span(cmd[on, j]) if on.any() else 0.0
-        if commanded > 10 * MOVES_QUANTA * quantum(run, joint) and not moves[j]:
+        if commanded > 10 * MOVES_QUANTA * resolution(run, "pos", joint) and not moves[j]:
             yield (
                 f"{joint} is commanded over {commanded:.2f} rad and does not move",
                 f"check its cable, horn and torque, or leave it out with --joint (all others: {_others(plant, joint)})",
