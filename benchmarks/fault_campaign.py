@@ -27,11 +27,10 @@ import numpy as np
 
 from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_robot
 from openant_tools.comms import messages
-from openant_tools.comms.camera import Camera, CameraSettings
-from openant_tools.comms.clock import RealClock, VirtualControl
+from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig, ImuConfig
-from openant_tools.comms.setup import config_of_unknown_robot
+from openant_tools.comms.setup import camera_of_robot, config_of_unknown_robot
 from openant_tools.errors import HardwareFault, OpenAntError
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
@@ -193,25 +192,13 @@ def imu_silent(robot: Robot, folder: Path) -> Row:
 
 
 def camera_frozen(robot: Robot, folder: Path) -> Row:
-    """The camera is the face's, not the engine's: legs go on, and whoever wants a pose is told."""
     out = folder / "camera.mcap"
-    clock = RealClock()
-    camera = Camera(CameraSettings(robot.ready["camera"]), clock)
-    camera.open()
-    try:
-        with moving_engine(robot, out) as (engine, number):
-            camera.wait(clock.now() + 5.0)
-            assert camera.fault() is None
-            robot.fault("camera_frozen")
-            noticed = robot.seconds_until(lambda: camera.newest() is None and camera.fault() is not None)
-            told = str(camera.fault())
-            assert not engine.done(number)
-            robot.fault("camera_frozen", on=False)
-    finally:
-        camera.close()
-    return Row(
-        "camera frozen", None, f"goes on; told after {noticed or -1:.1f} s, no pose from there", told, rows_of(out)
-    )
+    with moving_engine(robot, out, camera=camera_of_robot(None, robot.ready["camera"])) as (engine, number):
+        robot.fault("camera_frozen")
+        told = heard(engine, number, 2.0)
+        assert not engine.done(number)
+        robot.fault("camera_frozen", on=False)
+    return Row("camera frozen", None, "goes on; no pose from there", told, rows_of(out))
 
 
 def wrong_baud(robot: Robot, folder: Path) -> Row:

@@ -665,6 +665,9 @@ def test_a_robots_file_describes_its_camera(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="body_tag_id"):
         camera_of_robot(parse_config(tomllib.loads(with_camera))[0])
     lens = "size_px = [1920, 1080]\nfocal_px = [1500, 1501]\ncentre_px = [960, 540]\ndistortion = [0.1, 0, 0, 0, 0]\n"
+    partly = with_camera.replace("body_tag_id = -1", "body_tag_id = 7\nfocal_px = [1500, 1501]")
+    with pytest.raises(BadInput, match="the lens is described in part"):
+        camera_of_robot(parse_config(tomllib.loads(partly))[0])
     known = with_camera.replace("body_tag_id = -1", f"latency_s = 0.08\n{lens}body_tag_id = 7")
     found = camera_of_robot(parse_config(tomllib.loads(known))[0])
     assert found is not None

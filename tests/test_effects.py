@@ -23,6 +23,7 @@ from openant_tools.robot.config import Effect as Entry
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
 from openant_tools.sysid.identify import identify
+from openant_tools.sysid.parameter import choose, colours
 from openant_tools.sysid.result import write_fit
 
 #: a size of each parameter that shows
@@ -227,3 +228,15 @@ def test_entries_and_values_say_the_same() -> None:
     again = values_of(entries, joints)
     assert {key: value.tolist() for key, value in again.items()} == {k: v.tolist() for k, v in values.items()}
     assert "dead_zone" in as_toml(entries)
+
+
+def test_what_all_joints_share_is_one_value_that_moves_all_of_them() -> None:
+    """A sagging supply couples legs that a stand keeps apart: no rollout may serve two parameters then."""
+    plant = load_plant(nominal_model_path("standard"), JOINT_NAMES, Setup.STAND)
+    apart = choose(plant, ["stiffness"])
+    assert len(colours(plant, apart, coupled=False)) == 2
+    shared = choose(plant, ["stiffness", "voltage_sag"])
+    assert [parameter.name for parameter in shared if parameter.kind == "voltage_sag"] == ["voltage_sag.body"]
+    for members, masks in colours(plant, shared, coupled=False):
+        assert len(members) == 1
+        assert masks[0].all()

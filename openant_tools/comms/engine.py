@@ -487,31 +487,29 @@ class Engine:
 
     def _who_is_silent(self, trip: Trip) -> Trip:
         """Each servo asked alone: in a common read those behind a silent one wait for it and seem silent, too."""
-        silent, broken = list[str](), list[str]()
+        silent, broken = list[Servo](), list[Servo]()
         for servo in self._servos.servos:
             seen = [answer for _ in range(3) for answer in self._bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, [servo.id])]
             causes = {answer.cause for answer in seen}
             # Only what is the same every time is told: a busy host meets now this, now that.
             if causes == {Cause.CRC}:
-                broken.append(f"{servo.joint} (id {servo.id})")
+                broken.append(servo)
             elif causes == {Cause.TIMEOUT}:
-                silent.append(f"{servo.joint} (id {servo.id})")
-        if len(silent) == len(broken) == 1:
-            id = broken[0].rpartition(" ")[2].rstrip(")")
-            return replace(
-                trip,
-                what=f"{silent[0]} is silent and what comes from {broken[0]} is broken",
-                remedy=f"probably both have id {id}: unplug {broken[0].partition(' ')[0]}, and `openant comms scan` shows it",
+                silent.append(servo)
+        if not silent or len(broken) > 1 or (broken and len(silent) > 1):
+            return trip
+        first, names = silent[0], ", ".join(f"{servo.joint} (id {servo.id})" for servo in silent)
+        if broken:
+            [other] = broken
+            return Trip(
+                f"{names} is silent and what comes from {other.joint} (id {other.id}) is broken",
+                f"probably both have id {other.id}: unplug {other.joint}, and `openant comms scan` shows it",
+                first.joint,
             )
-        if len(silent) == 1 and not broken:
-            return trip if silent[0] in trip.what else replace(trip, what=f"{silent[0]} does not answer")
-        if silent and not broken:
-            return replace(
-                trip,
-                what=f"{', '.join(silent)} do not answer",
-                remedy=f"look at the cable before {silent[0].partition(' ')[0]} and at each servo's connectors",
-            )
-        return trip
+        if len(silent) > 1:
+            remedy = f"look at the cable before {first.joint} and at each servo's connectors"
+            return Trip(f"{names} do not answer", remedy, first.joint)
+        return trip if first.joint == trip.joint else Trip(f"{names} does not answer", trip.remedy, first.joint)
 
     def _stopped(self, trip: Trip) -> None:
         """Release everyone, tell, and only then make sure: on a bad line that may take a while."""

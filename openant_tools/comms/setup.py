@@ -86,7 +86,10 @@ def camera_of_robot(robot: RobotConfig | None, source: str | int | None = None) 
         raise BadInput(
             "camera.body_tag_id is not known yet", where="robot.toml", remedy="set it to the number of the robot's tag"
         )
-    lens = None
+    lens, parts = None, (seen.size_px, seen.focal_px, seen.centre_px)
+    if any(part is not None for part in parts) and any(part is None for part in parts):
+        remedy = "give camera.size_px, focal_px and centre_px together, or none of them"
+        raise BadInput("the lens is described in part", where="robot.toml", remedy=remedy)
     if seen.size_px is not None and seen.focal_px is not None and seen.centre_px is not None:
         (width, height), (fx, fy), (cx, cy) = seen.size_px, seen.focal_px, seen.centre_px
         k1, k2, p1, p2, k3 = seen.distortion

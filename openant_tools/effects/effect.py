@@ -44,6 +44,7 @@ class Effect:
         quantities: its parameters; all at 0 is no effect.
         order: laws of lower order act first: supply, then setpoints, then torques, then what follows from torques.
         law: makes the law for given values.
+        shared: what one joint does acts on all, and there is one value for the robot.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Effect:
     quantities: tuple[Quantity, ...]
     order: int
     law: Callable[[Values], Law]
+    shared: bool = False
 
     def quantity(self, name: str) -> Quantity:
         return next(quantity for quantity in self.quantities if quantity.name == name)

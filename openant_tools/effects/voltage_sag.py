@@ -40,4 +40,5 @@ EFFECT = Effect(
     quantities=(Quantity("resistance_ohm", "Ω", 0.5, high=20.0),),
     order=10,
     law=_law,
+    shared=True,
 )

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.errors import BadInput
 from openant_tools.gap.regime import Regime, regimes
 from openant_tools.model.floor import floors
 from openant_tools.model.gap import excess, gap
 from openant_tools.model.plant import Plant, load_plant, setup_of
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
+from openant_tools.sysid.identify import joints_in_common, own_model
 
 __all__ = ["Measurement", "Place", "Played", "measure"]
 
@@ -116,11 +116,9 @@ def measure(
     Raises:
         BadInput: no run, or none of the model's joints in it.
     """
-    if not runs:
-        raise BadInput("no run was named", remedy="name at least one recording")
-    wanted = list(joints) if joints is not None else _joints(runs, model)
+    wanted = joints_in_common(runs, model, joints)
     played = tuple(
-        _play(run, load_plant(run.model_path or model, wanted, setup_of(run.facts.setup)), horizon_s) for run in runs
+        _play(run, load_plant(own_model(run) or model, wanted, setup_of(run.facts.setup)), horizon_s) for run in runs
     )
     found = {signal: floors(runs, wanted, signal) for signal in UNITS}
     gaps = {
@@ -140,20 +138,6 @@ def measure(
 
 def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def _joints(runs: Sequence[Run], model: Path) -> list[str]:
-    plant = load_plant(model)
-    common = [
-        joint for joint in plant.joints if all(run.has("cmd", [joint]) and run.has("pos", [joint]) for run in runs)
-    ]
-    if not common:
-        raise BadInput(
-            f"the model's joints ({', '.join(plant.joints)}) are not those of the runs ({', '.join(runs[0].joints)})",
-            where=model,
-            remedy="give the model of this robot, with joints named as in the runs",
-        )
-    return common
 
 
 def _play(run: Run, plant: Plant, horizon_s: float | None) -> Played:

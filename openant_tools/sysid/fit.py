@@ -32,7 +32,7 @@ from openant_tools.model.gap import HORIZON_S, Gap, gap
 from openant_tools.model.plant import Plant, Setup
 from openant_tools.model.rollout import Rollouts, Trajectories
 from openant_tools.recording.run import Run
-from openant_tools.sysid.parameter import ACTION_DELAY, Parameter, apply, delays, effect_values
+from openant_tools.sysid.parameter import ACTION_DELAY, Parameter, apply, colours, delays, effect_values
 
 __all__ = ["Dataset", "Estimate", "Problem", "autocorrelation_time"]
 
@@ -293,7 +293,8 @@ class Problem:
         self._weight: Array = np.ones((sum(len(data.measured) for data in self.datasets), nj))
         self.noise, self.correlation_s, self.stamp_error_s = np.zeros(nj), np.zeros(nj), 0.0
         self._valley = np.array([parameter.definition.valley for parameter in self.parameters], bool)
-        self._colours = _colours(self.datasets, self.parameters)
+        floor = any(data.plant.setup is Setup.FLOOR for data in self.datasets)
+        self._colours = colours(self.datasets[0].plant, self.parameters, coupled=floor)
         self._on_floor = any(data.plant.setup is Setup.FLOOR for data in self.datasets)
         chattering = [FLOOR_STEP_OF_BODY if p.definition.body else FLOOR_STEP for p in self.parameters]
         self._differences = np.array(chattering if self._on_floor else [STEP] * len(self.parameters))
@@ -889,35 +890,6 @@ def gaps(datasets: Sequence[Dataset], parameters: Sequence[Parameter], us: Seque
         simulated.append(np.concatenate(per_dataset, axis=1))
     short, long = simulated
     return [Gap(gap(measured, short[v]), gap(measured, long[v])) for v in range(len(us))]
-
-
-def _colours(
-    datasets: Sequence[Dataset], parameters: Sequence[Parameter]
-) -> list[tuple[list[int], list[NDArray[np.bool_]]]]:
-    """Parameters that can be perturbed in one rollout, because they move joints of different kinematic trees.
-
-    On the stand the legs do not move each other (the torso is fixed), so that one rollout serves one parameter of each leg.
-    On the floor everything moves everything.
-
-    Returns:
-        for each colour, the indices of its parameters and, for each, the mask of the joints that it moves.
-    """
-    plants = [data.plant for data in datasets]
-    coupled = any(plant.setup is Setup.FLOOR for plant in plants)
-    tree = plants[0].tree if not coupled else np.zeros_like(plants[0].tree)
-    colours: list[tuple[set[int], list[int], list[NDArray[np.bool_]]]] = []
-    for p, parameter in enumerate(parameters):
-        trees = {int(tree[j]) for j in parameter.joints}
-        affected = np.isin(tree, list(trees))
-        for used, members, masks in colours:
-            if not used & trees:
-                used |= trees
-                members.append(p)
-                masks.append(affected)
-                break
-        else:
-            colours.append((trees, [p], [affected]))
-    return [(members, masks) for _, members, masks in colours]
 
 
 def sensor_floor(runs: Sequence[Run], joints: Sequence[str]) -> Array:

@@ -47,6 +47,8 @@ __all__ = [
     "Value",
     "calibrated",
     "identify",
+    "joints_in_common",
+    "own_model",
     "restated",
 ]
 
@@ -244,7 +246,7 @@ def identify(
     )
     if same:
         raise BadInput("a held-out run is also fitted", remedy="hold out runs that are not among those to fit")
-    joints = _joints_in_common(everything, model, joints)
+    joints = joints_in_common(everything, model, joints)
     cleaned = [without_errors(run, joints) for run in everything]
     everything, telemetry = [run for run, _ in cleaned], [found for _, found in cleaned]
     runs, hold_out = everything[: len(runs)], everything[len(runs) :]
@@ -320,7 +322,12 @@ def identify(
     )
 
 
-def _joints_in_common(runs: Sequence[Run], model: Path, wanted: Sequence[str] | None) -> list[str]:
+def joints_in_common(runs: Sequence[Run], model: Path, wanted: Sequence[str] | None) -> list[str]:
+    """The joints of a model, or those `wanted`, that every run commands and measures.
+
+    Raises:
+        BadInput: there are no runs, no such joints, or a run lacks one that is wanted.
+    """
     if not runs:
         raise BadInput("no runs to fit", remedy="name at least one recording")
     plant = load_plant(model, wanted, Setup.FLOOR)
@@ -348,7 +355,7 @@ def _datasets(
     """One dataset per model and setup; runs that name their own model are simulated with it."""
     groups: dict[tuple[Path, Setup], list[Run]] = {}
     for run in runs:
-        groups.setdefault((_own_model(run) or model, setup_of(run.facts.setup)), []).append(run)
+        groups.setdefault((own_model(run) or model, setup_of(run.facts.setup)), []).append(run)
     return [
         Dataset.prepare(
             load_plant(path, joints, setup, electrical="electrical_damping" in kinds, lagging=ACTUATOR_LAG in kinds),
@@ -359,7 +366,8 @@ def _datasets(
     ]
 
 
-def _own_model(run: Run) -> Path | None:
+def own_model(run: Run) -> Path | None:
+    """The model that a run itself names, where that file is."""
     own = run.model_path
     return own if own is not None and own.is_file() else None
 

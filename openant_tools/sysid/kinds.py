@@ -504,6 +504,7 @@ def _effect_kinds() -> Iterator[Kind]:
                 _share_of_limit(quantity.std) if quantity.unit == "N·m" else _constant(quantity.std),
                 low=quantity.low,
                 high=quantity.high,
+                body=effect.shared,
                 effect=(effect.name, quantity.name),
             )
 

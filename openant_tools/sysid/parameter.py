@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.effects.catalogue import effect
 from openant_tools.model.attribute import Attribute, stated
 from openant_tools.model.plant import Plant
 from openant_tools.sysid.kinds import ACTION_DELAY, KINDS, Kind, usual_torque
@@ -32,6 +33,7 @@ __all__ = [
     "apply",
     "buffered",
     "choose",
+    "colours",
     "delays",
     "effect_values",
     "given_numbers",
@@ -181,6 +183,40 @@ def buffered(plant: Plant, model: mujoco.MjModel, late: Array) -> None:
     for j, delay in enumerate(late):
         total = float(plant.model.actuator_delay[plant.actuator[j]]) + float(delay)
         model.actuator_delay[plant.actuator[j]] = total if total > plant.timestep / 2 else 0.0
+
+
+def colours(
+    plant: Plant, parameters: Sequence[Parameter], *, coupled: bool, some: Sequence[bool] | None = None
+) -> list[tuple[list[int], list[NDArray[np.bool_]]]]:
+    """Parameters that can be varied in one rollout, because they move joints of different kinematic trees.
+
+    On the stand the legs do not move each other (the torso is fixed), so that one rollout serves one parameter of each leg.
+
+    Args:
+        coupled: everything moves everything, as on the floor.
+        some: which parameters to vary; default all.
+
+    Returns:
+        for each colour, the indices of its parameters and, for each, the mask of the joints that it moves.
+    """
+    coupled |= any(effect(key[0]).shared for p in parameters if (key := p.definition.effect) is not None)
+    everywhere = set(plant.tree.tolist())
+    out: list[tuple[set[int], list[int], list[NDArray[np.bool_]]]] = []
+    for p, parameter in enumerate(parameters):
+        if some is not None and not some[p]:
+            continue
+        alone = coupled or parameter.definition.body or not parameter.joints
+        trees = set(everywhere) if alone else {int(plant.tree[j]) for j in parameter.joints}
+        mask = np.isin(plant.tree, list(trees))
+        for used, members, masks in out:
+            if not used & trees:
+                used |= trees
+                members.append(p)
+                masks.append(mask)
+                break
+        else:
+            out.append((trees, [p], [mask]))
+    return [(members, masks) for _, members, masks in out]
 
 
 def choose(

@@ -25,7 +25,7 @@ from openant_tools.sysid.fit import TIMING_STD_S, Dataset
 from openant_tools.sysid.forecast import Forecast, forecast
 from openant_tools.sysid.identify import DEFAULT_KINDS, IDENTIFIABLE, TWO_SIDED_95, UNDETERMINED
 from openant_tools.sysid.kinds import ELECTRICAL_DAMPING, KINDS
-from openant_tools.sysid.parameter import Parameter, apply, choose
+from openant_tools.sysid.parameter import Parameter, apply, choose, colours
 from openant_tools.sysid.plan_file import as_table
 from openant_tools.sysid.protocols import Protocol
 
@@ -296,9 +296,9 @@ def information(
     step = np.where(up, size, -size)
     if plant.setup is not Setup.FLOOR:
         step = np.where(up | (centre - size >= low), step, np.minimum(size, high - centre))
-    colours = _colours(plant, parameters, some)
+    rolled = colours(plant, parameters, coupled=plant.setup is Setup.FLOOR, some=some)
     variants = [centre]
-    for members, _ in colours:
+    for members, _ in rolled:
         moved = centre.copy()
         moved[members] += step[members]
         variants.append(np.clip(moved, low, high))
@@ -308,7 +308,7 @@ def information(
     for run, rows in zip(runs, data.fitted.rows, strict=True):
         weight = residual.weight(plant.setup, float(np.median(np.diff(run.t))))
         columns = np.zeros((rows.stop - rows.start, joints, len(parameters) + joints))
-        for c, (members, masks) in enumerate(colours):
+        for c, (members, masks) in enumerate(rolled):
             change = np.nan_to_num(seen.pos[1 + c, rows] - seen.pos[0, rows])
             for p, mask in zip(members, masks, strict=True):
                 columns[:, mask, p] = change[:, mask] / (variants[1 + c][p] - centre[p])
@@ -317,29 +317,6 @@ def information(
         flat = weight * columns.reshape(-1, columns.shape[2])
         out.append(flat.T @ flat)
     return out
-
-
-def _colours(
-    plant: Plant, parameters: Sequence[Parameter], some: Sequence[bool] | None
-) -> list[tuple[list[int], list[NDArray[np.bool_]]]]:
-    """Parameters that can be varied in one rollout, since they move joints of different legs, with what each moves."""
-    everywhere = set(plant.tree.tolist())
-    out: list[tuple[set[int], list[int], list[NDArray[np.bool_]]]] = []
-    for p, parameter in enumerate(parameters):
-        if some is not None and not some[p]:
-            continue
-        alone = plant.setup is Setup.FLOOR or parameter.definition.body or not parameter.joints
-        trees = everywhere if alone else {int(plant.tree[j]) for j in parameter.joints}
-        mask = np.isin(plant.tree, list(trees))
-        for used, members, masks in out:
-            if not used & trees:
-                used |= trees
-                members.append(p)
-                masks.append(mask)
-                break
-        else:
-            out.append((set(trees), [p], [mask]))
-    return [(members, masks) for _, members, masks in out]
 
 
 def marginal(total: Array, n: int) -> Array:
