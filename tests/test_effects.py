@@ -9,8 +9,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from plants import ENCODER_RAD, drive, pendulum, sweep, write
 
+from openant_tools.cli.sysid_fit import fit
 from openant_tools.effects.acting import Acting
 from openant_tools.effects.catalogue import catalogue, effect
 from openant_tools.effects.entries import as_toml, entries_of, values_of
@@ -19,7 +21,9 @@ from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run
+from openant_tools.recording.tables import write_table
 from openant_tools.robot.config import Effect as Entry
+from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
 from openant_tools.sysid.identify import identify
@@ -240,3 +244,20 @@ def test_what_all_joints_share_is_one_value_that_moves_all_of_them() -> None:
     for members, masks in colours(plant, shared, coupled=False):
         assert len(members) == 1
         assert masks[0].all()
+
+
+def test_effects_that_a_fit_leaves_out_are_named_and_kept(tmp_path: Path) -> None:
+    """What acts beside a model that was fitted without it would count twice: nobody should learn that from a policy."""
+    path, t = write(tmp_path / "pendulum.xml", pendulum()), np.arange(0.0, 4.0, 0.01)
+    table = []
+    for k in range(2):
+        columns = drive(load_plant(path).model, ["joint"], t, sweep(t, 1 + k)[:, -1:], quantum=ENCODER_RAD)
+        write_table(Run(f"run{k}", Facts(joints=("joint",)), t, columns), tmp_path / f"run{k}.parquet")
+        table.append(str(tmp_path / f"run{k}.parquet"))
+    robot = create_robot(tmp_path / "ant")
+    robot.update(effects=[Entry("dead_zone", "all", {"width_rad": 0.01})])
+    arguments = [table[0], "--hold-out", table[1], "--model", str(path), "--out", str(tmp_path / "fit")]
+    ran = CliRunner().invoke(fit, [*arguments, "--robot", str(robot.path)], standalone_mode=False)
+    assert ran.exception is None
+    assert "dead_zone of robot.toml took no part in this fit" in ran.output
+    assert [entry.effect for entry in robot.config().effects] == ["dead_zone"]

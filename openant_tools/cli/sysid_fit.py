@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.options import robot_folder, robot_option
+from openant_tools.cli.options import robot_folder, robot_option, tie_option
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
@@ -35,13 +35,7 @@ __all__ = ["fit"]
     metavar="FILE.toml",
     help="Fit what this file declares, too.",
 )
-@click.option(
-    "--tie",
-    type=click.Choice(["joint", "servo", "all"]),
-    default="joint",
-    show_default=True,
-    help="One value a joint, one a servo model, or one for all.",
-)
+@tie_option
 @robot_option
 def fit(
     runs: tuple[Path, ...],
@@ -79,7 +73,7 @@ def fit(
     from openant_tools.robot.folder import RobotFolder
     from openant_tools.sysid.declared import read_declarations
     from openant_tools.sysid.identify import identify
-    from openant_tools.sysid.result import write_fit, write_robot
+    from openant_tools.sysid.result import effects_beside, write_fit, write_robot
 
     folder = None if robot is None else RobotFolder.at(robot)
     if model is None:
@@ -121,6 +115,12 @@ def fit(
     )
     for note in result.notes:
         click.echo(note)
+    beside = [] if folder is None else [entry.effect for entry in effects_beside(result, folder) if entry.enabled]
+    if beside:
+        click.echo(
+            f"{', '.join(dict.fromkeys(beside))} of robot.toml took no part in this fit, but acts in the environment besides what "
+            "was found: fit it too with --also, or set enabled = false"
+        )
     if not result.accepted:
         click.echo("nothing that was fitted beats the given model on held-out runs; calibrated.xml is the given model")
     for path in written:

@@ -7,8 +7,16 @@ from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.options import json_option, report_option, robot_option
-from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, RATES_HZ, finite, robot_of
+from openant_tools.cli.options import (
+    finite,
+    json_option,
+    rate_option,
+    report_option,
+    robot_option,
+    seconds_option,
+    tie_option,
+)
+from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, robot_of
 
 if TYPE_CHECKING:
     from openant_tools.sysid.plan import Plan
@@ -31,27 +39,10 @@ __all__ = ["plan"]
 @click.option(
     "--kinds", multiple=True, metavar="KIND", help="Parameters of interest. Repeatable. Default: a fit's own."
 )
-@click.option(
-    "--tie",
-    type=click.Choice(["joint", "servo", "all"]),
-    default="joint",
-    show_default=True,
-    help="One value a joint, one a servo model, or one for all.",
-)
+@tie_option
 @click.option("--setup", type=click.Choice(["stand", "floor"]), help="Only what is played there. Default: all of it.")
-@click.option(
-    "--seconds", type=float, callback=finite, metavar="S", help="How long to play. Default: the protocol's own time."
-)
-@click.option(
-    "--rate",
-    "rate_hz",
-    type=RATES_HZ,
-    callback=finite,
-    default=100.0,
-    show_default=True,
-    metavar="HZ",
-    help="Commands and reads a second.",
-)
+@seconds_option
+@rate_option
 @click.option(
     "--seed",
     type=click.IntRange(0),

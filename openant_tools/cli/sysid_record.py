@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.options import robot_option
+from openant_tools.cli.options import finite, rate_option, robot_option, seconds_option
 from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, placeable, placed, virtual_option, virtual_robot
 
 if TYPE_CHECKING:
@@ -20,25 +20,10 @@ if TYPE_CHECKING:
     from openant_tools.sysid.protocols import Protocol
     from openant_tools.sysid.record import Recorded, Take
 
-__all__ = ["RATES_HZ", "finite", "record", "robot_of"]
+__all__ = ["record", "robot_of"]
 
 #: `protocols.FULL`, without loading it for every --help
 DEFAULT_PROTOCOL = "full"
-
-
-def finite(context: click.Context, option: click.Parameter, value: float | None) -> float | None:
-    """What click takes for a number need not be one: nan is within every range."""
-    from math import isfinite
-
-    from openant_tools.errors import BadInput
-
-    if value is not None and not isfinite(value):
-        raise BadInput(f"{option.opts[0]} is {value:g}", remedy="give it a number")
-    return value
-
-
-#: commands a second; a bus of eight servos at 1 Mbaud manages about 300
-RATES_HZ = click.FloatRange(10, 1000)
 
 
 @click.command()
@@ -55,16 +40,7 @@ RATES_HZ = click.FloatRange(10, 1000)
 @virtual_option
 @click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one U2D2 that is plugged in.")
 @robot_option
-@click.option(
-    "--rate",
-    "rate_hz",
-    type=RATES_HZ,
-    callback=finite,
-    default=100.0,
-    show_default=True,
-    metavar="HZ",
-    help="Commands and reads a second.",
-)
+@rate_option
 @click.option(
     "--seed",
     type=click.IntRange(0),
@@ -72,9 +48,7 @@ RATES_HZ = click.FloatRange(10, 1000)
     show_default=True,
     help="Chance of the protocol; the same seed plays the same.",
 )
-@click.option(
-    "--seconds", type=float, callback=finite, metavar="S", help="How long to play. Default: the protocol's own time."
-)
+@seconds_option
 @click.option("--repeat", "repeats", type=click.IntRange(1), default=1, show_default=True, help="Play it so often.")
 @click.option(
     "--hold-out-seed", type=click.IntRange(0), metavar="SEED", help="Record it with this seed, too, to judge a fit by."

@@ -13,13 +13,13 @@ from pathlib import Path
 from openant_tools.effects.entries import as_toml, entries_of
 from openant_tools.files import write_text
 from openant_tools.model.mjcf import write_model
-from openant_tools.robot.config import Provenance
+from openant_tools.robot.config import Effect, Provenance
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.sysid.identify import Identification, calibrated, restated
 from openant_tools.sysid.kinds import KINDS
 from openant_tools.sysid.report import fit_report
 
-__all__ = ["write_fit", "write_robot"]
+__all__ = ["effects_beside", "write_fit", "write_robot"]
 
 CALIBRATED = "calibrated.xml"
 #: beside it: what MuJoCo has no feature for
@@ -104,9 +104,13 @@ def write_robot(result: Identification, folder: RobotFolder) -> None:
         json.dumps(finding, indent=1, ensure_ascii=False) + "\n",
     )
     found = entries_of(result.effects, result.joints)
+    folder.update(values, provenance=provenance, effects=[*effects_beside(result, folder), *found])
+
+
+def effects_beside(result: Identification, folder: RobotFolder) -> list[Effect]:
+    """The robot's `[[effect]]` entries that were not fitted: the simulated fit was without them, and they stay as they are."""
     fitted = {kind.effect[0] for kind in (KINDS[p.kind] for p in result.parameters if p.kind in KINDS) if kind.effect}
-    others = [entry for entry in folder.config().effects if entry.effect not in fitted]
-    folder.update(values, provenance=provenance, effects=[*others, *found])
+    return [entry for entry in folder.config().effects if entry.effect not in fitted]
 
 
 def _rounded(value: float) -> float:
