@@ -11,7 +11,6 @@ largest ratio of a trial is the onset, wherever the plate goes afterwards.
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.sysid.bench.finding import Evidence, Finding
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2
+from openant_tools.sysid.bench.typed import typed_rows
 
 __all__ = [
     "BODY_UP", "Coefficient", "Kind", "Slope", "checked", "coefficient", "friction_finding", "onset_angle", "read_slopes",
@@ -151,18 +151,8 @@ def read_slopes(path: Path) -> list[Slope]:
     Raises:
         BadInput: names the line that cannot be.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise BadInput("there is no such file", where=path) from None
-    except UnicodeDecodeError:
-        raise BadInput("is not a text file", where=path, remedy="a CSV of angle,kind") from None
     slopes: list[Slope] = []
-    for number, row in enumerate(csv.reader(text.splitlines()), 1):
-        cells = [cell.strip() for cell in row]
-        if not any(cells) or cells[0].startswith("#"):
-            continue
-        where = f"{path}, line {number}"
+    for where, cells in typed_rows(path, "angle,kind"):
         match = _ANGLE.fullmatch(cells[0])
         if match is None:
             if not slopes and not any(character.isdigit() for character in cells[0]):

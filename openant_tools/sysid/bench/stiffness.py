@@ -13,7 +13,6 @@ friction nor torque constant enter; the first needs the data sheet's stall torqu
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,6 +26,7 @@ from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE
 from openant_tools.robot.servo import ServoModel
 from openant_tools.sysid.bench.finding import Evidence, Finding
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2
+from openant_tools.sysid.bench.typed import typed_rows
 
 __all__ = [
     "ARM_UNCERTAINTY", "DIVISORS", "DivisorVerdict", "DutyReading", "Line", "Weighing", "decide_divisor", "fit_line", "lever_arm",
@@ -260,18 +260,8 @@ def read_weighings(path: Path) -> list[Weighing]:
     Raises:
         BadInput: names the line that cannot be.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise BadInput("there is no such file", where=path) from None
-    except UnicodeDecodeError:
-        raise BadInput("is not a text file", where=path, remedy="a CSV of deflection,grams") from None
     readings: list[Weighing] = []
-    for number, row in enumerate(csv.reader(text.splitlines()), 1):
-        cells = [cell.strip() for cell in row]
-        if not any(cells) or cells[0].startswith("#"):
-            continue
-        where = f"{path}, line {number}"
+    for where, cells in typed_rows(path, "deflection,grams"):
         if len(cells) < 2:
             raise BadInput("needs two columns", where=where, remedy="deflection in rad, then grams")
         try:
