@@ -1,0 +1,119 @@
+"""A virtual robot in a process of its own, for a face that wants one: started and ended, or running already."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import tomlkit
+
+from openant_tools.errors import BadInput, HardwareFault
+
+__all__ = ["VIRTUAL_DEFAULT", "placeable", "placed", "virtual_robot"]
+
+#: the source that stands for a healthy standard Ant on its stand
+VIRTUAL_DEFAULT = "default"
+START_TIMEOUT_S = 60.0
+
+
+@contextlib.contextmanager
+def virtual_robot(source: str, *, clock: str | None = None) -> Iterator[Mapping[str, str | None]]:
+    """What a ready file says of the virtual robot meant by `source`; one that was started ends with the block.
+
+    Args:
+        source: a scenario (NAME.toml), the ready file of a running one, or `VIRTUAL_DEFAULT`.
+        clock: "real" or "stepped" for a robot started here; None for what its scenario says.
+    """
+    if source != VIRTUAL_DEFAULT and not source.endswith(".toml"):
+        yield _read(Path(source))
+        return
+    if source != VIRTUAL_DEFAULT and not Path(source).is_file():
+        remedy = "name a scenario (NAME.toml) or a ready file, or give --virtual alone for a healthy robot"
+        raise BadInput("there is no such scenario", where=source, remedy=remedy)
+    with tempfile.TemporaryDirectory(prefix="openant-virtual-") as folder:
+        ready = Path(folder) / "ready.json"
+        command = [sys.executable, "-m", "openant_tools.cli", "virtual", "start", "--ready-file", str(ready)]
+        command += [] if source == VIRTUAL_DEFAULT else ["--scenario", source]
+        command += [] if clock is None else ["--clock", clock]
+        with open(Path(folder) / "log", "w+") as log:
+            # A session of its own: Ctrl-C is for the command, which then ends the robot after torque is off.
+            process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+            try:
+                _await(process, ready, log.name)
+                yield _read(ready)
+            finally:
+                process.terminate()
+                try:
+                    process.wait(5.0)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+
+
+def placeable(source: str) -> bool:
+    """Whether a virtual robot is started for this command and may be put elsewhere: its scenario is open to us, and it
+    is not loose motors in a box."""
+    if source == VIRTUAL_DEFAULT:
+        return True
+    robot = _scenario(source).get("robot", {}) if source.endswith(".toml") else None
+    return isinstance(robot, dict) and robot.get("setup") != "loose" and "sealed" not in _scenario(source)
+
+
+@contextlib.contextmanager
+def placed(source: str, setup: str, heading_rad: float) -> Iterator[str]:
+    """The source of a virtual robot like that of `source`, which is placeable, but standing elsewhere."""
+    document = tomlkit.document() if source == VIRTUAL_DEFAULT else _scenario(source)
+    robot = document.setdefault("robot", tomlkit.table())
+    there = robot.get("setup", "stand")
+    if there == setup and (setup == "stand" or robot.get("heading_rad", 0.0) == heading_rad):
+        yield source
+        return
+    robot["setup"], robot["heading_rad"] = setup, heading_rad
+    if "eeprom" in robot:
+        robot["eeprom"] = str(Path(source).resolve().parent / str(robot["eeprom"]))
+    if source == VIRTUAL_DEFAULT:
+        document["clock"] = {"mode": "stepped"}
+    with tempfile.TemporaryDirectory(prefix="openant-placed-") as folder:
+        path = Path(folder) / (Path(source).name if source != VIRTUAL_DEFAULT else f"{setup}.toml")
+        path.write_text(tomlkit.dumps(document), encoding="utf-8")
+        yield str(path)
+
+
+def _scenario(source: str) -> tomlkit.TOMLDocument:
+    """A scenario as it stands; empty where it cannot be read: the robot itself will say what is wrong with it."""
+    try:
+        return tomlkit.parse(Path(source).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomlkit.exceptions.TOMLKitError):
+        return tomlkit.document()
+
+
+def _await(process: subprocess.Popen[bytes], ready: Path, log: str) -> None:
+    give_up = time.monotonic() + START_TIMEOUT_S
+    while not ready.is_file():
+        if process.poll() is not None:
+            words = Path(log).read_text().strip().splitlines()
+            raise HardwareFault(
+                words[-1].removeprefix("openant: ")
+                if words
+                else f"the virtual robot ended with status {process.returncode}"
+            )
+        if time.monotonic() > give_up:
+            raise HardwareFault(f"the virtual robot is not ready after {START_TIMEOUT_S:.0f} s")
+        time.sleep(0.02)
+
+
+def _read(path: Path) -> Mapping[str, str | None]:
+    try:
+        content = json.loads(path.read_text())
+        return {"bus": str(content["bus"]), **{key: content.get(key) for key in ("imu", "camera", "control")}}
+    except FileNotFoundError:
+        raise BadInput("there is no such ready file", where=path, remedy="start a virtual robot first") from None
+    except (ValueError, KeyError, TypeError):
+        remedy = "name what `openant virtual start --ready-file` wrote, or a scenario that ends with .toml"
+        raise BadInput("this is no ready file of a virtual robot", where=path, remedy=remedy) from None
