@@ -64,7 +64,7 @@ def test_the_torque_table_warns_of_the_lites_knees_and_not_of_the_standards(
 def test_a_robots_own_mass_pose_and_limits_enter_and_the_finding_is_kept(tmp_path: Path) -> None:
     folder = create_robot(tmp_path / "ant", "standard", values={"bus.pwm_limit": 0.25})
     assert openant("sysid", "torque", "--robot", folder.path, "--mass", "3.9", "--legs", 2, "--angle", "45deg") == 1
-    (file,) = folder.findings.iterdir()
+    (file,) = folder.findings.glob("*.json")
     finding = json.loads(file.read_text())
     assert finding["data"]["rows"][0]["verdict"] == "gives way"
     assert finding["data"]["rows"][0]["limit_nm"] == pytest.approx(4.1 * 0.25)
@@ -245,7 +245,7 @@ def test_the_servos_own_duty_tells_its_divisor_and_the_finding_is_kept(
     assert openant("sysid", "scale", *words, "--pose", -0.87, "--yes") == 0
     assert "By the servo's own duty the P divisor is 256" in capsys.readouterr().out
     assert "divisor 256" in (tmp_path / "report" / "report.html").read_text()
-    (file,) = folder.findings.iterdir()
+    (file,) = folder.findings.glob("*.json")
     finding = json.loads(file.read_text())
     assert [round(w["deflection_rad"], 2) for w in finding["data"]["weighings"]] == [0.02, 0.04, 0.06]
     source = folder.config().provenance["bench.scale_stiffness.knee_fl"]

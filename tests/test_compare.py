@@ -137,7 +137,7 @@ def test_a_robot_is_compared_with_itself_on_another_date(tmp_path: Path, capsys:
         folder.update(values, provenance=provenance)
     assert openant("sysid", "compare", "2026-03-05", "2026-09-30", "--robot", folder.path) == 1
     assert "at knee_fl: coulomb_friction.knee_fl (+120 %); 2 parameters" in capsys.readouterr().out
-    assert [file.name.partition("-")[0] for file in folder.findings.iterdir()] == ["comparison"]
+    assert [file.name.partition("-")[0] for file in folder.findings.glob("*.json")] == ["comparison"]
     assert openant("sysid", "compare", "2026-04-01", "2026-05-01", "--robot", folder.path) == 0
     assert "it was not measured anew in between" in capsys.readouterr().out
     assert openant("sysid", "compare", "2026-03-05", folder.path, "--robot", folder.path) == 1

@@ -20,8 +20,8 @@ from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_optio
 
 if TYPE_CHECKING:
     from openant_tools.comms.messages import EngineConfig
+    from openant_tools.procedure.finding import Finding
     from openant_tools.robot.folder import RobotFolder
-    from openant_tools.sysid.bench.finding import Finding
 
 __all__ = ["ANGLE", "scale", "tilt", "torque"]
 
@@ -482,7 +482,7 @@ def _command() -> str:
 def _conclude(finding: Finding, folder: RobotFolder | None, json_file: Path | None) -> int:
     """Print what was found, write it where it belongs, and say by the exit code whether it is well."""
     from openant_tools.files import write_text
-    from openant_tools.sysid.bench.finding import keep
+    from openant_tools.procedure.finding import keep
 
     click.echo(finding.what)
     if finding.next_action:

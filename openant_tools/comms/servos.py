@@ -7,7 +7,7 @@ register's zero. Everything else is in the servo's own frame, as its registers h
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -15,10 +15,11 @@ from openant_tools.comms.bus import FAST_READ_FIRMWARE, Answer, Bus, Found
 from openant_tools.comms.faults import Cause, Refused
 from openant_tools.comms.protocol2 import BROADCAST, SyncWriteTemplate, write
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.procedure.journal import EepromWrite
 from openant_tools.robot.registers import EEPROM_END, Register
 from openant_tools.robot.servo import HardwareError, ServoModel, hardware_errors, servo_model
 
-__all__ = ["BLOCK", "BLOCK_ADDRESS", "BLOCK_SIZE", "Block", "EepromWrite", "Servo", "Servos"]
+__all__ = ["BLOCK", "BLOCK_ADDRESS", "BLOCK_SIZE", "Block", "Servo", "Servos"]
 
 #: Registers 120…146 in one read: tick, moving, moving status, PWM, current or load, velocity, position, velocity and
 #: position trajectory, voltage, temperature.
@@ -70,28 +71,19 @@ class Servo:
         return self.direction * joint_rad + self.zero_rad
 
 
-@dataclass(frozen=True)
-class EepromWrite:
-    """One change of a servo's permanent memory, for the journal; counts."""
-
-    joint: str
-    id: int
-    register: str
-    old: int
-    new: int
-
-
 @dataclass
 class Servos:
     """The servos of one bus.
 
     Attributes:
         journal: every EEPROM write done through this object, in order; the caller keeps it.
+        before_write: called before each of them is sent; raising keeps it from being sent.
     """
 
     bus: Bus
     servos: Sequence[Servo]
     journal: list[EepromWrite] = field(default_factory=list)
+    before_write: Callable[[EepromWrite], None] | None = None
 
     def __post_init__(self) -> None:
         self._by_joint = {servo.joint: servo for servo in self.servos}
@@ -186,15 +178,17 @@ class Servos:
             old = item.decode(self.bus.read(servo.id, item.address, item.size))
             if old == counts:
                 return
+            change = EepromWrite(joint, servo.id, register, old, counts, self.bus.line.baud)
+            if self.before_write is not None:
+                self.before_write(change)
         data = item.encode(counts)
         try:
             self.bus.write(servo.id, item.address, data, f"{register} = {counts}")
         except Refused as refusal:
             raise self._explained(refusal, servo) from None
         if old is not None:
-            self.journal.append(EepromWrite(joint, servo.id, register, old, counts))
-            reader = counts if register == "id" else servo.id
-            now = item.decode(self.bus.read(reader, item.address, item.size))
+            self.journal.append(change)
+            now = item.decode(self.bus.read(change.id_after, item.address, item.size))
             if now != counts:
                 raise HardwareFault(
                     f"{register} of {joint} (id {servo.id}) reads back {now} after writing {counts}",

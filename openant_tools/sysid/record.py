@@ -14,9 +14,9 @@ import numpy as np
 
 from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
-from openant_tools.comms.journal import append_writes
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.errors import BadInput
+from openant_tools.procedure.journal import append_writes
 from openant_tools.recording.run import Facts
 from openant_tools.sysid.excitation import CommandSpace, Multisine
 from openant_tools.sysid.plan_file import as_table

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from openant_tools.errors import BadInput
+from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.robot.servo import ServoModel
-from openant_tools.sysid.bench.finding import Evidence, Finding
 
 __all__ = ["GRAVITY_M_S2", "KNEE_TO_GROUND_M", "Load", "knee_load", "knee_loads", "knee_torque", "torque_finding"]
 

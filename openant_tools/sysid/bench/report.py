@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from openant_tools.procedure.finding import Finding
 from openant_tools.report import KeyFigure, Report, plots
 from openant_tools.robot.servo import servo_model
-from openant_tools.sysid.bench.finding import Finding
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2
 from openant_tools.sysid.bench.stiffness import DIVISORS
 

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE
 from openant_tools.robot.servo import ServoModel
-from openant_tools.sysid.bench.finding import Evidence, Finding
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2
 from openant_tools.sysid.bench.typed import typed_rows
 

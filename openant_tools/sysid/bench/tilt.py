@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
-from openant_tools.comms.journal import append_writes
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.errors import BadInput
+from openant_tools.procedure.journal import append_writes
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import HOME_RAD
 from openant_tools.sysid.bench.friction import BODY_UP, onset_angle, up_direction

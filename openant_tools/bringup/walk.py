@@ -1,0 +1,220 @@
+"""The walk from loose motors to a robot that learns: its steps, in the order in which one builds, and how far it got."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from openant_tools.errors import BadInput
+from openant_tools.procedure.finding import Finding, latest
+from openant_tools.procedure.step import Step
+from openant_tools.robot.folder import RobotFolder
+
+__all__ = ["WALK", "Standing", "State", "standing", "step"]
+
+#: name → step, in order.
+WALK: Mapping[str, Step] = {
+    step.name: step
+    for step in (
+        Step(
+            "connect",
+            "Connect",
+            "Find the bus, the IMU and the camera, and see that the adapter answers at once.",
+            "openant_tools.calib.connect:connect",
+            table="the U2D2 and the flight controller plugged in, or a virtual robot",
+            changes="the ports in robot.toml",
+            minutes=1,
+        ),
+        Step(
+            "estop",
+            "Emergency stop",
+            "Prove that the stop key switches torque off, before anything moves.",
+            "openant_tools.calib.estop:estop",
+            needs=("connect",),
+            table="one servo on the cable, lying free; 12 V on",
+            changes="torque on and off",
+            minutes=1,
+        ),
+        Step(
+            "ids",
+            "Motor IDs",
+            "Give every bare servo its id, one at a time; or remap servos that are wired already.",
+            "openant_tools.calib.ids:ids",
+            needs=("connect", "estop"),
+            table="the eight servos, one cable; a pen to write the joint on each",
+            changes="id, baud rate and return delay of each servo",
+            moves=True,
+            minutes=10,
+        ),
+        Step(
+            "centre",
+            "Centring",
+            "Turn each bare servo to its mounting angle and hold it there while the horn goes on.",
+            "openant_tools.calib.centre:centre",
+            needs=("ids",),
+            table="servos without horns, horns and screws",
+            changes="operating mode, torque",
+            moves=True,
+            minutes=15,
+        ),
+        Step(
+            "legs",
+            "Leg by leg",
+            "Prove each leg (cable, range, nudge) before the next is built and the shell is closed.",
+            "openant_tools.calib.legs:legs",
+            needs=("ids",),
+            table="the legs, built one after the other, the torso on its stand",
+            changes="torque on and off",
+            moves=True,
+            minutes=15,
+        ),
+        Step(
+            "inventory",
+            "Inventory",
+            "Compare every EEPROM item of every servo with what it should be, and mend what differs.",
+            "openant_tools.calib.inventory:inventory",
+            needs=("ids",),
+            table="the whole robot on its cable",
+            changes="EEPROM items that differ; the return delay",
+            minutes=3,
+        ),
+        Step(
+            "zeros",
+            "Zeros and directions",
+            "Find each joint's zero from straight legs, and prove by nudges which leg moves and which way.",
+            "openant_tools.calib.zeros:zeros",
+            needs=("ids", "inventory"),
+            table="the robot on its stand, legs free",
+            changes="zero offsets and directions in robot.toml",
+            moves=True,
+            minutes=5,
+        ),
+        Step(
+            "bounds",
+            "Observation bounds",
+            "Find the joints' ranges by hand and by a slow sweep, then the bounds of all observations from many motions.",
+            "openant_tools.calib.bounds:bounds",
+            needs=("zeros",),
+            table="the robot on its stand",
+            changes="limits and observation bounds in robot.toml",
+            moves=True,
+            minutes=10,
+        ),
+        Step(
+            "imu",
+            "IMU",
+            "Find scale, bias, noise and mounting of the flight controller from a few poses.",
+            "openant_tools.calib.imu:imu",
+            needs=("connect",),
+            table="the robot in your hands",
+            changes="[imu] in robot.toml",
+            minutes=4,
+        ),
+        Step(
+            "arena",
+            "Arena",
+            "Camera, tags, origin and circle, and how late the picture is.",
+            "openant_tools.calib.arena:arena",
+            needs=("zeros", "imu"),
+            table="the camera above the floor, the origin's tag, the robot on the floor",
+            changes="[camera] in robot.toml",
+            moves=True,
+            minutes=10,
+        ),
+        Step(
+            "comms",
+            "Comms health",
+            "Measure losses, delays and jitter of bus, IMU and camera, and the quiet that servos need after a write.",
+            "openant_tools.calib.comms_health:comms_health",
+            needs=("inventory",),
+            table="the whole robot, cables as they will be",
+            changes="[bus] in robot.toml",
+            minutes=2,
+        ),
+        Step(
+            "thermal",
+            "Thermal soak",
+            "Let the robot stand for a while and watch it warm.",
+            "openant_tools.calib.soak:soak",
+            needs=("zeros",),
+            table="the robot on its stand",
+            changes="nothing",
+            moves=True,
+            minutes=5,
+        ),
+        Step(
+            "identify",
+            "Identification",
+            "Record excitations and fit a calibrated model to them.",
+            "openant_tools.bringup.identification:identification",
+            needs=("zeros", "bounds"),
+            table="the robot on its stand",
+            changes="calibrated.xml and [identified] in robot.toml",
+            moves=True,
+            minutes=15,
+        ),
+        Step(
+            "gap",
+            "Gap check",
+            "Measure how far the calibrated simulation is from the robot on a motion that it has not seen.",
+            "openant_tools.bringup.gap_check:gap_check",
+            needs=("identify",),
+            table="the robot on its stand",
+            changes="nothing",
+            moves=False,
+            minutes=3,
+        ),
+        Step(
+            "passport",
+            "Passport",
+            "One page with everything known about this robot, and what to train next.",
+            "openant_tools.bringup.passport:passport_step",
+            needs=("zeros",),
+            changes="passport.html and passport.md",
+            minutes=1,
+        ),
+    )
+}
+
+State = Literal["todo", "ok", "failed", "stale"]
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How far one step got.
+
+    Attributes:
+        finding: its newest; None where it has not been done.
+        state: `stale` where a step that it needs has been done again since.
+        waits_for: steps that it needs and that have not said yes yet.
+    """
+
+    step: Step
+    finding: Finding | None
+    state: State
+    waits_for: tuple[str, ...]
+
+
+def standing(folder: RobotFolder) -> dict[str, Standing]:
+    """Every step of the walk, in order, as the robot's `findings/` tell; the walk resumes from it."""
+    found = {name: latest(folder, name) for name in WALK}
+    out: dict[str, Standing] = {}
+    for name, step in WALK.items():
+        finding = found[name]
+        needed = [found[other] for other in step.needs]
+        state: State = "todo"
+        if finding is not None:
+            newer = any(other is not None and other.date > finding.date for other in needed)
+            state = "failed" if not finding.ok else "stale" if newer else "ok"
+        waits = tuple(other for other, seen in zip(step.needs, needed, strict=True) if seen is None or not seen.ok)
+        out[name] = Standing(step, finding, state, waits)
+    return out
+
+
+def step(name: str) -> Step:
+    """A step of the walk by name; raises BadInput for any other."""
+    try:
+        return WALK[name]
+    except KeyError:
+        raise BadInput(f"there is no step {name!r}", remedy=f"the steps are {', '.join(WALK)}") from None

@@ -1,0 +1,1 @@
+"""What every procedure yields and leaves behind: events, findings, the journal of writes."""

@@ -1,0 +1,237 @@
+"""A procedure is a generator that says what it does and asks for what it needs; any face can run it.
+
+    def blink(bench: Bench) -> Procedure:
+        yield Intent("blink the LED of hip_rr", (RegisterChange("hip_rr", "led", 0, 1),))
+        ...
+        return Finding(...)
+
+It opens what it needs itself and gives it back in `finally`: a face that closes the generator at any yield (Ctrl-C, the
+stop key, a closed terminal) leaves the robot with torque off, and the step can be begun again.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, Protocol
+
+from openant_tools.errors import OpenAntError
+from openant_tools.procedure.finding import Finding
+from openant_tools.robot.folder import RobotFolder
+
+__all__ = [
+    "Answer", "Ask", "Bench", "Declined", "Event", "Face", "Hands", "Intent", "Live", "Look", "Procedure", "Progress",
+    "RegisterChange", "Say", "Step", "drive",
+]  # fmt: skip
+
+
+# ---- what a procedure says -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far it is: `share` of 1, None where that is not known. No answer."""
+
+    share: float | None
+    words: str
+
+
+@dataclass(frozen=True)
+class Say:
+    """A sentence for the builder; `level` decides its glyph. No answer."""
+
+    words: str
+    level: Literal["info", "ok", "warn", "fail"] = "info"
+
+
+@dataclass(frozen=True)
+class RegisterChange:
+    """One register that will be written; counts, `old` None where it has not been read."""
+
+    joint: str
+    register: str
+    old: int | None
+    new: int
+
+    def __str__(self) -> str:
+        was = "" if self.old is None else f" {self.old} →"
+        return f"{self.joint}: {self.register}{was} {self.new}"
+
+
+@dataclass(frozen=True)
+class Intent:
+    """What will be done next. Nothing is written or moved before it is granted: answered by True.
+
+    A face that does not grant it need not answer: `drive` closes the procedure.
+    """
+
+    words: str
+    registers: tuple[RegisterChange, ...] = ()
+    moves: bool = False
+
+
+@dataclass(frozen=True)
+class Ask:
+    """A question, answered by one of `choices` (a string), or by a number in `unit` where there are none.
+
+    Attributes:
+        default: what Enter and `--yes` take; None where the builder must say it.
+        choices: words to choose from; empty for a number, or for free text where `unit` is "text".
+    """
+
+    question: str
+    choices: tuple[str, ...] = ()
+    unit: str = ""
+    default: str | float | None = None
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclass(frozen=True)
+class Hands:
+    """Something that the builder's hands must do; answered when it is done.
+
+    Attributes:
+        task: the same as data, for the hands of a virtual robot: `plug`, `unplug` (joint, or all), `assemble`,
+            `straighten`, `turn` (joint, through `path_rad` at the joint), `tilt` (torso, by `path_rad` as a rotation
+            vector), `place` (on `setup`), `free` (let everything go).
+        while_watching: the procedure goes on reading meanwhile (range capture by hand): a face answers at once, and
+            what is seen comes as `Live`.
+    """
+
+    words: str
+    task: Literal["plug", "unplug", "assemble", "straighten", "turn", "tilt", "place", "free"]
+    joint: str = ""
+    path_rad: tuple[float, ...] = ()
+    setup: Literal["stand", "floor", ""] = ""
+    while_watching: bool = False
+
+
+@dataclass(frozen=True)
+class Live:
+    """Values as they are now, joint → value in `unit`, for bars. Answered by True where the builder says "enough".
+
+    Attributes:
+        low, high: joint → the ends of its bar. marks: joint → a few words beside it.
+    """
+
+    values: Mapping[str, float]
+    unit: str
+    words: str = ""
+    low: Mapping[str, float] = field(default_factory=dict)
+    high: Mapping[str, float] = field(default_factory=dict)
+    marks: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Look:
+    """A drawing in characters (80 columns, ASCII only), or a picture's file, that goes with what follows."""
+
+    words: str
+    drawing: str = ""
+    picture: Path | None = None
+
+
+Event = Progress | Say | Intent | Ask | Hands | Live | Look
+Answer = bool | str | float | None
+Procedure = Generator[Event, Answer, Finding]
+
+
+# ---- what runs it ----------------------------------------------------------------------------------------------------
+
+
+class Face(Protocol):
+    """Command line, terminal program or test: what shows events and answers them."""
+
+    def answer(self, event: Event) -> Answer:
+        """Show one event; what it is answered with. Raising (KeyboardInterrupt too) ends the procedure in order."""
+        ...
+
+
+class Declined(OpenAntError):
+    """An intent was not granted: nothing was written and nothing moved from there on."""
+
+    exit_code = 130
+
+
+def drive(procedure: Procedure, face: Face) -> Finding:
+    """Run a procedure to its finding.
+
+    Whatever ends it early (an error, Ctrl-C in the face, an intent that is not granted) lets it put the robot into
+    order first: torque off, ports closed.
+
+    Raises:
+        Declined: an intent was not granted.
+        OpenAntError: the procedure's own words.
+    """
+    answer: Answer = None
+    try:
+        while True:
+            event = procedure.send(answer)
+            answer = face.answer(event)
+            if isinstance(event, Intent) and answer is not True:
+                raise Declined(f"not done: {event.words}", remedy="nothing was changed from there on; run it again")
+    except StopIteration as end:
+        finding: Finding = end.value
+        return finding
+    finally:
+        procedure.close()
+
+
+# ---- what it works on ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Bench:
+    """The robot's folder, and where it is plugged in.
+
+    Attributes:
+        bus, imu, camera: where they were named by hand (or by a ready file); None for what `robot.toml` says, or what
+            is found plugged in.
+        control: the control socket of a virtual robot.
+        joints: only these; empty for all.
+    """
+
+    folder: RobotFolder
+    bus: str | None = None
+    imu: str | None = None
+    camera: str | None = None
+    control: str | None = None
+    joints: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the walk.
+
+    Attributes:
+        name: as in `openant calib NAME` and in the names of its findings.
+        title: as on the screen.
+        does: one sentence.
+        needs: steps that must have said yes before; things on the table come in `table`.
+        table: what must be at hand.
+        changes: what it writes (registers, robot.toml); "" where it changes nothing.
+        moves: whether the robot moves.
+        minutes: of the builder's time, about.
+        safe_to_repeat: nothing is lost by doing it again.
+        procedure: "module:function", imported when it is run.
+    """
+
+    name: str
+    title: str
+    does: str
+    procedure: str
+    needs: tuple[str, ...] = ()
+    table: str = ""
+    changes: str = ""
+    moves: bool = False
+    minutes: float = 1.0
+    safe_to_repeat: bool = True
+
+    def start(self, bench: Bench) -> Procedure:
+        """The procedure, not yet begun."""
+        module, _, name = self.procedure.partition(":")
+        function: Callable[[Bench], Procedure] = getattr(importlib.import_module(module), name)
+        return function(bench)
