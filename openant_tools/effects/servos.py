@@ -99,6 +99,7 @@ class Servos:
             back_emf=rest["back_emf"],
             friction=rest["friction"].copy(),
             torque=np.zeros(rest["friction"].shape),
+            supply=np.broadcast_to(share, rest["friction"].shape),
         )
         for law in laws:
             law(view)

@@ -35,6 +35,7 @@ class Step:
         stiffness, velocity_gain, limit, back_emf: of the servo: N·m/rad, N·m·s/rad, N·m, N·m·s/rad.
         friction: N·m, the most that dry friction in the joint holds.
         torque: N·m put on the joint beside all this.
+        supply: share of the nominal voltage that reaches the servo, which stiffness, gains and limit already follow.
     """
 
     dt: float
@@ -50,6 +51,7 @@ class Step:
     back_emf: Array
     friction: Array
     torque: Array
+    supply: Array
 
     @property
     def motor_torque(self) -> Array:

@@ -29,6 +29,7 @@ def _law(values: Values) -> Law:
         step.stiffness *= share
         step.velocity_gain *= share
         step.limit *= share
+        step.supply = step.supply * share
 
     return act
 
