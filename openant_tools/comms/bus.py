@@ -11,7 +11,8 @@ import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
+from weakref import WeakValueDictionary
 
 from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.clock import Clock
@@ -161,7 +162,10 @@ class Bus:
         statistics: every request and every loss so far.
         fast: ids whose firmware knows Fast Sync Read. Where it fails, plain Sync Read is used until that has been
             answered whole for a while.
+        opened: the buses of this process that are not closed.
     """
+
+    opened: ClassVar[WeakValueDictionary[int, Bus]] = WeakValueDictionary()
 
     line: Line
     clock: Clock
@@ -176,6 +180,7 @@ class Bus:
     request_at: float = field(default=0.0, init=False)
 
     def __post_init__(self) -> None:
+        self.opened[id(self)] = self
         self._quiet_from = 0.0
         #: something was lost: what it left on the line may still come
         self._unsettled = False
@@ -361,6 +366,7 @@ class Bus:
         self.require([Answer(id, b"" if ok else None, 0, None if ok else Cause.TIMEOUT) for id, ok in answered.items()])
 
     def close(self) -> None:
+        self.opened.pop(id(self), None)
         self.line.close()
 
     # ---- how it is done ------------------------------------------------------------------------------------------

@@ -7,15 +7,18 @@ switches torque off.
 from __future__ import annotations
 
 import contextlib
+import itertools
+import os
 import socket
 import subprocess
 import sys
 import time
+import weakref
 from collections import deque
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from types import TracebackType
-from typing import Any
+from typing import Any, ClassVar
 
 from openant_tools.comms.messages import Command, EngineConfig, Event, Finished, Notice, Reply, Stop, Stopped
 from openant_tools.comms.ring import Ring, columns
@@ -36,10 +39,14 @@ class EngineProcess:
         config: as given.
         description: what the engine found when it connected: joints, firmware, registers, position.
         columns: names of the telemetry's numbers.
+        running: the engines of this process that are not closed, for a face that shows or stops what a procedure of
+            its own moves in another thread.
 
     Raises:
         HardwareFault: it could not connect; the message is the engine's.
     """
+
+    running: ClassVar[weakref.WeakSet[EngineProcess]] = weakref.WeakSet()
 
     def __init__(self, config: EngineConfig) -> None:
         self.config = config
@@ -48,7 +55,8 @@ class EngineProcess:
         self._seen = 0
         self._events: deque[Event] = deque()
         self._replies: dict[int, Reply] = {}
-        self._number = 0
+        #: commands' numbers; taken from it in one stroke, whichever thread does
+        self._numbers = itertools.count(1)
         self._ended = False
         ours, theirs = socket.socketpair()
         self._process = subprocess.Popen(
@@ -64,6 +72,7 @@ class EngineProcess:
         except BaseException:
             self.close()
             raise
+        self.running.add(self)
 
     @property
     def pid(self) -> int:
@@ -81,12 +90,12 @@ class EngineProcess:
 
     def start(self, command: Command) -> int:
         """Send a command without waiting; its number, for `done`."""
-        self._number += 1
+        number = next(self._numbers)
         try:
-            self._connection.send((self._number, command))
+            self._connection.send((number, command))
         except OSError:
             self._died()
-        return self._number
+        return number
 
     def done(self, number: int) -> bool:
         """Whether the command has been answered (for a motion: whether it has ended). Raises its error."""
@@ -110,6 +119,10 @@ class EngineProcess:
         """The stop key: torque off now."""
         self.ask(Stop(), 5.0)
 
+    def let_go(self) -> None:
+        """The stop key from any thread: torque off now, without waiting; whoever waits for a motion is told."""
+        self.start(Stop())
+
     # ---- what comes back -----------------------------------------------------------------------------------------
 
     def events(self) -> Iterator[Event]:
@@ -123,6 +136,10 @@ class EngineProcess:
         """Rows (n, columns) since the last call, oldest first; see `columns`. What was missed is gone."""
         rows, self._seen = self._ring.since(self._seen)
         return rows
+
+    def second_view(self) -> Ring:
+        """The telemetry for another reader, with a place of its own in it, from any thread; to be closed by it."""
+        return Ring(len(self.columns), os.dup(self._ring.fd))
 
     def _await(self, number: int, timeout_s: float | None) -> Any:
         give_up = None if timeout_s is None else time.monotonic() + timeout_s
@@ -164,6 +181,7 @@ class EngineProcess:
 
     def close(self) -> None:
         """Torque off, recording closed, process gone. May be called again."""
+        self.running.discard(self)
         if self._connection.closed:
             return
         with contextlib.suppress(OSError):
