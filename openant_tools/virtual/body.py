@@ -113,7 +113,14 @@ class Body:
         self._feet = [model.geom(f"lower_{joint.leg.name}").id for joint in knees] if self.on_floor else []
         links = ("root_", "upper_", "lower_")
         self._links = [g for g in range(self.model.ngeom) if self.model.geom(g).name.startswith(links)]
+        #: (3,) rad/s in the torso's axes, with which hands turn a torso that has no joint of its own
+        self.held_rate: Array = np.zeros(3)
         self.reset()
+
+    def hold(self, quaternion: Array, rate: Array) -> None:
+        """A hand has the torso in this attitude (4,) and turns it at this rate (3,) rad/s; on the stand only."""
+        self.model.body_quat[self._torso] = quaternion
+        self.held_rate = rate
 
     def reset(self) -> None:
         """The start: joints at the pose, torso on the stand or lying on the floor."""
@@ -205,7 +212,7 @@ class Body:
     @property
     def gyro(self) -> Array:
         """(3,) rad/s in the torso's frame."""
-        return self.data.sensor("gyro").data.copy() if self.has_torso else np.zeros(3)
+        return self.data.sensor("gyro").data + self.held_rate if self.has_torso else np.zeros(3)
 
     @property
     def accelerometer(self) -> Array:

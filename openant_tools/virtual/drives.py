@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from openant_tools.robot.control_table import AMPERE_PER_COUNT
 from openant_tools.robot.registers import PULSES_PER_TURN, PWM_FULL, RAD_S_PER_COUNT
 from openant_tools.virtual.body import Body
+from openant_tools.virtual.hands import Grip, grip_torque
 from openant_tools.virtual.motor import MotorSettings
 from openant_tools.virtual.profile import Trajectory, start_trajectory
 from openant_tools.virtual.servo import (
@@ -85,6 +86,8 @@ class Drives:
         #: counts what may set anything in motion
         self.touched = 0
         self._dropped_until = np.full(n, -1.0)
+        #: joints that somebody has in hand
+        self.grips: dict[int, Grip] = {}
         # what the sensors show
         self.duty, self.current, self.shaft_velocity = np.zeros(n), np.zeros(n), np.zeros(n)
         self.motor_torque = np.zeros(n)
@@ -273,7 +276,12 @@ class Drives:
     @property
     def at_rest(self) -> bool:
         """Whether nothing moves and nothing is about to."""
-        return not self._moves and not self._queue and bool(np.abs(self.body.v).max(initial=0.0) < REST_RAD_S)
+        return (
+            not self._moves
+            and not self._queue
+            and not self.grips
+            and bool(np.abs(self.body.v).max(initial=0.0) < REST_RAD_S)
+        )
 
     # ---- one step ----
 
@@ -324,6 +332,8 @@ class Drives:
             if self._varying_friction:
                 body.frictionloss[:] = self._friction(body.v, joint_torque)
             body.torque[:] = joint_torque
+        if self.grips:
+            body.torque += grip_torque(self.grips, body.q, body.v, self.time)
         if self._past is not None:
             self._past.append((body.q.copy(), self._filtered_velocity.copy()))
         body.step()

@@ -23,6 +23,9 @@ The control socket (Unix stream, one JSON object a line, one line of answer each
 | `{"do": "fault", "cause": …, "where": …, "on": bool, …}` | switches a fault; `{"t": s}` |
 | `{"do": "plug", "joint": …}`, `{"do": "unplug", …}` | puts a servo on the bus or takes it off; `{"t": s}` |
 | `{"do": "assemble", "setup": "stand"}` | builds the robot from the motors in the box, or puts it on "floor" or stand |
+| `{"do": "turn", "joint": …, "to": [rad, …], "leg_s": s}` | a hand leads a joint through these angles and holds it |
+| `{"do": "let_go"}` | hands off all joints |
+| `{"do": "tilt", "rotation_rad": [x, y, z], "seconds": s}` | hands turn the torso on its stand to this attitude |
 
 What fails answers `{"error": "…"}`. Counts of bytes run from the opening of this control connection or the last `open`.
 """
@@ -114,6 +117,13 @@ def _number(request: dict[str, Any], key: str, default: float | None = None) -> 
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise _Failed(f"not a request: {key} = {value!r} is no number")
     return float(value)
+
+
+def _numbers(request: dict[str, Any], key: str, count: int | None = None) -> list[float]:
+    values = request.get(key)
+    if not isinstance(values, list) or not values or (count is not None and len(values) != count):
+        raise _Failed(f"not a request: {key} = {values!r} is no list of {count or 'some'} numbers")
+    return [_number({key: value}, key) for value in values]
 
 
 class Server:
@@ -485,8 +495,21 @@ class Server:
         if do in ("plug", "unplug"):
             self._plug(str(request.get("joint")), do == "plug")
             return {"t": self.now}
+        if do == "turn":
+            angles = _numbers(request, "to")
+            self.world.turn_by_hand(self._joint(str(request.get("joint"))), angles, _number(request, "leg_s", 1.0))
+            return {"t": self.now}
+        if do == "let_go":
+            self.world.let_go()
+            return {"t": self.now}
+        if do == "tilt":
+            if self.world.settings.body.setup != "stand":
+                raise _Failed("only a robot on its stand is tilted by hand")
+            self.world.tilt_by_hand(_numbers(request, "rotation_rad", 3), _number(request, "seconds", 1.0))
+            return {"t": self.now}
         raise _Failed(
-            f"no such request: {do!r} (now, open, advance, settle, wait, state, wiring, fault, plug, unplug, assemble)"
+            f"no such request: {do!r} (now, open, advance, settle, wait, state, wiring, fault, plug, unplug, assemble, turn, "
+            "let_go, tilt)"
         )
 
     def _arrive(self, control: _Control, request: dict[str, Any]) -> None:
@@ -544,8 +567,10 @@ class Server:
         if device in self.ports:
             (self.ports[device].plug if plugged else self.ports[device].unplug)()
 
-    def _plug(self, joint: str, plugged: bool) -> None:
+    def _joint(self, joint: str) -> int:
         if joint not in self.world.joints:
             raise _Failed(f"no joint {joint!r}: there are {', '.join(self.world.joints)}")
-        k = self.world.joints.index(joint)
-        self.world.plug(k, plugged)
+        return self.world.joints.index(joint)
+
+    def _plug(self, joint: str, plugged: bool) -> None:
+        self.world.plug(self._joint(joint), plugged)

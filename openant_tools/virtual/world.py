@@ -19,6 +19,7 @@ from openant_tools.robot.servo import ServoModel, baud_code
 from openant_tools.virtual.body import Body, BodySettings
 from openant_tools.virtual.bus import BusSettings, Line
 from openant_tools.virtual.drives import Drive, Drives
+from openant_tools.virtual.hands import Grip, Tilting
 from openant_tools.virtual.motor import MotorSettings
 from openant_tools.virtual.servo import OVERLOAD_ERROR, ServoDevice
 
@@ -117,6 +118,7 @@ class World:
         if not settings.bus.chains:
             settings.bus.chains = _chains_by_leg(joints)
         self.events: list[Callable[[float], None]] = []
+        self._tilting: Tilting | None = None
         self._steps = 0
         self._poll_every = max(1, round(POLL_S / settings.body.timestep_s))
         self._heat_every = max(1, round(HEAT_S / settings.body.timestep_s))
@@ -152,6 +154,7 @@ class World:
         What the servos have in their EEPROM stays; the robot stands or lies as at a start.
         """
         self.settings.body.setup = setup
+        self._tilting = None
         was = self.drives
         self._build_body()
         self.drives.time = was.time
@@ -230,6 +233,10 @@ class World:
             view.now = now
         for event in self.events:
             event(now)
+        if self._tilting is not None:
+            self.body.hold(*self._tilting.at(now))
+            if self._tilting.ended(now):
+                self._tilting = None
         drives = self.drives
         drives.watch_supply(POLL_S)
         for k, servo in enumerate(self.servos):
@@ -260,6 +267,23 @@ class World:
             self.line.plugged.discard(k)
             self.drives.powered[k] = 0.0
             self.servos[k].power_off()
+
+    # ---- what hands do ----
+
+    def turn_by_hand(self, k: int, angles: Sequence[float], leg_s: float) -> None:
+        """Take joint k and lead it from where it is through `angles` (rad), `leg_s` (s) each; the last one is held."""
+        here = float(self.body.q[k])
+        self.drives.grips[k] = Grip(self.drives.time, (here, *angles), leg_s)
+        self.drives.touched += 1
+
+    def let_go(self) -> None:
+        """Hands off every joint; a tilted torso stays as it is."""
+        self.drives.grips.clear()
+        self.drives.touched += 1
+
+    def tilt_by_hand(self, rotation_rad: Sequence[float], seconds: float) -> None:
+        """Turn the torso on its stand to an attitude, as a rotation vector in the world, rad."""
+        self._tilting = Tilting.to(self.now, self.body.quaternion, rotation_rad, seconds)
 
     @property
     def line_baud(self) -> int:
