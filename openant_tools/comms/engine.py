@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing.connection import Connection
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +38,7 @@ from openant_tools.comms.ports import WANTED_LATENCY_MS, Host, udev_rule
 from openant_tools.comms.ring import ERR_CODES, Ring
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Block, Servo, Servos
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
+from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.recording.telemetry import Answer as RecordedAnswer
 from openant_tools.recording.telemetry import Cycle, ServoChannel
 from openant_tools.recording.writer import RecordingStopped, RecordingWriter
@@ -149,7 +151,7 @@ class Engine:
         servos = Servos(self._bus, config.servos)
         found = servos.identify()
         known = [replace(servo, firmware=found[servo.joint].firmware) for servo in config.servos]
-        self._servos = servos = Servos(self._bus, known)
+        self._servos = servos = Servos(self._bus, known, before_write=self._note_write)
         self._report_leftovers()
         delays = servos.read_all("return_delay_time")
         longest = max(delays.values()) * known[0].model.registers["return_delay_time"].scale
@@ -243,7 +245,11 @@ class Engine:
             middle = servo.to_servo((low + high) / 2)
             turns = round((seen - middle) / (2 * np.pi))
             moved.append(replace(servo, zero_rad=servo.zero_rad + turns * 2 * np.pi))
-        return Servos(self._bus, moved)
+        return Servos(self._bus, moved, before_write=self._note_write)
+
+    def _note_write(self, change: EepromWrite) -> None:
+        if self.config.journal is not None:
+            Journal(Path(self.config.journal)).append(change, "engine")
 
     def _read_registers(self) -> dict[str, dict[str, int]]:
         table: dict[str, dict[str, int]] = {joint: {} for joint in self._servos.joints}

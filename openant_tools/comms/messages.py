@@ -65,6 +65,7 @@ class EngineConfig:
         registers: joint → register → counts that must be in force; EEPROM is written only where it differs.
         chain: lists of joints, each in the order of its cable from the adapter outwards, where that is known.
         watchdog_s: how long servos go on moving when nothing is heard of us any more.
+        journal: file that every EEPROM write stands in before it is sent.
     """
 
     port: str
@@ -80,6 +81,7 @@ class EngineConfig:
     imu: ImuConfig | None = None
     camera: CameraConfig | None = None
     chain: tuple[tuple[str, ...], ...] = ()
+    journal: str | None = None
 
 
 # ---- to the engine: each is answered by a `Reply` ------------------------------------------------------------------

@@ -1,0 +1,51 @@
+"""The hands of a builder who has a virtual robot: what a procedure asks of hands, done by the control socket."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from openant_tools.comms.clock import VirtualControl
+from openant_tools.procedure.step import Hands
+from openant_tools.robot.joints import JOINT_NAMES
+
+__all__ = ["VirtualHands"]
+
+#: s that hands take for each stretch of a motion
+TURN_S, TILT_S = 0.8, 1.0
+
+
+class VirtualHands:
+    """Hands that do at once, or begin, what they are asked to.
+
+    Args:
+        control: the virtual robot's control socket.
+        mistakes: joint → the joint that is taken instead, for a builder who mixes them up.
+    """
+
+    def __init__(self, control: str, mistakes: Mapping[str, str] | None = None) -> None:
+        self._remote = VirtualControl(control)
+        self._mistakes = dict(mistakes or {})
+
+    def do(self, hands: Hands) -> None:
+        """Do one task; motions begin here and go on as the robot's time does."""
+        joint = self._mistakes.get(hands.joint, hands.joint)
+        match hands.task:
+            case "plug" | "unplug":
+                for name in (joint,) if joint else JOINT_NAMES:
+                    self._remote.ask(hands.task, joint=name)
+            case "assemble":
+                self._remote.ask("assemble", setup=hands.setup or "stand")
+            case "straighten":
+                for name in JOINT_NAMES:
+                    self._remote.ask("turn", joint=name, to=[0.0], leg_s=TURN_S)
+            case "turn":
+                self._remote.ask("turn", joint=joint, to=list(hands.path_rad), leg_s=TURN_S)
+            case "tilt":
+                self._remote.ask("tilt", rotation_rad=list(hands.path_rad), seconds=TILT_S)
+            case "place":
+                self._remote.ask("assemble", setup=hands.setup)
+            case "free":
+                self._remote.ask("let_go")
+
+    def close(self) -> None:
+        self._remote.close()

@@ -1,0 +1,114 @@
+"""Emergency stop: the stop key, and the guardian that acts when the program dies, proven on whatever servo answers."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+
+from openant_tools.calib.wires import BOOT_S, opened_bus, wait
+from openant_tools.comms import messages
+from openant_tools.comms.bus import Bus
+from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.guards import Guards
+from openant_tools.comms.messages import EngineConfig
+from openant_tools.comms.scan import Scanned, scan
+from openant_tools.comms.servos import Servo
+from openant_tools.comms.setup import find_bus
+from openant_tools.errors import HardwareFault
+from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.step import Ask, Bench, Hands, Intent, Procedure, Progress, RegisterChange, Say
+from openant_tools.robot.servo import servo_model
+
+__all__ = ["estop"]
+
+COMMAND = "openant calib estop"
+
+
+def estop(bench: Bench) -> Procedure:
+    """Torque on at rest, stop key, read back; torque on again, the program killed, read back.
+
+    Raises:
+        HardwareFault: no servo answers.
+    """
+    first = next(iter(bench.folder.config().motors))
+    with opened_bus(bench) as bus:
+        yield Progress(None, "looking for a servo at every baud rate")
+        seen = _usable(bus)
+        if not seen:
+            yield Hands(f"Plug one servo in (the one for {first} will do), 12 V on.", "plug", first)
+            wait(bus.clock, BOOT_S)
+            yield Progress(None, "looking for a servo at every baud rate")
+            seen = _usable(bus)
+    if not seen:
+        raise HardwareFault(
+            "no servo answers at any baud rate",
+            remedy="is 12 V on, and the cable in to the click? Only one servo at a time",
+        )
+    baud = max({one.baud for one in seen}, key=[one.baud for one in seen].count)
+    seen = [one for one in seen if one.baud == baud]
+    names = ", ".join(f"id {one.id} ({one.model})" for one in seen)
+    yield Intent(
+        f"switch torque on where {names} stands, then stop it, twice; nothing turns",
+        tuple(RegisterChange(f"id {one.id}", "torque_enable", 0, 1) for one in seen),
+        moves=True,
+    )
+    engine_config = EngineConfig(
+        port=find_bus(bench.bus, bench.folder.config()),
+        servos=tuple(Servo(f"id {one.id}", one.id, servo_model(one.model_number)) for one in seen),
+        baud=baud,
+        control=bench.control,
+        guards=Guards(angle_margin_rad=None),
+        # A bare servo may lie anywhere on its turn; nothing is commanded but to stay.
+        limits_rad={},
+    )
+    with EngineProcess(engine_config) as engine:
+        engine.ask(messages.Torque(True))
+        on = engine.ask(messages.ReadRegister("torque_enable"))
+        if not all(on.values()):
+            raise HardwareFault(f"torque does not come on at {', '.join(j for j, value in on.items() if not value)}")
+        yield Say("torque is on: the horn resists your fingers", "info")
+        yield Ask("Press Enter (in the terminal program: the stop key) to stop", ("stop",), default="stop")
+        engine.stop()
+        off = engine.ask(messages.ReadRegister("torque_enable"))
+    stopped = not any(off.values())
+    yield Say("stopped: torque is off, read back" if stopped else "torque is STILL ON", "ok" if stopped else "fail")
+
+    yield Progress(0.6, "the same with the program killed")
+    killed = EngineProcess(engine_config)
+    try:
+        killed.ask(messages.Torque(True))
+        os.kill(killed.pid, signal.SIGKILL)
+    finally:
+        with contextlib.suppress(HardwareFault):
+            killed.close()
+    with opened_bus(bench, baud) as bus:
+        wait(bus.clock, 0.3)
+        left = [one.id for one in seen if bus.read(one.id, 64, 1) != b"\0"]
+    yield Say(
+        "killed: its guardian switched torque off" if not left else f"id {left} kept torque", "fail" if left else "ok"
+    )
+    ok = stopped and not left
+    return Finding(
+        "estop",
+        ok,
+        "the stop key and a killed program both leave torque off" if ok else "torque stays on: do not go on",
+        (
+            Evidence("servos proven", float(len(seen)), "", "torque_enable (64) read back"),
+            Evidence("still on after the stop key", float(sum(map(bool, off.values()))), "", "register 64"),
+            Evidence("still on after a kill", float(len(left)), "", "register 64"),
+        ),
+        "" if ok else "pull the power plug; report this with the robot's folder",
+        COMMAND,
+        data={"servos": [vars(one) for one in seen]},
+    )
+
+
+def _usable(bus: Bus) -> list[Scanned]:
+    """Those that answer clearly; the platform's rate and the factory's are tried first and are enough if one is there."""
+    for bauds in ((1_000_000, 57_600), None):
+        found = scan(bus) if bauds is None else scan(bus, bauds)
+        servos = [one for one in found.servos if not one.clash]
+        if servos:
+            return servos
+    return []

@@ -1,0 +1,324 @@
+"""Motor IDs: one bare servo at a time is told which joint it is, and proves it; or servos wired already are renamed.
+
+Exactly one servo must answer over all baud rates before anything is written: factory-fresh servos all have id 1, and a
+write to two at once is heard by both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+
+from openant_tools.calib.wires import BOOT_S, journalled, opened_bus, wait
+from openant_tools.comms.bus import Bus
+from openant_tools.comms.scan import BAUDS, Scan, Scanned, scan
+from openant_tools.comms.servos import Servo, Servos
+from openant_tools.errors import HardwareFault
+from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.step import (
+    Answer,
+    Ask,
+    Bench,
+    Event,
+    Hands,
+    Intent,
+    Live,
+    Procedure,
+    Progress,
+    RegisterChange,
+    Say,
+)  # fmt: skip
+from openant_tools.robot.config import Motor, RobotConfig
+from openant_tools.robot.joints import JOINTS
+from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE
+from openant_tools.robot.servo import baud_code, servo_model
+
+__all__ = ["ids", "locate", "nudge"]
+
+COMMAND = "openant calib ids"
+#: A horn that turns so far and back is seen, and pinches nobody: bare servos have no leg yet.
+NUDGE_RAD = 0.2
+NUDGE_PWM = 0.2
+#: Ids that servos wait under while others are renamed; the guide's go up to 41.
+PARKING = range(200, 240)
+BLINKS = 3
+AGAIN, LEAVE = "try again", "leave it"
+
+
+@dataclass(frozen=True)
+class _Wrong:
+    """What keeps a servo from being named, in one line."""
+
+    words: str
+
+
+def ids(bench: Bench) -> Procedure:
+    """Name every servo of `bench.joints` (all by default)."""
+    config = bench.folder.config()
+    motors = [motor for motor in config.motors.values() if not bench.joints or motor.joint in bench.joints]
+    named, problems = list[str](), list[str]()
+    with opened_bus(bench) as bus:
+        yield Progress(None, "who is on the cable, at every baud rate")
+        found = scan(bus)
+        if _all_named(found, motors, config):
+            return _finding([motor.joint for motor in motors], motors, [], "every servo has its id already")
+        wired = not found.garbled and len(found.servos) > 1 and not any(one.clash for one in found.servos)
+        if wired:
+            answer = yield Ask(
+                f"{len(found.servos)} servos answer under ids of their own: rename them as they are wired, or set bare "
+                "servos up one at a time?",
+                ("as they are wired", "one at a time"),
+                default="as they are wired",
+            )
+            if answer == "as they are wired":
+                problems += yield from _rename(bench, bus, found, motors, config)
+                found = scan(bus)
+                named = [
+                    m.joint for m in motors if any((o.id, o.baud) == (m.id, config.bus.baud) for o in found.servos)
+                ]
+                return _finding(named, motors, problems)
+        if found.servos or found.garbled:
+            yield Hands("Take every servo off the cable; they are set up one at a time.", "unplug")
+            wait(bus.clock, BOOT_S)
+        for k, motor in enumerate(motors):
+            yield Progress(k / len(motors), f"{motor.joint} ({k + 1} of {len(motors)})")
+            trouble = yield from _one(bench, bus, motor, motors, config)
+            if trouble is None:
+                named.append(motor.joint)
+            else:
+                problems.append(trouble.words)
+            yield Hands(f"Take it off the cable, and write {motor.joint} on it.", "unplug", motor.joint)
+            wait(bus.clock, 0.1)
+    return _finding(named, motors, problems)
+
+
+def _one(
+    bench: Bench, bus: Bus, motor: Motor, motors: Sequence[Motor], config: RobotConfig
+) -> Generator[Event, Answer, _Wrong | None]:
+    """One servo from the box; None once it is named and has proven it."""
+    words = JOINTS[motor.joint].words
+    while True:
+        yield Hands(
+            f"Plug in one servo for the {words} ({motor.joint}): a {motor.model}, and no other.", "plug", motor.joint
+        )
+        wait(bus.clock, BOOT_S)
+        found = scan(bus)
+        wrong = _not_one(found, motor, motors, config)
+        if wrong is None:
+            break
+        yield Say(wrong.words, "fail")
+        if (yield Ask(wrong.words, (AGAIN, LEAVE), default=LEAVE)) != AGAIN:
+            return wrong
+        yield Hands("Take everything off the cable.", "unplug")
+        wait(bus.clock, BOOT_S)
+    seen = found.servos[0]
+    model = servo_model(seen.model_number)
+    wanted = {"id": motor.id, "baud_rate": baud_code(config.bus.baud), "return_delay_time": 0}
+    bus.line.set_baud(seen.baud)
+    servo = Servo(motor.joint, seen.id, model)
+    servos = journalled(bus, [servo], bench, COMMAND)
+    servos.set_torque(False)
+    old = {name: servos.read_counts(name, motor.joint) for name in wanted}
+    yield Intent(
+        f"make this {seen.model} (id {seen.id}, {seen.baud} baud, firmware {seen.firmware}) the {words}: id {motor.id}, "
+        f"{config.bus.baud} baud, no return delay; then blink its LED and nudge its horn",
+        tuple(RegisterChange(motor.joint, n, old[n], wanted[n]) for n in wanted if old[n] != wanted[n]),
+        moves=True,
+    )
+    servos.write_counts("return_delay_time", motor.joint, 0)
+    servos = _rename_to(bench, bus, servos, motor, config)
+    values = {name: servos.read_counts(name, motor.joint) for name in wanted}
+    if values != wanted:
+        return _Wrong(f"{motor.joint}: reads back {values} instead of {wanted} → power it off and on and try again")
+    yield from nudge(servos, motor.joint)
+    if (
+        yield Ask(f"Did this servo blink and turn? It is the {words} from now on.", ("yes", "no"), default="yes")
+    ) != "yes":
+        return _Wrong(
+            f"{motor.joint}: id {motor.id} answered, but the servo at hand did not move → another one is on the cable, or its "
+            "gear is broken"
+        )
+    yield Say(f"{motor.joint}: id {motor.id}, {config.bus.baud} baud, read back", "ok")
+    return None
+
+
+def _not_one(found: Scan, motor: Motor, motors: Sequence[Motor], config: RobotConfig) -> _Wrong | None:
+    """Why what is on the cable cannot become this joint's servo."""
+    clash = [one for one in found.servos if one.clash]
+    if found.garbled or clash:
+        where = ", ".join(f"id {one.id}" for one in clash) or "one id"
+        return _Wrong(
+            f"{motor.joint}: two servos answer at once under {where} → unplug all but one: pull the cable that goes on from "
+            "the first servo"
+        )
+    if not found.servos:
+        return _Wrong(
+            f"{motor.joint}: nothing answers at any baud rate → is 12 V on, and the cable in to the click at both ends?"
+        )
+    if len(found.servos) > 1:
+        known = {
+            one.id: m.joint for m in motors for one in found.servos if (one.id, one.baud) == (m.id, config.bus.baud)
+        }
+        others = ", ".join(f"{known.get(one.id, one.model)} (id {one.id} at {one.baud} baud)" for one in found.servos)
+        pull = next((name for name in known.values() if name != motor.joint), "all but the new one")
+        return _Wrong(f"{motor.joint}: {len(found.servos)} servos answer: {others} → pull the cable of {pull}")
+    seen = found.servos[0]
+    if seen.model_number != motor.servo.number:
+        places = sorted({JOINTS[m.joint].kind for m in motors if m.servo.number == seen.model_number})
+        belongs = f"it belongs into a {places[0]}" if places else "this kit has none of these"
+        return _Wrong(f"{motor.joint}: this is a {seen.model}, but the place is for a {motor.model} → {belongs}")
+    return None
+
+
+def _rename_to(bench: Bench, bus: Bus, servos: Servos, motor: Motor, config: RobotConfig) -> Servos:
+    """Id, then baud rate, each heard again at once under the new one; the servos as they answer afterwards.
+
+    Raises:
+        HardwareFault: it does not answer under its new name; the message says where it was last heard.
+    """
+    servo = servos[motor.joint]
+    servos.write_counts("id", motor.joint, motor.id)
+    servos = journalled(bus, [Servo(motor.joint, motor.id, servo.model)], bench, COMMAND)
+    if servos.read_counts("baud_rate", motor.joint) != baud_code(config.bus.baud):
+        item, code = servo.model.register("baud_rate"), baud_code(config.bus.baud)
+        before = bus.line.baud
+        _write_baud(servos, motor, code)
+        bus.line.set_baud(config.bus.baud)
+        if bus.ping(motor.id, insist=True) is None:
+            raise HardwareFault(
+                f"{motor.joint} (id {motor.id}) does not answer at {config.bus.baud} baud after it was set from {before}",
+                where=bus.line.path,
+                remedy="run the step again: it looks at every baud rate",
+            )
+        assert item.decode(bus.read(motor.id, item.address, item.size)) == code
+    return servos
+
+
+def _write_baud(servos: Servos, motor: Motor, code: int) -> None:
+    """The one register that cannot be read back where it was written: at the old rate nobody listens any more."""
+    bus, item = servos.bus, servos[motor.joint].model.register("baud_rate")
+    old = servos.read_counts("baud_rate", motor.joint)
+    from openant_tools.procedure.journal import EepromWrite
+
+    if servos.before_write is not None:
+        servos.before_write(EepromWrite(motor.joint, motor.id, "baud_rate", old, code, bus.line.baud))
+    bus.write(motor.id, item.address, item.encode(code), f"baud_rate = {code}")
+
+
+def nudge(servos: Servos, joint: str, angle_rad: float = NUDGE_RAD) -> Generator[Event, Answer, float]:
+    """Blink the LED, turn by `angle_rad` and back with little force; how far it went, rad. Torque is off afterwards."""
+    bus, clock = servos.bus, servos.bus.clock
+    for _ in range(BLINKS):
+        for on in (1, 0):
+            servos.write_counts("led", joint, on)
+            wait(clock, 0.15)
+    start = servos.read_counts("present_position", joint)
+    reach = round(angle_rad / RAD_PER_PULSE)
+    if servos.read_counts("operating_mode", joint) == 3 and not 0 <= start + reach <= 4095:
+        reach = -reach
+    try:
+        servos.write_counts("profile_velocity", joint, 40)
+        servos.set_torque(True, [joint])
+        servos.write_counts("goal_pwm", joint, round(NUDGE_PWM * PWM_FULL))
+        servos.write_counts("goal_position", joint, start + reach)
+        wait(clock, 0.7)
+        there = servos.read_counts("present_position", joint)
+        yield Live({joint: (there - start) * RAD_PER_PULSE}, "rad", "nudged")
+        servos.write_counts("goal_position", joint, start)
+        wait(clock, 0.7)
+    finally:
+        servos.set_torque(False, [joint])
+    servos.write_counts("profile_velocity", joint, 0)
+    del bus
+    return abs(there - start) * RAD_PER_PULSE
+
+
+# ---- servos that are wired already -----------------------------------------------------------------------------------
+
+
+def _rename(
+    bench: Bench, bus: Bus, found: Scan, motors: Sequence[Motor], config: RobotConfig
+) -> Generator[Event, Answer, list[str]]:
+    """Ask of each servo which joint it is, park those whose id is another's, and name all; what could not be done."""
+    left = [motor.joint for motor in motors]
+    chosen: dict[str, Scanned] = {}
+    for one in found.servos:
+        bus.line.set_baud(one.baud)
+        model = servo_model(one.model_number)
+        servos = Servos(bus, [Servo(f"id {one.id}", one.id, model)])
+        servos.set_torque(False)
+        yield Intent(f"blink the LED of id {one.id} and nudge its horn, to see which joint it is", moves=True)
+        yield from nudge(servos, f"id {one.id}", 0.06)
+        fits = [joint for joint in left if config.motors[joint].servo.number == one.model_number]
+        own = config.motor_with_id(one.id)
+        guess = own.joint if own is not None and own.joint in fits else fits[0] if fits else "none of them"
+        answer = yield Ask(f"Which joint is id {one.id} ({one.model})?", (*fits, "none of them"), default=guess)
+        if isinstance(answer, str) and answer in left:
+            chosen[answer] = one
+            left.remove(answer)
+    wanted = baud_code(config.bus.baud)
+    changes = [
+        RegisterChange(joint, "id", one.id, config.motors[joint].id)
+        for joint, one in chosen.items()
+        if one.id != config.motors[joint].id
+    ] + [
+        RegisterChange(joint, "baud_rate", baud_code(one.baud), wanted)
+        for joint, one in chosen.items()
+        if one.baud != config.bus.baud
+    ]
+    if changes:
+        yield Intent("give these servos the ids and the baud rate of their joints", tuple(changes))
+    taken = {one.id for one in found.servos} | {motor.id for motor in motors}
+    parking = iter([id for id in PARKING if id not in taken])
+    moved: dict[str, Servo] = {}
+    for joint, one in chosen.items():
+        bus.line.set_baud(one.baud)
+        servo = Servo(joint, one.id, servo_model(one.model_number))
+        if one.id != config.motors[joint].id:
+            parked = next(parking)
+            journalled(bus, [servo], bench, COMMAND).write_counts("id", joint, parked)
+            servo = Servo(joint, parked, servo.model)
+        moved[joint] = servo
+    for joint, servo in moved.items():
+        bus.line.set_baud(chosen[joint].baud)
+        _rename_to(bench, bus, journalled(bus, [servo], bench, COMMAND), config.motors[joint], config)
+        yield Say(f"{joint}: id {config.motors[joint].id}, {config.bus.baud} baud", "ok")
+    bus.line.set_baud(config.bus.baud)
+    return [f"{joint}: no servo was named so → plug it in and run the step again" for joint in left]
+
+
+def locate(bus: Bus, missing: Sequence[Motor], config: RobotConfig) -> dict[str, int]:
+    """joint → the baud rate at which its id answers instead of the robot's own, for those that are found."""
+    before, found = bus.line.baud, dict[str, int]()
+    try:
+        for baud in BAUDS:
+            if baud == config.bus.baud:
+                continue
+            bus.line.set_baud(baud)
+            found |= {
+                m.joint: baud for m in missing if m.joint not in found and bus.ping(m.id, insist=True) is not None
+            }
+    finally:
+        bus.line.set_baud(before)
+    return found
+
+
+def _all_named(found: Scan, motors: Sequence[Motor], config: RobotConfig) -> bool:
+    seen = {(one.id, one.baud, one.model_number) for one in found.servos if not one.clash}
+    return not found.garbled and {(m.id, config.bus.baud, m.servo.number) for m in motors} <= seen
+
+
+def _finding(named: Sequence[str], motors: Sequence[Motor], problems: Sequence[str], what: str = "") -> Finding:
+    ok = not problems and len(named) == len(motors)
+    return Finding(
+        "ids",
+        ok,
+        what or f"{len(named)} of {len(motors)} servos have their id, read back",
+        tuple(
+            Evidence(f"id of {m.joint}", float(m.id), "", "register 7, read back") for m in motors if m.joint in named
+        ),
+        "" if ok else "mend what is listed and run the step again: what is named stays named",
+        COMMAND,
+        data={"named": list(named)},
+        problems=tuple(problems),
+    )

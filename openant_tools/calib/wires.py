@@ -1,0 +1,133 @@
+"""The bench's ports, opened for one step and left with torque off."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.comms.bus import Bus
+from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
+from openant_tools.comms.imu import Imu, open_imu
+from openant_tools.comms.line import SerialLine
+from openant_tools.comms.messages import EngineConfig
+from openant_tools.comms.protocol2 import BROADCAST, write
+from openant_tools.comms.servos import Servo, Servos
+from openant_tools.comms.setup import config_of_robot, find_bus, imu_of_robot, open_bus
+from openant_tools.errors import HardwareFault
+from openant_tools.procedure.journal import EepromWrite, Journal
+from openant_tools.procedure.step import Bench
+from openant_tools.robot.config import Motor, RobotConfig
+
+__all__ = [
+    "BOOT_S", "SETTLE_S", "engine_config", "journalled", "opened_bus", "opened_imu", "robot_servos", "servo_angles", "wait",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
+
+#: s from power to the first answer of a servo, with a margin; and for a leg or a body to come to rest after hands.
+BOOT_S = 0.8
+SETTLE_S = 1.5
+#: Broadcasts of torque off when a port is given back.
+RELEASES = 3
+
+
+@contextlib.contextmanager
+def opened_bus(bench: Bench, baud: int | None = None) -> Iterator[Bus]:
+    """The bus at its own rate, or at `baud`; however the block is left, every servo at the rate it is left with is
+    released."""
+    config = bench.folder.config()
+    bus = open_bus(find_bus(bench.bus, config), baud or config.bus.baud, bench.control)
+    bus.timing = replace(bus.timing, write_read_gap_s=config.bus.write_read_gap_s, return_delay_s=508e-6)
+    try:
+        yield bus
+    finally:
+        with contextlib.suppress(HardwareFault):  # the port may be what has gone
+            for _ in range(RELEASES):
+                bus.send(write(BROADCAST, 64, b"\0").encode())
+            wait(bus.clock, 0.01)
+        bus.close()
+
+
+@contextlib.contextmanager
+def opened_imu(bench: Bench) -> Iterator[tuple[Imu, Clock]]:
+    """The flight controller, connected, and the clock that it lives by.
+
+    Raises:
+        HardwareFault: nobody has named its port, or it does not answer as one.
+    """
+    named = imu_of_robot(bench.folder.config(), bench.imu)
+    if named is None:
+        raise HardwareFault(
+            "no flight controller is known", remedy="plug it in and run `openant calib connect`, or name it with --imu"
+        )
+    clock: Clock = RealClock()
+    if bench.control:
+        remote = VirtualControl(bench.control)
+        if remote.ask("now")["stepped"]:
+            stepped = SteppedClock(remote)
+
+            def attached() -> SerialLine:
+                line = SerialLine(named.port, 115_200)
+                stepped.attach(imu=line)
+                return line
+
+            imu = Imu(attached, stepped, where=named.port)
+            imu.connect()
+            clock = stepped
+        else:
+            imu = open_imu(named.port, clock)
+    else:
+        imu = open_imu(named.port, clock)
+    try:
+        yield imu, clock
+    finally:
+        imu.close()
+
+
+def journalled(bus: Bus, servos: Sequence[Servo], bench: Bench, command: str) -> Servos:
+    """Servos whose every EEPROM write stands in the robot's journal before it is sent."""
+    journal = Journal(bench.folder.journal)
+
+    def note(change: EepromWrite) -> None:
+        journal.append(change, command)
+
+    return Servos(bus, servos, before_write=note)
+
+
+def robot_servos(config: RobotConfig, joints: Sequence[str] = ()) -> list[Servo]:
+    """The servos as robot.toml describes them, all or those of `joints`."""
+    return [_servo(motor) for motor in config.motors.values() if not joints or motor.joint in joints]
+
+
+def _servo(motor: Motor) -> Servo:
+    return Servo(motor.joint, motor.id, motor.servo, motor.direction, motor.zero_offset_rad)
+
+
+def engine_config(bench: Bench, **more: object) -> EngineConfig:
+    """The engine's config for this robot, its IMU beside the bus where it is known."""
+    config = bench.folder.config()
+    more = {"imu": imu_of_robot(config, bench.imu), "journal": str(bench.folder.journal), **more}
+    return config_of_robot(config, bench.bus, control=bench.control, **more)
+
+
+def wait(clock: Clock, seconds: float) -> None:
+    clock.sleep_until(clock.now() + seconds)
+
+
+def servo_angles(servos: Servos, readings: int = 1, pause_s: float = 0.01) -> Array:
+    """(readings, n) rad in each servo's own frame.
+
+    Raises:
+        NoAnswer: one is silent; the message names it.
+    """
+    rows = []
+    for k in range(readings):
+        if k:
+            wait(servos.bus.clock, pause_s)
+        counts = servos.read_all("present_position")
+        rows.append([counts[s.joint] * s.model.registers["present_position"].scale for s in servos.servos])
+    return np.array(rows)

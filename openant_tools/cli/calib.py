@@ -1,0 +1,186 @@
+"""`openant calib`: every step of bringing a robot up, as a command."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from openant_tools.bringup.walk import WALK
+from openant_tools.cli.options import json_option, robot_option
+from openant_tools.cli.virtual_for_command import virtual_option
+from openant_tools.procedure.step import Bench, Step
+
+__all__ = ["bench_of", "calib", "robot_of", "run_step", "step_options"]
+
+
+@click.group()
+def calib() -> None:
+    """Bring a robot up, step by step: what each will do is said before it is done.
+
+    What was found is kept in the robot's findings/, every write to a servo's memory in journal.jsonl: `openant calib undo`
+    takes the last step's writes back. `openant bringup` walks through all steps.
+    """
+
+
+def step_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """What every step takes."""
+    for option in reversed(
+        (
+            robot_option,
+            click.option(
+                "--port", metavar="PATH", help="The servos' adapter. Default: robot.toml's, else the one plugged in."
+            ),
+            click.option("--imu", metavar="PATH", help="The flight controller. Default: robot.toml's."),
+            click.option("--camera", metavar="SOURCE", help="The overhead camera. Default: robot.toml's."),
+            virtual_option,
+            click.option(
+                "--yes", is_flag=True, help="Grant everything and take every default; hands are the virtual robot's."
+            ),
+            json_option,
+        )
+    ):
+        function = option(function)
+    return function
+
+
+def robot_of(robot: Path | None) -> Any:
+    """The robot's folder; made, with the standard kit's nominal values, where it is named and empty."""
+    from openant_tools.cli.options import robot_folder
+    from openant_tools.robot.folder import RobotFolder, create_robot
+
+    path = robot_folder(robot, must_exist=robot is None)
+    return create_robot(path) if not (path / "robot.toml").is_file() else RobotFolder.at(path)
+
+
+@contextlib.contextmanager
+def bench_of(
+    robot: Path | None, port: str | None, imu: str | None, camera: str | None, virtual_source: str | None, yes: bool,
+    joints: tuple[str, ...] = (),
+) -> Iterator[tuple[Bench, Any]]:  # fmt: skip
+    """The bench and the face that a step runs with; a virtual robot started for it ends with the block."""
+    from openant_tools.bringup.virtual_hands import VirtualHands
+    from openant_tools.cli.face import CommandFace
+    from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_robot
+
+    folder = robot_of(robot)
+    with contextlib.ExitStack() as stack:
+        if virtual_source is None:
+            yield Bench(folder, port, imu, camera, None, joints), CommandFace(yes=yes)
+            return
+        clock = "stepped" if virtual_source == VIRTUAL_DEFAULT else None
+        found = stack.enter_context(virtual_robot(virtual_source, clock=clock))
+        control = str(found["control"])
+        hands = VirtualHands(control)
+        stack.callback(hands.close)
+        bench = Bench(folder, port or found["bus"], imu or found["imu"], camera or found["camera"], control, joints)
+        yield bench, CommandFace(yes=yes, hands=hands.do)
+
+
+def run_step(step: Step, bench: Bench, face: Any) -> Any:
+    """Run a step and keep its finding; a name that stands for "not this robot" is the caller's to refuse."""
+    from openant_tools.procedure.finding import keep
+    from openant_tools.procedure.step import drive
+
+    finding = drive(step.start(bench), face)
+    keep(finding, bench.folder)
+    return finding
+
+
+def _command(step: Step) -> click.Command:
+    @click.command(step.name, help=_help(step), short_help=step.does)
+    @click.option("--joint", "joints", multiple=True, metavar="NAME", help="Only this joint. Repeatable.")
+    @step_options
+    def command(
+        robot: Path | None,
+        port: str | None,
+        imu: str | None,
+        camera: str | None,
+        virtual_source: str | None,
+        yes: bool,
+        json_file: Path | None,
+        joints: tuple[str, ...],
+    ) -> int:
+        from openant_tools.cli.face import echo_finding
+        from openant_tools.errors import BadInput
+        from openant_tools.files import write_text
+        from openant_tools.robot.joints import JOINT_NAMES
+
+        for joint in joints:
+            if joint not in JOINT_NAMES:
+                raise BadInput(f"there is no joint {joint!r}", remedy=f"the joints are {', '.join(JOINT_NAMES)}")
+        with bench_of(robot, port, imu, camera, virtual_source, yes, joints) as (bench, face):
+            finding = run_step(step, bench, face)
+        echo_finding(finding)
+        if json_file is not None:
+            write_text(json_file, json.dumps(finding.as_json(), indent=1, ensure_ascii=False) + "\n")
+        return 0 if finding.ok else 1
+
+    return command
+
+
+def _help(step: Step) -> str:
+    lines = [
+        step.does,
+        "",
+        f"On the table: {step.table or 'nothing more'}.",
+        f"It changes: {step.changes or 'nothing'}.",
+    ]
+    lines.append("The robot moves." if step.moves else "Nothing moves.")
+    needs = ", ".join(WALK[name].title for name in step.needs)
+    return "\n".join([*lines, f"Before it: {needs}." if needs else ""])
+
+
+for _name in (
+    "connect",
+    "estop",
+    "ids",
+    "centre",
+    "legs",
+    "inventory",
+    "zeros",
+    "bounds",
+    "imu",
+    "arena",
+    "comms",
+    "thermal",
+):
+    calib.add_command(_command(WALK[_name]))
+
+
+@calib.command()
+@click.option(
+    "--all", "everything", is_flag=True, help="Every write that stands in the journal, not only the last step's."
+)
+@step_options
+def undo(
+    robot: Path | None,
+    port: str | None,
+    imu: str | None,
+    camera: str | None,
+    virtual_source: str | None,
+    yes: bool,
+    json_file: Path | None,
+    everything: bool,
+) -> int:
+    """Take back the last step's writes to the servos' memory, newest first, as journal.jsonl has them.
+
+    A servo that has lost its id and baud rate again must be alone on the cable, as it was when they were given.
+    """
+    from openant_tools.calib.undo import undo as undoing
+    from openant_tools.cli.face import echo_finding
+    from openant_tools.files import write_text
+    from openant_tools.procedure.finding import keep
+    from openant_tools.procedure.step import drive
+
+    with bench_of(robot, port, imu, camera, virtual_source, yes) as (bench, face):
+        finding = drive(undoing(bench, everything=everything), face)
+        keep(finding, bench.folder)
+    echo_finding(finding)
+    if json_file is not None:
+        write_text(json_file, json.dumps(finding.as_json(), indent=1, ensure_ascii=False) + "\n")
+    return 0 if finding.ok else 1

@@ -1,0 +1,145 @@
+"""The command line as the face of a procedure: rich on stderr, questions where a terminal is attached."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+import click
+from rich.console import Console
+from rich.markup import escape
+from rich.prompt import Confirm, FloatPrompt, Prompt
+
+from openant_tools.errors import BadInput
+from openant_tools.procedure.finding import Finding
+from openant_tools.procedure.step import Answer, Ask, Event, Hands, Intent, Live, Look, Progress, Say
+
+__all__ = ["CommandFace", "echo_finding"]
+
+_GLYPHS = {"info": ("·", "dim"), "ok": ("✓", "green"), "warn": ("▲", "yellow"), "fail": ("✗", "red")}
+_PLAIN = {"·": "-", "✓": "ok", "▲": "!", "✗": "x", "→": "->", "…": "..."}
+BAR_WIDTH = 24
+
+
+class CommandFace:
+    """Shows events as lines; asks, unless `yes` grants everything and takes the defaults.
+
+    Args:
+        yes: nobody is asked: intents are granted, defaults taken.
+        hands: who does what hands must do where nobody is asked (a virtual robot's); None for the builder.
+    """
+
+    def __init__(self, *, yes: bool, hands: Callable[[Hands], None] | None = None) -> None:
+        self.console = Console(stderr=True, highlight=False)
+        self._yes = yes
+        self._hands = hands
+        self._live = 0
+
+    def answer(self, event: Event) -> Answer:
+        """Show one event; what it is answered with."""
+        if not isinstance(event, Live):
+            self._end_live()
+        match event:
+            case Progress(share, words):
+                self._line(f"[dim]{'' if share is None else f'{100 * share:3.0f} % '}{escape(words)} …[/dim]")
+            case Say(words, level):
+                glyph, style = _GLYPHS[level]
+                self._line(f"[{style}]{glyph}[/{style}] {escape(words)}")
+            case Look(words, drawing, picture):
+                self._line(
+                    escape(words) + (f"\n{escape(drawing)}" if drawing else "") + (f" ({picture})" if picture else "")
+                )
+            case Live():
+                return self._show(event)
+            case Intent():
+                return self._grant(event)
+            case Hands():
+                return self._by_hand(event)
+            case Ask():
+                return self._ask(event)
+        return None
+
+    def _line(self, markup: str) -> None:
+        encoding = (self.console.encoding or "ascii").lower()
+        if not encoding.startswith("utf"):
+            for sign, plain in _PLAIN.items():
+                markup = markup.replace(sign, plain)
+        self.console.print(markup, soft_wrap=True)
+
+    def _grant(self, intent: Intent) -> bool:
+        self._line(
+            f"[bold]will {escape(intent.words)}[/bold]" + (" [yellow](it moves)[/yellow]" if intent.moves else "")
+        )
+        for change in intent.registers:
+            self._line(f"    {escape(str(change))}")
+        if self._yes:
+            return True
+        self._need_terminal("it would write or move")
+        return Confirm.ask("Do it?", console=self.console, default=True)
+
+    def _by_hand(self, hands: Hands) -> bool:
+        self._line(f"[cyan]hands:[/cyan] {escape(hands.words)}")
+        if self._hands is not None:
+            self._hands(hands)
+        elif not self._yes and not hands.while_watching:
+            self._need_terminal("it needs your hands")
+            Prompt.ask("Enter when done", console=self.console, default="", show_default=False)
+        elif self._yes and not hands.while_watching:
+            raise BadInput(
+                f"hands are needed: {hands.words}", remedy="run it in a terminal, without --yes, or with --virtual"
+            )
+        return True
+
+    def _ask(self, ask: Ask) -> Answer:
+        if self._yes:
+            if ask.default is None:
+                raise BadInput(
+                    f"nobody is there to answer: {ask.question}", remedy="run it in a terminal, without --yes"
+                )
+            self._line(f"[dim]? {escape(ask.question)} {escape(str(ask.default))}[/dim]")
+            return ask.default
+        self._need_terminal("it has a question")
+        question = escape(ask.question)
+        if ask.choices:
+            default = ask.default if isinstance(ask.default, str) else ask.choices[0]
+            return Prompt.ask(question, console=self.console, choices=list(ask.choices), default=default)
+        if ask.unit == "text":
+            return Prompt.ask(question, console=self.console, default=str(ask.default or ""))
+        while True:
+            number = FloatPrompt.ask(f"{question} [{ask.unit}]", console=self.console, default=ask.default)
+            if (
+                isinstance(number, int | float)
+                and (ask.low is None or number >= ask.low)
+                and (ask.high is None or number <= ask.high)
+            ):
+                return float(number)
+            self._line(f"[red]✗[/red] from {ask.low} to {ask.high} {ask.unit}")
+
+    def _show(self, live: Live) -> bool:
+        """Bars that stay in place on a terminal; nothing where the output goes to a file."""
+        if self.console.is_terminal and live.low:
+            if self._live:
+                sys.stderr.write(f"\x1b[{self._live}A")
+            for joint, value in live.values.items():
+                low, high = live.low.get(joint, value - 1), live.high.get(joint, value + 1)
+                at = round(min(max((value - low) / max(high - low, 1e-9), 0.0), 1.0) * (BAR_WIDTH - 1))
+                bar = "".join("#" if k == at else "-" for k in range(BAR_WIDTH))
+                sys.stderr.write(f"\x1b[2K  {joint:8} {bar} {value:+.2f} {live.unit} {live.marks.get(joint, '')}\n")
+            self._live = len(live.values)
+        return False
+
+    def _end_live(self) -> None:
+        self._live = 0
+
+    def _need_terminal(self, why: str) -> None:
+        if not sys.stdin.isatty():
+            raise BadInput(f"{why} and nobody is there to ask", remedy="add --yes if it may")
+
+
+def echo_finding(finding: Finding) -> None:
+    """The result of a step, for stdout: the sentence, what is wrong, what is next."""
+    click.echo(f"{'ok' if finding.ok else 'NOT OK'}: {finding.what}")
+    for problem in finding.problems:
+        click.echo(f"  {problem}")
+    if finding.next_action:
+        click.echo(f"next: {finding.next_action}")
