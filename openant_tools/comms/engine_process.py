@@ -78,6 +78,11 @@ class EngineProcess:
     def pid(self) -> int:
         return self._process.pid
 
+    @property
+    def ended(self) -> bool:
+        """Whether it is known to have ended, by itself or by `close`."""
+        return self._ended or self._connection.closed
+
     def __enter__(self) -> EngineProcess:
         return self
 
