@@ -60,7 +60,7 @@ def fit(datasets: Sequence[Dataset], kinds: Sequence[str], start: dict[str, floa
     parameters = choose(datasets[0].plant, [kind for kind in KINDS if kind in (*SERVO, *kinds)])
     runs = [run for data in datasets for run in data.runs]
     floor = np.maximum(sensor_floor(runs, datasets[0].plant.joints), 1e-6)
-    problem = Problem(datasets, parameters, floor)
+    problem = Problem(datasets, parameters, floor, tempered=True)
     first = np.array([start.get(p.kind, c) for p, c in zip(parameters, problem.centre, strict=True)])
     found = problem.solve(first if start else None)
     return {p.kind: float(u) for p, u in zip(parameters, found.u, strict=True)}

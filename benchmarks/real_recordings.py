@@ -95,6 +95,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--shared", type=Path, default=Path(__file__).resolve().parents[2] / "shared" / "realdata")
     parser.add_argument("--only", choices=["bam-xl330", "sage-so101"])
+    parser.add_argument("--joint", action="append", choices=list(TURNED_KG_M2), help="of sage-so101; default both")
     parser.add_argument("--work", type=Path, default=Path("/tmp/real_recordings"))
     options = parser.parse_args()
     if options.only != "sage-so101":
@@ -106,7 +107,8 @@ def main() -> None:
         table("bam-xl330, full-run position error", groups, options.work)
     if options.only != "bam-xl330":
         recorded = [read_run(path) for path in sorted((options.shared / "sage-so101").glob("*.parquet"))]
-        for joint, turned in TURNED_KG_M2.items():
+        for joint in options.joint or TURNED_KG_M2:
+            turned = TURNED_KG_M2[joint]
             model = options.work / f"so101_{joint}.xml"
             model.parent.mkdir(parents=True, exist_ok=True)
             model.write_text(SO101.format(joint=joint, turned=turned).strip())

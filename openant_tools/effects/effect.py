@@ -55,5 +55,11 @@ class Effect:
     law: Callable[[Values], Law]
     shared: bool = False
 
+    @property
+    def chief(self) -> Quantity | None:
+        """The parameter that is the effect's size in its usual form, where one is: others are other forms of it, or its shape."""
+        first = self.quantities[0]
+        return first if len(self.quantities) == 1 or first.name == "coefficient" else None
+
     def quantity(self, name: str) -> Quantity:
         return next(quantity for quantity in self.quantities if quantity.name == name)

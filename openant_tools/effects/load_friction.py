@@ -1,4 +1,10 @@
-"""Gears rub more the more torque they carry."""
+"""Gears rub more the more torque they carry.
+
+A gear carries what the motor gives on its one side and what the link asks on its other; standing still the two are the
+same. In motion they differ by what inertia and friction take, and which of them the teeth feel is a matter of the gear. Each form
+has a coefficient of its own; what they say adds up. The usual one takes the mean of both sides: on a real servo
+(docs/effects.md) it explains more than either alone or the greater of them.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +17,13 @@ __all__ = ["EFFECT"]
 
 
 def _law(values: Values) -> Law:
-    coefficient = values["coefficient"]
+    motor = values["motor_side"] + values["coefficient"] / 2
+    link = values["link_side"] + values["coefficient"] / 2
+    greater = values["greater_side"]
 
     def act(step: Step) -> None:
-        # A tooth carries what the motor gives on one side and what the link asks on the other.
-        step.friction += coefficient * np.maximum(np.abs(step.motor_torque), np.abs(step.load))
+        given, asked = np.abs(step.motor_torque), np.abs(step.load)
+        step.friction += motor * given + link * asked + greater * np.maximum(given, asked)
 
     return act
 
@@ -24,7 +32,12 @@ EFFECT = Effect(
     name="load_friction",
     family="friction",
     words="friction grows with the torque that the gears carry",
-    quantities=(Quantity("coefficient", "N·m/(N·m)", 0.15, high=0.9),),
+    quantities=(
+        Quantity("coefficient", "N·m/(N·m)", 0.25, high=0.9),
+        Quantity("motor_side", "N·m/(N·m)", 0.25, high=0.9),
+        Quantity("link_side", "N·m/(N·m)", 0.25, high=0.9),
+        Quantity("greater_side", "N·m/(N·m)", 0.25, high=0.9),
+    ),
     order=30,
     law=_law,
 )

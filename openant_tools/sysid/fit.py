@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear, nnls
 from scipy.stats import norm
 
-from openant_tools.effects.rollout import rollout
+from openant_tools.effects.rollout import EffectValues, rollout
 from openant_tools.model.floor import resolution
 from openant_tools.model.gap import HORIZON_S, Gap, gap
 from openant_tools.model.plant import Plant, Setup
@@ -98,6 +98,8 @@ class Dataset:
         measured: (rows, joints) rad, the runs' positions one after another.
         nthread: of the rollouts; 0 takes all cores.
         measured_supply: gains and torque limits follow the voltage that the runs logged.
+        acting: effects between steps that the robot is known to have, in every simulation; at joints where a parameter
+            says what an effect is, the parameter counts.
     """
 
     plant: Plant
@@ -105,11 +107,20 @@ class Dataset:
     measured: Array
     nthread: int = 0
     measured_supply: bool = False
+    acting: EffectValues = field(default_factory=dict)
 
     @classmethod
-    def prepare(cls, plant: Plant, runs: Sequence[Run], nthread: int = 0, *, measured_supply: bool = False) -> Dataset:
+    def prepare(
+        cls,
+        plant: Plant,
+        runs: Sequence[Run],
+        nthread: int = 0,
+        *,
+        measured_supply: bool = False,
+        acting: EffectValues | None = None,
+    ) -> Dataset:
         measured = np.concatenate([run.signal("pos", plant.joints) for run in runs])
-        return cls(plant, tuple(runs), measured, nthread, measured_supply)
+        return cls(plant, tuple(runs), measured, nthread, measured_supply, acting or {})
 
     @cached_property
     def full(self) -> Rollouts:
@@ -151,7 +162,7 @@ class Dataset:
         """What the model would have done with the parameters at each u, (parameters,), by default as the fit compares."""
         rollouts = rollouts or self.fitted
         models, late = self._variants(parameters, us)
-        effects = [effect_values(self.plant, parameters, u) for u in us]
+        effects = [effect_values(self.plant, parameters, u, self.acting) for u in us]
         if self.measured_supply or any(effects):
             return rollout(rollouts, models, effects, late, measured_supply=self.measured_supply)
         return rollouts(models, late)
@@ -161,7 +172,7 @@ class Dataset:
     ) -> Iterator[tuple[slice, Array, Array]]:
         """`simulate` piece by piece, so that no more than a piece of it is held: rows, positions, velocities."""
         rollouts = rollouts or self.fitted
-        if self.measured_supply or any(effect_values(self.plant, parameters, u) for u in us):
+        if self.measured_supply or any(effect_values(self.plant, parameters, u, self.acting) for u in us):
             whole = self.simulate(parameters, us, rollouts)  # effects act step by step on all runs at once
             return iter([(slice(0, whole.pos.shape[1]), whole.pos, whole.vel)])
         return rollouts.stream(*self._variants(parameters, us))
@@ -278,11 +289,15 @@ class Problem:
         datasets: all with the same joints in the same order.
         parameters: the unknowns.
         floor: (joints,) rad, the least residual deviation that a sensor of this resolution can show.
+        tempered: all runs of a joint count alike, by their length, as one observation per TEMPER_S: to compare models all
+            of which are wrong by the error that they leave. Trusting each stretch as far as the model can follow it, as is
+            done otherwise, lets a wrong model choose what it is judged by.
     """
 
     datasets: Sequence[Dataset]
     parameters: Sequence[Parameter]
     floor: Array
+    tempered: bool = False
     evaluations: int = field(default=0, init=False)
     _prior_weight: float = field(default=1.0, init=False)
 
@@ -437,7 +452,7 @@ class Problem:
         tell()
         # A servo works with torque on. What a falling leg adds is taken as far as it agrees with what the driven one
         # shows: the driven stretches are fitted alone first, and the others enter with the weight that this leaves them.
-        if self._has_limp:
+        if self._has_limp and not self.tempered:
             # Nothing in driven stretches tells the valleys; their prior alone must not move them out of theirs.
             point = self._approach(point, tell, enough=NEAR, driven_only=True, held=self._valley).point
         near = self._approach(point, tell, enough=NEAR)
@@ -743,14 +758,17 @@ class Problem:
         return np.clip(halves, self.low, self.high), contradictory
 
     def _score(self, point: _Point) -> float:
-        """−log posterior with each stretch's own unknown noise, one effective sample per TEMPER_S: compares starts."""
+        """−log posterior with unknown noise (each stretch's own, if not `tempered`), one effective sample per TEMPER_S:
+        compares starts."""
         score = 0.5 * float(np.sum((point.u - self.centre) ** 2))
+        together = np.nanmean(point.residual**2, axis=0)
         for stretch in self._stretches:
             for j, rows in enumerate(stretch.rows):
                 part = point.residual[rows, j]
                 n = int(np.isfinite(part).sum())
                 if n:
-                    variance = max(float(np.nanmean(part**2)), self.floor[j] ** 2)
+                    own = float(together[j] if self.tempered else np.nanmean(part**2))
+                    variance = max(own, self.floor[j] ** 2)
                     score += 0.5 * n * stretch.period / TEMPER_S * math.log(variance)
         return score
 
@@ -761,6 +779,9 @@ class Problem:
         """
         residual = point.residual
         self._weight = np.zeros_like(residual)
+        if self.tempered:
+            self._weigh_alike(residual)
+            return
         joints = residual.shape[1]
         squares, samples, times = np.zeros(joints), np.zeros(joints), np.zeros(joints)
         stamps, stamped = 0.0, 0
@@ -786,6 +807,14 @@ class Problem:
         self.noise = np.sqrt(squares / np.maximum(samples, 1))
         self.correlation_s = times / np.maximum(samples, 1)
         self.stamp_error_s = math.sqrt(stamps / max(stamped, 1))
+
+    def _weigh_alike(self, residual: Array) -> None:
+        """One deviation for all rows of a joint, and one effective sample per TEMPER_S."""
+        self.noise = np.maximum(np.sqrt(np.nanmean(residual**2, axis=0)), self.floor)
+        self.correlation_s, self.stamp_error_s = np.full(len(self.noise), TEMPER_S), 0.0
+        for stretch in self._stretches:
+            for j, rows in enumerate(stretch.rows):
+                self._weight[rows, j] = math.sqrt(stretch.period / TEMPER_S) / self.noise[j]
 
     def _let_driven_lead(self) -> None:
         """No row without torque counts for more than one of the least trusted driven stretch.

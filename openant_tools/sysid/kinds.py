@@ -492,11 +492,11 @@ def _constant(std: float) -> Callable[[float], float]:
 
 
 def _effect_kinds() -> Iterator[Kind]:
-    """One kind for each parameter of each effect that acts between steps; named as the effect where it has only one."""
+    """One kind for each parameter of each effect that acts between steps; the chief one bears the effect's own name."""
     for effect in catalogue().values():
         for quantity in effect.quantities:
             yield Kind(
-                effect.name if len(effect.quantities) == 1 else f"{effect.name}_{quantity.name}",
+                effect.name if quantity is effect.chief else f"{effect.name}_{quantity.name}",
                 quantity.unit,
                 _nothing,
                 _write_nothing,

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.effects.catalogue import effect
+from openant_tools.effects.rollout import EffectValues
 from openant_tools.model.attribute import Attribute, stated
 from openant_tools.model.plant import Plant
 from openant_tools.sysid.kinds import ACTION_DELAY, KINDS, Kind, usual_torque
@@ -155,9 +156,15 @@ def _restated(plant: Plant, values: tuple[tuple[Attribute, tuple[float, ...]], .
     return _compiled[key]
 
 
-def effect_values(plant: Plant, parameters: Sequence[Parameter], u: Array) -> dict[tuple[str, str], Array]:
-    """(effect, its parameter) → (joints,) of the effects that act between steps, with the parameters at u."""
-    out: dict[tuple[str, str], Array] = {}
+def effect_values(
+    plant: Plant, parameters: Sequence[Parameter], u: Array, given: EffectValues | None = None
+) -> dict[tuple[str, str], Array]:
+    """(effect, its parameter) → (joints,) of the effects that act between steps, with the parameters at u.
+
+    Args:
+        given: what acts besides, at joints whose value no parameter says.
+    """
+    out = {key: np.array(value, float) for key, value in (given or {}).items()}
     for parameter, value in zip(parameters, u, strict=True):
         key = parameter.definition.effect
         if key is not None:
