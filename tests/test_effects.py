@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -256,18 +258,34 @@ def test_what_all_joints_share_is_one_value_that_moves_all_of_them() -> None:
         assert masks[0].all()
 
 
-def test_effects_that_a_fit_leaves_out_are_named_and_kept(tmp_path: Path) -> None:
-    """What acts beside a model that was fitted without it would count twice: nobody should learn that from a policy."""
+def test_a_fit_goes_around_the_effects_that_a_robot_has(tmp_path: Path) -> None:
+    """What robot.toml says acts in every simulation of the fit, so that nothing else is bent to stand for it."""
     path, t = write(tmp_path / "pendulum.xml", pendulum()), np.arange(0.0, 4.0, 0.01)
-    table = []
+    plant = load_plant(path)
+    stiffer = copy.copy(plant.model)
+    stiffer.actuator_gainprm[:, 0], stiffer.actuator_biasprm[:, 1] = 8.8, -8.8
+    tables = []
     for k in range(2):
-        columns = drive(load_plant(path).model, ["joint"], t, sweep(t, 1 + k)[:, -1:], quantum=ENCODER_RAD)
-        write_table(Run(f"run{k}", Facts(joints=("joint",)), t, columns), tmp_path / f"run{k}.parquet")
-        table.append(str(tmp_path / f"run{k}.parquet"))
+        command = sweep(t, 1 + k)[:, -1]
+        run = Run(f"run{k}", Facts(joints=("joint",)), t, {"cmd.joint": command, "pos.joint": np.zeros_like(t)})
+        made = rollout(Rollouts(plant, [run]), [stiffer], [{("dead_zone", "width_rad"): np.array([0.08])}])
+        position = np.round(made.pos[0, :, 0] / ENCODER_RAD) * ENCODER_RAD
+        tables.append(str(tmp_path / f"run{k}.parquet"))
+        write_table(replace(run, columns={"cmd.joint": command, "pos.joint": position}), Path(tables[-1]))
     robot = create_robot(tmp_path / "ant")
-    robot.update(effects=[Entry("dead_zone", "all", {"width_rad": 0.01})])
-    arguments = [table[0], "--hold-out", table[1], "--model", str(path), "--out", str(tmp_path / "fit")]
-    ran = CliRunner().invoke(fit, [*arguments, "--robot", str(robot.path)], standalone_mode=False)
+    entries = [
+        Entry("dead_zone", "all", {"width_rad": 0.08}),
+        Entry("load_friction", ("knee_fl",), {"coefficient": 0.1}),
+        Entry("cogging", "all", {"amplitude_nm": 0.3}, enabled=False),
+    ]
+    robot.update(effects=entries)
+    arguments = [tables[0], "--hold-out", tables[1], "--model", str(path), "--out", str(tmp_path / "fit")]
+    ran = CliRunner().invoke(fit, [*arguments, "--kind", "stiffness", "--also", "load_friction", "--robot", str(robot.path)],
+                             standalone_mode=False)  # fmt: skip
     assert ran.exception is None
-    assert "dead_zone of robot.toml took no part in this fit" in ran.output
-    assert [entry.effect for entry in robot.config().effects] == ["dead_zone"]
+    assert "What robot.toml says of dead_zone acted in every simulation" in ran.output
+    found = json.loads((tmp_path / "fit" / "fit.json").read_text())
+    assert found["parameters"]["stiffness.joint"]["value"] == pytest.approx(8.8, rel=0.01)
+    assert found["acting"] == [{"effect": "dead_zone", "joints": ["joint"], "parameters": {"width_rad": 0.08}}]
+    # What was not fitted stays as it was, and of an effect that was fitted the joints that were not.
+    assert [entry for entry in robot.config().effects if entry.joints != ("joint",)] == entries

@@ -53,7 +53,8 @@ def fit(
     """Fit a model to recordings and write calibrated.xml, fit.json and report.html to DIR.
 
     What does not beat the given model on held-out runs falls back to it. Without --hold-out, runs are left out in turn.
-    With --robot, calibrated.xml and every value with its provenance go into the robot's folder too.
+    With --robot, calibrated.xml and every value with its provenance go into the robot's folder too; effects that its
+    robot.toml has act in the fit as they stand there.
 
     \b
       openant sysid fit run1.mcap run2.mcap --hold-out run3.mcap --robot my-ant --out fit
@@ -73,11 +74,13 @@ def fit(
     from openant_tools.robot.folder import RobotFolder
     from openant_tools.sysid.declared import read_declarations
     from openant_tools.sysid.identify import identify
-    from openant_tools.sysid.result import effects_beside, write_fit, write_robot
+    from openant_tools.sysid.result import write_fit, write_robot
 
     folder = None if robot is None else RobotFolder.at(robot)
+    described = folder
     if model is None:
-        model = (folder or _robot_here()).model_path()
+        described = folder or _robot_here()
+        model = described.model_path()
     recordings = [read_run(path) for path in runs]
     held_out = [read_run(path) for path in hold_out]
     console = Console(stderr=True)
@@ -94,6 +97,7 @@ def fit(
             measured_supply=measured_supply,
             tie=tie,
             declared=None if declared is None else read_declarations(declared),
+            effects=() if described is None else described.config().effects,
             progress=lambda what, done: bar.update(task, description=what, completed=done),
         )
         bar.update(task, description="writing the report", completed=1.0)
@@ -115,12 +119,6 @@ def fit(
     )
     for note in result.notes:
         click.echo(note)
-    beside = [] if folder is None else [entry.effect for entry in effects_beside(result, folder) if entry.enabled]
-    if beside:
-        click.echo(
-            f"{', '.join(dict.fromkeys(beside))} of robot.toml took no part in this fit, but acts in the environment besides what "
-            "was found: fit it too with --also, or set enabled = false"
-        )
     if not result.accepted:
         click.echo("nothing that was fitted beats the given model on held-out runs; calibrated.xml is the given model")
     for path in written:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear, nnls
 from scipy.stats import norm
 
+from openant_tools.effects.catalogue import effect
 from openant_tools.effects.rollout import EffectValues, rollout
 from openant_tools.model.floor import resolution
 from openant_tools.model.gap import HORIZON_S, Gap, gap
@@ -309,8 +310,9 @@ class Problem:
         self.noise, self.correlation_s, self.stamp_error_s = np.zeros(nj), np.zeros(nj), 0.0
         self._valley = np.array([parameter.definition.valley for parameter in self.parameters], bool)
         floor = any(data.plant.setup is Setup.FLOOR for data in self.datasets)
-        self._colours = colours(self.datasets[0].plant, self.parameters, coupled=floor)
-        self._on_floor = any(data.plant.setup is Setup.FLOOR for data in self.datasets)
+        shared = any(effect(name).shared for data in self.datasets for name, _ in data.acting)
+        self._colours = colours(self.datasets[0].plant, self.parameters, coupled=floor or shared)
+        self._on_floor = floor
         chattering = [FLOOR_STEP_OF_BODY if p.definition.body else FLOOR_STEP for p in self.parameters]
         self._differences = np.array(chattering if self._on_floor else [STEP] * len(self.parameters))
         #: for each joint, the parameters that move it and their colours

@@ -16,12 +16,16 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.effects.catalogue import catalogue
+from openant_tools.effects.entries import entries_of, values_of
+from openant_tools.effects.rollout import EffectValues
 from openant_tools.errors import BadInput
 from openant_tools.model.attribute import Attribute
 from openant_tools.model.floor import floors
 from openant_tools.model.gap import HORIZON_S, Gap, share_closed
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.recording.run import Run
+from openant_tools.robot.config import Effect as Entry
 from openant_tools.sysid.declared import Declaration, declared_parameters
 from openant_tools.sysid.fit import Dataset, Estimate, Problem, gaps, sensor_floor
 from openant_tools.sysid.kinds import ACTUATOR_LAG, SPEED_LIMIT
@@ -137,6 +141,7 @@ class Identification:
         correlation_s: joint → s, how long a residual remembers itself; far above the sample time it is model error.
         stamp_error_s: s, standard deviation by which time stamps miss the moments of sampling, row by row.
         u: (parameters,) of the written model, for `models`.
+        acting: effects between steps that were given and acted as they are, in the given model and in the written one.
         notes: what a reader should know.
     """
 
@@ -156,6 +161,7 @@ class Identification:
     covariance: Array
     datasets: tuple[Dataset, ...]
     held_out: tuple[Dataset, ...]
+    acting: EffectValues
     notes: tuple[str, ...]
 
     @property
@@ -164,7 +170,12 @@ class Identification:
 
     @property
     def effects(self) -> dict[tuple[str, str], Array]:
-        """(effect, its parameter) → (joints,) of what acts between the steps of the written model."""
+        """(effect, its parameter) → (joints,) of what acts between the steps of the written model, found or given."""
+        return effect_values(self.datasets[0].plant, self.parameters, self.u, self.acting)
+
+    @property
+    def effects_found(self) -> dict[tuple[str, str], Array]:
+        """Those of `effects` that were fitted."""
         return effect_values(self.datasets[0].plant, self.parameters, self.u)
 
     def as_json(self) -> dict[str, Any]:
@@ -203,6 +214,10 @@ class Identification:
                 "share_closed": share_closed(self.before.full, self.after.full, self.floor),
             },
             "accepted": list(self.accepted),
+            "acting": [
+                {"effect": entry.effect, "joints": list(entry.joints), "parameters": dict(entry.parameters)}
+                for entry in entries_of(self.acting, self.joints)
+            ],
             "noise_rad": dict(self.noise),
             "residual_correlation_s": dict(self.correlation_s),
             "stamp_error_s": self.stamp_error_s,
@@ -221,6 +236,7 @@ def identify(
     tie: str = "joint",
     declared: Declaration | None = None,
     measured_supply: bool = False,
+    effects: Sequence[Entry] = (),
     progress: Progress | None = None,
 ) -> Identification:
     """Fit `model` to `runs` and judge the result on `hold_out`, or by leaving out runs in turn.
@@ -235,6 +251,8 @@ def identify(
         tie: `joint` (each its own values), `servo` (one value for all joints of a servo model) or `all`.
         declared: parameters that a user declared, fitted besides.
         measured_supply: gains and torque limits follow the voltage that the runs logged, in the given model too.
+        effects: `[[effect]]` entries that the robot has: those that act between steps act in every simulation as they are,
+            unless they are fitted themselves.
         progress: called with what is being done and the share that is done.
 
     Raises:
@@ -261,8 +279,10 @@ def identify(
             remedy="leave --measured-supply out, or say supply_v in the run's facts",
         )
 
+    acting = _acting(effects, joints, wanted)
+
     def datasets(of: Sequence[Run]) -> list[Dataset]:
-        return _datasets(of, model, joints, wanted, measured_supply)
+        return _datasets(of, model, joints, wanted, measured_supply, acting)
 
     data, judged = datasets(runs), datasets(hold_out)
     for one in (*data, *judged):
@@ -277,7 +297,7 @@ def identify(
 
     problem = Problem(data, chosen, floor)
     folds = [] if hold_out else _folds(runs)
-    total = 1 + len(folds)
+    total = 2 + len(folds)  # the fit, one of each fold, and judging them
 
     def share(part: int) -> Progress | None:
         return progress and (lambda what, done: progress(what, (part + done) / total))
@@ -295,7 +315,7 @@ def identify(
 
     untied = verdicts(estimate, np.ones(len(chosen), bool))
     undetermined = np.array([verdict.word == "undetermined" for verdict in untied], bool)
-    kept, before, after = _judge(trials, chosen, undetermined)
+    kept, before, after = _judge(trials, chosen, undetermined, share(total - 1))
     u = np.where(kept, _conditional(estimate, ~kept), 0.0)
     u[undetermined & kept] = problem.centre[undetermined & kept]
     tests = [run for _, test in folds for run in test]
@@ -318,7 +338,12 @@ def identify(
         covariance=estimate.covariance,
         datasets=tuple(data),
         held_out=tuple(judged or data),
-        notes=(*_telemetry_notes(everything, telemetry), *_notes(estimate, joints, runs, values)),
+        acting=acting,
+        notes=(
+            *_telemetry_notes(everything, telemetry),
+            *_acting_notes(acting),
+            *_notes(estimate, joints, runs, values),
+        ),
     )
 
 
@@ -349,8 +374,22 @@ def joints_in_common(runs: Sequence[Run], model: Path, wanted: Sequence[str] | N
     return common
 
 
+def _acting(entries: Sequence[Entry], joints: Sequence[str], kinds: Sequence[str]) -> EffectValues:
+    """What the robot's entries say acts between steps, without the effects that are fitted.
+
+    What the rest of a model carries (a written delay, a hinge with play) is in the model already.
+    """
+    fitted = {key[0] for kind in kinds if (key := KINDS[kind].effect) is not None}
+    return values_of([entry for entry in entries if entry.effect in catalogue() and entry.effect not in fitted], joints)
+
+
 def _datasets(
-    runs: Sequence[Run], model: Path, joints: Sequence[str], kinds: Sequence[str], measured_supply: bool
+    runs: Sequence[Run],
+    model: Path,
+    joints: Sequence[str],
+    kinds: Sequence[str],
+    measured_supply: bool,
+    acting: EffectValues,
 ) -> list[Dataset]:
     """One dataset per model and setup; runs that name their own model are simulated with it."""
     groups: dict[tuple[Path, Setup], list[Run]] = {}
@@ -361,6 +400,7 @@ def _datasets(
             load_plant(path, joints, setup, electrical="electrical_damping" in kinds, lagging=ACTUATOR_LAG in kinds),
             members,
             measured_supply=measured_supply,
+            acting=acting,
         )
         for (path, setup), members in groups.items()
     ]
@@ -444,16 +484,28 @@ def _judge(
     trials: Sequence[tuple[Estimate, Sequence[Dataset]]],
     parameters: Sequence[Parameter],
     undetermined: NDArray[np.bool_],
+    progress: Progress | None = None,
 ) -> tuple[NDArray[np.bool_], Gap, Gap]:
     """Which parameters keep their estimates: the rule of formats, section 6.
 
     Starting from all, the kind or joint whose return to the given model helps most on held-out runs goes back, as long as
     one does; and on, while what is left does not beat the given model at both horizons.
     """
+    told = 0.0
+
+    def tell() -> None:
+        # How many go back nobody knows beforehand, mostly none or few.
+        nonlocal told
+        if progress:
+            progress("judging on held-out runs", told)
+        told += (1.0 - told) / 3
+
+    tell()
     before = _pooled(trials, parameters, [np.zeros(len(parameters), bool)], undetermined)[0]
     kept = np.ones(len(parameters), bool)
     after = _pooled(trials, parameters, [kept], undetermined)[0]
     while kept.any():
+        tell()
         # What is kept must pay too.
         beats = after.horizon < before.horizon and after.full < before.full and _score(after, before) < -WORTH
         groups = [
@@ -548,6 +600,15 @@ def _telemetry_notes(runs: Sequence[Run], telemetry: Sequence[Telemetry]) -> Ite
     ]
     if lost:
         yield f"Samples are missing: {', '.join(lost)}. `openant comms diagnose` names why."
+
+
+def _acting_notes(acting: EffectValues) -> Iterator[str]:
+    if acting:
+        names = list(dict.fromkeys(name for name, _ in acting))
+        yield (
+            f"What robot.toml says of {', '.join(names)} acted in every simulation as it stands there. Fit it too with "
+            f"{' '.join(f'--also {name}' for name in names)}, or set enabled = false."
+        )
 
 
 def _notes(estimate: Estimate, joints: Sequence[str], runs: Sequence[Run], values: Sequence[Value]) -> tuple[str, ...]:

@@ -8,8 +8,10 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
+from openant_tools.effects.catalogue import effect
 from openant_tools.effects.entries import as_toml, entries_of
 from openant_tools.files import write_text
 from openant_tools.model.mjcf import write_model
@@ -103,14 +105,23 @@ def write_robot(result: Identification, folder: RobotFolder) -> None:
         folder.findings / f"sysid-fit-{now:%Y%m%dT%H%M%SZ}.json",
         json.dumps(finding, indent=1, ensure_ascii=False) + "\n",
     )
-    found = entries_of(result.effects, result.joints)
+    found = entries_of(result.effects_found, result.joints)
     folder.update(values, provenance=provenance, effects=[*effects_beside(result, folder), *found])
 
 
 def effects_beside(result: Identification, folder: RobotFolder) -> list[Effect]:
-    """The robot's `[[effect]]` entries that were not fitted: the simulated fit was without them, and they stay as they are."""
+    """The robot's `[[effect]]` entries that were not fitted, which stay as they are; of one that was, the joints that were
+    not."""
     fitted = {kind.effect[0] for kind in (KINDS[p.kind] for p in result.parameters if p.kind in KINDS) if kind.effect}
-    return [entry for entry in folder.config().effects if entry.effect not in fitted]
+    config, beside = folder.config(), list[Effect]()
+    for entry in config.effects:
+        if entry.effect not in fitted:
+            beside.append(entry)
+        elif not effect(entry.effect).shared:
+            mine = tuple(config.motors) if isinstance(entry.joints, str) else entry.joints
+            rest = tuple(joint for joint in mine if joint not in result.joints)
+            beside += [replace(entry, joints=rest)] if rest else []
+    return beside
 
 
 def _rounded(value: float) -> float:
