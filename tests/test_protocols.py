@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from openant_tools.cli.comms import comms
 from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, record
-from openant_tools.cli.virtual_for_command import placeable, placed
+from openant_tools.cli.virtual_for_command import clock_of_its_own, placeable, placed
 from openant_tools.errors import BadInput
 from openant_tools.recording.reader import read_recording
 from openant_tools.robot.joints import JOINT_NAMES
@@ -321,6 +321,24 @@ def test_a_virtual_robot_is_put_where_it_is_needed_unless_it_says_itself_where_i
     for name, text in (("loose.toml", '[robot]\nsetup = "loose"\n'), ("sealed.toml", 'sealed = "x"\n'), ("r.json", "")):
         (tmp_path / name).write_text(text)
         assert not placeable(str(tmp_path / name))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "clock"),
+    [
+        ("default", "", "stepped"),
+        ("ant.toml", "seed = 1\n", "stepped"),
+        ("real.toml", '[clock]\nmode = "real"\n', None),
+        ("ready.json", "{}", None),
+    ],
+)
+def test_a_robot_started_for_one_command_steps_unless_its_scenario_says_otherwise(
+    name: str, text: str, clock: str | None, tmp_path: Path
+) -> None:
+    if name != "default":
+        (tmp_path / name).write_text(text)
+        name = str(tmp_path / name)
+    assert clock_of_its_own(name) == clock
 
 
 def test_the_list_says_what_is_played_where() -> None:

@@ -65,15 +65,14 @@ def bench_of(
     """The bench and the face that a step runs with; a virtual robot started for it ends with the block."""
     from openant_tools.bringup.virtual_hands import VirtualHands
     from openant_tools.cli.face import CommandFace
-    from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_robot
+    from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_robot
 
     folder = robot_of(robot)
     with contextlib.ExitStack() as stack:
         if virtual_source is None:
             yield Bench(folder, port, imu, camera, None, joints), CommandFace(yes=yes)
             return
-        clock = "stepped" if virtual_source == VIRTUAL_DEFAULT else None
-        found = stack.enter_context(virtual_robot(virtual_source, clock=clock))
+        found = stack.enter_context(virtual_robot(virtual_source, clock=clock_of_its_own(virtual_source)))
         control = str(found["control"])
         hands = VirtualHands(control)
         stack.callback(hands.close)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from openant_tools.cli.options import json_option, robot_option
-from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option, virtual_robot
+from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_option, virtual_robot
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -86,8 +86,7 @@ def scan(paths: Sequence[str], virtual_source: str | None, bauds: Sequence[int],
     with contextlib.ExitStack() as stack:
         control = None
         if virtual_source is not None:
-            clock = "stepped" if virtual_source == VIRTUAL_DEFAULT else None
-            robot = stack.enter_context(virtual_robot(virtual_source, clock=clock))
+            robot = stack.enter_context(virtual_robot(virtual_source, clock=clock_of_its_own(virtual_source)))
             paths, control = (*paths, str(robot["bus"])), robot["control"]
         buses = list(paths) or [port.stable_path for port in Host().ports() if port.kind == "bus"]
         if not buses:
@@ -146,7 +145,7 @@ def bench(
 
     console = Console(stderr=True)
     # Stepped, a virtual robot shows its bus and nothing of what else this machine does.
-    clock = "stepped" if virtual_source == VIRTUAL_DEFAULT else None
+    clock = None if virtual_source is None else clock_of_its_own(virtual_source)
     with _engine_config(port, virtual_source, robot, clock=clock) as config:
         bus = open_bus(config.port, config.baud, config.control)
         try:

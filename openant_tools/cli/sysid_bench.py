@@ -16,7 +16,7 @@ import click
 
 from openant_tools.cli.options import json_option, report_option, robot_option
 from openant_tools.cli.sysid_record import robot_of
-from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option, virtual_robot
+from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_option, virtual_robot
 
 if TYPE_CHECKING:
     from openant_tools.comms.messages import EngineConfig
@@ -419,9 +419,7 @@ def _engine_config(
     with contextlib.ExitStack() as stack:
         control = imu_port = None
         if virtual_source is not None:
-            # One that is ours alone need not wait for real time.
-            clock = "stepped" if virtual_source == VIRTUAL_DEFAULT or virtual_source.endswith(".toml") else None
-            found = stack.enter_context(virtual_robot(virtual_source, clock=clock))
+            found = stack.enter_context(virtual_robot(virtual_source, clock=clock_of_its_own(virtual_source)))
             port, control, imu_port = port or found["bus"], found["control"], found["imu"]
         described = None if folder is None else folder.config()
         more = {"imu": imu_of_robot(described, imu_port) if imu else None}

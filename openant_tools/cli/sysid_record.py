@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from openant_tools.cli.options import finite, rate_option, robot_option, seconds_option
-from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, placeable, placed, virtual_option, virtual_robot
+from openant_tools.cli.virtual_for_command import clock_of_its_own, placeable, placed, virtual_option, virtual_robot
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -196,9 +196,7 @@ def _record_here(
 
     control = imu_port = camera_source = None
     if virtual_source is not None:
-        # One that is ours alone need not wait for real time.
-        clock = "stepped" if virtual_source == VIRTUAL_DEFAULT else None
-        found = stack.enter_context(virtual_robot(virtual_source, clock=clock))
+        found = stack.enter_context(virtual_robot(virtual_source, clock=clock_of_its_own(virtual_source)))
         port, control, imu_port = port or found["bus"], found["control"], found["imu"]
         camera_source = found["camera"]
     described = None if folder is None else folder.config()

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import click
 
-from openant_tools.virtual.process import VIRTUAL_DEFAULT, placeable, placed, virtual_robot
+from openant_tools.virtual.process import VIRTUAL_DEFAULT, clock_of_its_own, placeable, placed, virtual_robot
 
-__all__ = ["VIRTUAL_DEFAULT", "placeable", "placed", "virtual_option", "virtual_robot"]
+__all__ = ["VIRTUAL_DEFAULT", "clock_of_its_own", "placeable", "placed", "virtual_option", "virtual_robot"]
 
 virtual_option = click.option(
     "--virtual",
@@ -15,6 +15,6 @@ virtual_option = click.option(
     is_flag=False,
     flag_value=VIRTUAL_DEFAULT,
     metavar="[SCENARIO|READY_FILE]",
-    help="Use a virtual robot: started for this command (from a scenario .toml, or a healthy one), or running (its "
-    "ready file).",
+    help="Use a virtual robot: started for this command (from a scenario .toml, or a healthy one; in stepped time, unless "
+    "the scenario says otherwise), or running (its ready file).",
 )

@@ -15,7 +15,7 @@ import tomlkit
 
 from openant_tools.errors import BadInput, HardwareFault
 
-__all__ = ["VIRTUAL_DEFAULT", "placeable", "placed", "virtual_robot"]
+__all__ = ["VIRTUAL_DEFAULT", "clock_of_its_own", "placeable", "placed", "virtual_robot"]
 
 #: the source that stands for a healthy standard Ant on its stand
 VIRTUAL_DEFAULT = "default"
@@ -54,6 +54,18 @@ def virtual_robot(source: str, *, clock: str | None = None) -> Iterator[Mapping[
                 except subprocess.TimeoutExpired:
                     process.kill()
                     process.wait()
+
+
+def clock_of_its_own(source: str) -> str | None:
+    """The clock of a robot that is started for one command: "stepped", unless its scenario says which.
+
+    Nobody watches such a robot, so it need not wait for real time; and a host that is busy elsewhere cannot let a
+    watchdog trip. None for what the scenario says, and for a robot that is running already.
+    """
+    if source == VIRTUAL_DEFAULT:
+        return "stepped"
+    clock = _scenario(source).get("clock", {}) if source.endswith(".toml") else None
+    return "stepped" if isinstance(clock, dict) and "mode" not in clock else None
 
 
 def placeable(source: str) -> bool:
