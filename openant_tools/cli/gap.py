@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from openant_tools.cli.gap_blind import blind
 from openant_tools.cli.options import json_option, report_option, robot_option
 
 __all__ = ["gap"]
@@ -15,6 +16,9 @@ __all__ = ["gap"]
 @click.group()
 def gap() -> None:
     """The gap between a robot and its simulation."""
+
+
+gap.add_command(blind)
 
 
 @gap.command()

@@ -1,0 +1,57 @@
+"""The answers of a set: open beside the runs while a diagnosis is built, sealed where it is judged.
+
+Sealed, all answers of a set stand in one file, encrypted by the seal of scenarios (AES-256-GCM); its commitment, the SHA-256
+of a random salt and the plain text, stands in `set.toml` and is to be committed before the diagnosis is tuned.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import tomlkit
+
+from openant_tools.blind.draw import Answer
+from openant_tools.errors import BadInput
+from openant_tools.files import write_text
+from openant_tools.virtual.seal import commitment_of, open_sealed, seal
+
+__all__ = ["SEALED", "read_answers", "write_answers"]
+
+SEALED, OPEN = "answers.sealed.toml", "truth.toml"
+
+
+def write_answers(out: Path, names: Sequence[str], answers: Sequence[Answer], key: bytes | None) -> str:
+    """Write the answers of robots of these names; their commitment."""
+    tables = {name: answer.as_table() for name, answer in zip(names, answers, strict=True)}
+    if key is not None:
+        return seal(tomlkit.dumps({"answer": tables}), key, out / SEALED)
+    for name, table in tables.items():
+        write_text(out / name / OPEN, tomlkit.dumps(table))
+    return commitment_of(b"", tomlkit.dumps({"answer": tables}))
+
+
+def read_answers(folder: Path, key: bytes | None, commitment: str) -> Mapping[str, Answer]:
+    """Robot → answer.
+
+    Raises:
+        BadInput: the seal needs a key, does not open, or is not the one that was committed to.
+    """
+    path = folder / SEALED
+    if not path.exists():
+        found = sorted(folder.glob(f"*/{OPEN}"))
+        if not found:
+            raise BadInput(
+                "there are no answers here", where=folder, remedy="name a set that `openant gap blind make` made"
+            )
+        return {file.parent.name: Answer.of(tomllib.loads(file.read_text(encoding="utf-8"))) for file in found}
+    if key is None:
+        raise BadInput("the answers are sealed", where=path, remedy="name the key by --key-file")
+    table = tomllib.loads(path.read_text(encoding="utf-8"))
+    if table["sealed"]["commitment"] != commitment:
+        raise BadInput(
+            "the answers are not those that the set committed to", where=path, remedy="take the set's own file"
+        )
+    opened = tomllib.loads(open_sealed(table, key, path))
+    return {name: Answer.of(one) for name, one in opened["answer"].items()}
