@@ -7,6 +7,7 @@ import importlib
 import signal
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from types import FrameType
 
 import click
@@ -70,14 +71,28 @@ class Manual(click.Group):
 
 @click.group(
     cls=Manual,
+    invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
     epilog="Each command explains itself: `openant sysid fit --help`. Exit codes: 0 done, 1 a finding that says no, "
     "2 bad input or no hardware, 130 interrupted.",
 )
 @click.version_option(package_name="openant-tools", prog_name="openant")
-def openant() -> None:
+@click.option("--robot", type=click.Path(path_type=Path), metavar="DIR", help="The terminal program's robot.")
+@click.option(
+    "--virtual", "virtual_source", is_flag=False, flag_value="default", metavar="[SCENARIO|READY_FILE]",
+    help="Begin the terminal program with a virtual robot.",
+)  # fmt: skip
+@click.option(
+    "--serve", "port", type=click.IntRange(1, 65535), is_flag=False, flag_value=8000, metavar="[PORT]",
+    help="Show the terminal program in a browser, at http://localhost:8000.",
+)  # fmt: skip
+@click.pass_context
+def openant(context: click.Context, robot: Path | None, virtual_source: str | None, port: int | None) -> int | None:
     """Open Ant Tools: from a box of parts to a robot that learns, and a simulation of it that you can trust.
 
+    \b
+    Without a command, in a terminal:
+      openant                                        the terminal program: the walk from loose motors to learning
     \b
     First success, without any hardware:
       openant demo                                   the whole way on a virtual robot, in minutes
@@ -88,6 +103,17 @@ def openant() -> None:
       openant sysid fit run.mcap --model ant.xml --out fit
       openant train sac --robot my-ant --steps 30000 --out my-ant/runs/sac
     """
+    if context.invoked_subcommand is not None:
+        if robot is not None or virtual_source is not None or port is not None:
+            raise click.UsageError("--robot, --virtual and --serve before a command are for none: give them after it")
+        return None
+    if port is None and not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise click.exceptions.NoArgsIsHelpError(context)
+    from openant_tools.cli import terminal
+
+    if port is not None:
+        return terminal.serve(port, robot, virtual_source)
+    return terminal.terminal(robot, virtual_source)
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:

@@ -1,0 +1,365 @@
+"""The terminal program: one app, one session, screens on top of each other; keys that hold everywhere."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import ClassVar
+
+from textual import work
+from textual.app import App, SystemCommand
+from textual.binding import Binding, BindingType
+from textual.screen import Screen
+from textual.theme import Theme
+from textual.widget import Widget
+from textual.widgets import Input
+
+from openant_tools.bringup.walk import WALK
+from openant_tools.errors import OpenAntError
+from openant_tools.procedure.step import Step
+from openant_tools.tui.dialogs import Help, Question
+from openant_tools.tui.feeds import ReplayFeed
+from openant_tools.tui.jump import Jump
+from openant_tools.tui.marks import BLUE, GREEN, ORANGE, VERMILION, plain
+from openant_tools.tui.page import Page
+from openant_tools.tui.screens.findings import FindingsScreen
+from openant_tools.tui.screens.learn import LearnScreen
+from openant_tools.tui.screens.live import LiveScreen
+from openant_tools.tui.screens.recordings import RecordingsScreen
+from openant_tools.tui.screens.settings import SettingsScreen
+from openant_tools.tui.screens.step import StepScreen
+from openant_tools.tui.screens.walk import WalkScreen
+from openant_tools.tui.session import Session
+from openant_tools.virtual.process import VIRTUAL_DEFAULT
+
+__all__ = ["OpenAnt", "run"]
+
+#: how often screens take in what is new
+TICK_S = 0.1
+#: how long a step may take to put the robot in order when the program ends
+END_S = 10.0
+
+INTERRUPTED = 130
+SCENARIOS = Path(__file__).parent / "scenarios"
+
+THEME = Theme(
+    "open-ant", primary=BLUE, secondary="#CC79A7", accent=ORANGE, success=GREEN, warning=ORANGE, error=VERMILION,
+    background="#10151b", surface="#171d25", panel="#202833", foreground="#e6e6e6", dark=True,
+)  # fmt: skip
+
+UNDO = Step(
+    "undo",
+    "Undo",
+    "Take back the last step's writes to the servos' memory, newest first, as journal.jsonl has them.",
+    "openant_tools.calib.undo:undo",
+    table="the servos that were written to, plugged in as they were then",
+    changes="registers back to what they were",
+)
+
+SCREENS: Mapping[str, tuple[type[Page], str]] = {
+    "live": (LiveScreen, "All joints live, torque off"),
+    "findings": (FindingsScreen, "What was found out about this robot; its passport"),
+    "recordings": (RecordingsScreen, "Recordings, and their replay on any screen"),
+    "learn": (LearnScreen, "Train an agent, see it learn"),
+    "settings": (SettingsScreen, "The robot's folder, how it looks, what this machine has"),
+}
+
+#: words → scenario, of the virtual robots that can be chosen
+VIRTUAL_ROBOTS: tuple[tuple[str, str], ...] = (
+    ("Loose motors, fresh from the factory: the walk from its beginning", str(SCENARIOS / "loose.toml")),
+    ("A healthy robot on its stand, ids and zeros as they should be", VIRTUAL_DEFAULT),
+    ("A healthy robot on the floor, under its camera", str(SCENARIOS / "floor.toml")),
+)
+
+GENERAL_HELP = """\
+# Open Ant
+
+| key | |
+|---|---|
+| `space` | **STOP**: torque off, at any time, on every screen |
+| `F8` | a fault has been seen (it stays on every screen until then) |
+| `Ctrl-P` | palette: every command by name |
+| `Ctrl-O` | jump mode: a letter on everything that can be gone to |
+| `Tab`, arrows, `Enter` | move, choose |
+| `Esc` | back; on the first screen: quit |
+| `F1` | help on what has the focus |
+"""
+
+
+class OpenAnt(App[int]):
+    """The program.
+
+    Args:
+        path: the robot's folder.
+        virtual: start with this virtual robot (`openant_tools.virtual.process`); None for none.
+        clock: of a virtual robot that is started here; "real" unless a test steps it.
+        ticking: whether screens follow the session by themselves; a test may tick by hand.
+    """
+
+    TITLE = "Open Ant"
+    CSS_PATH = "app.tcss"
+    #: from which size on screens use the room beside and below
+    HORIZONTAL_BREAKPOINTS: ClassVar[list[tuple[int, str]]] = [(0, "-narrow"), (110, "-wide")]
+    VERTICAL_BREAKPOINTS: ClassVar[list[tuple[int, str]]] = [(0, "-short"), (34, "-tall")]
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("space", "stop", "STOP", priority=True, show=False),
+        Binding("ctrl+c", "interrupt", show=False, priority=True),
+        Binding("f1", "help", "Help", key_display="F1"),
+        Binding("ctrl+o", "jump", "Jump", show=False),
+        Binding("ctrl+p", "command_palette", "All", key_display="^P"),
+        Binding("f8", "see", "Seen", show=False),
+        Binding("p", "pause", "Pause", show=False),
+        Binding("comma", "step(-0.1)", show=False),
+        Binding("full_stop", "step(0.1)", show=False),
+        Binding("left_square_bracket", "step(-5)", show=False),
+        Binding("right_square_bracket", "step(5)", show=False),
+        Binding("less_than_sign", "speed(0.5)", show=False),
+        Binding("greater_than_sign", "speed(2)", show=False),
+        Binding("x", "end_replay", show=False),
+    ]
+
+    def __init__(
+        self, path: Path, *, virtual: str | None = None, clock: str | None = "real", ticking: bool = True
+    ) -> None:
+        super().__init__()
+        self.session = Session(path)
+        self._virtual = virtual
+        self._clock = clock
+        self._ticking = ticking
+        self.register_theme(THEME)
+        self.theme = THEME.name
+        self.set_class(plain(), "-ascii")
+
+    def get_default_screen(self) -> WalkScreen:
+        return WalkScreen()
+
+    def on_mount(self) -> None:
+        if self._ticking:
+            self.set_interval(TICK_S, self.tick)
+        if self._virtual is not None:
+            self.start_virtual(self._virtual)
+
+    def tick(self) -> None:
+        """Let the screen show what came since the last tick."""
+        before = self.session.feed
+        self.session.tick()
+        notices, self.session.notices = self.session.notices, []
+        if notices:
+            more = f" (and {len(notices) - 1} more)" if len(notices) > 1 else ""
+            self.notify(f"{notices[0]}{more}", title="Engine", timeout=8)
+        if isinstance(self.screen, Page) and (
+            self.session.feed is not None or before is not None or self._running_step
+        ):
+            self.screen.draw()
+
+    # ---- stop ----------------------------------------------------------------------------------------------------
+
+    def action_stop(self) -> None:
+        """The stop key: torque off first, everything else after."""
+        told = self.session.release()
+        for screen in self.screen_stack:
+            if isinstance(screen, StepScreen):
+                screen.stopped()
+        if isinstance(self.focused, Input):
+            self.focused.insert_text_at_cursor(" ")
+            if not told:
+                return
+        words = "STOP: torque is switched off" if told else "STOP: nothing is connected, no torque is on"
+        self.notify(words, severity="error" if told else "information", timeout=4)
+
+    def action_interrupt(self) -> None:
+        """Ctrl-C: torque off, everything put in order, gone."""
+        self.session.release()
+        self._quit(INTERRUPTED)
+
+    async def action_quit(self) -> None:
+        self.action_leave()
+
+    def action_leave(self) -> None:
+        """Quit; asks first where something is going on."""
+        if self._running_step is None and not self.session.learning:
+            self._quit(0)
+            return
+        words = "Something is still running. Quit all the same? Torque goes off; training is saved and can go on later."
+        self.push_screen(Question(words, "Quit", "Stay"), self._answered_quit)
+
+    def _answered_quit(self, choice: int | None) -> None:
+        if choice == 0:
+            self._quit(0)
+
+    @property
+    def _running_step(self) -> StepScreen | None:
+        return next((one for one in self.screen_stack if isinstance(one, StepScreen) and one.running), None)
+
+    @work(exclusive=True, group="quit")
+    async def _quit(self, code: int) -> None:
+        """End what runs and wait for it, so that the robot is in order before the terminal is given back."""
+        running = self._running_step
+        if running is not None:
+            running.end()
+        for _ in range(round(END_S / TICK_S)):
+            if self._running_step is None:
+                break
+            await asyncio.sleep(TICK_S)
+        self.exit(code, return_code=code)
+
+    # ---- going about ---------------------------------------------------------------------------------------------
+
+    async def action_back(self) -> None:
+        if len(self.screen_stack) > 1:
+            self.pop_screen()
+
+    def action_go(self, name: str) -> None:
+        """Open a screen by its name in `SCREENS`; where it is open already, go back to it."""
+        kind, _ = SCREENS[name]
+        for screen in self.screen_stack:
+            if isinstance(screen, kind):
+                while self.screen is not screen:
+                    self.pop_screen()
+                return
+        self.push_screen(kind())
+
+    def open_step(self, name: str, *, instead: bool = False) -> None:
+        """Open a step of the walk, on top or instead of the screen that is open."""
+        running = self._running_step
+        if running is not None and not instead:
+            self.notify(f"{running.step.title} is still running: leave it first", severity="warning")
+            return
+        screen = StepScreen(UNDO if name == UNDO.name else WALK[name])
+        if instead:
+            self.switch_screen(screen)
+        else:
+            self.push_screen(screen)
+
+    def action_jump(self) -> None:
+        if not isinstance(self.screen, Jump):
+            self.push_screen(Jump(self.screen))
+
+    def action_help(self) -> None:
+        """Help on the focused widget, else on the screen, and the keys that hold everywhere."""
+        if isinstance(self.screen, Help):
+            return
+        own = next((words for widget in self._focus_path() if (words := getattr(widget, "HELP", None))), "")
+        self.push_screen(Help(f"{own}\n{GENERAL_HELP}"))
+
+    def _focus_path(self) -> Iterable[Widget]:
+        widget: Widget | None = self.focused
+        while widget is not None and widget is not self.screen:
+            yield widget
+            widget = widget.parent if isinstance(widget.parent, Widget) else None
+        yield self.screen
+
+    def action_see(self) -> None:
+        """Faults have been seen."""
+        self.session.faults.see()
+        if isinstance(self.screen, Page):
+            self.screen.draw()
+
+    def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
+        yield SystemCommand("STOP", "Torque off, now", self.action_stop)
+        yield SystemCommand("Help", "On what has the focus", self.action_help)
+        for name, (kind, words) in SCREENS.items():
+            yield SystemCommand(kind.TITLE, words, partial(self.action_go, name))
+        for name, step in WALK.items():
+            yield SystemCommand(f"Step: {step.title}", step.does, partial(self.open_step, name))
+        yield SystemCommand("Undo", UNDO.does, lambda: self.open_step(UNDO.name))
+        yield SystemCommand("Watch the robot", "Live strips, torque off", self.action_watch)
+        yield SystemCommand("Virtual robot", "Start one, or end the one that runs", self.action_virtual)
+        yield SystemCommand("Faults seen", "Take them off the screen", self.action_see)
+        yield SystemCommand("Theme", "Colours", self.search_themes)
+        yield SystemCommand("Quit", "Torque off, back to the shell", self.action_leave)
+
+    # ---- the robot -----------------------------------------------------------------------------------------------
+
+    def action_virtual(self) -> None:
+        """Start a virtual robot, or end the one that runs."""
+        if self._running_step is not None:
+            self.notify("a step is running: leave it first", severity="warning")
+        elif self.session.virtual is None:
+            self.push_screen(Question("A virtual robot:", *(words for words, _ in VIRTUAL_ROBOTS)), self._chose_virtual)
+        else:
+            self._in_background("ending the virtual robot", self.session.end_virtual, self.refresh_walk)
+
+    def _chose_virtual(self, choice: int | None) -> None:
+        if choice is not None:
+            self.start_virtual(VIRTUAL_ROBOTS[choice][1])
+
+    def start_virtual(self, source: str) -> None:
+        """Start a virtual robot and tell the first screen."""
+        self._in_background(
+            "starting a virtual robot", lambda: self.session.start_virtual(source, self._clock), self.refresh_walk
+        )
+
+    def action_watch(self) -> None:
+        """The live screen; connects where nothing is connected yet."""
+        self.action_go("live")
+        if self.session.feed is None and self._running_step is None:
+            self._in_background("connecting, torque off", self.session.connect, lambda: None)
+
+    def free_bus(self, then: Callable[[], None]) -> None:
+        """Stop watching, so that a step can have the bus, then go on."""
+        if self.session.watching:
+            self._in_background("giving the bus free", self.session.disconnect, then)
+        else:
+            then()
+
+    def refresh_walk(self) -> None:
+        for screen in self.screen_stack:
+            if isinstance(screen, WalkScreen):
+                screen.refresh_steps()
+                screen.draw()
+
+    @work(thread=True, group="robot")
+    def _in_background(self, words: str, do: Callable[[], None], then: Callable[[], None]) -> None:
+        self.call_from_thread(self.notify, f"{words} ...", timeout=3)
+        try:
+            do()
+        except OpenAntError as error:
+            self.session.faults.note("", str(error))
+            self.call_from_thread(self.screen.draw if isinstance(self.screen, Page) else self.refresh)
+        else:
+            self.call_from_thread(then)
+
+    # ---- replay --------------------------------------------------------------------------------------------------
+
+    def play(self, feed: ReplayFeed) -> None:
+        """Show a recording on all screens, beginning with the live one."""
+        self.session.play(feed)
+        self.action_go("live")
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        if action in ("pause", "step", "speed", "end_replay"):
+            return self.session.replay is not None
+        return True
+
+    def action_pause(self) -> None:
+        replay = self.session.replay
+        if replay is not None:
+            replay.playing = not replay.playing
+
+    def action_step(self, seconds: float) -> None:
+        replay = self.session.replay
+        if replay is not None:
+            replay.seek(replay.position_s + seconds)
+
+    def action_speed(self, factor: float) -> None:
+        replay = self.session.replay
+        if replay is not None:
+            replay.speed = min(max(replay.speed * factor, 0.125), 16.0)
+
+    def action_end_replay(self) -> None:
+        self.session.play(None)
+        if isinstance(self.screen, Page):
+            self.screen.draw()
+
+
+def run(path: Path, virtual: str | None = None) -> int:
+    """Run the program in this terminal until it is left; the exit code. However it ends, torque is off afterwards."""
+    app = OpenAnt(path, virtual=virtual)
+    try:
+        app.run()
+    finally:
+        app.session.close()
+    return app.return_code or 0

@@ -1,0 +1,46 @@
+"""Help on the widget that has the focus, and a question with a few answers."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Vertical, VerticalScroll
+from textual.screen import ModalScreen
+from textual.widgets import Markdown, OptionList, Static
+
+__all__ = ["Help", "Question"]
+
+
+class Help(ModalScreen[None]):
+    """A page of Markdown; any of the usual keys closes it."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,q,f1,enter", "dismiss", "Close", key_display="esc")]
+
+    def __init__(self, words: str) -> None:
+        super().__init__()
+        self._words = words
+
+    def compose(self) -> ComposeResult:
+        with VerticalScroll(id="help"):
+            yield Markdown(self._words)
+            yield Static("Esc closes this page, arrows move in it.", classes="note")
+
+
+class Question(ModalScreen[int | None]):
+    """Dismissed with the number of the choice, from 0; None for Escape."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape", "dismiss(None)", "No")]
+
+    def __init__(self, words: str, *choices: str) -> None:
+        super().__init__()
+        self._words, self._offered = words, choices
+
+    def compose(self) -> ComposeResult:
+        with Vertical(id="question"):
+            yield Static(self._words)
+            yield OptionList(*self._offered)
+
+    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+        self.dismiss(event.option_index)

@@ -1,0 +1,103 @@
+"""What is wrong now, from the newest rows; and faults that stay until somebody has seen them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from openant_tools.comms.guards import Guards
+from openant_tools.comms.ring import ERR_CODES
+from openant_tools.tui.feeds import History
+from openant_tools.tui.marks import Name
+
+__all__ = ["Condition", "Fault", "Faults", "condition"]
+
+#: the engine's own idea of a servo that is lost
+SILENT_S = Guards().silent_s or 0.25
+BUS = "bus"
+
+
+@dataclass(frozen=True)
+class Condition:
+    """How one joint is, as a mark and a word; `fault` where somebody should know even when it is over."""
+
+    mark: Name
+    word: str
+    fault: str = ""
+
+
+def condition(history: History, joint: str) -> Condition:
+    """One joint's condition, of the newest rows; it is what its answers say, no more."""
+    if not len(history.rows):
+        return Condition("todo", "no data")
+    answered = history.column(f"ok.{joint}") > 0
+    code = history.newest(f"err.{joint}")
+    word = ERR_CODES[int(code)] if np.isfinite(code) and 0 <= code < len(ERR_CODES) else ""
+    if word == "alert":
+        return Condition("fail", "alert", "raises its alert bit: read its hardware error status")
+    if not answered[-1]:
+        last = history.t[answered][-1] if answered.any() else history.t[0]
+        silent = float(history.t[-1] - last)
+        if silent >= SILENT_S:
+            return Condition("fail", "silent", f"does not answer ({word or 'no word'}): look at its cable")
+        return Condition("warn", word or "late")
+    return Condition("ok", "ok")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One thing that went wrong.
+
+    Attributes:
+        where: a joint, a step, or "".
+        over: whether it has gone by itself meanwhile.
+    """
+
+    where: str
+    words: str
+    over: bool = False
+
+    def __str__(self) -> str:
+        return ": ".join(part for part in (self.where, self.words) if part) + (" (over now)" if self.over else "")
+
+
+class Faults:
+    """The faults that nobody has acknowledged, oldest first; the same one twice counts once."""
+
+    def __init__(self) -> None:
+        self._open: dict[str, Fault] = {}
+
+    @property
+    def unseen(self) -> tuple[Fault, ...]:
+        return tuple(self._open.values())
+
+    def note(self, where: str, words: str) -> None:
+        """Something went wrong; it stays until `see`."""
+        self._open[where or words] = Fault(where, words)
+
+    def is_over(self, where: str) -> None:
+        """It has gone by itself; it still has to be seen."""
+        fault = self._open.get(where)
+        if fault is not None and not fault.over:
+            self._open[where] = Fault(fault.where, fault.words, over=True)
+
+    def watch(self, history: History) -> None:
+        """Take in what the newest rows say of each joint; where most are silent it is the bus."""
+        found = {joint: condition(history, joint) for joint in history.joints}
+        silent = [joint for joint, one in found.items() if one.word == "silent"]
+        if len(silent) > len(found) / 2:
+            self.note(
+                BUS, f"{len(silent)} of {len(found)} servos do not answer: power, first cable, or a busy computer"
+            )
+            return
+        self.is_over(BUS)
+        for joint, one in found.items():
+            if one.fault:
+                self.note(joint, one.fault)
+            elif one.mark == "ok":
+                self.is_over(joint)
+
+    def see(self) -> None:
+        """Somebody has looked at all of them; what is still wrong comes again."""
+        self._open.clear()

@@ -1,0 +1,174 @@
+"""Where the numbers on the screen come from: an engine's telemetry, or a recording played again. Both give the same rows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.ring import COMMON, ERR_CODES, SIGNALS, columns
+from openant_tools.recording.run import Run
+
+__all__ = ["WINDOW_S", "Feed", "History", "LiveFeed", "ReplayFeed"]
+
+Array = NDArray[np.float64]
+
+#: what the strips show
+WINDOW_S = 10.0
+
+
+class Feed(Protocol):
+    """A source of rows.
+
+    Attributes:
+        title: for the top line.
+        joints: in the order of the rows' columns (`comms.ring.columns`).
+    """
+
+    title: str
+    joints: tuple[str, ...]
+
+    def rows(self) -> Array:
+        """Rows (n, columns) since the last call, oldest first."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class LiveFeed:
+    """An engine's ring, read with a place of our own: neither the engine nor who drives it notices."""
+
+    def __init__(self, engine: EngineProcess, title: str) -> None:
+        self.engine = engine
+        self.title = title
+        self.joints = tuple(servo.joint for servo in engine.config.servos)
+        self._ring = engine.second_view()
+        self._seen = self._ring.count
+
+    @property
+    def ended(self) -> bool:
+        return self.engine not in EngineProcess.running
+
+    def rows(self) -> Array:
+        rows, self._seen = self._ring.since(self._seen)
+        return rows
+
+    def close(self) -> None:
+        self._ring.close()
+
+
+class ReplayFeed:
+    """A recording as if it came now.
+
+    Attributes:
+        position_s: since its start.
+        playing, speed: how it goes on.
+        jumped: whether it was set elsewhere since the last rows; what is on the screen then belongs to another time.
+    """
+
+    def __init__(self, run: Run, clock: Callable[[], float] = time.monotonic) -> None:
+        self.run = run
+        self.title = f"replay of {run.name}"
+        self.joints = run.joints
+        self.playing = True
+        self.speed = 1.0
+        self.jumped = False
+        self._clock = clock
+        self._then = clock()
+        self._table = _table(run)
+        self._position_s = 0.0
+        self._row = 0
+
+    @property
+    def position_s(self) -> float:
+        return self._position_s
+
+    @property
+    def duration_s(self) -> float:
+        return self.run.duration_s
+
+    def seek(self, position_s: float) -> None:
+        """Go to a time; the window before it is shown at once."""
+        self._position_s = min(max(position_s, 0.0), self.duration_s)
+        start = self.run.t[0] + self._position_s - WINDOW_S if len(self.run.t) else 0.0
+        self._row = int(np.searchsorted(self.run.t, start))
+        self.jumped = True
+
+    def rows(self) -> Array:
+        now = self._clock()
+        if self.playing:
+            self._position_s = min(self._position_s + (now - self._then) * self.speed, self.duration_s)
+            self.playing = self._position_s < self.duration_s
+        self._then = now
+        end = int(np.searchsorted(self.run.t, self.run.t[0] + self._position_s, side="right")) if len(self.run.t) else 0
+        rows = self._table[self._row : end]
+        self._row = max(self._row, end)
+        return rows
+
+    def close(self) -> None:
+        pass
+
+
+class History:
+    """The rows of the last seconds, for whoever draws them.
+
+    Attributes:
+        t: (n,) s. rows: (n, columns).
+    """
+
+    def __init__(self, joints: Sequence[str]) -> None:
+        self.joints = tuple(joints)
+        self._index = {name: k for k, name in enumerate(columns(joints))}
+        self.rows: Array = np.empty((0, len(self._index)))
+
+    @property
+    def t(self) -> Array:
+        return self.rows[:, 0]
+
+    def add(self, rows: Array) -> None:
+        if len(rows):
+            self.rows = np.concatenate([self.rows, rows])
+            self.rows = self.rows[np.searchsorted(self.t, self.t[-1] - WINDOW_S) :]
+
+    def clear(self) -> None:
+        self.rows = self.rows[:0]
+
+    def column(self, name: str) -> Array:
+        """(n,) one column by its name in a run table."""
+        out: Array = self.rows[:, self._index[name]]
+        return out
+
+    def newest(self, name: str) -> float:
+        """The last value of a column; NaN where there is none."""
+        return float(self.rows[-1, self._index[name]]) if len(self.rows) else float("nan")
+
+    def last_known(self, name: str) -> float:
+        """The last value that is a number, of those in the window; NaN where there is none."""
+        values = self.column(name)
+        known = values[np.isfinite(values)]
+        return float(known[-1]) if len(known) else float("nan")
+
+
+def _table(run: Run) -> Array:
+    """A run as rows of the ring."""
+    codes = {word: code for code, word in enumerate(ERR_CODES)}
+    out = np.full((len(run.t), len(COMMON) + len(SIGNALS) * len(run.joints)), np.nan)
+    for k, name in enumerate(columns(run.joints)):
+        signal, _, joint = name.partition(".")
+        if name == "t":
+            out[:, k] = run.t
+        elif name == "torque":
+            out[:, k] = run.signal("torque", default=1.0).max(axis=1, initial=0.0)
+        elif signal == "err" and joint in run.joints:
+            words = run.columns.get(name)
+            out[:, k] = 0.0 if words is None else [codes.get(str(word), 1) for word in words]
+        elif signal == "ok" and joint in run.joints:
+            answered = np.isfinite(run.column(f"pos.{joint}")).astype(float)
+            out[:, k] = run.column(name) if name in run.columns else answered
+        else:
+            out[:, k] = run.column(name)
+    return out

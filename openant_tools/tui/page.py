@@ -1,0 +1,118 @@
+"""What every screen has: a line on the robot, faults until they are seen, the controls of a replay, the keys."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from rich.text import Text
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.screen import Screen
+from textual.widgets import Footer, Static
+
+from openant_tools.tui.leg_map import JointChosen, LegMap
+from openant_tools.tui.marks import MARKS, mark, marked
+from openant_tools.tui.session import Session
+from openant_tools.tui.strips import JointStrips
+
+if TYPE_CHECKING:
+    from openant_tools.tui.app import OpenAnt
+
+__all__ = ["Page"]
+
+
+class Page(Screen[None]):
+    """A screen of the program.
+
+    Attributes:
+        TITLE: in the top line.
+        HELP: what F1 shows where the focused widget has nothing of its own to say.
+    """
+
+    TITLE = ""
+    HELP = ""
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape", "app.back", "Back")]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._drawn_top: Text | None = None
+
+    @property
+    def ant(self) -> OpenAnt:
+        from openant_tools.tui.app import OpenAnt
+
+        assert isinstance(self.app, OpenAnt)
+        return self.app
+
+    @property
+    def session(self) -> Session:
+        return self.ant.session
+
+    def compose(self) -> ComposeResult:
+        yield Static(id="top")
+        yield Static(id="faults")
+        yield from self.body()
+        yield Static(id="replay")
+        yield Footer(compact=True, show_command_palette=False)
+
+    def body(self) -> ComposeResult:
+        """The screen's own part."""
+        yield from ()
+
+    def on_mount(self) -> None:
+        self.draw()
+
+    def on_screen_resume(self) -> None:
+        self.draw()
+
+    def draw(self) -> None:
+        """Show the session as it is now."""
+        if not self.query("#top"):
+            return  # not there yet, or gone already
+        session = self.session
+        top = self._top()
+        if top != self._drawn_top:
+            self._drawn_top = top
+            self.query_one("#top", Static).update(top)
+        faults = session.faults.unseen
+        bar = self.query_one("#faults", Static)
+        bar.display = bool(faults)
+        if faults:
+            more = f"  and {len(faults) - 1} more" if len(faults) > 1 else ""
+            bar.update(Text.assemble((f"{mark('fail')} FAULT {faults[0]}{more}  ", "bold"), ("F8: seen", "reverse")))
+        replay = session.replay
+        line = self.query_one("#replay", Static)
+        line.display = replay is not None
+        if replay is not None:
+            words = "playing" if replay.playing else "paused"
+            keys = "p pause  , . step  [ ] 5 s  < > speed  x end"
+            line.update(f"{words} {replay.position_s:.1f} of {replay.duration_s:.1f} s, x{replay.speed:g}   {keys}")
+        for map_ in self.query(LegMap):
+            map_.chosen = session.selected
+            map_.draw(session.history)
+        for strips in self.query(JointStrips):
+            strips.chosen = session.selected
+            strips.draw(session.history)
+
+    def _top(self) -> Text:
+        session = self.session
+        text = Text.assemble(("Open Ant", "bold"), f"  {self.title}  ", no_wrap=True, overflow="ellipsis")
+        text.append(session.name if session.folder is not None else "no robot's folder", "bold")
+        if session.feed is not None:
+            text.append(f"  {mark('info')} {session.feed.title}")
+        elif session.virtual is not None:
+            text.append(f"  {mark('info')} virtual robot")
+        else:
+            text.append(f"  {mark('off')} not connected")
+        if session.feed is not None and len(session.history.rows):
+            on = session.history.newest("torque") > 0
+            text.append("  ")
+            text.append_text(marked("on" if on else "off", "torque ON" if on else "torque off"))
+        stop = "SPACE: STOP"
+        room = max(self.size.width - 2 - len(stop) - 1, 20)
+        text.truncate(room, overflow="ellipsis", pad=True)
+        return text.append(f" {stop}", f"bold {MARKS['fail'].colour}")
+
+    def on_joint_chosen(self, message: JointChosen) -> None:
+        self.session.selected = message.joint
+        self.draw()

@@ -1,0 +1,76 @@
+"""Everything that was found out about this robot, newest first, and its passport."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.text import Text
+from textual.app import ComposeResult
+from textual.containers import Horizontal, VerticalScroll
+from textual.widgets import Markdown, OptionList
+from textual.widgets.option_list import Option
+
+from openant_tools.tui.marks import mark
+from openant_tools.tui.page import Page
+
+__all__ = ["FindingsScreen"]
+
+NONE_YET = """\
+# Nothing found yet
+
+Each step of the walk leaves a finding here: one sentence, the numbers it rests on, and what to do next.
+The same stands in the robot's folder as JSON and Markdown.
+"""
+
+
+class FindingsScreen(Page):
+    """The list on the left, the chosen one on the right."""
+
+    TITLE = "Findings"
+    HELP = """\
+# Findings and passport
+
+A finding is one sentence, the numbers that it rests on with their units and sources, and the next action. They are
+kept in the robot's `findings/`, one a run of a step. The passport is the page that gathers them.
+"""
+
+    def body(self) -> ComposeResult:
+        with Horizontal():
+            yield OptionList(id="list")
+            with VerticalScroll(can_focus=True):
+                yield Markdown(id="text")
+
+    def on_mount(self) -> None:
+        super().on_mount()
+        self._files = self._find()
+        chooser = self.query_one("#list", OptionList)
+        for number, path in enumerate(self._files):
+            chooser.add_option(Option(_title(path), id=str(number)))
+        if self._files:
+            chooser.highlighted = 0
+        else:
+            self.query_one(Markdown).update(NONE_YET)
+        chooser.focus()
+
+    def _find(self) -> list[Path]:
+        folder = self.session.folder
+        if folder is None:
+            return []
+        passport = folder.passport.with_suffix(".md")
+        found = sorted(folder.findings.glob("*-2*.md"), key=lambda path: path.stem.rpartition("-")[2], reverse=True)
+        return [passport, *found] if passport.is_file() else found
+
+    def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
+        try:
+            words = self._files[event.option_index].read_text(encoding="utf-8")
+        except OSError as error:
+            words = f"It cannot be read: {error.strerror}."
+        self.query_one(Markdown).update(words)
+
+
+def _title(path: Path) -> Text:
+    if path.stem == "passport":
+        return Text(f"{mark('info')} Passport", style="bold")
+    step, _, stamp = path.stem.rpartition("-")
+    day = f"{stamp[6:8]}.{stamp[4:6]}. {stamp[9:11]}:{stamp[11:13]}" if len(stamp) >= 13 else stamp
+    return Text(f"{step:14.14} {day}")

@@ -1,0 +1,126 @@
+"""Learn: start a training run in a process of its own, watch its curve, stop it, let it go on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from rich.text import Text
+from textual.app import ComposeResult
+from textual.containers import Vertical
+from textual.widgets import Input, OptionList, Static
+from textual.widgets.option_list import Option
+
+from openant_tools.tui.braille import trace
+from openant_tools.tui.marks import BLUE, marked, plain
+from openant_tools.tui.page import Page
+from openant_tools.tui.training import AGENTS, Training, read_curve
+
+__all__ = ["LearnScreen"]
+
+REFRESH_S = 1.0
+_WORDS = {"sac": "soft actor-critic, as in the paper", "sarsa": "SARSA(lambda) with tile coding, as in the paper"}
+
+
+class LearnScreen(Page):
+    """What to train above, how it goes below."""
+
+    TITLE = "Learn"
+    HELP = """\
+# Learn
+
+Choose an agent: it trains in the simulation of this robot, in a process of its own, with the command that stands on the
+screen. You may leave this screen meanwhile. Stopping saves; the same command, or the same choice, goes on from there.
+
+The curve is the average reward over the last 120 s of robot time, in cm/s: how fast it walks where it should.
+"""
+
+    def body(self) -> ComposeResult:
+        with Vertical(id="form"):
+            yield Static("Steps (of 0.12 s; 30000 are an hour of robot time), and the seed", classes="title")
+            yield Input("30000", type="integer", id="steps")
+            yield Input("0", type="integer", id="seed")
+            yield OptionList(
+                *(Option(f"Train {name}: {_WORDS[name]}", id=name) for name in AGENTS),
+                Option("Stop and save", id="stop"),
+                id="choices",
+            )
+        yield Static(id="progress")
+
+    def on_mount(self) -> None:
+        super().on_mount()
+        self.set_interval(REFRESH_S, self.draw_progress)
+        self.query_one("#choices").focus()
+        self.draw_progress()
+
+    def on_input_submitted(self, event: Input.Submitted) -> None:
+        self.query_one("#choices").focus()
+
+    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+        if event.option_id == "stop":
+            if self.session.training is not None:
+                self.session.training.stop()
+        elif event.option_id is not None:
+            self.start(event.option_id)
+        self.draw_progress()
+
+    def start(self, agent: str) -> None:
+        """Train, or go on with the run of the same agent and seed."""
+        folder = self.session.folder
+        progress = self.query_one("#progress", Static)
+        if folder is None:
+            progress.update(marked("fail", "there is no robot's folder: make one in Settings (s on the first screen)"))
+            return
+        if self.session.learning:
+            progress.update(marked("warn", "one run is enough at a time: stop it first"))
+            return
+        steps, seed = (self.query_one(f"#{name}", Input).value for name in ("steps", "seed"))
+        if not steps.isdigit() or int(steps) < 1 or not seed.isdigit():
+            progress.update(marked("fail", "steps and seed are whole numbers"))
+            return
+        out = folder.runs / f"{agent}-{seed}"
+        training = Training(agent, folder.path, int(steps), int(seed), out)
+        training.start()
+        self.session.training = training
+
+    def draw_progress(self) -> None:
+        """From the files of the run."""
+        training, folder = self.session.training, self.session.folder
+        text = Text()
+        if training is not None:
+            if training.running:
+                text.append_text(marked("wait", "training"))
+            else:
+                code = training.exit_code
+                text.append_text(
+                    marked("ok", "done") if code == 0 else marked("warn", "stopped, saved") if code == 130
+                    else marked("fail", training.last_words)
+                )  # fmt: skip
+            text.append(f"   {training.command}\n")
+            self._curve(text, training.folder, training.steps)
+        elif folder is not None:
+            for run in sorted(folder.runs.glob("*/learning_curve.csv")):
+                text.append(f"{run.parent.name}\n", "bold")
+                self._curve(text, run.parent, None)
+        if not text:
+            text.append("No run yet.")
+        self.query_one("#progress", Static).update(text)
+
+    def _curve(self, text: Text, run: Path, steps: int | None) -> None:
+        points = read_curve(run)
+        if not points:
+            text.append("  no point of the curve yet\n")
+            return
+        step = np.array([point.step for point in points], float)
+        reward = 100 * np.array([point.average_reward_m_s for point in points])
+        width = max(20, self.size.width - 4)
+        share = "" if steps is None else f" of {steps} ({step[-1] / steps:.0%})"
+        text.append(
+            f"  step {step[-1]:.0f}{share}, {points[-1].seconds / 60:.0f} min of robot time: {reward[-1]:+.2f} cm/s\n"
+        )
+        low, high = min(0.0, float(reward.min())), max(1.0, float(reward.max()))
+        stop = max(float(step[-1]), float(steps or 0.0))
+        lines = trace(step, reward, 0.0, stop, low, high, width, 4, plain=plain())
+        for line in lines:
+            text.append(f"  {line}\n", BLUE)
+        text.append(f"  {low:+.1f} ... {high:+.1f} cm/s over 0 ... {stop:.0f} steps\n")

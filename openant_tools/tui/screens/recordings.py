@@ -1,0 +1,92 @@
+"""The robot's recordings; any of them can be played again on every screen."""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+from typing import ClassVar
+
+from rich.text import Text
+from textual import work
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Vertical
+from textual.widgets import Input, OptionList, Static
+from textual.widgets.option_list import Option
+
+from openant_tools.errors import OpenAntError
+from openant_tools.recording.tables import read_run
+from openant_tools.tui.feeds import ReplayFeed
+from openant_tools.tui.page import Page
+
+__all__ = ["RecordingsScreen"]
+
+SUFFIXES = (".mcap", ".parquet", ".csv")
+
+
+class RecordingsScreen(Page):
+    """Choose a recording of the robot's, or name any other run."""
+
+    TITLE = "Recordings"
+    HELP = """\
+# Recordings
+
+`Enter` plays a recording as if its robot were here: strips, map and every other screen show it, with the controls of
+the replay in the line above the keys. `x` ends the replay.
+
+In the field below, any other run can be named: a recording (`.mcap`) or a table (`.parquet`, `.csv`) of any software
+that has the columns of docs/recordings.md.
+"""
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("n", "name", "Name a file")]
+
+    def body(self) -> ComposeResult:
+        with Vertical():
+            yield OptionList(id="list")
+            yield Input(placeholder="n: another run, such as ../logs/walk.parquet", id="path")
+            yield Static(id="note", classes="note")
+
+    def on_mount(self) -> None:
+        super().on_mount()
+        self._files = self._find()
+        chooser = self.query_one("#list", OptionList)
+        for number, path in enumerate(self._files):
+            stat = path.stat()
+            when = datetime.datetime.fromtimestamp(stat.st_mtime).strftime("%d.%m.%Y %H:%M")
+            chooser.add_option(Option(Text(f"{path.name:40.40} {stat.st_size / 1e6:7.1f} MB  {when}"), id=str(number)))
+        if not self._files:
+            self.note("No recordings yet: `openant sysid record` and the steps of the walk make them.")
+        chooser.focus()
+
+    def _find(self) -> list[Path]:
+        folder = self.session.folder
+        if folder is None or not folder.recordings.is_dir():
+            return []
+        found = [path for path in folder.recordings.rglob("*") if path.suffix in SUFFIXES]
+        return sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)
+
+    def action_name(self) -> None:
+        self.query_one("#path", Input).focus()
+
+    def note(self, words: str) -> None:
+        self.query_one("#note", Static).update(words)
+
+    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+        self.play(self._files[event.option_index])
+
+    def on_input_submitted(self, event: Input.Submitted) -> None:
+        if event.value.strip():
+            self.play(Path(event.value.strip()).expanduser())
+
+    def play(self, path: Path) -> None:
+        """Read a run and show it on the live screen."""
+        self.note(f"reading {path} ...")
+        self._read(path)
+
+    @work(thread=True, exclusive=True, group="read")
+    def _read(self, path: Path) -> None:
+        try:
+            feed = ReplayFeed(read_run(path, need=("pos",)))
+        except OpenAntError as error:
+            self.app.call_from_thread(self.note, str(error))
+        else:
+            self.app.call_from_thread(self.ant.play, feed)

@@ -1,0 +1,380 @@
+"""One step of the walk: what it says and asks, from its procedure in a thread; its finding; what comes next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+from rich.text import Text
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal, Vertical, VerticalScroll
+from textual.widgets import Input, OptionList, Static
+from textual.widgets.option_list import Option
+
+from openant_tools.bringup.walk import WALK, standing
+from openant_tools.errors import OpenAntError
+from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.step import Answer, Ask, Event, Hands, Intent, Live, Look, Progress, Say, Step
+from openant_tools.tui.bars import bars
+from openant_tools.tui.dialogs import Question
+from openant_tools.tui.leg_map import LegMap
+from openant_tools.tui.marks import MARKS, Name, mark, marked
+from openant_tools.tui.page import Page
+from openant_tools.tui.step_run import BY_VIRTUAL_HANDS, StepRun
+
+__all__ = ["StepScreen"]
+
+#: the answer that the stop key gives where a procedure asks for the stop key
+STOP = "stop"
+_LEVELS: Mapping[str, Name] = {"info": "info", "ok": "ok", "warn": "warn", "fail": "fail"}
+PATIENCE_S = 0.05
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One line to choose, and what choosing it does."""
+
+    words: str
+    do: Callable[[], None]
+
+
+class StepScreen(Page):
+    """A log above, what is asked below; beside it the robot, where there is room."""
+
+    HELP = """\
+# A step of the walk
+
+The step says what it will do and which registers it will change, and does nothing before you grant it. Arrow keys and
+`Enter` answer. `Space` is the stop key at any time: torque off, the step ends. `Esc` leaves the step; it ends in order,
+and can be begun again: what it found or wrote before stays, and every write to a servo's memory stands in
+`journal.jsonl` with the value before, so that it can be undone.
+"""
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("escape", "leave", "Leave"),
+        Binding("pageup", "scroll(-1)", "Log", key_display="pgup/dn"),
+        Binding("pagedown", "scroll(1)", "Log", show=False),
+    ]
+
+    def __init__(self, step: Step) -> None:
+        super().__init__()
+        self.step = step
+        self.title = step.title
+        self._run: StepRun | None = None
+        self._choices: list[Choice] = []
+        self._pending: Event | None = None
+        self._progress: Progress | None = None
+        self._live: Live | None = None
+        self._drawn_live: Live | None = None
+        self._granted_all = False
+
+    def body(self) -> ComposeResult:
+        yield Static(id="head")
+        with Horizontal(id="work"):
+            yield VerticalScroll(id="log", can_focus=True)
+            yield LegMap(self.session.history)
+        with Vertical(id="ask"):
+            yield Static(id="live")
+            yield Static(id="question")
+            yield OptionList(id="choices")
+            yield Input(id="value")
+
+    def on_mount(self) -> None:
+        super().on_mount()
+        self.introduce()
+
+    @property
+    def running(self) -> bool:
+        return self._run is not None and self._run.running
+
+    def draw(self) -> None:
+        super().draw()
+        self.query_one("#head", Static).update(self._head())
+        if self._live is not self._drawn_live:
+            self._drawn_live = self._live
+            line = self.query_one("#live", Static)
+            line.display = self._live is not None
+            if self._live is not None:
+                line.update(bars(self._live, line.size.width or self.size.width - 4))
+
+    def _head(self) -> Text:
+        text = Text(no_wrap=True, overflow="ellipsis")
+        if self.running:
+            progress = self._progress
+            share = "" if progress is None or progress.share is None else f" {progress.share:.0%}"
+            text.append_text(marked("wait", f"running{share}"))
+            if self._pending is not None:
+                text.append_text(marked("warn", "  your turn"))
+            elif progress is not None:
+                text.append(f"  {progress.words}")
+        else:
+            text.append(self.step.does)
+        return text
+
+    # ---- before and after ----------------------------------------------------------------------------------------
+
+    def introduce(self) -> None:
+        """What the step is about, and the offer to begin."""
+        step, folder = self.step, self.session.folder
+        self.say(Text(step.does, style="bold"))
+        if step.table:
+            self.say(Text(f"You need {step.table}."))
+        moves = "The robot moves; you are asked before it does." if step.moves else "Nothing moves."
+        self.say(Text(f"It changes {step.changes or 'nothing'}. {moves} About {step.minutes:g} minutes."))
+        if folder is None:
+            self.say(
+                marked("warn", f"there is no robot's folder at {self.session.path.resolve()}: make one in Settings (s)")
+            )
+            self.offer("", [Choice("Settings", lambda: self.ant.action_go("settings")), self._back()])
+            return
+        one = standing(folder).get(step.name)
+        if one is not None and one.waits_for:
+            names = ", ".join(WALK[name].title for name in one.waits_for)
+            self.say(marked("warn", f"before this one should come: {names}"))
+        if one is not None and one.finding is not None:
+            self.show_finding(one.finding, "the last time: ")
+        self.offer("", [Choice("Begin", self.begin), self._back()])
+
+    def begin(self) -> None:
+        """Run the procedure from its start."""
+        session = self.session
+        try:
+            bench = session.bench()
+        except OpenAntError as error:
+            self.say(marked("fail", str(error)))
+            return
+        self.offer("", [])
+        self.say(marked("wait", f"{self.step.title} begins"))
+        self._granted_all = False
+        self._progress = self._live = None
+        if session.replay is not None:
+            session.play(None)
+        run = self._run = StepRun(
+            self.step, bench, self._from_thread, lambda finding, why: self._to_screen(self.ended, finding, why)
+        )
+        # The bus has one master: who only watched gives it free first.
+        self.ant.free_bus(run.start)
+
+    def ended(self, finding: Finding | None, why: str) -> None:
+        """The procedure is through: draw what it found, or why it did not."""
+        self._pending = self._progress = self._live = None
+        again = Choice("Begin again", self.begin)
+        if finding is None:
+            self.say(marked("fail", why))
+            self.session.faults.note(self.step.title, why) if "→" in why and "not done" not in why else None
+            self.offer("It ended without a finding.", [again, self._back()])
+        else:
+            self.show_finding(finding)
+            names = list(WALK)
+            after = names.index(self.step.name) + 1 if self.step.name in names else len(names)
+            following = names[after] if after < len(names) else None
+            choices = [again, self._back()]
+            if following is not None:
+                forward = Choice(f"Next: {WALK[following].title}", lambda: self.ant.open_step(following, instead=True))
+                choices = [forward, *choices] if finding.ok else [again, forward, self._back()]
+            self.offer(finding.next_action, choices)
+        self.draw()
+
+    def show_finding(self, finding: Finding, before: str = "") -> None:
+        self.say(marked("ok" if finding.ok else "fail", f"{before}{finding.what}"))
+        for problem in finding.problems:
+            self.say(Text(f"  {mark('warn')} {problem}", style=MARKS["warn"].colour))
+        for evidence in finding.evidence:
+            self.say(Text(f"  {_evidence(evidence)}"))
+        if finding.next_action:
+            self.say(Text(f"Next: {finding.next_action}", style="bold"))
+
+    # ---- from the procedure --------------------------------------------------------------------------------------
+
+    def _from_thread(self, event: Event) -> None:
+        """Called in the procedure's thread: what changes many times a second waits for the next tick."""
+        if isinstance(event, Live):
+            self._live = event
+        elif isinstance(event, Progress):
+            self._progress = event
+        else:
+            self._to_screen(self.shown, event)
+
+    def _to_screen(self, callback: Callable[..., None], *arguments: object) -> None:
+        if self.is_attached and self.app.is_running:
+            self.app.call_from_thread(callback, *arguments)
+
+    def shown(self, event: Event) -> None:
+        """Draw one event, and offer the answers that it takes."""
+        if isinstance(event, Say):
+            self.say(marked(_LEVELS[event.level], event.words))
+        elif isinstance(event, Look):
+            self.say(Text("\n".join(part for part in (event.words, event.drawing) if part)))
+            if event.picture is not None:
+                self.say(Text(f"picture: {event.picture}"))
+        elif isinstance(event, Intent):
+            self._intend(event)
+        elif isinstance(event, Ask):
+            self._ask(event)
+        elif isinstance(event, Hands):
+            self._hands(event)
+
+    def _intend(self, event: Intent) -> None:
+        self.say(Text(f"{mark('info')} It will {event.words}.", style="bold"))
+        for change in event.registers:
+            self.say(Text(f"    {change}"))
+        if self._granted_all and not event.moves:
+            self.say(marked("ok", "granted with the rest"))
+            self._reply_later(True)
+            return
+        count = f" It writes {len(event.registers)} registers." if event.registers else ""
+        motion = f" {mark('warn')} The robot moves." if event.moves else ""
+        choices = [
+            Choice("Yes, do it", lambda: self.reply(True, "granted")),
+            Choice("No, leave everything as it is", lambda: self.reply(False, "not granted")),
+        ]
+        if event.registers and not event.moves:
+            choices.insert(1, Choice("Yes, and all further writes of this step", self._grant_all))
+        self.ask(event, f"May it?{count}{motion}", choices)
+
+    def _grant_all(self) -> None:
+        self._granted_all = True
+        self.reply(True, "granted, with all further writes of this step")
+
+    def _ask(self, event: Ask) -> None:
+        if event.choices:
+            choices = [Choice(word, lambda word=word: self.reply(word, word)) for word in event.choices]  # type: ignore[misc]
+            default = event.choices.index(str(event.default)) if event.default in event.choices else 0
+            self.ask(event, event.question, choices, default)
+            return
+        span = f" ({event.low:g} ... {event.high:g})" if event.low is not None and event.high is not None else ""
+        unit = "" if event.unit == "text" else event.unit
+        self.ask(event, f"{event.question} {unit}{span}", [])
+        field = self.query_one("#value", Input)
+        field.display = True
+        field.value = "" if event.default is None else str(event.default)
+        field.focus()
+
+    def on_input_submitted(self, message: Input.Submitted) -> None:
+        event = self._pending
+        if not isinstance(event, Ask):
+            return
+        value: str | float = message.value.strip()
+        if event.unit != "text":
+            try:
+                value = float(value)
+            except ValueError:
+                self.say(marked("warn", f"{value!r} is no number"))
+                return
+            if not (event.low is None or value >= event.low) or not (event.high is None or value <= event.high):
+                self.say(marked("warn", f"{value:g} is outside {event.low} ... {event.high}"))
+                return
+        self.reply(value, str(value))
+
+    def _hands(self, event: Hands) -> None:
+        self.say(Text(f"{mark('info')} {event.words}", style="bold"))
+        if event.while_watching:
+            return
+        choices = [Choice("Done", lambda: self.reply(True, "done"))]
+        if self.session.virtual is not None:
+            by_hand = Choice(
+                "Let the virtual robot's hands do it", lambda: self.reply(BY_VIRTUAL_HANDS, "done by virtual hands")
+            )
+            choices = [by_hand, Choice("It is done already", choices[0].do)]
+        self.ask(event, "Your hands are needed.", choices)
+
+    # ---- to the procedure ----------------------------------------------------------------------------------------
+
+    def ask(self, event: Event, words: str, choices: list[Choice], chosen: int = 0) -> None:
+        self._pending = event
+        self.offer(words, choices, chosen)
+        self.draw()
+
+    def reply(self, answer: Answer, words: str) -> None:
+        """Answer what the procedure waits for."""
+        if self._run is None or self._pending is None:
+            return
+        self._pending = None
+        self.say(Text(f"  {mark('ok')} {words}", style=MARKS["todo"].colour))
+        self.offer("", [])
+        self._run.reply(answer)
+
+    def _reply_later(self, answer: Answer) -> None:
+        if self._run is not None:
+            self._run.reply(answer)
+
+    def offer(self, words: str, choices: list[Choice], chosen: int = 0) -> None:
+        """Put lines to choose from below the log."""
+        self._choices = choices
+        question = self.query_one("#question", Static)
+        question.display = bool(words)
+        question.update(Text(words, style="bold"))
+        self.query_one("#value", Input).display = False
+        chooser = self.query_one("#choices", OptionList)
+        chooser.clear_options()
+        chooser.display = bool(choices)
+        chooser.add_options([Option(choice.words) for choice in choices])
+        if choices:
+            chooser.highlighted = chosen
+            chooser.focus()
+        else:
+            self.query_one("#log").focus()
+
+    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+        self._choices[event.option_index].do()
+
+    def on_key(self, event: object) -> None:
+        if getattr(event, "key", "") == "enter" and self.running and self._pending is None and self._run is not None:
+            self._run.enough()
+
+    def stopped(self) -> None:
+        """The stop key: torque is off by now. Where the step asks for the stop key, this is its answer."""
+        if self._run is None or not self.running:
+            return
+        if isinstance(self._pending, Ask) and STOP in self._pending.choices:
+            self.reply(STOP, "stop key")
+        else:
+            self.say(marked("fail", "STOP: torque off; the step ends"))
+            self._run.end("stopped by hand")
+
+    def action_leave(self) -> None:
+        """Back to the walk; a step that runs is ended first, after a question."""
+        if not self.running:
+            self.app.pop_screen()
+            return
+
+        def answered(choice: int | None) -> None:
+            if choice == 0:
+                self.end()
+                self.app.pop_screen()
+
+        words = (
+            "Leave this step? It ends with torque off. What it wrote and found so far is kept; it can be begun again."
+        )
+        self.app.push_screen(Question(words, "Leave", "Stay"), answered)
+
+    def end(self) -> None:
+        """End what runs, in order."""
+        if self._run is not None and self.running:
+            self.session.release()
+            self._run.end("left by hand")
+
+    def on_unmount(self) -> None:
+        self.end()
+
+    def _back(self) -> Choice:
+        return Choice("Back to the walk", self.action_leave)
+
+    # ---- the log -------------------------------------------------------------------------------------------------
+
+    def say(self, words: Text) -> None:
+        """One more entry of the log."""
+        log = self.query_one("#log", VerticalScroll)
+        log.mount(Static(words))
+        log.scroll_end(animate=False)
+
+    def action_scroll(self, by: int) -> None:
+        log = self.query_one("#log", VerticalScroll)
+        log.scroll_relative(y=by * max(1, log.size.height - 1), animate=False)
+
+
+def _evidence(evidence: Evidence) -> str:
+    value = "unknown" if evidence.value is None else f"{evidence.value:.4g} {evidence.unit}".rstrip()
+    span = "" if evidence.low is None or evidence.high is None else f" ({evidence.low:.3g} ... {evidence.high:.3g})"
+    return f"{evidence.name}: {value}{span}, {evidence.source}"

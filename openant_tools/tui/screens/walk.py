@@ -1,0 +1,144 @@
+"""The first screen: the steps of the walk and how far this robot got."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import ClassVar
+
+from rich.text import Text
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal, Vertical
+from textual.geometry import Offset
+from textual.widgets import OptionList, Static
+from textual.widgets.option_list import Option
+
+from openant_tools.bringup.walk import WALK, Standing, standing
+from openant_tools.procedure.step import Step
+from openant_tools.tui.leg_map import LegMap
+from openant_tools.tui.marks import Name, mark, marked
+from openant_tools.tui.page import Page
+
+__all__ = ["WalkScreen", "standing_mark"]
+
+_MARKS: dict[str, Name] = {"todo": "todo", "ok": "ok", "failed": "fail", "stale": "stale"}
+VIRTUAL = "virtual"
+
+
+def standing_mark(one: Standing) -> Text:
+    """A step's state, with what it waits for where it cannot be begun."""
+    return marked(_MARKS[one.state])
+
+
+class WalkList(OptionList):
+    """The steps; each has a letter in jump mode."""
+
+    HELP = """\
+# The walk
+
+The steps from loose motors to a robot that learns, in the order in which one builds. `Enter` opens one; it says what it
+will do before it does anything. You can leave a step, come back, repeat it, and undo what it wrote.
+
+| mark | |
+|---|---|
+| `·` to do | not done yet |
+| `✓` ok | done, with evidence in the robot's `findings/` |
+| `✗` no | it found something: open it and read what to do |
+| `↻` again | a step that it builds on was done again since |
+
+No robot here? The line below the steps starts a virtual one, which behaves like a real one down to its bytes.
+"""
+
+    def jump_points(self) -> Iterable[tuple[Offset, Callable[[], None]]]:
+        for row in range(min(self.option_count, self.size.height)):
+            at = row + int(self.scroll_offset.y)
+            if at < self.option_count and not self.get_option_at_index(at).disabled:
+                yield self.region.offset + Offset(0, row), partial(self._open, at)
+
+    def _open(self, index: int) -> None:
+        self.focus()
+        self.highlighted = index
+        self.action_select()
+
+
+class WalkScreen(Page):
+    """Steps on the left, what the chosen one does and the robot on the right."""
+
+    TITLE = "Walk"
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("v", "app.virtual", "Virtual"),
+        Binding("c", "app.watch", "Live"),
+        Binding("f", "app.go('findings')", "Findings"),
+        Binding("r", "app.go('recordings')", "Replay"),
+        Binding("t", "app.go('learn')", "Learn"),
+        Binding("s", "app.go('settings')", "Settings"),
+        Binding("escape,q", "app.leave", "Quit", key_display="q"),
+    ]
+
+    def body(self) -> ComposeResult:
+        with Horizontal():
+            yield WalkList(id="walk")
+            with Vertical(id="beside"):
+                yield Static(id="about")
+                yield LegMap(self.session.history)
+
+    def on_mount(self) -> None:
+        self.refresh_steps()
+        super().on_mount()
+        self.query_one(WalkList).focus()
+
+    def on_screen_resume(self) -> None:
+        self.refresh_steps()
+        super().on_screen_resume()
+
+    def refresh_steps(self) -> None:
+        """Read the robot's findings anew."""
+        walk = self.query_one(WalkList)
+        chosen = walk.highlighted
+        folder = self.session.folder
+        self._standing = standing(folder) if folder is not None else {}
+        walk.clear_options()
+        for n, (name, step) in enumerate(WALK.items(), 1):
+            state = standing_mark(self._standing[name]) if name in self._standing else marked("todo")
+            walk.add_option(Option(Text.assemble(f"{n:2} {step.title:21} ", state), id=name))
+        offer = "End the virtual robot" if self.session.virtual is not None else "Start a virtual robot"
+        walk.add_option(Option(Text(f" v {offer}", style="bold"), id=VIRTUAL))
+        first = next((k for k, name in enumerate(WALK) if self._state(name) != "ok"), 0)
+        walk.highlighted = first if chosen is None else min(chosen, walk.option_count - 1)
+
+    def _state(self, name: str) -> str:
+        return self._standing[name].state if name in self._standing else "todo"
+
+    def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
+        about = self.query_one("#about", Static)
+        if event.option_id is None or event.option_id == VIRTUAL:
+            about.update(_ABOUT_VIRTUAL)
+        else:
+            about.update(_about(WALK[event.option_id], self._standing.get(event.option_id)))
+
+    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+        if event.option_id == VIRTUAL:
+            self.ant.action_virtual()
+        elif event.option_id is not None:
+            self.ant.open_step(event.option_id)
+
+
+_ABOUT_VIRTUAL = Text.assemble(
+    ("Virtual robot\n", "bold"),
+    "Servos, flight controller and camera in software, behind real ports and protocols. Walk through all steps with it "
+    "before your robot does, or learn without one.",
+)
+
+
+def _about(step: Step, one: Standing | None) -> Text:
+    text = Text.assemble((f"{step.title}", "bold"), f"  about {step.minutes:g} min\n{step.does}\n")
+    if one is not None and one.finding is not None:
+        text.append(f"{mark('ok' if one.finding.ok else 'fail')} {one.finding.what}\n", "bold")
+    if one is not None and one.waits_for:
+        text.append(f"{mark('warn')} wants first: {', '.join(WALK[name].title for name in one.waits_for)}\n")
+    if step.table:
+        text.append(f"You need {step.table}.\n")
+    moves = "the robot moves, after you say so" if step.moves else "nothing moves"
+    text.append(f"Changes {step.changes or 'nothing'}; {moves}.")
+    return text

@@ -1,0 +1,215 @@
+"""What all screens work on: the robot's folder, where it is plugged in, and what is shown of it. Knows no Textual."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.messages import EngineConfig, Notice, Stopped
+from openant_tools.comms.release import release_all
+from openant_tools.comms.setup import config_of_robot, config_of_unknown_robot, find_bus, imu_of_robot
+from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.procedure.step import Bench
+from openant_tools.robot.config import CONFIG_NAME
+from openant_tools.robot.folder import RobotFolder, create_robot
+from openant_tools.robot.joints import JOINT_NAMES
+from openant_tools.tui.faults import Faults
+from openant_tools.tui.feeds import Feed, History, LiveFeed, ReplayFeed
+from openant_tools.tui.training import Training
+from openant_tools.virtual.process import virtual_robot
+
+__all__ = ["Session"]
+
+
+class Session:
+    """One robot, real or virtual, and the rows that its engine (or a recording) brings.
+
+    Attributes:
+        path: the robot's folder, whether or not it is one yet.
+        virtual: what the ready file of a virtual robot says; None where the robot is real.
+        feed: where rows come from now; None where there are none.
+        history: the rows of the last seconds.
+        selected: the joint that all screens show as chosen.
+        notices: what the engine had to say, until somebody takes it.
+        training: the run that was started last, which goes on whatever is on the screen.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.virtual: Mapping[str, str | None] | None = None
+        self.feed: Feed | None = None
+        self.history = History(JOINT_NAMES)
+        self.faults = Faults()
+        self.selected = JOINT_NAMES[0]
+        self.notices: list[str] = []
+        self.training: Training | None = None
+        self._engine: EngineProcess | None = None
+        self._virtual_process = contextlib.ExitStack()
+        #: one thread connects or starts a robot at a time
+        self._busy = threading.Lock()
+
+    # ---- the robot -----------------------------------------------------------------------------------------------
+
+    @property
+    def folder(self) -> RobotFolder | None:
+        """The robot's folder, or None while there is no robot.toml."""
+        return RobotFolder(self.path) if (self.path / CONFIG_NAME).is_file() else None
+
+    @property
+    def name(self) -> str:
+        return self.path.resolve().name
+
+    def open(self, path: Path) -> None:
+        """Work on another robot's folder."""
+        self.disconnect()
+        self.path = path
+
+    def create(self, path: Path, kit: str) -> None:
+        """Make a robot's folder with the nominal values of its kit; raises BadInput."""
+        create_robot(path, kit)
+        self.open(path)
+
+    def bench(self) -> Bench:
+        """Where procedures work. Raises BadInput while there is no robot's folder."""
+        folder = self.folder
+        if folder is None:
+            raise BadInput(
+                "there is no robot.toml here", where=self.path, remedy="make a robot's folder: Settings, key s"
+            )
+        if self.virtual is None:
+            return Bench(folder)
+        bus, imu, camera, control = (self.virtual[key] for key in ("bus", "imu", "camera", "control"))
+        return Bench(folder, bus, imu, camera, control)
+
+    def start_virtual(self, source: str, clock: str | None = "real") -> None:
+        """Start a virtual robot, or use a running one, in place of whatever was there; takes seconds.
+
+        Raises:
+            OpenAntError: it cannot be started.
+        """
+        with self._busy:
+            self._disconnect()
+            self._virtual_process.close()
+            self.virtual = None
+            self.virtual = self._virtual_process.enter_context(virtual_robot(source, clock=clock))
+
+    def end_virtual(self) -> None:
+        with self._busy:
+            self._disconnect()
+            self._virtual_process.close()
+            self.virtual = None
+
+    # ---- watching it ---------------------------------------------------------------------------------------------
+
+    @property
+    def watching(self) -> bool:
+        return self._engine is not None
+
+    def connect(self) -> None:
+        """Start an engine that reads the robot, torque off; takes seconds.
+
+        Raises:
+            OpenAntError: no bus, or not all servos answer.
+        """
+        with self._busy:
+            if self._engine is None:
+                self._engine = EngineProcess(self._config())
+
+    def disconnect(self) -> None:
+        """Give the bus free; torque goes off."""
+        with self._busy:
+            self._disconnect()
+
+    def _disconnect(self) -> None:
+        engine, self._engine = self._engine, None
+        if engine is not None:
+            engine.close()
+
+    def _config(self) -> EngineConfig:
+        port = control = imu = None
+        if self.virtual is not None:
+            port, control, imu = self.virtual["bus"], self.virtual["control"], self.virtual["imu"]
+        folder = self.folder
+        if folder is None:
+            config = config_of_unknown_robot(find_bus(port), control)
+        else:
+            robot = folder.config()
+            journal = str(folder.journal)
+            config = config_of_robot(robot, port, control=control, imu=imu_of_robot(robot, imu), journal=journal)
+        # Who watches writes nothing: registers are set when something is to move.
+        return replace(config, registers={})
+
+    def release(self) -> int:
+        """The stop key: torque off everywhere, now, from any thread; how many were told."""
+        return release_all()
+
+    # ---- what the screens draw -----------------------------------------------------------------------------------
+
+    @property
+    def replay(self) -> ReplayFeed | None:
+        return self.feed if isinstance(self.feed, ReplayFeed) else None
+
+    def play(self, feed: ReplayFeed | None) -> None:
+        """Show a recording on every screen instead of the robot; None for the robot again."""
+        self._show(feed)
+
+    def tick(self) -> None:
+        """Take in what came since the last tick, from the newest engine of this process or the recording."""
+        if self.replay is None:
+            self._follow_engines()
+        if self.feed is not None:
+            rows = self.feed.rows()
+            if self.replay is not None and self.replay.jumped:
+                self.history.clear()
+                self.replay.jumped = False
+            self.history.add(rows)
+            if self.replay is None:
+                self.faults.watch(self.history)
+        if self._engine is not None:
+            self._hear(self._engine)
+
+    def _follow_engines(self) -> None:
+        """Show the engine that runs, be it ours or one that a procedure has started."""
+        if isinstance(self.feed, LiveFeed) and not self.feed.ended:
+            return
+        running = list(EngineProcess.running)
+        if running:
+            self._show(LiveFeed(running[-1], "live"))
+        elif self.feed is not None:
+            self._show(None)
+
+    def _show(self, feed: Feed | None) -> None:
+        if self.feed is not None:
+            self.feed.close()
+        self.feed = feed
+        self.history = History(JOINT_NAMES if feed is None else feed.joints)
+
+    def _hear(self, engine: EngineProcess) -> None:
+        try:
+            for event in engine.events():
+                if isinstance(event, Stopped):
+                    self.faults.note(event.joint or "", f"stopped: {event.what}")
+                elif isinstance(event, Notice):
+                    self.notices.append(event.text)
+            ended = engine.ended
+        except HardwareFault:
+            ended = True
+        if ended:
+            self.faults.note("", "the engine has ended; torque is off")
+            self._engine = None
+
+    @property
+    def learning(self) -> bool:
+        return self.training is not None and self.training.running
+
+    def close(self) -> None:
+        """Torque off, training saved, processes gone."""
+        self._show(None)
+        self.disconnect()
+        if self.training is not None:
+            self.training.close()
+        self._virtual_process.close()

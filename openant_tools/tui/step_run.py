@@ -1,0 +1,113 @@
+"""A procedure in a thread of its own, with the terminal program as its face."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+
+from openant_tools.bringup.virtual_hands import VirtualHands
+from openant_tools.errors import OpenAntError
+from openant_tools.procedure.finding import Finding, keep
+from openant_tools.procedure.step import Answer, Ask, Bench, Declined, Event, Hands, Intent, Live, Step, drive
+
+__all__ = ["BY_VIRTUAL_HANDS", "StepRun"]
+
+#: a reply to `Hands`: the virtual robot's hands are to do it
+BY_VIRTUAL_HANDS = "virtual hands"
+
+
+class _Ended(Declined):
+    """The builder left or pressed the stop key."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(why, remedy="torque is off; what was found so far is kept, the step can be begun again")
+
+
+class StepRun:
+    """One run of a step, whose finding is kept in the robot's folder. The callbacks are called in its thread.
+
+    Args:
+        show: for each event.
+        done: with the finding, or None and why there is none.
+    """
+
+    def __init__(
+        self, step: Step, bench: Bench, show: Callable[[Event], None], done: Callable[[Finding | None, str], None]
+    ) -> None:
+        self.step = step
+        self._bench = bench
+        self._show = show
+        self._done = done
+        self._answers: queue.Queue[Answer | _Ended] = queue.Queue()
+        self._ended: _Ended | None = None
+        self._enough = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"step {step.name}", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    @property
+    def running(self) -> bool:
+        return self._thread.is_alive()
+
+    def reply(self, answer: Answer) -> None:
+        """What the builder said to the event that waits."""
+        self._answers.put(answer)
+
+    def enough(self) -> None:
+        """The builder has seen enough of what is live."""
+        self._enough.set()
+
+    def end(self, why: str) -> None:
+        """End it in order at its next word; torque goes off."""
+        self._ended = _Ended(why)
+        self._answers.put(self._ended)
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for its end; whether it has ended."""
+        self._thread.join(timeout_s)
+        return not self.running
+
+    def answer(self, event: Event) -> Answer:
+        """The procedure's side: show, and wait where an answer is wanted."""
+        if self._ended is not None:
+            raise self._ended
+        self._show(event)
+        if isinstance(event, Live):
+            seen = self._enough.is_set()
+            self._enough.clear()
+            return seen
+        if isinstance(event, Hands) and event.while_watching and self._bench.control is not None:
+            self._do_virtually(event)
+        elif isinstance(event, Intent | Ask) or (isinstance(event, Hands) and not event.while_watching):
+            answer = self._answers.get()
+            if isinstance(answer, _Ended):
+                raise answer
+            if isinstance(event, Hands) and answer == BY_VIRTUAL_HANDS:
+                self._do_virtually(event)
+                return True
+            return answer
+        return None
+
+    def _do_virtually(self, event: Hands) -> None:
+        assert self._bench.control is not None
+        hands = VirtualHands(self._bench.control)
+        try:
+            hands.do(event)
+        finally:
+            hands.close()
+
+    def _run(self) -> None:
+        try:
+            finding = drive(self.step.start(self._bench), self)
+            keep(finding, self._bench.folder)
+        except (OpenAntError, OSError) as error:
+            self._done(None, str(error))
+        except ModuleNotFoundError as error:
+            self._done(None, f"this step is not part of this version ({error.name} is missing)")
+        except Exception as error:  # whatever it is, the builder sees it and torque is off; the log has the rest
+            self._done(None, f"{type(error).__name__}: {error}")
+            raise
+        else:
+            self._done(finding, "")

@@ -1,0 +1,220 @@
+"""Strips: one line a joint with its state, its value, the last ten seconds of it, and how its servo fares."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from rich.segment import Segment
+from rich.style import Style
+from textual.binding import Binding, BindingType
+from textual.geometry import Size
+from textual.reactive import reactive
+from textual.strip import Strip
+from textual.widget import Widget
+
+from openant_tools.robot.joints import JOINT_NAMES
+from openant_tools.robot.kit import ANGLE_LIMIT_RAD
+from openant_tools.tui.braille import trace
+from openant_tools.tui.faults import condition
+from openant_tools.tui.feeds import WINDOW_S, History
+from openant_tools.tui.leg_map import JointChosen
+from openant_tools.tui.marks import BLUE, MARKS, mark, plain
+
+__all__ = ["SIGNALS", "JointStrips"]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One thing that can be shown of every joint.
+
+    Attributes:
+        columns: of the rows; the first that has values counts.
+        low, high: what the strip spans at least.
+        form: of the number beside it.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    unit: str
+    low: float
+    high: float
+    form: str
+
+
+SIGNALS: tuple[Signal, ...] = (
+    Signal("angle", ("pos",), "rad", -ANGLE_LIMIT_RAD["knee"], ANGLE_LIMIT_RAD["knee"], "+6.2f"),
+    Signal("velocity", ("vel",), "rad/s", -1.0, 1.0, "+6.2f"),
+    Signal("effort (A, or share of full load)", ("cur", "load"), "", -0.2, 0.2, "+6.2f"),
+    Signal("duty", ("pwm",), "of 1", -0.2, 0.2, "+6.2f"),
+    Signal("supply", ("volt",), "V", 9.0, 13.0, "6.1f"),
+    Signal("temperature", ("temp",), "°C", 20.0, 60.0, "6.0f"),
+    Signal("round trip", ("rtt",), "ms", 0.0, 5.0, "6.2f"),
+)
+#: columns → factor from the row's unit to the one shown
+_FACTOR: Mapping[str, float] = {"rtt": 1e3}
+#: columns of text before and after the trace
+_BEFORE, _AFTER = 25, 17
+
+
+class JointStrips(Widget, can_focus=True):
+    """Live or replayed strips of all joints."""
+
+    HELP = """\
+# Strips
+
+One line a joint: how its servo is, the newest value, the last ten seconds, supply and temperature.
+A gap in a trace is a time without an answer; nothing is drawn that was not measured.
+
+| key | |
+|---|---|
+| `←` `→` | another signal: angle, velocity, effort, duty, supply, temperature, round trip |
+| `↑` `↓` | choose a joint, here and on the map of the robot |
+
+All strips of a signal share one scale, which stands in the top line; it grows when a value leaves it.
+"""
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("left", "signal(-1)", "Signal", key_display="←→"),
+        Binding("right", "signal(1)", "Signal", show=False),
+        Binding("up", "choose(-1)", "Joint", show=False),
+        Binding("down", "choose(1)", "Joint", key_display="↑↓"),
+    ]
+    DEFAULT_CSS = "JointStrips { height: 1fr; min-height: 10; }"
+
+    chosen = reactive(JOINT_NAMES[0])
+    signal = reactive(0)
+
+    def __init__(self, history: History, *, id: str | None = None) -> None:
+        super().__init__(id=id)
+        self._history = history
+        self._lines: list[Strip] = []
+
+    def draw(self, history: History) -> None:
+        """Draw these rows; called ten times a second."""
+        self._history = history
+        self._redraw()
+        self.refresh()
+
+    def action_signal(self, by: int) -> None:
+        self.signal = (self.signal + by) % len(SIGNALS)
+        self.draw(self._history)
+
+    def action_choose(self, by: int) -> None:
+        joints = self._history.joints
+        at = joints.index(self.chosen) if self.chosen in joints else 0
+        self.post_message(JointChosen(joints[(at + by) % len(joints)]))
+
+    def get_content_height(self, container: Size, viewport: Size, width: int) -> int:
+        return 1 + len(self._history.joints)
+
+    def watch_chosen(self) -> None:
+        self._redraw()
+
+    def on_resize(self) -> None:
+        self._redraw()
+
+    def render_line(self, y: int) -> Strip:
+        return self._lines[y] if y < len(self._lines) else Strip.blank(self.size.width, self.rich_style)
+
+    def _redraw(self) -> None:
+        width, history = self.size.width, self._history
+        if width < _BEFORE + 8:
+            self._lines = []
+            return
+        after = _AFTER if width >= 70 else 0
+        across = width - _BEFORE - after
+        chosen = SIGNALS[self.signal]
+        values = {joint: self._values(joint, chosen) for joint in history.joints}
+        low, high = _scale(chosen, values)
+        ascii_only = plain()
+        height = max(1, min(3, (self.size.height - 2) // max(1, len(history.joints))))
+        stop = float(history.t[-1]) if len(history.rows) else WINDOW_S
+        grey = Style(color="#A8A8A8")
+        unit = chosen.unit.replace("°", "") if ascii_only else chosen.unit
+        title = f"{chosen.title} {unit}"
+        scale = f"{low:.3g} ... {high:.3g} {unit}, {WINDOW_S:.0f} s"
+        head = f"{'joint':9}{'servo':9}{title}"
+        room = width - len(head) - after - 1
+        head += scale.rjust(room) if room > len(scale) else ""
+        lines = [[Segment(head.ljust(width - after), grey)]]
+        if after:
+            lines[0].append(Segment(f"{'V':>7}{'C' if ascii_only else '°C':>5}{'ms':>5}", grey))
+        for joint in history.joints:
+            lines += self._joint(joint, chosen, values[joint], stop, low, high, across, height, after > 0)
+        lines.append([Segment(self._body(width), grey)])
+        ground = self.rich_style
+        self._lines = [Strip(line).adjust_cell_length(width).apply_style(ground) for line in lines]
+
+    def _joint(
+        self,
+        joint: str,
+        chosen: Signal,
+        values: np.ndarray,
+        stop: float,
+        low: float,
+        high: float,
+        across: int,
+        height: int,
+        after: bool,
+    ) -> list[list[Segment]]:
+        found = condition(self._history, joint)
+        here = joint == self.chosen
+        drawn = trace(
+            self._history.t, values, stop - WINDOW_S, stop, low, high, across, height, plain=plain()
+        )  # fmt: skip
+        name = Style(bold=here, reverse=here)
+        state = Style(color=MARKS[found.mark].colour, bold=found.mark == "fail")
+        newest = values[-1] if len(values) else np.nan
+        number = f"{newest:{chosen.form}}" if np.isfinite(newest) else f"{'-':>6}"
+        blue = Style(color=BLUE)
+        lines = [
+            [
+                Segment(f"{joint:8}", name),
+                Segment(f" {mark(found.mark)} {found.word:7.7}", state),
+                Segment(f"{number:>6} "),
+                Segment(drawn[0], blue),
+            ]
+        ]
+        if after:
+            newest_of = self._history.last_known
+            lines[0].append(
+                Segment(_after(newest_of(f"volt.{joint}"), newest_of(f"temp.{joint}"), newest_of(f"rtt.{joint}")))
+            )
+        lines += [[Segment(" " * _BEFORE), Segment(line, blue)] for line in drawn[1:]]
+        return lines
+
+    def _values(self, joint: str, chosen: Signal) -> np.ndarray:
+        for name in chosen.columns:
+            values = self._history.column(f"{name}.{joint}")
+            if np.isfinite(values).any():
+                return values * _FACTOR.get(name, 1.0)
+        return np.full(len(self._history.rows), np.nan)
+
+    def _body(self, width: int) -> str:
+        """One line on the torso: turn rate, specific force, place; empty where nobody measures them."""
+        newest = self._history.last_known
+        groups = (("gyro", "xyz", "rad/s"), ("acc", "xyz", "m/s2"), ("base", "xy", "m"))
+        words = []
+        for name, axes, unit in groups:
+            values = [newest(f"{name}.{axis}") for axis in axes]
+            if all(np.isfinite(values)):
+                words.append(f"{name} " + " ".join(f"{value:+.2f}" for value in values) + f" {unit}")
+        return "   ".join(words)[:width].ljust(width)
+
+
+def _scale(chosen: Signal, values: Mapping[str, np.ndarray]) -> tuple[float, float]:
+    """What all strips span: the signal's own range, and what goes beyond it."""
+    known = [column[np.isfinite(column)] for column in values.values()]
+    low = min([chosen.low, *(float(column.min()) for column in known if len(column))])
+    high = max([chosen.high, *(float(column.max()) for column in known if len(column))])
+    return low, high
+
+
+def _after(volts: float, celsius: float, rtt_s: float) -> str:
+    shown = (f"{volts:7.1f}", f"{celsius:5.0f}", f"{rtt_s * 1e3:5.1f}")
+    return "".join(
+        text if np.isfinite(value) else " " * len(text)
+        for text, value in zip(shown, (volts, celsius, rtt_s), strict=True)
+    )
