@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import time
 
 from openant_tools.calib.wires import BOOT_S, opened_bus, wait
 from openant_tools.comms import messages
@@ -23,6 +24,8 @@ from openant_tools.robot.servo import servo_model
 __all__ = ["estop"]
 
 COMMAND = "openant calib estop"
+#: s within which the guardian has said its word and given the port back.
+GUARDIAN_S = 3.0
 
 
 def estop(bench: Bench) -> Procedure:
@@ -82,8 +85,8 @@ def estop(bench: Bench) -> Procedure:
     finally:
         with contextlib.suppress(HardwareFault):
             killed.close()
+    _until_guardian_left(bench, baud)
     with opened_bus(bench, baud) as bus:
-        wait(bus.clock, 0.3)
         left = [one.id for one in seen if bus.read(one.id, 64, 1) != b"\0"]
     yield Say(
         "killed: its guardian switched torque off" if not left else f"id {left} kept torque", "fail" if left else "ok"
@@ -102,6 +105,19 @@ def estop(bench: Bench) -> Procedure:
         COMMAND,
         data={"servos": [vars(one) for one in seen]},
     )
+
+
+def _until_guardian_left(bench: Bench, baud: int) -> None:
+    """The guardian keeps the port for as long as it repeats its packet; real time even where the robot's is stepped."""
+    give_up = time.monotonic() + GUARDIAN_S
+    while True:
+        try:
+            with opened_bus(bench, baud):
+                return
+        except HardwareFault:
+            if time.monotonic() > give_up:
+                raise
+            time.sleep(0.05)
 
 
 def _usable(bus: Bus) -> list[Scanned]:

@@ -13,7 +13,6 @@ from openant_tools.calib.wires import BOOT_S, journalled, opened_bus, wait
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.scan import BAUDS, Scan, Scanned, scan
 from openant_tools.comms.servos import Servo, Servos
-from openant_tools.errors import HardwareFault
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import (
     Answer,
@@ -171,43 +170,17 @@ def _not_one(found: Scan, motor: Motor, motors: Sequence[Motor], config: RobotCo
 
 
 def _rename_to(bench: Bench, bus: Bus, servos: Servos, motor: Motor, config: RobotConfig) -> Servos:
-    """Id, then baud rate, each heard again at once under the new one; the servos as they answer afterwards.
-
-    Raises:
-        HardwareFault: it does not answer under its new name; the message says where it was last heard.
-    """
+    """Id, then baud rate, each heard again at once under the new one; the servos as they answer afterwards."""
     servo = servos[motor.joint]
     servos.write_counts("id", motor.joint, motor.id)
     servos = journalled(bus, [Servo(motor.joint, motor.id, servo.model)], bench, COMMAND)
-    if servos.read_counts("baud_rate", motor.joint) != baud_code(config.bus.baud):
-        item, code = servo.model.register("baud_rate"), baud_code(config.bus.baud)
-        before = bus.line.baud
-        _write_baud(servos, motor, code)
-        bus.line.set_baud(config.bus.baud)
-        if bus.ping(motor.id, insist=True) is None:
-            raise HardwareFault(
-                f"{motor.joint} (id {motor.id}) does not answer at {config.bus.baud} baud after it was set from {before}",
-                where=bus.line.path,
-                remedy="run the step again: it looks at every baud rate",
-            )
-        assert item.decode(bus.read(motor.id, item.address, item.size)) == code
+    servos.write_baud(motor.joint, config.bus.baud)
     return servos
-
-
-def _write_baud(servos: Servos, motor: Motor, code: int) -> None:
-    """The one register that cannot be read back where it was written: at the old rate nobody listens any more."""
-    bus, item = servos.bus, servos[motor.joint].model.register("baud_rate")
-    old = servos.read_counts("baud_rate", motor.joint)
-    from openant_tools.procedure.journal import EepromWrite
-
-    if servos.before_write is not None:
-        servos.before_write(EepromWrite(motor.joint, motor.id, "baud_rate", old, code, bus.line.baud))
-    bus.write(motor.id, item.address, item.encode(code), f"baud_rate = {code}")
 
 
 def nudge(servos: Servos, joint: str, angle_rad: float = NUDGE_RAD) -> Generator[Event, Answer, float]:
     """Blink the LED, turn by `angle_rad` and back with little force; how far it went, rad. Torque is off afterwards."""
-    bus, clock = servos.bus, servos.bus.clock
+    clock = servos.bus.clock
     for _ in range(BLINKS):
         for on in (1, 0):
             servos.write_counts("led", joint, on)
@@ -229,7 +202,6 @@ def nudge(servos: Servos, joint: str, angle_rad: float = NUDGE_RAD) -> Generator
     finally:
         servos.set_torque(False, [joint])
     servos.write_counts("profile_velocity", joint, 0)
-    del bus
     return abs(there - start) * RAD_PER_PULSE
 
 

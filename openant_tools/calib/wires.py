@@ -23,7 +23,7 @@ from openant_tools.procedure.step import Bench
 from openant_tools.robot.config import Motor, RobotConfig
 
 __all__ = [
-    "BOOT_S", "SETTLE_S", "engine_config", "journalled", "opened_bus", "opened_imu", "robot_servos", "servo_angles", "wait",
+    "BOOT_S", "SETTLE_S", "engine_config", "journalled", "opened_bus", "opened_imu", "rest", "robot_servos", "servo_angles", "wait",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -112,6 +112,12 @@ def engine_config(bench: Bench, **more: object) -> EngineConfig:
     config = bench.folder.config()
     more = {"imu": imu_of_robot(config, bench.imu), "journal": str(bench.folder.journal), **more}
     return config_of_robot(config, bench.bus, control=bench.control, **more)
+
+
+def rest(bench: Bench) -> None:
+    """Let a robot that hands have put somewhere come to rest, and its servos start, torque off."""
+    with opened_bus(bench) as bus:
+        wait(bus.clock, BOOT_S + SETTLE_S)
 
 
 def wait(clock: Clock, seconds: float) -> None:

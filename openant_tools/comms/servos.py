@@ -17,7 +17,7 @@ from openant_tools.comms.protocol2 import BROADCAST, SyncWriteTemplate, write
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.procedure.journal import EepromWrite
 from openant_tools.robot.registers import EEPROM_END, Register
-from openant_tools.robot.servo import HardwareError, ServoModel, hardware_errors, servo_model
+from openant_tools.robot.servo import HardwareError, ServoModel, baud_code, hardware_errors, servo_model
 
 __all__ = ["BLOCK", "BLOCK_ADDRESS", "BLOCK_SIZE", "Block", "Servo", "Servos"]
 
@@ -195,6 +195,29 @@ class Servos:
                     where=self.bus.line.path,
                     remedy="write it again; a servo that forgets its memory must be replaced",
                 )
+
+    def write_baud(self, joint: str, baud: int) -> None:
+        """Set a servo's baud rate and follow it there: the line is at the new rate when this returns.
+
+        Raises:
+            HardwareFault: it does not answer at the new rate; the line is back at the old one.
+        """
+        servo, item = self._item("baud_rate", joint)
+        old, before = self.read_counts("baud_rate", joint), self.bus.line.baud
+        change = EepromWrite(joint, servo.id, "baud_rate", old, baud_code(baud), before)
+        if change.old != change.new:
+            if self.before_write is not None:
+                self.before_write(change)
+            self.bus.write(servo.id, item.address, item.encode(change.new), f"baud_rate = {change.new}")
+            self.journal.append(change)
+        self.bus.line.set_baud(baud)
+        if self.bus.ping(servo.id, insist=True) is None or self.read_counts("baud_rate", joint) != change.new:
+            self.bus.line.set_baud(before)
+            raise HardwareFault(
+                f"{joint} (id {servo.id}) does not answer at {baud} baud after it was set from {before}",
+                where=self.bus.line.path,
+                remedy="`openant calib ids` looks at every baud rate",
+            )
 
     def write_all(self, register: str, counts: Mapping[str, int]) -> float:
         """A RAM register of many joints by one sync write, unanswered; the time its last byte has left (s)."""

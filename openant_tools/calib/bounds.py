@@ -1,0 +1,335 @@
+"""Observation bounds: ranges by hand, a slow sweep, and the smallest and largest of every observation in many motions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.calib.motions import LIBRARY, motion
+from openant_tools.calib.sweep import JointSweep, analyse, play_watched, sweep
+from openant_tools.calib.wires import SETTLE_S, engine_config, opened_bus, rest, robot_servos, servo_angles, wait
+from openant_tools.comms import messages
+from openant_tools.comms.bus import Bus
+from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.servos import Servos
+from openant_tools.errors import HardwareFault
+from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.step import (
+    Answer,
+    Ask,
+    Bench,
+    Event,
+    Hands,
+    Intent,
+    Live,
+    Look,
+    Procedure,
+    Progress,
+)  # fmt: skip
+from openant_tools.recording.run import Facts, Run
+from openant_tools.recording.tables import read_run
+from openant_tools.robot.config import Provenance
+from openant_tools.robot.joints import JOINT_NAMES, JOINTS
+from openant_tools.robot.kit import ANGLE_LIMIT_RAD
+
+__all__ = ["Range", "Unwrapped", "bounds", "measured_bounds"]
+
+COMMAND = "openant calib bounds"
+Array = NDArray[np.float64]
+
+#: A stop that hands reach comes within this of the kit's; a joint that turns less is blocked.
+SHORT_RAD = 0.15
+#: Beyond this a joint turns further than any Ant's: a loose horn.
+FAR_RAD = 0.6
+#: s without a new extreme, with both ends seen, end the capture; and the longest that it waits for hands.
+QUIET_S, LONGEST_S = 1.2, 60.0
+SAMPLE_S = 0.05
+#: Commands keep this far from what hands could reach.
+KEEP_OFF_RAD = 0.03
+QUANTILES = (0.001, 0.01, 0.99, 0.999)
+SIGNALS = ("pos", "vel")
+BODY = ("gyro.x", "gyro.y", "gyro.z", "acc.x", "acc.y", "acc.z")
+
+
+@dataclass
+class Unwrapped:
+    """An encoder followed over its seam: differences are taken the short way round, as no hand turns half a turn between
+    two readings."""
+
+    last: float | None = None
+    angle: float = 0.0
+    seam: bool = False
+
+    def add(self, angle_rad: float) -> float:
+        """The unwrapped angle, rad, for one more reading."""
+        if self.last is None:
+            self.angle = angle_rad
+        else:
+            step = angle_rad - self.last
+            short = (step + math.pi) % (2 * math.pi) - math.pi
+            self.seam |= abs(step - short) > 1e-6
+            self.angle += short
+        self.last = angle_rad
+        return self.angle
+
+
+@dataclass
+class Range:
+    """What hands reach with one joint, rad, and the stops as they came again: their spread is the hysteresis."""
+
+    low: float = math.inf
+    high: float = -math.inf
+    lows: list[float] = field(default_factory=list)
+    highs: list[float] = field(default_factory=list)
+    seam: bool = False
+
+    def add(self, angle: float) -> bool:
+        """Take one reading; whether it is a new extreme."""
+        new = angle < self.low - 0.005 or angle > self.high + 0.005
+        self.low, self.high = min(self.low, angle), max(self.high, angle)
+        return new
+
+
+def bounds(bench: Bench) -> Procedure:
+    """Ranges, sweep, library; writes limits and `[observation]` into robot.toml."""
+    config = bench.folder.config()
+    problems, evidence = list[str](), list[Evidence]()
+    with opened_bus(bench) as bus:
+        servos = Servos(bus, robot_servos(config))
+        servos.identify()
+        servos.set_torque(False)
+        ranges = yield from _by_hand(bus, servos, bench.joints or JOINT_NAMES)
+    limits = dict[str, tuple[float, float]]()
+    for joint, motor in config.motors.items():
+        kit_limit = ANGLE_LIMIT_RAD[JOINTS[joint].kind]
+        seen = ranges.get(joint)
+        if seen is None:
+            limits[joint] = (motor.min_rad, motor.max_rad)
+            continue
+        evidence += [
+            Evidence(f"{joint} low end", seen.low, "rad", "by hand, torque off"),
+            Evidence(f"{joint} high end", seen.high, "rad", "by hand, torque off"),
+        ]
+        problems += _range_words(joint, seen, kit_limit)
+        limits[joint] = (-_limit(-seen.low, kit_limit), _limit(seen.high, kit_limit))
+    blocked = [joint for joint, (low, high) in limits.items() if low > -0.2 or high < 0.2]
+    if blocked:
+        return Finding(
+            "bounds", False, f"{', '.join(blocked)} can hardly be moved", tuple(evidence), "free the joint and run it again", COMMAND,
+            problems=tuple(problems),
+        )  # fmt: skip
+    yield Intent(
+        "write these limits into robot.toml; then sweep every joint slowly through its range, and play "
+        f"{len(LIBRARY)} motions on the stand",
+        moves=True,
+    )
+    values: dict[str, object] = {}
+    for joint, (low, high) in limits.items():
+        values |= {f"motors.{joint}.min_rad": low, f"motors.{joint}.max_rad": high}
+    bench.folder.update(values, provenance=Provenance("measured", COMMAND))
+    swept = yield from sweep(engine_config(bench, imu=None), bench.folder.recordings / "sweep.mcap", "slow sweep")
+    sweeps = analyse(swept, limits)
+    for one in sweeps.values():
+        evidence.append(
+            Evidence(f"friction of {one.joint}", one.friction_nm, "N·m", "slow sweep, from duty and back-EMF")
+        )
+    problems += _sweep_words(sweeps)
+
+    runs = [(yield from _library(bench, "stand"))]
+    if (
+        yield Ask("Also on the floor? It needs a metre of room around the robot.", ("yes", "no"), default="yes")
+    ) == "yes":
+        yield Hands("Put the robot on the floor, on its belly, legs straight out.", "place", setup="floor")
+        rest(bench)
+        yield Intent("play two of the motions on the floor; the robot stands up, walks about and lies down", moves=True)
+        runs.append((yield from _library(bench, "floor")))
+        yield Hands("Put it back on its stand.", "place", setup="stand")
+        rest(bench)
+    found, quantiles = measured_bounds(runs)
+    recording = ", ".join(bench.folder.relative(run.path) for run in runs if run.path)
+    bench.folder.update(
+        {f"observation.{name}": [round(low, 5), round(high, 5)] for name, (low, high) in found.items()},
+        provenance={"observation": Provenance("measured", COMMAND, recording)},
+    )
+    picture = coverage_picture(runs, bench.folder.findings / "bounds-coverage.png")
+    yield Look("What the motions covered:", picture=picture)
+    ok = not problems
+    return Finding(
+        "bounds",
+        ok,
+        f"ranges of {len(ranges)} joints, bounds of {len(found)} observations from {sum(len(run.t) for run in runs)} steps",
+        tuple(evidence),
+        "" if ok else "look at the joints that are named; the bounds stand and can be used",
+        COMMAND,
+        data={
+            "limits_rad": limits,
+            "ranges_rad": {joint: [seen.low, seen.high] for joint, seen in ranges.items()},
+            "hysteresis_rad": {joint: _spread(seen) for joint, seen in ranges.items()},
+            "seam": [joint for joint, seen in ranges.items() if seen.seam],
+            "sweep": {joint: one.as_dict() for joint, one in sweeps.items()},
+            "quantiles": {name: dict(zip(map(str, QUANTILES), q, strict=True)) for name, q in quantiles.items()},
+            "picture": bench.folder.relative(picture),
+            "recordings": recording,
+        },
+        problems=tuple(problems),
+    )
+
+
+def _limit(reached_rad: float, kit_rad: float) -> float:
+    """The limit of commands on one side: the kit's where hands got there, else short of where they got."""
+    return kit_rad if reached_rad > kit_rad - KEEP_OFF_RAD else round(max(0.0, reached_rad - KEEP_OFF_RAD), 5)
+
+
+def _by_hand(bus: Bus, servos: Servos, joints: Sequence[str]) -> Generator[Event, Answer, dict[str, Range]]:
+    """joint → its range by hand. Each is led to both stops, twice; the capture ends by itself when nothing new comes."""
+    found: dict[str, Range] = {}
+    names = list(servos.joints)
+    for k, joint in enumerate(joints):
+        yield Progress(k / len(joints), f"{joint}: range by hand")
+        servo, at = servos[joint], names.index(joint)
+        far = ANGLE_LIMIT_RAD[JOINTS[joint].kind] + 0.1
+        yield Hands(
+            f"Move the {JOINTS[joint].words} from stop to stop, twice, gently.", "turn", joint,
+            (far, -far, far, -far, 0.0), while_watching=True,
+        )  # fmt: skip
+        seen, track = Range(), Unwrapped()
+        start = bus.clock.now()
+        newest, towards = start, 0
+        extreme = 0.0
+        while bus.clock.now() - start < LONGEST_S:
+            wait(bus.clock, SAMPLE_S)
+            angle = servo.to_joint(track.add(float(servo_angles(servos)[0][at])))
+            angle = angle if abs(angle) < math.pi else (angle + math.pi) % (2 * math.pi) - math.pi
+            if seen.add(angle):
+                newest = bus.clock.now()
+            way = 1 if angle > extreme + 0.02 else -1 if angle < extreme - 0.02 else 0
+            if way:
+                if towards and way != towards:
+                    (seen.highs if towards > 0 else seen.lows).append(extreme)
+                towards = way
+            if way == towards and way:
+                extreme = angle
+            both = seen.high > 0.1 and seen.low < -0.1
+            mark = ("both ends seen" if both else "the other end, too") + (", seam crossed" if track.seam else "")
+            limit = ANGLE_LIMIT_RAD[JOINTS[joint].kind]
+            enough = yield Live({joint: angle}, "rad", "range by hand", {joint: -limit}, {joint: limit}, {joint: mark})
+            if enough is True or (both and bus.clock.now() - newest > QUIET_S and bus.clock.now() - start > 4.0):
+                break
+        seen.seam = track.seam
+        yield Hands("Let go.", "free")
+        if seen.high - seen.low < 0.05:
+            raise HardwareFault(
+                f"{joint} was not moved within {LONGEST_S:.0f} s", remedy="move the joint that is named"
+            )
+        found[joint] = seen
+    wait(bus.clock, SETTLE_S / 2)
+    return found
+
+
+def _spread(seen: Range) -> float:
+    """rad between repeats of the same stop."""
+    ends = [e for e in seen.highs if e > seen.high - 0.15], [e for e in seen.lows if e < seen.low + 0.15]
+    return max((max(end) - min(end) for end in ends if len(end) > 1), default=0.0)
+
+
+def _range_words(joint: str, seen: Range, limit: float) -> list[str]:
+    words = []
+    for end, kit_end, name in (
+        (seen.low, -limit, "down" if "knee" in joint else "clockwise"),
+        (seen.high, limit, "up" if "knee" in joint else "counter-clockwise"),
+    ):
+        short = abs(kit_end) - abs(end)
+        if short > SHORT_RAD:
+            words.append(
+                f"{joint}: stops {math.degrees(short):.0f}° early going {name} → a cable in the way, a screw, or a wrong spline"
+            )
+        elif -short > FAR_RAD:
+            words.append(f"{joint}: turns {math.degrees(-short):.0f}° beyond its stop going {name} → the horn is loose")
+    return words
+
+
+def _sweep_words(sweeps: Mapping[str, JointSweep]) -> list[str]:
+    """What is odd already on a new robot: a joint far from the others of its kind, lost answers."""
+    words = []
+    for kind in ("hip", "knee"):
+        mine = {j: s.friction_nm for j, s in sweeps.items() if JOINTS[j].kind == kind and s.friction_nm is not None}
+        middle = float(np.median(list(mine.values()))) if mine else 0.0
+        words += [
+            f"{joint}: friction {friction:.2f} N·m, the other {kind}s have {middle:.2f} → screws too tight, or thread-locker in the gear"
+            for joint, friction in mine.items()
+            if friction > 2 * middle + 0.03
+        ]
+    words += [
+        f"{joint}: {100 * one.lost:.1f} % of its answers were lost while it moved → look at its cable"
+        for joint, one in sweeps.items()
+        if one.lost > 0.01
+    ]
+    return words
+
+
+def _library(bench: Bench, setup: str) -> Generator[Event, Answer, Run]:
+    """Play the motions and record them in one file; the recording."""
+    floor = setup == "floor"
+    path = bench.folder.recordings / f"bounds-{setup}.mcap"
+    config = engine_config(bench)
+    joints = tuple(servo.joint for servo in config.servos)
+    with EngineProcess(config) as engine:
+        lying = np.asarray(engine.description["position"], float)
+        engine.ask(messages.Torque(True))
+        names = ("wander", "trot") if floor else tuple(LIBRARY)
+        engine.ask(messages.Ramp(motion(names[0], joints, config.limits_rad, config.rate_hz, 0, floor=floor)[0]))
+        engine.ask(messages.Record(str(path), Facts(joints=joints, setup=setup, protocol="bounds"), overwrite=True))
+        for seed, name in enumerate(names):
+            played = motion(name, joints, config.limits_rad, config.rate_hz, seed, floor=floor)
+            yield Progress(seed / len(names), f"{name}: {LIBRARY[name]}")
+            yield from play_watched(engine, messages.Play(played, name), len(played) / config.rate_hz, name)
+        engine.ask(messages.StopRecording())
+        if floor:
+            low, high = np.array([config.limits_rad[joint] for joint in joints]).T
+            engine.ask(messages.Ramp(np.clip(lying, low, high)))
+        engine.ask(messages.Torque(False))
+    return read_run(path)
+
+
+def measured_bounds(runs: Sequence[Run]) -> tuple[dict[str, tuple[float, float]], dict[str, tuple[float, ...]]]:
+    """name of a run table's column → (smallest, largest) and → `QUANTILES` over every step of the runs."""
+    found: dict[str, tuple[float, float]] = {}
+    quantiles: dict[str, tuple[float, ...]] = {}
+    names = [f"{signal}.{joint}" for signal in SIGNALS for joint in runs[0].joints] + list(BODY)
+    for name in names:
+        values = np.concatenate([run.column(name) for run in runs])
+        values = values[np.isfinite(values)]
+        if len(values) and float(np.ptp(values)) > 0:
+            found[name] = (float(values.min()), float(values.max()))
+            quantiles[name] = tuple(float(q) for q in np.quantile(values, QUANTILES))
+    return found, quantiles
+
+
+def coverage_picture(runs: Sequence[Run], path: Path) -> Path:
+    """Where each leg has been: hip against knee angle, stand and floor; the file."""
+    from matplotlib.figure import Figure
+
+    colours = {"stand": "#0072B2", "floor": "#D55E00"}  # Okabe–Ito
+    figure = Figure(figsize=(8, 6.4), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True, sharey=True)
+    for place, leg in zip(axes.flat, ("fl", "fr", "rl", "rr"), strict=True):
+        for run in runs:
+            hip, knee = run.column(f"pos.hip_{leg}"), run.column(f"pos.knee_{leg}")
+            setup = run.facts.setup or ""
+            place.plot(np.degrees(hip), np.degrees(knee), ".", ms=1.5, color=colours.get(setup, "#000000"), label=setup)
+        place.set_title(leg, fontsize=10)
+        place.grid(alpha=0.3)
+    for row in axes[:, 0]:
+        row.set_ylabel("knee (°)")
+    for column in axes[-1, :]:
+        column.set_xlabel("hip (°)")
+    axes[0, 0].legend(markerscale=6, loc="upper right")
+    figure.suptitle("Poses covered by the motions for the observation bounds")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    return path

@@ -1,0 +1,75 @@
+"""Comms health: losses, rate and the quiet that servos need after a write, measured with torque off."""
+
+from __future__ import annotations
+
+from openant_tools.calib.wires import opened_bus, robot_servos, wait
+from openant_tools.comms.bench import bus_limit_hz, measure_gap, measure_rate
+from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servos
+from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.step import Bench, Procedure, Progress
+from openant_tools.robot.config import Provenance
+
+__all__ = ["comms_health"]
+
+COMMAND = "openant calib comms"
+#: Cycles at the control rate, as long as a builder is willing to wait.
+CYCLES, RATE_HZ = 500, 100.0
+LOST_SHARE = 0.002
+#: Of what the wire would allow; less is an adapter that holds answers back.
+RATE_SHARE = 0.35
+
+
+def comms_health(bench: Bench) -> Procedure:
+    """Measure and judge; the gap after a write goes into robot.toml.
+
+    Raises:
+        HardwareFault: not all servos answer.
+    """
+    config = bench.folder.config()
+    problems = list[str]()
+    with opened_bus(bench) as bus:
+        servos = Servos(bus, robot_servos(config))
+        servos.identify()
+        servos.set_torque(False)
+        yield Progress(0.1, f"{CYCLES} reads at {RATE_HZ:g} Hz")
+        lost = dict.fromkeys(servos.joints, 0)
+        for _ in range(CYCLES):
+            for servo, answer in zip(servos.servos, bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, servos.ids), strict=True):
+                lost[servo.joint] += not answer.ok
+            wait(bus.clock, 1 / RATE_HZ)
+        yield Progress(0.5, "as fast as it goes")
+        rate = measure_rate(bus, servos.ids, 2.0)
+        yield Progress(0.8, "the quiet that is needed between a write and a read")
+        trials, gap = measure_gap(bus, servos.ids)
+    for joint, count in lost.items():
+        if count > LOST_SHARE * CYCLES:
+            problems.append(
+                f"{joint}: {count} of {CYCLES} answers were lost → look at the cable before it, and at its plugs"
+            )
+    limit = bus_limit_hz(config.bus.baud, len(lost), fast=False, gap_s=config.bus.write_read_gap_s)
+    if rate.hz < RATE_SHARE * limit:
+        problems.append(
+            f"the bus manages {rate.hz:.0f} cycles/s of {limit:.0f} → the adapter's latency timer (`openant calib connect`) or "
+            "the servos' return delay (`openant calib inventory`)"
+        )
+    if gap is None:
+        problems.append("reads fail whatever the pause after a write → noise on the bus, or a bad cable")
+    elif abs(gap - config.bus.write_read_gap_s) > 1e-6:
+        # Never below what robots in the field were found to need.
+        bench.folder.update({"bus.write_read_gap_s": max(gap, 0.2e-3)}, provenance=Provenance("measured", COMMAND))
+    return Finding(
+        "comms",
+        not problems,
+        f"{sum(lost.values())} of {CYCLES * len(lost)} answers lost at {RATE_HZ:g} Hz; up to {rate.hz:.0f} cycles/s",
+        (
+            Evidence(
+                "answers lost", sum(lost.values()) / (CYCLES * len(lost)), "1", f"{CYCLES} reads at {RATE_HZ:g} Hz"
+            ),
+            Evidence("cycles a second", rate.hz, "Hz", f"write and read; the wire allows {rate.limit_hz:.0f}"),
+            Evidence("quiet after a write", gap, "s", f"{trials[0].tries} reads for each gap"),
+        ),
+        "mend what is listed and run it again" if problems else "",
+        COMMAND,
+        data={"lost": lost, "rate_hz": rate.hz},
+        problems=tuple(problems),
+    )

@@ -1,0 +1,296 @@
+"""IMU: scale, bias, noise and mounting of the flight controller, from poses that hands can hold.
+
+Gravity seen from the board in three poses whose gravity in the body is known gives the rotation between the two frames
+(Wahba's problem, solved by SVD: Markley, J. Astronaut. Sci. 1988). How well the angles between the measured directions
+agree with those between the known ones says whether the poses were held: rotations leave angles alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.calib.wires import SETTLE_S, opened_imu, wait
+from openant_tools.comms.clock import Clock
+from openant_tools.comms.imu import STANDARD_GRAVITY, Imu
+from openant_tools.errors import HardwareFault
+from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.step import Answer, Ask, Bench, Event, Hands, Intent, Live, Look, Procedure, Progress, Say
+from openant_tools.robot.config import Provenance
+
+__all__ = ["POSES", "Mounting", "Pose", "imu", "mounting"]
+
+COMMAND = "openant calib imu"
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """One pose: how hands bring it about, and where it points.
+
+    Attributes:
+        turn_rad: rotation vector from level, in the world, which is the body's axes while it is level.
+        up: specific force in the body's axes there, as a unit vector.
+    """
+
+    words: str
+    turn_rad: tuple[float, float, float]
+    up: tuple[float, float, float]
+
+
+#: Level, nose down, left side down: none is opposite another, so that two of them would do and three check each other.
+POSES: tuple[Pose, ...] = (
+    Pose("level on its stand", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    Pose("nose straight down", (0.0, math.pi / 2, 0.0), (-1.0, 0.0, 0.0)),
+    Pose("left side straight down", (-math.pi / 2, 0.0, 0.0), (0.0, -1.0, 0.0)),
+)
+DRAWING = """\
+   level              nose down           left side down
+    ____                 ||
+ --|____|--> front    ---||---              |   left leg down
+                         \\/                 |___ torso on its side
+"""
+REST_S = 1.0
+#: At rest hands and stands shake by no more: m/s², rad/s (one standard deviation).
+STILL_M_S2, STILL_RAD_S = 0.35, 0.08
+#: Poses held by hand are a few degrees off; beyond this the answer is not to be trusted.
+AGREE_RAD, LOW_RAD = math.radians(6), math.radians(15)
+#: Share by which |acc| may miss gravity; a wrong scale is a factor of two.
+GRAVITY_SHARE = 0.06
+#: The yaw check: a quarter turn by hand, left.
+YAW_RAD, YAW_SHARE = math.pi / 2, 0.15
+TRIES = 3
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """How the board sits in the body.
+
+    Attributes:
+        rotation: (3, 3), body from board.
+        vector_rad: the same as a rotation vector.
+        disagreement_rad: largest difference of an angle between two poses as measured and as it should be.
+    """
+
+    rotation: Array
+    vector_rad: tuple[float, float, float]
+    disagreement_rad: float
+
+    @property
+    def confidence(self) -> str:
+        return "high" if self.disagreement_rad < AGREE_RAD else "low" if self.disagreement_rad < LOW_RAD else "none"
+
+
+def mounting(measured: Array, known: Array) -> Mounting:
+    """The rotation that takes directions (n, 3) seen by the board to those (n, 3) known in the body."""
+    seen = measured / np.linalg.norm(measured, axis=1, keepdims=True)
+    u, _, vt = np.linalg.svd(known.T @ seen)
+    rotation = u @ np.diag([1.0, 1.0, float(np.linalg.det(u @ vt))]) @ vt
+    apart = np.abs(np.arccos(np.clip(seen @ seen.T, -1, 1)) - np.arccos(np.clip(known @ known.T, -1, 1)))
+    return Mounting(rotation, _vector(rotation), float(apart.max()))
+
+
+def _vector(rotation: Array) -> tuple[float, float, float]:
+    """Rotation vector (rad) of a rotation matrix, by its quaternion's largest part, sound at half turns too."""
+    trace = float(np.trace(rotation))
+    w = math.sqrt(max(0.0, 1 + trace)) / 2
+    xyz = np.sqrt(np.maximum(0.0, 1 + 2 * np.diag(rotation) - trace)) / 2
+    if w > 1e-3:
+        skew = np.array(
+            [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+        )
+        xyz = skew / (4 * w)
+    else:
+        main = int(np.argmax(xyz))
+        signs = np.sign(rotation[main] + rotation[:, main])
+        signs[main] = 1.0
+        xyz = xyz * np.where(signs == 0, 1.0, signs)
+    length = float(np.linalg.norm(xyz))
+    if length < 1e-12:
+        return (0.0, 0.0, 0.0)
+    x, y, z = (2 * math.atan2(length, w) / length * xyz).tolist()
+    return (float(x), float(y), float(z))
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """Readings at rest: mean and standard deviation of acc (m/s²) and gyro (rad/s), (3,) each."""
+
+    acc: Array
+    gyro: Array
+    acc_noise: Array
+    gyro_noise: Array
+
+    @property
+    def still(self) -> bool:
+        return bool(self.acc_noise.max() < STILL_M_S2 and self.gyro_noise.max() < STILL_RAD_S)
+
+
+def imu(bench: Bench) -> Procedure:
+    """Poses, then a quarter turn; writes `[imu]` where the answer is sure.
+
+    Raises:
+        HardwareFault: no flight controller is known, or it stops answering.
+    """
+    problems = list[str]()
+    with opened_imu(bench) as (driver, clock):
+        info = driver.info
+        for note in info.notes:
+            yield Say(note, "warn")
+            if "gravity decides" in note.lower() or "Gravity says" in note:
+                problems.append(f"IMU scale: {note} → {info.acc_lsb_per_g} LSB/g is used")
+        yield Look("Three poses, each held still for a second.", DRAWING)
+        for attempt in range(TRIES):
+            rests = list[_Rest]()
+            for k, pose in enumerate(POSES):
+                yield Progress(0.25 * k, pose.words)
+                rests.append((yield from _pose(driver, clock, pose)))
+            found = mounting(np.array([rest.acc for rest in rests]), np.array([pose.up for pose in POSES]))
+            if found.confidence == "high" or attempt == TRIES - 1:
+                break
+            words = f"low confidence: the poses disagree by {math.degrees(found.disagreement_rad):.0f}°"
+            if (yield Ask(f"{words}. Once more?", ("yes", "no"), default="yes")) != "yes":
+                break
+        level = rests[0]
+        yield Hands("Put it back on its stand, level.", "tilt", path_rad=(0.0, 0.0, 0.0))
+        wait(clock, SETTLE_S)
+        turned = yield from _quarter_turn(driver, clock, found.rotation, level)
+    norms = np.array([np.linalg.norm(rest.acc) for rest in rests])
+    scale_error = float(norms.mean() / STANDARD_GRAVITY - 1)
+    axis, angle = _axis_words(found.vector_rad)
+    gyro_bias = found.rotation @ level.gyro
+    evidence = (
+        Evidence(
+            "norm of acc over gravity", 1 + scale_error, "1", f"{len(POSES)} poses at rest, {info.acc_lsb_per_g} LSB/g"
+        ),
+        Evidence("gyro bias", float(np.linalg.norm(gyro_bias)), "rad/s", "at rest, level"),
+        Evidence("gyro noise", float(level.gyro_noise.max()), "rad/s", "standard deviation at rest"),
+        Evidence("acc noise", float(level.acc_noise.max()), "m/s²", "standard deviation at rest"),
+        Evidence("mounting", angle, "rad", f"rotation about {axis}, from gravity in {len(POSES)} poses"),
+        Evidence("poses disagree by", found.disagreement_rad, "rad", "angles between measured directions"),
+        Evidence("quarter turn", turned, "rad", "integral of the gyro about the body's vertical"),
+    )
+    if abs(scale_error) > GRAVITY_SHARE:
+        problems.append(
+            f"IMU scale: |acc| at rest is {norms.mean():.2f} m/s² instead of {STANDARD_GRAVITY:.2f} → calibrate the accelerometer "
+            "in Betaflight (level, still), then run this step again"
+        )
+    yaw_off = abs(abs(turned) / YAW_RAD - 1)
+    if turned < 0 or yaw_off > YAW_SHARE:
+        problems.append(
+            f"gyro: a quarter turn to the left reads {math.degrees(turned):.0f}° → "
+            + (
+                "its sign is wrong: the mounting was taken in wrong poses"
+                if turned < 0
+                else "its scale is off, or the turn was not 90°"
+            )
+        )
+    if found.confidence != "high":
+        problems.append(
+            f"low confidence in the mounting: the poses disagree by {math.degrees(found.disagreement_rad):.0f}° → retry, hold them still "
+            "against a wall or a table's edge"
+        )
+    if angle > math.radians(8):
+        yield Say(
+            f"the board is mounted rotated by {math.degrees(angle):.0f}° about {axis}; that is taken into account",
+            "warn",
+        )
+        problems.append(
+            f"the board is mounted rotated by {math.degrees(angle):.0f}° about {axis} → robot.toml takes it into account"
+        )
+    ok = found.confidence == "high" and abs(scale_error) <= GRAVITY_SHARE and turned > 0 and yaw_off <= YAW_SHARE
+    if ok:
+        yield Intent("write scale, mounting and gyro bias into [imu] of robot.toml")
+        provenance = Provenance("measured", COMMAND)
+        bench.folder.update(
+            {
+                "imu.mounting_rad": [round(x, 5) for x in found.vector_rad],
+                "imu.gyro_bias_rad_s": [round(float(x), 6) for x in gyro_bias],
+                "imu.acc_counts_per_g": float(info.acc_lsb_per_g),
+            },
+            provenance=provenance,
+        )
+    return Finding(
+        "imu",
+        ok,
+        f"{info.variant} {info.firmware}, {info.acc_lsb_per_g} LSB/g, mounted "
+        + (f"at {math.degrees(angle):.0f}° about {axis}, " if angle > math.radians(1) else "straight, ")
+        + f"{info.rate_hz:.0f} samples/s",
+        evidence,
+        "" if ok else "run it again; nothing was written",
+        COMMAND,
+        data={
+            "mounting_rad": list(found.vector_rad),
+            "confidence": found.confidence,
+            "acc_lsb_per_g": info.acc_lsb_per_g,
+            "rate_hz": info.rate_hz,
+            "uid": info.uid,
+            "notes": list(info.notes),
+        },
+        problems=tuple(problems),
+    )
+
+
+def _pose(driver: Imu, clock: Clock, pose: Pose) -> Generator[Event, Answer, _Rest]:
+    """Hold a pose and read at rest."""
+    yield Hands(f"Hold the robot {pose.words} and keep still.", "tilt", path_rad=pose.turn_rad)
+    wait(clock, SETTLE_S)
+    for _ in range(TRIES):
+        rest = _rest(driver, clock)
+        if rest.still:
+            break
+        yield Say("it moves; keep still", "warn")
+    x, y, z = rest.acc.tolist()
+    yield Live({"x": x, "y": y, "z": z}, "m/s²", pose.words)
+    return rest
+
+
+def _rest(driver: Imu, clock: Clock) -> _Rest:
+    samples = _samples(driver, clock, REST_S)
+    acc, gyro = samples[:, 1:4], samples[:, 4:7]
+    return _Rest(acc.mean(axis=0), gyro.mean(axis=0), acc.std(axis=0), gyro.std(axis=0))
+
+
+def _samples(driver: Imu, clock: Clock, seconds: float) -> Array:
+    """(n, 7): t, acc, gyro, in the board's own axes."""
+    begin, rows = clock.now(), list[tuple[float, ...]]()
+    while clock.now() < begin + seconds:
+        sample = driver.read(clock.now() + 0.5)
+        if sample.t < begin:
+            continue  # it lay unread since the last pose
+        rows.append((sample.t, *sample.acc, *sample.gyro))
+    if len(rows) < 10:
+        raise HardwareFault(f"only {len(rows)} IMU samples came in {seconds:g} s", where=driver.where)
+    return np.array(rows)
+
+
+def _quarter_turn(driver: Imu, clock: Clock, rotation: Array, level: _Rest) -> Generator[Event, Answer, float]:
+    """Integral of the body's yaw rate, less its bias, over a quarter turn to the left, rad."""
+    yield Progress(0.85, "yaw check")
+    yield Hands(
+        "Within three seconds turn the robot a quarter turn to the left (counter-clockwise seen from above), level.",
+        "tilt",
+        path_rad=(0.0, 0.0, YAW_RAD),
+        while_watching=True,
+    )
+    samples = _samples(driver, clock, 3.0)
+    rate = (samples[:, 4:7] - level.gyro) @ rotation.T
+    turned = float(np.sum(np.diff(samples[:, 0]) * (rate[1:, 2] + rate[:-1, 2]) / 2))
+    yield Hands("Turn it back.", "tilt", path_rad=(0.0, 0.0, 0.0))
+    wait(clock, SETTLE_S)
+    return turned
+
+
+def _axis_words(vector: tuple[float, float, float]) -> tuple[str, float]:
+    """The nearest of the body's axes in words, and the angle, rad."""
+    angle = math.sqrt(sum(x * x for x in vector))
+    if angle < 1e-6:
+        return "any axis", 0.0
+    main = int(np.argmax(np.abs(vector)))
+    share = abs(vector[main]) / angle
+    name = ("x (forward)", "y (left)", "z (up)")[main]
+    return (("−" if vector[main] < 0 else "") + name if share > 0.98 else "a slanted axis"), angle

@@ -1,0 +1,285 @@
+"""Inventory: every EEPROM item of every servo, found against expected; what differs is mended or accepted."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import replace
+
+from openant_tools.calib.ids import locate
+from openant_tools.calib.wires import journalled, opened_bus, robot_servos, wait
+from openant_tools.comms.bus import Bus, Found
+from openant_tools.comms.faults import NoAnswer
+from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servo, Servos
+from openant_tools.errors import BadInput
+from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.step import (
+    Answer,
+    Ask,
+    Bench,
+    Event,
+    Hands,
+    Intent,
+    Procedure,
+    Progress,
+    RegisterChange,
+    Say,
+)  # fmt: skip
+from openant_tools.robot.config import Motor, Provenance, RobotConfig
+from openant_tools.robot.joints import JOINTS
+from openant_tools.robot.registers import EEPROM_END, PWM_FULL
+from openant_tools.robot.servo import baud_code, servo_model
+
+__all__ = ["FIRMWARE_BRINGS", "expected_eeprom", "inventory"]
+
+COMMAND = "openant calib inventory"
+#: firmware → what it brought (ROBOTIS e-manual); older ones lack it.
+FIRMWARE_BRINGS: Mapping[int, str] = {
+    38: "the Bus Watchdog, which stops a servo that nobody talks to",
+    42: "clearing of turns, time-based profiles",
+    45: "Fast Sync Read and the servo's own backup",
+}
+#: Return delays to try, in counts of 2 µs; the factory's is the last.
+DELAYS = (0, 1, 5, 10, 25, 50, 125, 250)
+SWEEP_READS = 120
+#: Supply and temperature limits may be set tighter than the factory's by a builder who knows why.
+IDENTITY = frozenset({"model_number", "model_information", "firmware_version", "id", "baud_rate"})
+FIX_ALL, FIX_ONE, ACCEPT = "fix all", "fix one by one", "accept"
+
+
+def expected_eeprom(motor: Motor, config: RobotConfig) -> dict[str, int]:
+    """register → counts that a servo of this robot should hold: the factory's but for what the robot needs."""
+    wanted = {
+        name: register.default
+        for name, register in motor.servo.registers.items()
+        if register.address < EEPROM_END and register.writable and register.default is not None and name not in IDENTITY
+    }
+    wanted |= {
+        "return_delay_time": round(config.bus.return_delay_s / 2e-6),
+        "pwm_limit": round(config.bus.pwm_limit * PWM_FULL),
+    }
+    return wanted
+
+
+def inventory(bench: Bench) -> Procedure:
+    """Look through all servos, mend what is granted, and find the smallest return delay without loss."""
+    config = bench.folder.config()
+    problems, evidence = list[str](), list[Evidence]()
+    table: dict[str, dict[str, int]] = {}
+    with opened_bus(bench) as bus:
+        yield Progress(None, "who answers")
+        found, missing = _ping_all(bus, config)
+        if len(missing) == len(config.motors):
+            yield Hands("Connect the whole robot: all eight servos on the cable, 12 V on.", "plug")
+            wait(bus.clock, 0.8)
+            found, missing = _ping_all(bus, config)
+        if missing:
+            problems += yield from _missing(bench, bus, config, missing)
+            found, missing = _ping_all(bus, config)
+        problems += _wrong_models(found, config)
+        present = [
+            servo for servo in robot_servos(config) if servo.joint in found and not _wrong(found, config, servo.joint)
+        ]
+        servos = journalled(bus, present, bench, COMMAND)
+        for k, servo in enumerate(present):
+            yield Progress(k / max(1, len(present)), f"reading {servo.joint}")
+            table[servo.joint] = _read_eeprom(servos, servo, found[servo.joint].firmware)
+        yield Say(f"{len(present)} of {len(config.motors)} servos read, {sum(map(len, table.values()))} items")
+        for joint, seen in found.items():
+            lacks = [what for firmware, what in FIRMWARE_BRINGS.items() if seen.firmware < firmware]
+            evidence.append(Evidence(f"firmware of {joint}", float(seen.firmware), "", "register 6"))
+            if lacks:
+                yield Say(f"{joint} has firmware {seen.firmware}, without {'; '.join(lacks)}", "warn")
+        differences = [
+            RegisterChange(joint, name, items[name], wanted)
+            for joint, items in table.items()
+            for name, wanted in expected_eeprom(config.motors[joint], config).items()
+            if name in items and items[name] != wanted and not _harmless(name, items[name])
+        ]
+        accepted: list[RegisterChange] = []
+        if differences:
+            yield Say(f"{len(differences)} items differ from what they should be", "warn")
+            left = yield from _mend(servos, differences)
+            accepted += left
+            problems += [
+                f"{change.joint}: {change.register} is {change.old}, expected {change.new} → accepted"
+                for change in left
+            ]
+        delay_s = yield from _sweep(bus, servos, present)
+        errors = {s.joint: servos.hardware_errors(s.joint) for s in present}
+        problems += [f"{joint}: {e.name} → {e.advice}" for joint, found_errors in errors.items() for e in found_errors]
+        volts = {s.joint: servos.read("present_input_voltage", s.joint) for s in present}
+    if delay_s is not None:
+        evidence.append(
+            Evidence("return delay", delay_s, "s", f"smallest of {len(DELAYS)} without a loss in {SWEEP_READS} reads")
+        )
+        bench.folder.update({"bus.return_delay_s": delay_s}, provenance=Provenance("measured", COMMAND))
+    if volts:
+        evidence.append(Evidence("lowest supply", min(volts.values()), "V", "register 144 at rest"))
+    bad = (
+        len(found) < len(config.motors) or bool(_wrong_models(found, config)) or any(errors.values()) or delay_s is None
+    )
+    ok = not bad
+    return Finding(
+        "inventory",
+        ok,
+        f"{len(present)} of {len(config.motors)} servos as expected"
+        + (f", {len(differences) - len(accepted)} items mended" if differences else ""),
+        tuple(evidence),
+        "" if ok else "mend what is listed and run it again",
+        COMMAND,
+        data={"eeprom": table, "accepted": [str(change) for change in accepted], "volts": volts},
+        problems=tuple(problems),
+    )
+
+
+def _harmless(name: str, value: int) -> bool:
+    """Extended position mode does all that position mode does, and a joint across the encoder's seam needs it."""
+    return name == "operating_mode" and value == 4
+
+
+def _ping_all(bus: Bus, config: RobotConfig) -> tuple[dict[str, Found], list[Motor]]:
+    found = {motor.joint: bus.ping(motor.id, insist=True) for motor in config.motors.values()}
+    return (
+        {joint: seen for joint, seen in found.items() if seen is not None},
+        [config.motors[joint] for joint, seen in found.items() if seen is None],
+    )
+
+
+def _missing(
+    bench: Bench, bus: Bus, config: RobotConfig, missing: Sequence[Motor]
+) -> Generator[Event, Answer, list[str]]:
+    """Servos that do not answer: left at another baud rate, which is mended, or not there; in words."""
+    yield Progress(None, f"looking for {', '.join(m.joint for m in missing)} at other baud rates")
+    elsewhere = locate(bus, missing, config)
+    words = []
+    wanted = baud_code(config.bus.baud)
+    if elsewhere:
+        for joint, baud in elsewhere.items():
+            yield Say(f"{joint} (id {config.motors[joint].id}) answers at {baud} baud: its rate was left there", "warn")
+        if (yield Ask(f"Set them to {config.bus.baud} baud?", ("yes", "no"), default="yes")) == "yes":
+            changes = tuple(RegisterChange(j, "baud_rate", baud_code(b), wanted) for j, b in elsewhere.items())
+            yield Intent(f"set {', '.join(elsewhere)} to {config.bus.baud} baud", changes)
+            for joint, baud in elsewhere.items():
+                _set_baud(bench, bus, config.motors[joint], baud, config)
+                words.append(f"{joint}: was left at {baud} baud → set to {config.bus.baud}")
+            bus.line.set_baud(config.bus.baud)
+    for motor in missing:
+        if motor.joint not in elsewhere:
+            words.append(_silence(bus, motor, config))
+            yield Say(words[-1], "fail")
+    return words
+
+
+def _silence(bus: Bus, motor: Motor, config: RobotConfig) -> str:
+    """Where to look for a servo that answers at no rate: the cable before it in its leg."""
+    joint = JOINTS[motor.joint]
+    hip = config.motors[f"hip_{joint.leg.name}"]
+    if joint.kind == "knee" and bus.ping(hip.id, insist=True) is not None:
+        where = f"look at the cable between {hip.joint} and {motor.joint}, then at {motor.joint} itself"
+    elif joint.kind == "knee":
+        where = f"its hip is silent, too: look at the cable to {hip.joint}"
+    else:
+        where = f"look at the cable to {motor.joint} and its id"
+    return f"{motor.joint} (id {motor.id}) answers at no baud rate → {where}"
+
+
+def _set_baud(bench: Bench, bus: Bus, motor: Motor, baud: int, config: RobotConfig) -> None:
+    bus.line.set_baud(baud)
+    found = bus.ping(motor.id, insist=True)
+    if found is None:
+        raise NoAnswer(f"{motor.joint} (id {motor.id}) answered at {baud} baud and no longer does", where=bus.line.path)
+    servos = journalled(bus, [Servo(motor.joint, motor.id, servo_model(found.model_number))], bench, COMMAND)
+    servos.set_torque(False)
+    servos.write_baud(motor.joint, config.bus.baud)
+
+
+def _wrong(found: Mapping[str, Found], config: RobotConfig, joint: str) -> bool:
+    return found[joint].model_number != config.motors[joint].servo.number
+
+
+def _wrong_models(found: Mapping[str, Found], config: RobotConfig) -> list[str]:
+    """Servos of another model than the place is for; two of one leg that stand in each other's are swapped."""
+    wrong = {joint for joint in found if _wrong(found, config, joint)}
+    words = []
+    for joint in sorted(wrong):
+        other = ("knee" if joint.startswith("hip") else "hip") + joint[-3:]
+        model = _name(found[joint].model_number)
+        if other in wrong and found[other].model_number == config.motors[joint].servo.number:
+            if joint < other:
+                words.append(
+                    f"{joint} and {other} are swapped: id {config.motors[joint].id} is a {model} → exchange their ids "
+                    "(`openant calib ids`), or the motors"
+                )
+        else:
+            words.append(
+                f"{joint} is a {model}, the place is for a {config.motors[joint].model} → put the right servo in"
+            )
+    return words
+
+
+def _name(number: int) -> str:
+    try:
+        return servo_model(number).name
+    except BadInput:
+        return f"servo of model number {number}"
+
+
+def _read_eeprom(servos: Servos, servo: Servo, firmware: int) -> dict[str, int]:
+    """Every item below 64 that this firmware has, by one read for each stretch without a hole: holes refuse."""
+    items = sorted(
+        (r for r in servo.model.registers.values() if r.end <= EEPROM_END and r.min_firmware <= firmware),
+        key=lambda register: register.address,
+    )
+    values: dict[str, int] = {}
+    while items:
+        stretch = [items.pop(0)]
+        while items and items[0].address == stretch[-1].end:
+            stretch.append(items.pop(0))
+        start = stretch[0].address
+        data = servos.bus.read(servo.id, start, stretch[-1].end - start)
+        values |= {r.name: r.decode(data[r.address - start : r.end - start]) for r in stretch}
+    return values
+
+
+def _mend(servos: Servos, differences: Sequence[RegisterChange]) -> Generator[Event, Answer, list[RegisterChange]]:
+    """Ask what to do with them, do it; what was accepted as it is."""
+    for change in differences:
+        yield Say(str(change), "warn")
+    answer = yield Ask("What to do with them?", (FIX_ALL, FIX_ONE, ACCEPT), default=FIX_ALL)
+    chosen = list(differences) if answer == FIX_ALL else []
+    if answer == FIX_ONE:
+        for change in differences:
+            if (yield Ask(f"Set {change}?", ("yes", "no"), default="yes")) == "yes":
+                chosen.append(change)
+    if chosen:
+        yield Intent(f"write {len(chosen)} EEPROM items, each read back", tuple(chosen))
+        servos.set_torque(False)
+        for change in chosen:
+            servos.write_counts(change.register, change.joint, change.new)
+    return [change for change in differences if change not in chosen]
+
+
+def _sweep(bus: Bus, servos: Servos, present: Sequence[Servo]) -> Generator[Event, Answer, float | None]:
+    """The smallest return delay, s, at which no read of all servos loses an answer; None where none is clean."""
+    if not present:
+        return None
+    kept, ids = bus.timing, [servo.id for servo in present]
+    old = servos.read_all("return_delay_time")
+    tried: int | None = None
+    for delay in DELAYS:
+        if any(value != delay for value in servos.read_all("return_delay_time").values()):
+            changes = tuple(RegisterChange(j, "return_delay_time", v, delay) for j, v in old.items() if v != delay)
+            yield Intent(f"try a return delay of {2 * delay} µs", changes)
+            for servo in present:
+                servos.write_counts("return_delay_time", servo.joint, delay)
+        bus.timing = replace(kept, return_delay_s=delay * 2e-6)
+        yield Progress(None, f"{SWEEP_READS} reads with a return delay of {2 * delay} µs")
+        lost = sum(
+            not answer.ok for _ in range(SWEEP_READS) for answer in bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, ids)
+        )
+        if lost == 0:
+            tried = delay
+            break
+        yield Say(f"{lost} of {SWEEP_READS * len(ids)} answers were lost", "warn")
+    bus.timing = kept
+    return None if tried is None else tried * 2e-6

@@ -1,0 +1,135 @@
+"""Leg by leg: cable, range and nudge of one leg before the next is built and the shell is closed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+
+import numpy as np
+
+from openant_tools.calib.bounds import Unwrapped
+from openant_tools.calib.ids import nudge
+from openant_tools.calib.wires import BOOT_S, opened_bus, robot_servos, servo_angles, wait
+from openant_tools.comms.bus import Bus
+from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servos
+from openant_tools.errors import HardwareFault
+from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.step import Answer, Ask, Bench, Event, Hands, Intent, Live, Procedure, Progress, Say
+from openant_tools.robot.config import RobotConfig
+from openant_tools.robot.joints import JOINTS, LEGS, Leg
+from openant_tools.robot.kit import ANGLE_LIMIT_RAD
+
+__all__ = ["legs"]
+
+COMMAND = "openant calib legs"
+#: Reads while the builder wiggles the cables and moves the leg; more than this share lost is a bad contact.
+READ_S, LOST_SHARE = 4.0, 0.005
+#: Share of the kit's range that a hand must reach at a leg that is not in its shell yet.
+RANGE_SHARE = 0.6
+NUDGE_RAD, NUDGED_RAD = 0.1, 0.04
+AGAIN, GO_ON = "try again", "go on with the next"
+
+
+def legs(bench: Bench) -> Procedure:
+    """Each leg on its own; what one leg lacks is named before the next begins."""
+    config = bench.folder.config()
+    wanted = [leg for leg in LEGS if not bench.joints or any(joint.endswith(leg.name) for joint in bench.joints)]
+    problems, evidence, proven = list[str](), list[Evidence](), list[str]()
+    with opened_bus(bench) as bus:
+        yield Hands(
+            "Build the legs one after the other; the torso stands on its stand, cables out.", "assemble", setup="stand"
+        )
+        yield Hands("Take every leg off the cable.", "unplug")
+        wait(bus.clock, 0.2)
+        for k, leg in enumerate(wanted):
+            while True:
+                yield Progress(k / len(wanted), f"{leg.words} leg ({k + 1} of {len(wanted)})")
+                try:
+                    found = yield from _one(bus, leg, config)
+                    trouble = ""
+                except HardwareFault as fault:
+                    found, trouble = [], str(fault)
+                if not trouble:
+                    evidence += found
+                    proven.append(leg.name)
+                    yield Say(f"{leg.words} leg: cable, range and nudge are good", "ok")
+                    break
+                yield Say(trouble, "fail")
+                if (yield Ask(trouble, (AGAIN, GO_ON), default=GO_ON)) != AGAIN:
+                    problems.append(f"{leg.words} leg: {trouble}")
+                    break
+    return Finding(
+        "legs",
+        not problems,
+        f"{len(proven)} of {len(wanted)} legs are proven",
+        tuple(evidence),
+        "mend what is listed and run it again; the shell stays open" if problems else "close the shell",
+        COMMAND,
+        data={"proven": proven},
+        problems=tuple(problems),
+    )
+
+
+def _one(bus: Bus, leg: Leg, config: RobotConfig) -> Generator[Event, Answer, list[Evidence]]:
+    """One leg; raises HardwareFault with what is wrong with it."""
+    joints = [f"hip_{leg.name}", f"knee_{leg.name}"]
+    for joint in joints:
+        yield Hands(f"Connect {joint}.", "plug", joint)
+    wait(bus.clock, BOOT_S)
+    servos = Servos(bus, robot_servos(config, joints))
+    servos.identify()
+    servos.set_torque(False)
+    evidence = list[Evidence]()
+    tracks = {joint: (Unwrapped(), list[float]()) for joint in joints}
+    for joint in joints:
+        far = ANGLE_LIMIT_RAD[JOINTS[joint].kind] + 0.05
+        yield Hands(
+            f"Move {joint} from stop to stop, and wiggle its cables meanwhile.", "turn", joint, (far, -far, 0.0),
+            while_watching=True,
+        )  # fmt: skip
+        asked = lost = 0
+        end = bus.clock.now() + READ_S
+        while bus.clock.now() < end:
+            answers = bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, servos.ids)
+            asked, lost = asked + len(answers), lost + sum(not answer.ok for answer in answers)
+            if asked % 20 == 0:
+                try:
+                    now = servos.joint_rad(
+                        [
+                            round(a / servos.servos[0].model.registers["present_position"].scale)
+                            for a in servo_angles(servos)[0]
+                        ]
+                    )
+                except HardwareFault:
+                    continue  # a loss like the others; it is counted above
+                for name, angle in zip(joints, now, strict=True):
+                    tracks[name][1].append(tracks[name][0].add(angle))
+                if (yield Live(dict(zip(joints, now, strict=True)), "rad", f"moving {joint}")) is True:
+                    break
+            wait(bus.clock, 0.005)
+        yield Hands("Let go.", "free")
+        if lost > LOST_SHARE * asked:
+            raise HardwareFault(
+                f"{lost} of {asked} answers were lost while {joint} moved",
+                remedy=f"look at the cable before {joint} and at its plugs: press each in to the click",
+            )
+        seen = float(np.ptp(tracks[joint][1])) if tracks[joint][1] else 0.0
+        whole = 2 * ANGLE_LIMIT_RAD[JOINTS[joint].kind]
+        evidence.append(Evidence(f"range of {joint}", seen, "rad", "by hand"))
+        evidence.append(
+            Evidence(f"answers lost at {joint}", lost / max(1, asked), "1", f"{asked} reads while it moved")
+        )
+        if seen < RANGE_SHARE * whole:
+            raise HardwareFault(
+                f"{joint} turned by {math.degrees(seen):.0f}° of {math.degrees(whole):.0f}°",
+                remedy="is a screw or a cable in its way?",
+            )
+    yield Intent(f"nudge {' and '.join(joints)} by {math.degrees(NUDGE_RAD):.0f}°, gently", moves=True)
+    for joint in joints:
+        went = yield from nudge(servos, joint, NUDGE_RAD)
+        evidence.append(Evidence(f"nudge of {joint}", went, "rad", "encoder"))
+        if went < NUDGED_RAD:
+            raise HardwareFault(
+                f"{joint} does not follow its motor ({math.degrees(went):.1f}°)", remedy="is its horn screwed on?"
+            )
+    return evidence

@@ -1,0 +1,311 @@
+"""Zeros and directions: what every encoder shows with straight legs, and which servo moves when one joint is moved.
+
+Hands tell more than motors here. With torque off the builder moves one named joint one named way: the servo that turns is
+that joint's, whatever its id says, and the sign of its turn is the joint's direction. A gentle nudge by the motor then
+proves the other way round that what is commanded is what moves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from openant_tools.calib.wires import SETTLE_S, engine_config, opened_bus, robot_servos, servo_angles, wait
+from openant_tools.comms import messages
+from openant_tools.comms.bus import Bus
+from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.servos import Servos
+from openant_tools.errors import HardwareFault
+from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.step import (
+    Answer,
+    Ask,
+    Bench,
+    Event,
+    Hands,
+    Intent,
+    Live,
+    Look,
+    Procedure,
+    Progress,
+    Say,
+)  # fmt: skip
+from openant_tools.robot.config import Provenance, RobotConfig
+from openant_tools.robot.joints import JOINT_NAMES, JOINTS
+from openant_tools.robot.kit import ANGLE_LIMIT_RAD, NOMINAL_ZERO_RAD
+from openant_tools.robot.registers import RAD_PER_PULSE
+
+__all__ = ["Moved", "Straight", "straight", "zeros"]
+
+COMMAND = "openant calib zeros"
+#: Horns go on in eighths of a turn.
+GRID_RAD = math.pi / 4
+READINGS = 25
+#: Legs that are put straight by a ruler are within this; more is a horn between two splines, or a leg not straight.
+STRAIGHT_RAD = math.radians(8)
+#: By how much the builder moves a joint, and how much of it must be seen.
+BY_HAND_RAD, SEEN_RAD = 0.5, 0.15
+NUDGE_RAD, NUDGED_RAD = 0.12, 0.07
+WAYS = {"hip": "counter-clockwise seen from above", "knee": "up: lift its foot"}
+DRAWING = """\
+            front
+     fl \\          / fr        every leg straight out, at 45 degrees to the torso,
+          \\ ____ /             level, hip and knee in one line:
+           |    |              lay a ruler along each leg
+          / ---- \\
+     rl /          \\ rr
+"""
+
+
+@dataclass(frozen=True)
+class Straight:
+    """One joint with its leg straight.
+
+    Attributes:
+        angle_rad: of the servo, in its own frame, within one turn.
+        eighths: how many splines (45°) it sits from the nominal mounting.
+        residual_rad: what is left beside the grid.
+    """
+
+    angle_rad: float
+    eighths: int
+    residual_rad: float
+
+
+def straight(angle_rad: float) -> Straight:
+    """Where on the grid of horn positions a servo's angle (rad) with its leg straight lies."""
+    angle = angle_rad % (2 * math.pi)
+    away = angle - NOMINAL_ZERO_RAD
+    eighths = round(away / GRID_RAD)
+    return Straight(angle, eighths, away - eighths * GRID_RAD)
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What was seen while one joint was moved by hand: the joint of the servo that turned, and how far, rad."""
+
+    asked: str
+    seen: str
+    by_rad: float
+
+
+def zeros(bench: Bench) -> Procedure:
+    """Measure zeros and directions, name what is built wrong, write robot.toml, and nudge every joint to prove it."""
+    config = bench.folder.config()
+    joints = bench.joints or JOINT_NAMES
+    problems = list[str]()
+    with opened_bus(bench) as bus:
+        servos = Servos(bus, robot_servos(config))
+        servos.identify()
+        servos.set_torque(False)
+        yield Look("Put all legs straight.", DRAWING)
+        yield Hands("Put every leg straight out and hold still; torque is off.", "straighten")
+        wait(bus.clock, SETTLE_S)
+        yield Progress(0.1, f"{READINGS} readings of every encoder")
+        rows = servo_angles(servos, READINGS)
+        if float(np.ptp(rows, axis=0).max()) > math.radians(2):
+            moved = servos.servos[int(np.ptp(rows, axis=0).argmax())].joint
+            return _failed(f"{moved} moved while it was read", "hold the legs still and run it again")
+        level = rows.mean(axis=0)
+        yield Hands("Let go.", "free")
+        movements = yield from _by_hand(bus, servos, joints)
+    grid = {servo.joint: straight(float(level[k])) for k, servo in enumerate(servos.servos)}
+    evidence = [
+        Evidence(f"residual of {joint}", seen.residual_rad, "rad", "encoder with straight legs, from the 45° grid")
+        for joint, seen in grid.items()
+    ]
+    unseen = [joint for joint in joints if joint not in movements]
+    problems += [
+        f"{joint}: no servo turned when it was moved → look at its horn screw and its cable" for joint in unseen
+    ]
+    owner = {joint: movement.seen for joint, movement in movements.items() if movement.seen != joint}
+    if unseen or len({movement.seen for movement in movements.values()}) < len(movements):
+        return _failed(
+            "it cannot be told which servo is which joint",
+            "move only the joint that is named, well and one way",
+            problems=(*problems, *(f"{a}: the servo of {b} turned" for a, b in owner.items())),
+            evidence=evidence,
+        )
+    values: dict[str, object] = {}
+    if owner:
+        problems += yield from _swapped(owner, config, values)
+    ids = {joint: owner.get(joint, joint) for joint in joints}
+    for joint in joints:
+        seen, movement = grid[ids[joint]], movements[joint]
+        direction = 1 if movement.by_rad > 0 else -1
+        path = f"motors.{joint}"
+        values[f"{path}.zero_offset_rad"] = round(seen.angle_rad, 5)
+        if direction != config.motors[joint].direction:
+            values[f"{path}.direction"] = direction
+            problems.append(
+                f"{joint}: reversed, its servo turns backwards (a mirrored leg or mount) → direction = {direction} in "
+                "robot.toml; build it as the guide says if the robot's own software is to drive it"
+            )
+        problems += _spline(joint, seen, direction)
+    far = [joint for joint in joints if abs(grid[ids[joint]].residual_rad) > STRAIGHT_RAD]
+    for joint in far:
+        degrees = math.degrees(grid[ids[joint]].residual_rad)
+        problems.append(
+            f"{joint}: {degrees:+.1f}° beside the grid of horn positions → was the leg straight? else its horn or gear slips"
+        )
+    yield Intent(
+        "write zero offsets and directions into robot.toml, then nudge every joint by "
+        f"{math.degrees(NUDGE_RAD):.0f}° with the motors, on the stand",
+        moves=True,
+    )
+    bench.folder.update(values, provenance=Provenance("measured", COMMAND))
+    nudged = yield from _nudge_all(bench, joints)
+    problems += nudged.problems
+    evidence += nudged.evidence
+    ok = not far and nudged.ok
+    widest = max((abs(grid[ids[joint]].residual_rad) for joint in joints), default=0.0)
+    return Finding(
+        "zeros",
+        ok,
+        f"zeros of {len(joints)} joints, at most {math.degrees(widest):.1f}° beside the 45° grid; every joint moves as commanded"
+        if ok
+        else "not every zero and direction is sure",
+        tuple(evidence),
+        "" if ok else "mend what is listed and run it again",
+        COMMAND,
+        data={
+            "zero_rad": {joint: grid[ids[joint]].angle_rad for joint in joints},
+            "eighths": {joint: grid[ids[joint]].eighths for joint in joints},
+            "direction": {joint: 1 if movements[joint].by_rad > 0 else -1 for joint in joints},
+            "swapped": owner,
+        },
+        problems=tuple(problems),
+    )
+
+
+def _by_hand(bus: Bus, servos: Servos, joints: tuple[str, ...]) -> Generator[Event, Answer, dict[str, Moved]]:
+    """joint → what turned when the builder moved it; a joint at which nothing turned is missing."""
+    found: dict[str, Moved] = {}
+    for k, joint in enumerate(joints):
+        kind = JOINTS[joint].kind
+        yield Progress(0.2 + 0.6 * k / len(joints), f"{joint} by hand")
+        # Half a turn up or round is beyond no stop; from straight it is safe either way.
+        before = servo_angles(servos)[0]
+        yield Hands(
+            f"Move the {JOINTS[joint].words} about 30° {WAYS[kind]}, and hold it.", "turn", joint, (BY_HAND_RAD,)
+        )
+        wait(bus.clock, SETTLE_S)
+        change = servo_angles(servos)[0] - before
+        change = (change + math.pi) % (2 * math.pi) - math.pi
+        yield Live({s.joint: float(change[n]) for n, s in enumerate(servos.servos)}, "rad", f"moved: {joint}")
+        most = int(np.abs(change).argmax())
+        yield Hands("Put it back.", "turn", joint, (0.0,))
+        wait(bus.clock, SETTLE_S)
+        yield Hands("Let go.", "free")
+        if abs(change[most]) > SEEN_RAD:
+            found[joint] = Moved(joint, servos.servos[most].joint, float(change[most]))
+            words = f"{joint}: its servo turned {math.degrees(change[most]):+.0f}°"
+            if found[joint].seen != joint:
+                words = f"{joint} was moved, but the servo with the id of {found[joint].seen} turned"
+            yield Say(words, "ok" if found[joint].seen == joint else "warn")
+    return found
+
+
+def _swapped(
+    owner: Mapping[str, str], config: RobotConfig, values: dict[str, object]
+) -> Generator[Event, Answer, list[str]]:
+    """Name servos that sit in each other's place, and let robot.toml follow how the robot is built."""
+    words = list[str]()
+    for joint, other in owner.items():
+        mine, its = config.motors[joint], config.motors[other]
+        pair = (
+            f"{joint} and {other} are swapped"
+            if owner.get(other) == joint
+            else f"the servo of {joint} has the id of {other}"
+        )
+        if mine.model != its.model:
+            raise HardwareFault(
+                f"{pair}, and they are of different models ({mine.model}, {its.model})",
+                remedy="exchange the two motors: a hip's is too weak for a knee",
+            )
+        if owner.get(other) != joint or joint < other:
+            words.append(
+                f"{pair} → their ids are exchanged in robot.toml; `openant calib ids` can exchange them in the servos"
+            )
+    for line in words:
+        yield Say(line, "warn")
+    yield Ask("Let robot.toml follow how the robot is built?", ("yes",), default="yes")
+    for joint, other in owner.items():
+        values[f"motors.{joint}.id"] = config.motors[other].id
+    return words
+
+
+def _spline(joint: str, seen: Straight, direction: int) -> list[str]:
+    """What a horn on another spline than the guide's means for this joint."""
+    if seen.eighths == 0:
+        return []
+    limit = ANGLE_LIMIT_RAD[JOINTS[joint].kind]
+    ends = [seen.angle_rad + direction * end for end in (-limit, limit)]
+    seam = min(ends) < 0 or max(ends) > 2 * math.pi
+    return [
+        f"{joint}: its horn is on the wrong spline, {abs(seen.eighths)} × 45° {'beyond' if seen.eighths > 0 else 'before'} where "
+        "it belongs → its zero follows in robot.toml"
+        + (", and it runs in extended position mode since its range crosses the encoder's seam" if seam else "")
+        + "; the guide's mounting is better"
+    ]
+
+
+@dataclass(frozen=True)
+class _Nudged:
+    ok: bool
+    problems: tuple[str, ...]
+    evidence: tuple[Evidence, ...]
+
+
+def _nudge_all(bench: Bench, joints: tuple[str, ...]) -> Generator[Event, Answer, _Nudged]:
+    """Move each joint a little by its motor, and see that it goes there, comes back, and no other does."""
+    problems, evidence = list[str](), list[Evidence]()
+    with EngineProcess(engine_config(bench)) as engine:
+        names = [servo.joint for servo in engine.config.servos]
+        start = np.asarray(engine.description["position"], float)
+        for note in engine.events():
+            if isinstance(note, messages.Notice):
+                yield Say(note.text, "info")
+        engine.ask(messages.Torque(True))
+        limits = np.array([engine.config.limits_rad[name] for name in names])
+        start = np.clip(start, limits[:, 0], limits[:, 1])
+        for k, joint in enumerate(joints):
+            yield Progress(0.8 + 0.2 * k / len(joints), f"nudging {joint}")
+            at = names.index(joint)
+            there = start.copy()
+            there[at] += NUDGE_RAD if start[at] + NUDGE_RAD < limits[at, 1] else -NUDGE_RAD
+            before = _measured(engine, names)
+            engine.ask(messages.Ramp(there))
+            engine.ask(messages.Hold(0.3))
+            reached = _measured(engine, names)
+            engine.ask(messages.Ramp(start))
+            engine.ask(messages.Hold(0.2))
+            went = reached - before
+            sign = math.copysign(1.0, there[at] - start[at])
+            others = [name for n, name in enumerate(names) if n != at and abs(went[n]) > NUDGED_RAD]
+            if sign * went[at] < NUDGED_RAD:
+                why = "turned the wrong way" if sign * went[at] < -NUDGED_RAD else "did not follow"
+                problems.append(
+                    f"{joint}: {why} ({math.degrees(went[at]):+.1f}°) → is it blocked, or its horn screw loose?"
+                )
+            if others:
+                problems.append(f"{joint}: {', '.join(others)} moved with it → look for two servos with one id")
+            evidence.append(Evidence(f"nudge of {joint}", float(went[at]), "rad", "encoder, motor commanded"))
+        engine.ask(messages.Torque(False))
+    return _Nudged(not problems, tuple(problems), tuple(evidence))
+
+
+def _measured(engine: EngineProcess, names: list[str]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """(n,) rad: where the joints are, in the servos' own frames made joint angles without turns."""
+    counts = engine.ask(messages.ReadRegister("present_position"))
+    servos = {servo.joint: servo for servo in engine.config.servos}
+    angles = np.array([servos[name].to_joint(counts[name] * RAD_PER_PULSE) for name in names])
+    wrapped: np.ndarray[tuple[int], np.dtype[np.float64]] = (angles + math.pi) % (2 * math.pi) - math.pi
+    return wrapped
+
+
+def _failed(what: str, remedy: str, problems: tuple[str, ...] = (), evidence: list[Evidence] | None = None) -> Finding:
+    return Finding("zeros", False, what, tuple(evidence or ()), remedy, COMMAND, problems=problems)
