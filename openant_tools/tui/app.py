@@ -100,9 +100,6 @@ class OpenAnt(App[int]):
 
     TITLE = "Open Ant"
     CSS_PATH = "app.tcss"
-    #: from which size on screens use the room beside and below
-    HORIZONTAL_BREAKPOINTS: ClassVar[list[tuple[int, str]]] = [(0, "-narrow"), (110, "-wide")]
-    VERTICAL_BREAKPOINTS: ClassVar[list[tuple[int, str]]] = [(0, "-short"), (34, "-tall")]
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("space", "stop", "STOP", priority=True, show=False),
         Binding("ctrl+c", "interrupt", show=False, priority=True),

@@ -35,6 +35,9 @@ class Page(Screen[None]):
 
     def __init__(self) -> None:
         super().__init__()
+        # From which size on a screen uses the room beside and below.
+        self.HORIZONTAL_BREAKPOINTS = [(0, "-narrow"), (110, "-wide")]
+        self.VERTICAL_BREAKPOINTS = [(0, "-short"), (34, "-tall")]
         self._drawn_top: Text | None = None
 
     @property
