@@ -31,8 +31,9 @@ OUTSIDE: Mapping[str, str] = {
     "eccentric_encoder": "the encoder's magnet is off its axis",
 }
 
-#: Effects that this maker has to make: their form in the virtual robot is another than the catalogue's words.
-_BATCH_ONLY = frozenset({"speed_limit", "viscous_nonlinear", "tracker_scale"})
+#: Effects that the batch simulator has to make: the virtual robot gives them another form (speed_limit brakes always,
+#: viscous_nonlinear replaces the linear part), starts every time cold, or films nothing.
+_BATCH_ONLY = frozenset({"speed_limit", "viscous_nonlinear", "thermal_derating", "tracker_scale"})
 #: Pairs that no record tells apart, or that are one fault told twice.
 _TWINS = (
     {"action_delay", "sensor_delay"}, {"stiffness_error", "weak_joint"}, {"coulomb_friction", "stribeck_friction"},
@@ -120,14 +121,14 @@ class Mix:
 
     Attributes:
         sizes: shares of small, medium and large among the robots with one effect.
-        virtual: share of the robots that come from the virtual robot's bus.
+        virtual: share of the robots that come from the virtual robot's bus, of those whose effect it can have.
     """
 
     none: float = 0.35
     two: float = 0.15
     outside: float = 0.12
     sizes: tuple[float, float, float] = (0.25, 0.4, 0.35)
-    virtual: float = 0.0
+    virtual: float = 0.5
 
     def __post_init__(self) -> None:
         shares = (self.none, self.two, self.outside)
@@ -161,7 +162,7 @@ def draw_answers(count: int, seed: int, mix: Mix | None = None) -> list[Answer]:
             answer = replace(answer, tracker=True)
         possible = not answer.outside and not {drawn.effect for drawn in answer.effects} & _BATCH_ONLY
         if possible and chance.random() < mix.virtual:
-            answer = replace(answer, maker="virtual")
+            answer = replace(answer, maker="virtual", tracker=False)
         answers.append(answer)
     return answers
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,7 @@ def logged(robot: TrueRobot, motion: Motion, number: int, trace: Trace) -> Run:
         out: Array = np.rint((values + deviation * chance.standard_normal(values.shape)) / count) * count
         return out
 
-    columns: dict[str, Array] = {}
+    columns: dict[str, NDArray[Any]] = {}
     position = noisy(_between(trace.position, at), senses.encoder_rad, RAD_PER_PULSE)
     velocity = noisy(_between(trace.velocity, at), 0.0, RAD_S_PER_COUNT)
     last = np.clip((plan.row + robot.clocks.sense_s) / STEP_S, 0, len(trace.duty) - 1).astype(int)

@@ -17,6 +17,7 @@ from openant_tools.blind.draw import Answer, Mix, draw_answers
 from openant_tools.blind.log import logged
 from openant_tools.blind.robot import true_robot
 from openant_tools.blind.simulate import simulate
+from openant_tools.blind.through_bus import record_through_bus
 from openant_tools.errors import BadInput
 from openant_tools.files import write_text
 from openant_tools.recording.tables import write_table
@@ -85,9 +86,12 @@ def make_set(
     commitment = _claim(out, drawn, {"robots": len(drawn), "seed": seed, "motion_seed": motion_seed}, commit, mix, key)
     write_text(out / "model.xml", nominal_mjcf("standard"))
     todo = [k for k in range(len(drawn)) if not _done(out / _name(k), played)]
-    batches = [todo[at : at + BATCH] for at in range(0, len(todo), BATCH)]
+    by_batch = [k for k in todo if drawn[k].maker == "batch"]
+    batches = [by_batch[at : at + BATCH] for at in range(0, len(by_batch), BATCH)]
+    batches += [[k] for k in todo if drawn[k].maker == "virtual"]
     work = (delayed(_make_batch)(out, [(k, drawn[k]) for k in batch], played) for batch in batches)
     progress("simulating", 0.0)
+    # A robot of the bus takes about as long as a batch of the others.
     for done, _ in enumerate(Parallel(n_jobs=jobs, return_as="generator_unordered")(work), 1):
         progress("simulating", done / len(batches))
     return commitment
@@ -123,6 +127,12 @@ def _claim(
 
 
 def _make_batch(out: Path, batch: Sequence[tuple[int, Answer]], played: Sequence[Motion]) -> None:
+    if batch[0][1].maker == "virtual":
+        ((k, answer),) = batch
+        record_through_bus(
+            answer, played, lambda motion, run: write_table(run, out / _name(k) / f"{motion.name}.parquet")
+        )
+        return
     robots = [true_robot(answer) for _, answer in batch]
     for number, motion in enumerate(played):
         for (k, _), robot, trace in zip(batch, robots, simulate(robots, motion, number), strict=True):

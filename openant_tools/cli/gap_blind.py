@@ -6,7 +6,7 @@ import contextlib
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import click
 
@@ -49,6 +49,7 @@ def _share(name: str, words: str) -> Callable[[click.decorators.FC], click.decor
 @_share("--none", "Robots without effect, of all. Default 0.35.")
 @_share("--two", "Robots with two effects. Default 0.15.")
 @_share("--outside", "Robots outside the catalogue. Default 0.12.")
+@_share("--virtual", "Robots from the virtual robot's bus, where it can have the effect; a minute each. Default 0.5.")
 @_key_option
 @click.option("--open", "unsealed", is_flag=True, help="Leave the answers open, beside the runs: for development.")
 @_jobs_option
@@ -87,10 +88,18 @@ def make(
         if key_file.resolve().is_relative_to(out.resolve()):
             raise BadInput("the key would lie beside what it seals", where=key_file, remedy="keep it outside the set")
         key = read_key(key_file) if key_file.exists() else make_key(key_file)
-    mix = Mix(**{name: value for name, value in shares.items() if value is not None})
+    given: dict[str, Any] = {name: value for name, value in shares.items() if value is not None}
     with _shown() as progress:
         commitment = make_set(
-            out, count, seed, mix=mix, commit=full, key=key, motion_seed=motion_seed, jobs=jobs, progress=progress
+            out,
+            count,
+            seed,
+            mix=Mix(**given),
+            commit=full,
+            key=key,
+            motion_seed=motion_seed,
+            jobs=jobs,
+            progress=progress,
         )
     click.echo(f"{count} robots in {out}")
     click.echo(f"commitment of their answers: {commitment}")

@@ -1,0 +1,326 @@
+"""The blind benchmark: robots that nobody chose, verdicts before answers, and a table that hides nothing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import tomllib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomlkit
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from openant_tools.blind import commands
+from openant_tools.blind import make as make_module
+from openant_tools.blind.answers import read_answers
+from openant_tools.blind.commands import Motion
+from openant_tools.blind.draw import OUTSIDE, Answer, Drawn, Mix, draw_answers
+from openant_tools.blind.log import logged
+from openant_tools.blind.make import make_set, seed_of_commit
+from openant_tools.blind.robot import true_robot
+from openant_tools.blind.run import run_set, verdict_path
+from openant_tools.blind.score import Case, read, score, wilson
+from openant_tools.blind.score_report import score_report, write_docs
+from openant_tools.blind.simulate import simulate
+from openant_tools.blind.sizes import KINDS, SIZES, STANDARD, size_table
+from openant_tools.blind.through_bus import scenario_of
+from openant_tools.cli.gap import gap
+from openant_tools.errors import BadInput
+from openant_tools.recording.tables import read_run
+from openant_tools.robot.joints import JOINTS
+from openant_tools.virtual.scenario import parse_scenario
+from openant_tools.virtual.seal import make_key
+
+HEALTHY = Answer("none", (), 5, "batch", True)
+
+
+def ill(effect: str, joints: tuple[str, ...] | str, size: str = "large", **parameters: Any) -> Answer:
+    return replace(HEALTHY, group="single", effects=(Drawn(effect, joints, parameters, size),))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def short() -> Iterator[tuple[Motion, ...]]:
+    """Two short runs in place of seven: a piece of the first on the stand, and of the first on the floor."""
+    whole = commands.motions(3)
+    first = [next(one for one in whole if one.setup == setup) for setup in ("stand", "floor")]
+    cut = tuple(
+        replace(one, commands=one.commands[40:100], limp=one.limp[40:100], held_out=one.setup == "floor")
+        for one in first
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(make_module, "motions", lambda seed: cut)
+        yield cut
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, short: tuple[Motion, ...]) -> tuple[Path, Path, bytes]:
+    """Three robots in a folder, their key file, and the key."""
+    place = tmp_path_factory.mktemp("blind")
+    key = make_key(place / "key")
+    long_leg = replace(HEALTHY, group="outside", outside="long_leg", parameters={"joint": "knee_fr", "strength": 1.0})
+    answers = [HEALTHY, ill("action_delay", ("knee_fl",), delay_s=0.04), long_leg]
+    make_set(place / "set", 3, 3, answers=answers, key=key)
+    return place / "set", place / "key", key
+
+
+@pytest.fixture
+def sealed_set(made: tuple[Path, Path, bytes], tmp_path: Path) -> tuple[Path, Path, bytes]:
+    """The same robots, for one test."""
+    return Path(shutil.copytree(made[0], tmp_path / "set")), made[1], made[2]
+
+
+def says(robot: Path, model: Path) -> dict[str, Any]:
+    """A judge that finds whatever robot 1 has."""
+    name = "action_delay" if robot.name == "robot-001" else "none"
+    found = {"effect": "action_delay", "joints": ["knee_fl"], "probability": 0.9 if name != "none" else 0.05}
+    return {
+        "verdict": name, "effects": [found], "selected": [name] if name != "none" else [],
+        "gap": {"before": 0.02, "after": 0.002, "floor": 0.001}, "ambiguous_with": [],
+    }  # fmt: skip
+
+
+# ---- what is drawn ----
+
+
+def test_every_effect_comes_before_any_comes_twice_and_all_kinds_of_robots_are_there() -> None:
+    answers = draw_answers(120, 7, Mix(virtual=0.0))
+    assert Counter(answer.group for answer in answers) == {"none": 42, "two": 18, "outside": 14, "single": 46}
+    singles = Counter(answer.effects[0].effect for answer in answers if answer.group == "single")
+    assert set(singles) == set(KINDS)
+    assert max(singles.values()) == 2
+    assert {answer.outside for answer in answers if answer.outside} == set(OUTSIDE)
+    assert draw_answers(120, 7, Mix(virtual=0.0)) == answers
+    assert draw_answers(120, 8, Mix(virtual=0.0)) != answers
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**31))
+def test_an_answer_survives_its_file_and_describes_a_robot(seed: int) -> None:
+    for answer in draw_answers(6, seed, Mix(none=0.1, two=0.3, outside=0.3)):
+        assert Answer.of(tomllib.loads(tomlkit.dumps(answer.as_table()))) == answer
+        robot = true_robot(answer)
+        assert np.isfinite(robot.servos.kt).all()
+        if answer.maker == "virtual":
+            for setup in ("stand", "floor"):
+                parse_scenario(tomllib.loads(scenario_of(answer, setup, 0.0)))
+
+
+def test_the_catalogue_is_whole_and_sizes_grow() -> None:
+    names = Path(__file__).parents[2] / "shared" / "effects.md"
+    if names.exists():
+        rows = [line.split("|")[2].strip(" `") for line in names.read_text().splitlines() if line.startswith("| ")]
+        assert set(rows[1:]) - {"effect"} == set(KINDS)
+    chance = np.random.default_rng(0)
+    delays = [KINDS["action_delay"].draw(k, chance, ("knee_fl",), STANDARD)["delay_s"] for k in range(len(SIZES))]
+    assert delays == sorted(delays)
+    assert size_table().count("\n") == len(KINDS) + 1
+
+
+def test_a_seed_from_a_commit_is_its_hash(tmp_path: Path) -> None:
+    seed, full = seed_of_commit("HEAD", Path(__file__).parent)
+    assert seed == int(full[:8], 16)
+    with pytest.raises(BadInput, match="no commit"):
+        seed_of_commit("nothing-like-it", Path(__file__).parent)
+
+
+# ---- what is simulated ----
+
+
+def test_a_late_robot_is_late_and_only_where_it_is(short: tuple[Motion, ...]) -> None:
+    late = ill("action_delay", ("knee_fl",), delay_s=0.06)
+    robots = [true_robot(answer) for answer in (HEALTHY, late)]
+    healthy, slow = (
+        logged(robot, short[0], 0, trace) for robot, trace in zip(robots, simulate(robots, short[0], 0), strict=True)
+    )
+    off = np.sqrt(np.mean((healthy.signal("pos") - slow.signal("pos")) ** 2, axis=0))
+    at = list(JOINTS).index("knee_fl")
+    assert off[at] > 0.02
+    assert np.delete(off, at).max() < 0.003
+    command, position = healthy.signal("cmd"), healthy.signal("pos")
+    assert np.sqrt(np.mean((command - position) ** 2)) < 0.15
+    assert {
+        "cur.knee_fl",
+        "load.hip_fl",
+        "pwm.knee_fl",
+        "volt.hip_rr",
+        "temp.hip_rr",
+        "gyro.z",
+        "acc.z",
+        "cmd_t",
+    } <= set(healthy.columns)
+    # The same robot in other company is the same robot.
+    alone = simulate(robots[1:], short[0], 0)[0]
+    np.testing.assert_allclose(logged(robots[1], short[0], 0, alone).signal("pos"), slow.signal("pos"))
+
+
+@pytest.mark.parametrize("name", ["mount_resonance", "rubber_band", "loose_battery", "uneven_floor", "slipping_horn"])
+def test_what_the_catalogue_has_no_name_for_runs(name: str, short: tuple[Motion, ...]) -> None:
+    strange = replace(HEALTHY, group="outside", outside=name, parameters={"joint": "knee_fr", "strength": 1.4})
+    robot = true_robot(strange)
+    (trace,) = simulate([robot], replace(short[1], commands=short[1].commands[:8], limp=short[1].limp[:8]), 3)
+    assert np.isfinite(trace.position).all()
+    assert trace.base is not None
+    assert 0.1 < trace.base[-1, 2] < 0.2
+
+
+# ---- seal, run, score ----
+
+
+def test_a_sealed_set_tells_nothing_and_opens_only_after_the_verdicts(sealed_set: tuple[Path, Path, bytes]) -> None:
+    folder, _, key = sealed_set
+    assert not list(folder.rglob("truth.toml"))
+    assert "action_delay" not in "".join(path.read_text() for path in folder.rglob("*.toml"))
+    run = read_run(folder / "robot-001" / "stand-1.parquet")
+    assert run.facts.setup == "stand"
+    with pytest.raises(BadInput, match="3 of 3 robots have no verdict"):
+        read(folder, key)
+    assert run_set(folder, diagnose=says) == 3
+    with pytest.raises(BadInput, match="sealed"):
+        read(folder, None)
+    with pytest.raises(BadInput, match="does not open"):
+        read(folder, bytes(32))
+    facts, cases = read(folder, key)
+    assert [case.answer.group for case in cases] == ["none", "single", "outside"]
+    with pytest.raises(BadInput, match="not those that the set committed to"):
+        read_answers(folder, key, "0" * 64)
+    assert facts["commitment"] == tomllib.loads((folder / "answers.sealed.toml").read_text())["sealed"]["commitment"]
+
+
+def test_a_robot_done_is_not_done_again_and_one_refused_is_tried_again(sealed_set: tuple[Path, Path, bytes]) -> None:
+    folder = sealed_set[0]
+    asked: list[str] = []
+
+    def judge(robot: Path, model: Path) -> dict[str, Any]:
+        asked.append(robot.name)
+        if robot.name == "robot-002" and len(asked) < 4:
+            raise BadInput("this robot is strange", remedy="look again")
+        return says(robot, model)
+
+    assert run_set(folder, diagnose=judge) == 3
+    assert "strange" in json.loads(verdict_path(folder, "robot-002").read_text())["error"]
+    assert run_set(folder, diagnose=judge) == 1
+    assert run_set(folder, diagnose=judge) == 0
+    assert asked == ["robot-000", "robot-001", "robot-002", "robot-002"]
+
+
+def test_two_workers_of_a_dask_cluster_share_the_robots(sealed_set: tuple[Path, Path, bytes]) -> None:
+    distributed = pytest.importorskip("distributed")
+    import cloudpickle
+
+    # Workers cannot import a test: it goes to them as it is.
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    try:
+        # Threads in place of processes, which take long to start; what is said goes over TCP all the same.
+        with distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
+        ) as cluster:
+            address = cluster.scheduler_address
+            assert run_set(sealed_set[0], backend="dask", scheduler=address, diagnose=says) == 3
+    finally:
+        cloudpickle.unregister_pickle_by_value(sys.modules[__name__])
+    assert read(sealed_set[0], sealed_set[2])[1][1].verdict == "action_delay"
+
+
+def test_the_score_counts_what_is_right_and_shows_what_is_not(
+    sealed_set: tuple[Path, Path, bytes], tmp_path: Path
+) -> None:
+    folder, key_file, _ = sealed_set
+    run_set(folder, diagnose=says)
+    out, docs = tmp_path / "score.json", tmp_path / "docs" / "blind.md"
+    done = CliRunner().invoke(
+        gap, ["blind", "score", str(folder), "--key-file", str(key_file), "--json", str(out), "--docs", str(docs)]
+    )
+    assert done.exit_code == 0, done.output
+    assert "| false alarms on robots without effect | 0 % | 0 … 79 % | 1 |" in done.output
+    rows = {row["what"]: row for row in json.loads(out.read_text())["rows"]}
+    assert rows["right name first, medium and large, joint, servo, bus"]["k"] == 1
+    assert rows["outside the catalogue: not given a name"]["k"] == 1
+    assert rows["excess gap closed on held-out runs, median, right name given"]["value"] == pytest.approx(
+        0.913, abs=1e-3
+    )
+    page = docs.read_text()
+    assert "commitment of the answers" in page
+    assert (docs.parent / "pictures" / "blind-confusion.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_false_alarm_and_a_wrong_name_are_shown() -> None:
+    wrong = {"verdict": "actuator_lag", "effects": [{"effect": "actuator_lag", "probability": 0.8, "joints": "all"}]}
+    cases = [
+        Case("robot-000", HEALTHY, wrong),
+        Case("robot-001", ill("action_delay", ("knee_fl",), delay_s=0.04), wrong),
+        Case("robot-002", ill("action_delay", "all", delay_s=0.006, size="small"),
+             {"verdict": "ambiguous", "ambiguous_with": [["action_delay", "sensor_delay"]], "effects": []}),
+        Case("robot-003", ill("stiffness_error", "all", scale=1.25, size="small"), {"verdict": "none", "effects": []}),
+        Case("robot-004", ill("backlash", ("knee_fl",), gap_rad=0.007, size="small"), {"verdict": "none", "effects": []}),
+    ]  # fmt: skip
+    found = score({"seed": 1, "commitment": "x"}, cases)
+    assert [case.robot for case in found.failures] == ["robot-000", "robot-001", "robot-004"]
+    alarms = next(row for row in found.rows if row.words.startswith("false alarms"))
+    assert (alarms.k, alarms.n, alarms.reached) == (1, 1, "below")
+    assert found.confusions[("action_delay", "actuator_lag")] == 1
+    page = score_report(found).html()
+    assert "large action_delay at knee_fl" in page
+
+
+@given(st.integers(1, 400).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_wilson_holds_the_proportion(counts: tuple[int, int]) -> None:
+    k, n = counts
+    low, high = wilson(k, n)
+    assert 0 <= low <= k / n <= high <= 1 or k in (0, n)
+    assert wilson(0, 120)[1] == pytest.approx(0.031, abs=1e-3)
+
+
+# ---- bad input ----
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["make", "--out", "S", "--open"], "a set needs a seed"),
+        (["make", "--out", "S", "--seed", "1"], "sealed or open"),
+        (["make", "--out", "S", "--seed", "1", "--seed-from", "HEAD", "--open"], "one seed"),
+        (["make", "--out", "S", "--seed", "1", "--key-file", "S/key"], "beside what it seals"),
+        (["make", "--out", ".", "--seed", "1", "--open"], "not empty"),
+        (["make", "--out", "S", "--seed", "1", "--open", "--none", "0.9", "--two", "0.4"], "together at most"),
+        (["run", "."], "no set.toml"),
+        (["score", "."], "no set.toml"),
+    ],
+)
+def test_bad_input_gets_one_clear_line(
+    given: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("something").write_text("here")
+    done = CliRunner().invoke(gap, ["blind", *given])
+    assert isinstance(done.exception, BadInput), done.output
+    assert message in str(done.exception)
+    assert not list(tmp_path.rglob("*.parquet"))
+
+
+def test_a_set_goes_on_where_it_was_and_another_is_not_written_over(sealed_set: tuple[Path, Path, bytes]) -> None:
+    folder, _, key = sealed_set
+    answers = list(read_answers(folder, key, tomllib.loads((folder / "set.toml").read_text())["commitment"]).values())
+    (folder / "robot-001" / "floor-1.json").unlink()
+    untouched, again = folder / "robot-000" / "stand-1.parquet", folder / "robot-001" / "floor-1.json"
+    before = untouched.stat().st_mtime_ns
+    make_set(folder, 3, 3, answers=answers, key=key)
+    assert untouched.stat().st_mtime_ns == before
+    assert again.exists()
+    with pytest.raises(BadInput, match="another set"):
+        make_set(folder, 3, 4, answers=answers, key=key)
+
+
+def test_docs_name_the_commonest_confusions(tmp_path: Path) -> None:
+    wrong = {"verdict": "actuator_lag", "effects": []}
+    cases = [Case(f"robot-{k}", ill("action_delay", "all", delay_s=0.04), wrong) for k in range(2)]
+    write_docs(score({"seed": 1, "commitment": "x", "seed_from_commit": "abc"}, cases), tmp_path / "blind.md")
+    assert "action_delay taken for actuator_lag (2)" in (tmp_path / "blind.md").read_text()
