@@ -19,6 +19,8 @@ from textual.widgets import Input
 from openant_tools.bringup.walk import WALK
 from openant_tools.errors import OpenAntError
 from openant_tools.procedure.step import Step
+from openant_tools.robot.config import CONFIG_NAME
+from openant_tools.robot.kit import KITS
 from openant_tools.tui.dialogs import Help, Question
 from openant_tools.tui.feeds import ReplayFeed
 from openant_tools.tui.jump import Jump
@@ -42,6 +44,8 @@ TICK_S = 0.1
 END_S = 10.0
 
 INTERRUPTED = 130
+#: the folder that is offered where there is none
+NEW_ROBOT = "my-ant"
 SCENARIOS = Path(__file__).parent / "scenarios"
 
 THEME = Theme(
@@ -218,8 +222,40 @@ class OpenAnt(App[int]):
                 return
         self.push_screen(kind())
 
+    def need_folder(self, then: Callable[[], None]) -> None:
+        """Go on once there is a robot's folder; where there is none yet, offer to make one."""
+        if self.session.folder is not None:
+            then()
+            return
+        place = self.session.path / NEW_ROBOT
+        kits = list(KITS.values())
+
+        def answered(choice: int | None) -> None:
+            if choice is None:
+                return
+            if choice == len(kits):
+                self.action_go("settings")
+                return
+            try:
+                if (place / CONFIG_NAME).is_file():
+                    self.session.open(place)
+                else:
+                    self.session.create(place, kits[choice].name)
+            except OpenAntError as error:
+                self.notify(str(error), severity="error")
+                return
+            self.refresh_walk()
+            then()
+
+        words = f"All that is found out about a robot is kept in a folder. There is none here yet: make {place}?"
+        offers = [f"Yes: {kit.words}" for kit in kits]
+        self.push_screen(Question(words, *offers, "Another place, or one that is there already: Settings"), answered)
+
     def open_step(self, name: str, *, instead: bool = False) -> None:
         """Open a step of the walk, on top or instead of the screen that is open."""
+        self.need_folder(lambda: self._open_step(name, instead))
+
+    def _open_step(self, name: str, instead: bool) -> None:
         running = self._running_step
         if running is not None and not instead:
             self.notify(f"{running.step.title} is still running: leave it first", severity="warning")
@@ -275,9 +311,12 @@ class OpenAnt(App[int]):
         if self._running_step is not None:
             self.notify("a step is running: leave it first", severity="warning")
         elif self.session.virtual is None:
-            self.push_screen(Question("A virtual robot:", *(words for words, _ in VIRTUAL_ROBOTS)), self._chose_virtual)
+            self.need_folder(self._ask_virtual)
         else:
             self._in_background("ending the virtual robot", self.session.end_virtual, self.refresh_walk)
+
+    def _ask_virtual(self) -> None:
+        self.push_screen(Question("A virtual robot:", *(words for words, _ in VIRTUAL_ROBOTS)), self._chose_virtual)
 
     def _chose_virtual(self, choice: int | None) -> None:
         if choice is not None:
@@ -310,14 +349,20 @@ class OpenAnt(App[int]):
 
     @work(thread=True, group="robot")
     def _in_background(self, words: str, do: Callable[[], None], then: Callable[[], None]) -> None:
-        self.call_from_thread(self.notify, f"{words} ...", timeout=3)
+        self.call_from_thread(self._say_doing, words)
         try:
             do()
         except OpenAntError as error:
             self.session.faults.note("", str(error))
-            self.call_from_thread(self.screen.draw if isinstance(self.screen, Page) else self.refresh)
         else:
             self.call_from_thread(then)
+        finally:
+            self.call_from_thread(self._say_doing, "")
+
+    def _say_doing(self, words: str) -> None:
+        self.session.doing = words
+        if isinstance(self.screen, Page):
+            self.screen.draw()
 
     # ---- replay --------------------------------------------------------------------------------------------------
 

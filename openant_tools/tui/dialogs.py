@@ -10,6 +10,8 @@ from textual.containers import Vertical, VerticalScroll
 from textual.screen import ModalScreen
 from textual.widgets import Markdown, OptionList, Static
 
+from openant_tools.tui.choices import Choices
+
 __all__ = ["Help", "Question"]
 
 
@@ -38,9 +40,9 @@ class Question(ModalScreen[int | None]):
         self._words, self._offered = words, choices
 
     def compose(self) -> ComposeResult:
-        with Vertical(id="question"):
+        with Vertical(id="asked"):
             yield Static(self._words)
-            yield OptionList(*self._offered)
+            yield Choices(*self._offered)
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         self.dismiss(event.option_index)

@@ -101,7 +101,9 @@ class Page(Screen[None]):
         session = self.session
         text = Text.assemble(("Open Ant", "bold"), f"  {self.title}  ", no_wrap=True, overflow="ellipsis")
         text.append(session.name if session.folder is not None else "no robot's folder", "bold")
-        if session.feed is not None:
+        if session.doing:
+            text.append(f"  {mark('wait')} {session.doing}", MARKS["wait"].colour)
+        elif session.feed is not None:
             text.append(f"  {mark('info')} {session.feed.title}")
         elif session.virtual is not None:
             text.append(f"  {mark('info')} virtual robot")

@@ -35,6 +35,7 @@ class Session:
         history: the rows of the last seconds.
         selected: the joint that all screens show as chosen.
         notices: what the engine had to say, until somebody takes it.
+        doing: what takes its time in the background; "" for nothing.
         training: the run that was started last, which goes on whatever is on the screen.
     """
 
@@ -46,6 +47,7 @@ class Session:
         self.faults = Faults()
         self.selected = JOINT_NAMES[0]
         self.notices: list[str] = []
+        self.doing = ""
         self.training: Training | None = None
         self._engine: EngineProcess | None = None
         self._virtual_process = contextlib.ExitStack()

@@ -10,6 +10,7 @@ from textual.containers import Horizontal, VerticalScroll
 from textual.widgets import Markdown, OptionList
 from textual.widgets.option_list import Option
 
+from openant_tools.tui.choices import Choices
 from openant_tools.tui.marks import mark
 from openant_tools.tui.page import Page
 
@@ -36,14 +37,14 @@ kept in the robot's `findings/`, one a run of a step. The passport is the page t
 
     def body(self) -> ComposeResult:
         with Horizontal():
-            yield OptionList(id="list")
+            yield Choices(id="list")
             with VerticalScroll(can_focus=True):
                 yield Markdown(id="text")
 
     def on_mount(self) -> None:
         super().on_mount()
         self._files = self._find()
-        chooser = self.query_one("#list", OptionList)
+        chooser = self.query_one("#list", Choices)
         for number, path in enumerate(self._files):
             chooser.add_option(Option(_title(path), id=str(number)))
         if self._files:

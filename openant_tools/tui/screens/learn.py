@@ -12,6 +12,7 @@ from textual.widgets import Input, OptionList, Static
 from textual.widgets.option_list import Option
 
 from openant_tools.tui.braille import trace
+from openant_tools.tui.choices import Choices
 from openant_tools.tui.marks import BLUE, marked, plain
 from openant_tools.tui.page import Page
 from openant_tools.tui.training import AGENTS, Training, read_curve
@@ -40,7 +41,7 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
             yield Static("Steps (of 0.12 s; 30000 are an hour of robot time), and the seed", classes="title")
             yield Input("30000", type="integer", id="steps")
             yield Input("0", type="integer", id="seed")
-            yield OptionList(
+            yield Choices(
                 *(Option(f"Train {name}: {_WORDS[name]}", id=name) for name in AGENTS),
                 Option("Stop and save", id="stop"),
                 id="choices",

@@ -16,6 +16,7 @@ from textual.widgets.option_list import Option
 
 from openant_tools.errors import OpenAntError
 from openant_tools.recording.tables import read_run
+from openant_tools.tui.choices import Choices
 from openant_tools.tui.feeds import ReplayFeed
 from openant_tools.tui.page import Page
 
@@ -41,14 +42,14 @@ that has the columns of docs/recordings.md.
 
     def body(self) -> ComposeResult:
         with Vertical():
-            yield OptionList(id="list")
+            yield Choices(id="list")
             yield Input(placeholder="n: another run, such as ../logs/walk.parquet", id="path")
             yield Static(id="note", classes="note")
 
     def on_mount(self) -> None:
         super().on_mount()
         self._files = self._find()
-        chooser = self.query_one("#list", OptionList)
+        chooser = self.query_one("#list", Choices)
         for number, path in enumerate(self._files):
             stat = path.stat()
             when = datetime.datetime.fromtimestamp(stat.st_mtime).strftime("%d.%m.%Y %H:%M")

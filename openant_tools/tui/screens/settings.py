@@ -17,6 +17,7 @@ from textual.widgets.option_list import Option
 
 from openant_tools.errors import OpenAntError
 from openant_tools.robot.kit import KITS
+from openant_tools.tui.choices import Choices
 from openant_tools.tui.marks import marked, plain
 from openant_tools.tui.page import Page
 
@@ -41,7 +42,7 @@ there, or a new place, and press `Enter`; then choose below whether to open it o
         with VerticalScroll():
             yield Static("The robot's folder", classes="title")
             yield Input(str(self.session.path), id="path")
-            yield OptionList(
+            yield Choices(
                 Option("Open this folder", id="open"),
                 *(Option(f"Make a new robot there: {kit.words}", id=name) for name, kit in KITS.items()),
                 Option("Switch between Unicode and plain ASCII", id="ascii"),

@@ -18,10 +18,12 @@ from openant_tools.errors import OpenAntError
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Answer, Ask, Event, Hands, Intent, Live, Look, Progress, Say, Step
 from openant_tools.tui.bars import bars
+from openant_tools.tui.choices import Choices
 from openant_tools.tui.dialogs import Question
 from openant_tools.tui.leg_map import LegMap
 from openant_tools.tui.marks import MARKS, Name, mark, marked
 from openant_tools.tui.page import Page
+from openant_tools.tui.screens.walk import standing_mark
 from openant_tools.tui.step_run import BY_VIRTUAL_HANDS, StepRun
 
 __all__ = ["StepScreen"]
@@ -75,9 +77,9 @@ and can be begun again: what it found or wrote before stays, and every write to 
             yield VerticalScroll(id="log", can_focus=True)
             yield LegMap(self.session.history)
         with Vertical(id="ask"):
-            yield Static(id="live")
+            yield Static(id="bars")
             yield Static(id="question")
-            yield OptionList(id="choices")
+            yield Choices(id="choices")
             yield Input(id="value")
 
     def on_mount(self) -> None:
@@ -86,14 +88,15 @@ and can be begun again: what it found or wrote before stays, and every write to 
 
     @property
     def running(self) -> bool:
-        return self._run is not None and self._run.running
+        """Whether its procedure has not come to its end yet."""
+        return self._run is not None
 
     def draw(self) -> None:
         super().draw()
         self.query_one("#head", Static).update(self._head())
         if self._live is not self._drawn_live:
             self._drawn_live = self._live
-            line = self.query_one("#live", Static)
+            line = self.query_one("#bars", Static)
             line.display = self._live is not None
             if self._live is not None:
                 line.update(bars(self._live, line.size.width or self.size.width - 4))
@@ -103,13 +106,14 @@ and can be begun again: what it found or wrote before stays, and every write to 
         if self.running:
             progress = self._progress
             share = "" if progress is None or progress.share is None else f" {progress.share:.0%}"
-            text.append_text(marked("wait", f"running{share}"))
+            text.append_text(marked("wait", f"running{share}  "))
             if self._pending is not None:
-                text.append_text(marked("warn", "  your turn"))
+                text.append_text(marked("warn", "your turn"))
             elif progress is not None:
-                text.append(f"  {progress.words}")
-        else:
-            text.append(self.step.does)
+                text.append(progress.words)
+        elif self.session.folder is not None:
+            one = standing(self.session.folder).get(self.step.name)
+            text.append_text(standing_mark(one) if one is not None else marked("todo", ""))
         return text
 
     # ---- before and after ----------------------------------------------------------------------------------------
@@ -121,7 +125,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
         if step.table:
             self.say(Text(f"You need {step.table}."))
         moves = "The robot moves; you are asked before it does." if step.moves else "Nothing moves."
-        self.say(Text(f"It changes {step.changes or 'nothing'}. {moves} About {step.minutes:g} minutes."))
+        self.say(Text(f"It changes {step.changes or 'nothing'}. {moves} About {step.minutes:g} min."))
         if folder is None:
             self.say(
                 marked("warn", f"there is no robot's folder at {self.session.path.resolve()}: make one in Settings (s)")
@@ -158,11 +162,10 @@ and can be begun again: what it found or wrote before stays, and every write to 
 
     def ended(self, finding: Finding | None, why: str) -> None:
         """The procedure is through: draw what it found, or why it did not."""
-        self._pending = self._progress = self._live = None
+        self._run = self._pending = self._progress = self._live = None
         again = Choice("Begin again", self.begin)
         if finding is None:
             self.say(marked("fail", why))
-            self.session.faults.note(self.step.title, why) if "→" in why and "not done" not in why else None
             self.offer("It ended without a finding.", [again, self._back()])
         else:
             self.show_finding(finding)
@@ -306,7 +309,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
         question.display = bool(words)
         question.update(Text(words, style="bold"))
         self.query_one("#value", Input).display = False
-        chooser = self.query_one("#choices", OptionList)
+        chooser = self.query_one("#choices", Choices)
         chooser.clear_options()
         chooser.display = bool(choices)
         chooser.add_options([Option(choice.words) for choice in choices])
@@ -320,12 +323,12 @@ and can be begun again: what it found or wrote before stays, and every write to 
         self._choices[event.option_index].do()
 
     def on_key(self, event: object) -> None:
-        if getattr(event, "key", "") == "enter" and self.running and self._pending is None and self._run is not None:
+        if getattr(event, "key", "") == "enter" and self._run is not None and self._pending is None:
             self._run.enough()
 
     def stopped(self) -> None:
         """The stop key: torque is off by now. Where the step asks for the stop key, this is its answer."""
-        if self._run is None or not self.running:
+        if self._run is None:
             return
         if isinstance(self._pending, Ask) and STOP in self._pending.choices:
             self.reply(STOP, "stop key")
@@ -351,7 +354,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
 
     def end(self) -> None:
         """End what runs, in order."""
-        if self._run is not None and self.running:
+        if self._run is not None:
             self.session.release()
             self._run.end("left by hand")
 

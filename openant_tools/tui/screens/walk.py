@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from functools import partial
 from typing import ClassVar
 
 from rich.text import Text
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
-from textual.geometry import Offset
 from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
 
 from openant_tools.bringup.walk import WALK, Standing, standing
 from openant_tools.procedure.step import Step
+from openant_tools.tui.choices import Choices
 from openant_tools.tui.leg_map import LegMap
 from openant_tools.tui.marks import Name, mark, marked
 from openant_tools.tui.page import Page
@@ -31,8 +29,8 @@ def standing_mark(one: Standing) -> Text:
     return marked(_MARKS[one.state])
 
 
-class WalkList(OptionList):
-    """The steps; each has a letter in jump mode."""
+class WalkList(Choices):
+    """The steps."""
 
     HELP = """\
 # The walk
@@ -49,17 +47,6 @@ will do before it does anything. You can leave a step, come back, repeat it, and
 
 No robot here? The line below the steps starts a virtual one, which behaves like a real one down to its bytes.
 """
-
-    def jump_points(self) -> Iterable[tuple[Offset, Callable[[], None]]]:
-        for row in range(min(self.option_count, self.size.height)):
-            at = row + int(self.scroll_offset.y)
-            if at < self.option_count and not self.get_option_at_index(at).disabled:
-                yield self.region.offset + Offset(0, row), partial(self._open, at)
-
-    def _open(self, index: int) -> None:
-        self.focus()
-        self.highlighted = index
-        self.action_select()
 
 
 class WalkScreen(Page):
