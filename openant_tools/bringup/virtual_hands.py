@@ -47,5 +47,10 @@ class VirtualHands:
             case "free":
                 self._remote.ask("let_go")
 
+    def resume(self, assembled: bool) -> None:
+        """Put a robot that was just started back to where the walk had got: out of its box, if it was built."""
+        if assembled and self._remote.ask("state")["setup"] == "loose":
+            self._remote.ask("assemble", setup="stand")
+
     def close(self) -> None:
         self._remote.close()

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from openant_tools.errors import BadInput
-from openant_tools.procedure.finding import Finding, latest
-from openant_tools.procedure.step import Step
+from openant_tools.errors import BadInput, OpenAntError
+from openant_tools.procedure.finding import Finding, keep, latest
+from openant_tools.procedure.step import Bench, Declined, Face, Say, Step, drive
 from openant_tools.robot.folder import RobotFolder
 
-__all__ = ["WALK", "Standing", "State", "standing", "step"]
+__all__ = ["WALK", "Standing", "State", "do", "standing", "step", "walk"]
 
 #: name → step, in order.
 WALK: Mapping[str, Step] = {
@@ -218,3 +218,52 @@ def step(name: str) -> Step:
         return WALK[name]
     except KeyError:
         raise BadInput(f"there is no step {name!r}", remedy=f"the steps are {', '.join(WALK)}") from None
+
+
+def do(step: Step, bench: Bench, face: Face) -> Finding:
+    """Do one step and keep its finding; what kept it from being done is its finding, too.
+
+    Raises:
+        Declined: an intent was not granted. Nothing is kept then, nor after Ctrl-C: the step is still to be done.
+    """
+    try:
+        finding = drive(step.start(bench), face)
+    except Declined:
+        raise
+    except OpenAntError as error:
+        what = f"{error.where}: {error.what}" if error.where else error.what
+        finding = Finding(step.name, False, what, (), error.remedy or "", f"openant calib {step.name}")
+    keep(finding, bench.folder)
+    return finding
+
+
+def walk(
+    bench: Bench,
+    face: Face,
+    *,
+    again: bool = False,
+    notice: Callable[[Step, Finding | None], None] = lambda step, found: None,
+) -> dict[str, Finding]:
+    """All steps in order; those that stand are not done again, those whose needs say no are left out.
+
+    Args:
+        again: do every step, also those that stand.
+        notice: called with each step before it is done (None), and with its finding afterwards.
+
+    Returns:
+        step → its newest finding, for the steps that have one.
+
+    Raises:
+        Declined: an intent was not granted; the walk resumes at that step.
+    """
+    for name, step in WALK.items():
+        now = standing(bench.folder)[name]
+        if now.state == "ok" and not again:
+            continue
+        if now.waits_for:
+            titles = ", ".join(WALK[other].title for other in now.waits_for)
+            face.answer(Say(f"{step.title} is left out: it needs {titles}", "warn"))
+            continue
+        notice(step, None)
+        notice(step, do(step, bench, face))
+    return {name: now.finding for name, now in standing(bench.folder).items() if now.finding is not None}

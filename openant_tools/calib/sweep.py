@@ -104,7 +104,7 @@ def _there_and_back(reach: float, rate_hz: float) -> Array:
     """0 → +reach → −reach → 0 at constant speed, rad."""
     corners = np.array([0.0, reach, -reach, 0.0])
     times = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(corners)))]) / SPEED_RAD_S
-    return np.interp(np.arange(0.0, times[-1], 1 / rate_hz), times, corners)
+    return np.asarray(np.interp(np.arange(0.0, times[-1], 1 / rate_hz), times, corners), float)
 
 
 def sweep(config: EngineConfig, path: Path, words: str) -> Generator[Event, Answer, Run]:

@@ -21,6 +21,7 @@ __all__ = ["main"]
 COMMANDS: dict[str, tuple[str, str, str]] = {
     "demo": ("demo", "Start here", "The whole way on a virtual robot: record, identify, learn, report."),
     "virtual": ("virtual", "Robot", "A virtual Open Ant that speaks the real protocols."),
+    "bringup": ("bringup", "Robot", "From loose motors to a robot with a passport, step by step."),
     "calib": ("calib", "Robot", "Bring a robot up, step by step: ids, centring, zeros, bounds, IMU, arena; undo."),
     "config": ("config", "Robot", "Check, show, import and export the robot's configuration."),
     "comms": ("comms", "Robot", "The bus: scan, watch, measure."),

@@ -34,6 +34,7 @@ class CommandFace:
         self._yes = yes
         self._hands = hands
         self._live = 0
+        self._said = ("", 0.0)
 
     def answer(self, event: Event) -> Answer:
         """Show one event; what it is answered with."""
@@ -41,7 +42,7 @@ class CommandFace:
             self._end_live()
         match event:
             case Progress(share, words):
-                self._line(f"[dim]{'' if share is None else f'{100 * share:3.0f} % '}{escape(words)} …[/dim]")
+                self._progress(share, words)
             case Say(words, level):
                 glyph, style = _GLYPHS[level]
                 self._line(f"[{style}]{glyph}[/{style}] {escape(words)}")
@@ -58,6 +59,13 @@ class CommandFace:
             case Ask():
                 return self._ask(event)
         return None
+
+    def _progress(self, share: float | None, words: str) -> None:
+        """One line where something new begins, and one a quarter of the way: lines stay, unlike a bar."""
+        before, at = self._said
+        if words != before or (share or 0.0) - at > 0.25:
+            self._said = (words, share or 0.0)
+            self._line(f"[dim]{'' if share is None else f'{100 * share:3.0f} % '}{escape(words)} …[/dim]")
 
     def _line(self, markup: str) -> None:
         encoding = (self.console.encoding or "ascii").lower()

@@ -156,6 +156,18 @@ class Report:
         write_text(path, self.html())
         return Path(path)
 
+    def write_markdown(self, path: str | Path) -> Path:
+        """Write the Markdown to `path`, its pictures into a folder of the same name beside it."""
+        path = Path(path)
+        pictures = f"{path.stem}-figures"
+
+        def save(name: str, data: bytes) -> str:
+            write_bytes(path.parent / pictures / name, data)
+            return f"{pictures}/{name}"
+
+        write_text(path, self._markdown(save))
+        return path
+
     def write_folder(self, folder: str | Path) -> Path:
         """Write report.html, report.md with figures/, and report.json into `folder`; returns the HTML's path."""
         folder = Path(folder)

@@ -1,0 +1,62 @@
+"""Gap check as a step: how far nominal and calibrated simulation are from the robot, joint by joint."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from openant_tools.bringup.relay import relayed
+from openant_tools.errors import BadInput
+from openant_tools.gap.measure import Measurement, measure
+from openant_tools.procedure.finding import Evidence, Finding, latest
+from openant_tools.procedure.step import Bench, Procedure
+from openant_tools.recording.tables import read_run
+from openant_tools.robot.folder import NOMINAL_MODEL
+
+__all__ = ["gap_by_joint", "gap_check"]
+
+COMMAND = "openant bringup"
+
+
+def gap_check(bench: Bench) -> Procedure:
+    """Measure on the recording that the fit held out.
+
+    Raises:
+        BadInput: nothing was identified yet.
+    """
+    identified = latest(bench.folder, "identify")
+    if identified is None:
+        raise BadInput("nothing was identified yet", remedy="do the step Identification first")
+    runs = [read_run(bench.folder.path / name) for name in identified.data["held_out"]]
+    models: list[Path] = [bench.folder.path / NOMINAL_MODEL, bench.folder.model_path()]
+    found: list[Measurement] = []
+    for model in models:
+        one = yield from relayed(lambda progress, notice, model=model: measure(runs, model))  # type: ignore[misc]
+        found.append(one)
+    before, after = found
+    closed = 1 - after.excess("pos") / before.excess("pos") if before.excess("pos") > 0 else math.nan
+    better = after.gaps["pos"] <= before.gaps["pos"]
+    worst = after.places[0] if after.places else None
+    return Finding(
+        "gap",
+        better,
+        f"simulated joints are {1e3 * after.gaps['pos']:.2f} mrad off (nominal {1e3 * before.gaps['pos']:.2f}, "
+        f"floor {1e3 * after.floors['pos']:.2f})" + (f", most at {worst.joint} in {worst.regime}" if worst else ""),
+        (
+            Evidence("position gap, nominal", before.gaps["pos"], "rad", "0.5 s horizon, held-out recording"),
+            Evidence("position gap, calibrated", after.gaps["pos"], "rad", "the same"),
+            Evidence("floor", after.floors["pos"], "rad", "repeats of the recording"),
+            Evidence("gap closed", None if math.isnan(closed) else closed, "1", "1 − excess after / before"),
+        ),
+        "" if better else "the calibrated model is no better: record again, or `openant gap diagnose`",
+        COMMAND,
+        data={"by_joint_rad": gap_by_joint(after), "measure": after.as_json()},
+    )
+
+
+def gap_by_joint(found: Measurement) -> dict[str, float]:
+    """joint → rms of measured minus simulated position, rad."""
+    off = np.concatenate([one.measured["pos"] - one.simulated["pos"] for one in found.played])
+    return {joint: float(np.sqrt(np.nanmean(off[:, k] ** 2))) for k, joint in enumerate(found.joints)}

@@ -1,0 +1,68 @@
+"""Identification as a step: a motion on the stand, another one twice to judge by, and the fit."""
+
+from __future__ import annotations
+
+import datetime
+
+from openant_tools.bringup.relay import relayed
+from openant_tools.calib.wires import engine_config
+from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.step import Bench, Intent, Procedure
+from openant_tools.recording.tables import read_run
+from openant_tools.robot.folder import NOMINAL_MODEL
+from openant_tools.sysid.identify import identify
+from openant_tools.sysid.protocols import protocols
+from openant_tools.sysid.record import record_takes, takes
+from openant_tools.sysid.result import write_fit, write_robot
+
+__all__ = ["PROTOCOL", "identification"]
+
+COMMAND = "openant bringup"
+PROTOCOL = "stand"
+#: s of each recording: a fit takes as long as its data, and this is what tells friction and inertia apart.
+RECORD_S = 16.0
+
+
+def identification(bench: Bench) -> Procedure:
+    """Record, fit, write calibrated.xml; what beats nothing leaves the nominal model where it is."""
+    stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
+    out = bench.folder.recordings / f"identify-{stamp}.mcap"
+    played = protocols(PROTOCOL, RECORD_S)
+    wanted = takes(out, played, 0)
+    judge = takes(out.with_name(f"identify-{stamp}-held-out.mcap"), played, 1, repeats=2)
+    yield Intent(
+        f"play `{PROTOCOL}` three times for {RECORD_S:.0f} s on the stand, legs free, and fit the model to what is seen",
+        moves=True,
+    )
+    config = engine_config(bench, imu=None)
+    text = bench.folder.config_file.read_text(encoding="utf-8")
+    yield from relayed(
+        lambda progress, notice: record_takes(
+            config, [*wanted, *judge], robot_toml=text, progress=progress, notice=notice
+        )
+    )
+    fitted, held_out = [read_run(take.path) for take in wanted], [read_run(take.path) for take in judge]
+    nominal = bench.folder.path / NOMINAL_MODEL
+    result = yield from relayed(lambda progress, notice: identify(fitted, nominal, held_out, progress=progress))
+    written = write_fit(result, bench.folder.path / "fit")
+    if result.accepted:
+        write_robot(result, bench.folder)
+    return Finding(
+        "identify",
+        bool(result.accepted),
+        f"error on a motion it has not seen: {1e3 * result.before.full:.1f} → {1e3 * result.after.full:.2f} mrad "
+        f"(floor {1e3 * result.floor:.2f})",
+        (
+            Evidence("error before", result.before.full, "rad", "nominal model, held-out recording, full run"),
+            Evidence("error after", result.after.full, "rad", "calibrated model, the same recording"),
+            Evidence("floor", result.floor, "rad", "two repeats of that recording"),
+        ),
+        "" if result.accepted else "look at fit/report.html; the nominal model stays in use",
+        COMMAND,
+        data={
+            "report": bench.folder.relative(written[2]),
+            "fitted": [bench.folder.relative(take.path) for take in wanted],
+            "held_out": [bench.folder.relative(take.path) for take in judge],
+            "values": {v.name: [v.value, v.low, v.high, v.verdict] for v in result.values},
+        },
+    )

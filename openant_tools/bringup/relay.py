@@ -1,0 +1,57 @@
+"""Work that reports by callbacks, as a procedure: it runs in a thread, its progress comes as events."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Generator
+from typing import TypeVar
+
+from openant_tools.procedure.step import Answer, Event, Progress, Say
+
+__all__ = ["relayed"]
+
+T = TypeVar("T")
+
+
+class _Cancelled(Exception):
+    """Raised inside the work, where it next reports: whatever it has open is put into order on the way out."""
+
+
+def relayed(
+    work: Callable[[Callable[[str, float], None], Callable[[str], None]], T],
+) -> Generator[Event, Answer, T]:
+    """Run `work(progress, notice)` and yield what it reports; its result.
+
+    A face that closes the procedure ends the work at its next report. What the work raises is raised here.
+    """
+    events: queue.SimpleQueue[Event | None] = queue.SimpleQueue()
+    cancelled, outcome, failure = threading.Event(), list[T](), list[BaseException]()
+
+    def progress(words: str, share: float) -> None:
+        if cancelled.is_set():
+            raise _Cancelled
+        events.put(Progress(share, words))
+
+    def notice(words: str) -> None:
+        events.put(Say(words))
+
+    def run() -> None:
+        try:
+            outcome.append(work(progress, notice))
+        except BaseException as error:
+            failure.append(error)
+        finally:
+            events.put(None)
+
+    thread = threading.Thread(target=run, name="procedure's work", daemon=True)
+    thread.start()
+    try:
+        while (event := events.get()) is not None:
+            yield event
+    finally:
+        cancelled.set()
+        thread.join()
+    if failure:
+        raise failure[0]
+    return outcome[0]
