@@ -160,11 +160,15 @@ def draw_answers(count: int, seed: int, mix: Mix | None = None) -> list[Answer]:
             answer = replace(answer, outside=name, parameters=_outside(chance))
         if any(KINDS[drawn.effect].needs_tracker for drawn in answer.effects):
             answer = replace(answer, tracker=True)
-        possible = not answer.outside and not {drawn.effect for drawn in answer.effects} & _BATCH_ONLY
+        possible = not answer.outside and not any(_batch_only(drawn) for drawn in answer.effects)
         if possible and chance.random() < mix.virtual:
             answer = replace(answer, maker="virtual", tracker=False)
         answers.append(answer)
     return answers
+
+
+def _batch_only(drawn: Drawn) -> bool:
+    return drawn.effect in _BATCH_ONLY or (drawn.effect == "sensor_delay" and drawn.joints == "body")
 
 
 def _deck(names: Sequence[str], chance: np.random.Generator) -> Any:

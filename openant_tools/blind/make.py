@@ -27,7 +27,7 @@ __all__ = ["SCHEMA", "make_set", "seed_of_commit"]
 
 SCHEMA = "openant.blind/1"
 #: robots that are simulated together: enough that array steps cost little beside mechanics
-BATCH = 12
+BATCH = 20
 
 
 def seed_of_commit(commit: str, folder: Path | None = None) -> tuple[int, str]:

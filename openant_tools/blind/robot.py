@@ -117,7 +117,7 @@ class Clocks:
         row_s: scatter of the rows about their rate. stamp_s: error of a row's stamp.
         gap_s: from a row to its command; gap_scatter_s of it. base_s: from the command's last byte to its effect.
         delay, lag, slew, jitter, lost, longest: (8,) of the commands.
-        sensor_s: by how much joints' answers are old.
+        sensor_s: by how much joints' answers are old; imu_s: the IMU's.
     """
 
     row_s: float
@@ -282,7 +282,10 @@ def _apply(robot: TrueRobot, drawn: Drawn) -> None:
         case "slew_limit":
             c.slew[at] = p["rate_rad_s"]
         case "sensor_delay":
-            c.sensor_s = p["delay_s"]
+            if drawn.joints == "body":
+                c.imu_s += p["delay_s"]
+            else:
+                c.sensor_s = p["delay_s"]
         case "clock_jitter":
             c.jitter = p["std_s"]
         case "command_dropout":

@@ -96,7 +96,9 @@ def reliability(found: Score) -> MatplotlibFigure:
     for _, _, stated, present, count in found.reliability:
         low, high = wilson(round(present * count), count)
         axes.plot([stated, stated], [low, high], color=plots.BLUE, lw=1.0)
-        axes.annotate(f"{count}", (stated, high), textcoords="offset points", xytext=(0, 2), ha="center", fontsize=7)
+        axes.annotate(
+            f"{count}", (stated, max(high, present)), textcoords="offset points", xytext=(0, 5), ha="center", fontsize=7
+        )
     axes.plot(
         [one[2] for one in found.reliability],
         [one[3] for one in found.reliability],
@@ -105,7 +107,7 @@ def reliability(found: Score) -> MatplotlibFigure:
         label="seen",
     )
     axes.set_xlim(-0.02, 1.02)
-    axes.set_ylim(-0.02, 1.08)
+    axes.set_ylim(-0.03, 1.12)
     axes.set_xlabel("stated probability (–)")
     axes.set_ylabel("share present (–)")
     plots.legend(axes)

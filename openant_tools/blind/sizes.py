@@ -206,7 +206,7 @@ def _kinds() -> dict[str, Kind]:
         "action_delay": joint("ja", _plain("delay_s", "s", (0.005, 0.008), (0.012, 0.02), (0.03, 0.05))),
         "actuator_lag": joint("ja", _plain("time_constant_s", "s", (0.008, 0.012), (0.02, 0.035), (0.05, 0.09))),
         "slew_limit": joint("ja", _plain("rate_rad_s", "rad/s", (2.2, 2.8), (1.1, 1.6), (0.5, 0.8))),
-        "sensor_delay": joint("a", _plain("delay_s", "s", (0.005, 0.008), (0.012, 0.02), (0.03, 0.05))),
+        "sensor_delay": joint("ab", _plain("delay_s", "s", (0.005, 0.008), (0.012, 0.02), (0.03, 0.05))),
         "clock_jitter": joint("a", _plain("std_s", "s", (0.002, 0.003), (0.005, 0.007), (0.010, 0.014))),
         "command_dropout": joint(
             "ja", _plain("fraction", "", (0.03, 0.05), (0.08, 0.14), (0.2, 0.3), more=_longest)

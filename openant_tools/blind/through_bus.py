@@ -146,7 +146,7 @@ def record_through_bus(
 
 
 def _record_here(answer: Answer, played: Sequence[Motion]) -> list[tuple[Motion, Run]]:
-    first = played[0]
+    first, robot = played[0], true_robot(answer)
     done = []
     with tempfile.TemporaryDirectory(prefix="openant-blind-") as name:
         folder = Path(name)
@@ -168,12 +168,15 @@ def _record_here(answer: Answer, played: Sequence[Motion]) -> list[tuple[Motion,
                     engine.ask(messages.Record(str(path), facts_of(motion)))
                     engine.ask(messages.Play(motion.commands, motion.name, motion.limp if motion.limp.any() else None))
                     engine.ask(messages.StopRecording())
-                    done.append((motion, _as_logged(read_run(path), motion)))
+                    done.append((motion, _as_logged(read_run(path), motion, robot)))
                 engine.ask(messages.Torque(False))
     return done
 
 
-def _as_logged(run: Run, motion: Motion) -> Run:
-    """With the facts that all runs of a set have: nothing that tells which simulator made it."""
+def _as_logged(run: Run, motion: Motion, robot: TrueRobot) -> Run:
+    """With the facts that all runs of a set have, and the stamps that a host writes: stepped time has none of its scatter."""
     facts = replace(facts_of(motion), resolution=run.facts.resolution)
-    return Run(motion.name, facts, run.t - run.t[0], {**run.columns, "cmd_t": run.column("cmd_t") - run.t[0]})
+    chance = np.random.default_rng([robot.seed, len(motion.name), round(100 * motion.seconds)])
+    off = np.clip(chance.standard_normal(len(run.t)), -3, 3) * robot.clocks.stamp_s
+    t = run.t + off
+    return Run(motion.name, facts, t - t[0], {**run.columns, "cmd_t": run.column("cmd_t") + off - t[0]})
