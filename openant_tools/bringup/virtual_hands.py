@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 
 from openant_tools.comms.clock import VirtualControl
@@ -10,6 +11,8 @@ from openant_tools.robot.joints import JOINT_NAMES
 
 __all__ = ["VirtualHands"]
 
+#: s until servos that were just powered answer
+POWER_UP_S = 1.0
 #: s that hands take for each stretch of a motion
 TURN_S, TILT_S = 0.8, 1.0
 
@@ -51,6 +54,11 @@ class VirtualHands:
         """Put a robot that was just started back to where the walk had got: out of its box, if it was built."""
         if assembled and self._remote.ask("state")["setup"] == "loose":
             self._remote.ask("assemble", setup="stand")
+            now = self._remote.ask("now")
+            if now["stepped"]:
+                self._remote.ask("advance", to=now["t"] + POWER_UP_S)
+            else:
+                time.sleep(POWER_UP_S)
 
     def close(self) -> None:
         self._remote.close()

@@ -1,5 +1,7 @@
 """Arena."""
+
 from __future__ import annotations
+
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.step import Bench, Procedure, Say
 

@@ -29,7 +29,7 @@ from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.registers import EEPROM_END, PWM_FULL
 from openant_tools.robot.servo import baud_code, servo_model
 
-__all__ = ["FIRMWARE_BRINGS", "expected_eeprom", "inventory"]
+__all__ = ["FIRMWARE_BRINGS", "expected_eeprom", "inventory", "silence_words"]
 
 COMMAND = "openant calib inventory"
 #: firmware → what it brought (ROBOTIS e-manual); older ones lack it.
@@ -165,12 +165,12 @@ def _missing(
             bus.line.set_baud(config.bus.baud)
     for motor in missing:
         if motor.joint not in elsewhere:
-            words.append(_silence(bus, motor, config))
+            words.append(silence_words(bus, motor, config))
             yield Say(words[-1], "fail")
     return words
 
 
-def _silence(bus: Bus, motor: Motor, config: RobotConfig) -> str:
+def silence_words(bus: Bus, motor: Motor, config: RobotConfig) -> str:
     """Where to look for a servo that answers at no rate: the cable before it in its leg."""
     joint = JOINTS[motor.joint]
     hip = config.motors[f"hip_{joint.leg.name}"]

@@ -23,6 +23,8 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "virtual": ("virtual", "Robot", "A virtual Open Ant that speaks the real protocols."),
     "bringup": ("bringup", "Robot", "From loose motors to a robot with a passport, step by step."),
     "calib": ("calib", "Robot", "Bring a robot up, step by step: ids, centring, zeros, bounds, IMU, arena; undo."),
+    "check": ("check", "Robot", "Two minutes before a session: is the robot as its passport has it?"),
+    "passport": ("passport", "Robot", "One page with everything known about a robot."),
     "config": ("config", "Robot", "Check, show, import and export the robot's configuration."),
     "comms": ("comms", "Robot", "The bus: scan, watch, measure."),
     "rec": ("rec", "Data", "Recordings: info, repair, export, import."),

@@ -1,0 +1,361 @@
+"""The daily check, two minutes before a session: what is not as it was when the passport was written, and what to look at.
+
+Bus, supply, temperatures and IMU are read; then the slow sweep of the step Observation bounds is made again. Friction,
+a leg's weight and both stops of every joint are compared with what stood then: a joint that grew stiff, a foot that was
+lost, a horn that slipped and a plug that works itself loose each change one of them and leave the others alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Mapping, Sequence
+
+import numpy as np
+
+from openant_tools.bringup.gap_check import gap_by_joint
+from openant_tools.bringup.relay import relayed
+from openant_tools.calib.inventory import silence_words
+from openant_tools.calib.sweep import JointSweep, analyse, joint_sweep_of, play_watched, sweep
+from openant_tools.calib.wires import engine_config, opened_bus, opened_imu, robot_servos
+from openant_tools.comms import messages
+from openant_tools.comms.body_imu import rotation
+from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.imu import STANDARD_GRAVITY
+from openant_tools.comms.servos import Servos
+from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.gap.measure import measure
+from openant_tools.procedure.finding import Evidence, Finding, latest
+from openant_tools.procedure.step import Answer, Ask, Bench, Event, Intent, Procedure, Progress, Say
+from openant_tools.recording.run import Facts, Run
+from openant_tools.recording.tables import read_run
+from openant_tools.robot.config import RobotConfig
+from openant_tools.robot.joints import JOINTS
+from openant_tools.sysid.excitation import CommandSpace
+from openant_tools.sysid.protocols import protocol
+
+__all__ = ["changed", "check", "loose"]
+
+COMMAND = "openant check"
+#: Friction: grown by this factor and by more than the sweep repeats to. Doubled friction is far beyond both.
+FRICTION_FACTOR, FRICTION_NM = 1.5, 0.012
+#: A leg's weight at its knee: share of what it was. The sweep repeats to 2 %; a foot is a fifth and more.
+WEIGHT_SHARE, WEIGHT_NM = 0.15, 0.003
+#: Both stops moved by so much: the zero did. A spline is 0.79 rad.
+ZERO_RAD = 0.015
+#: Share of answers lost while the joint moves.
+LOST_SHARE = 0.004
+#: K below a servo's limit at which a session should not begin.
+COOL_K = 20.0
+#: IMU: |acc| against gravity, the body's lean on its stand, rad, and the gyro's rate at rest, rad/s.
+GRAVITY_SHARE, LEAN_RAD, STILL_RAD_S = 0.06, math.radians(6), 0.05
+TWITCH_S = 20.0
+#: A joint's simulation error that was this much smaller when the model was made.
+GAP_FACTOR, GAP_RAD = 1.8, 0.004
+START_LIST = (
+    "cables run outside the circle and are not twisted",
+    "the robot stands on its stand, legs free all round",
+    "screws of feet and horns are in",
+)
+
+
+def check(bench: Bench) -> Procedure:
+    """Read, sweep, twitch, compare.
+
+    Raises:
+        BadInput: there is nothing to compare with: the step Observation bounds was not done.
+    """
+    config = bench.folder.config()
+    bounds = latest(bench.folder, "bounds")
+    if bounds is None or "sweep" not in bounds.data:
+        raise BadInput(
+            "there is nothing to compare with yet",
+            where=bench.folder.path,
+            remedy="`openant calib bounds` keeps what is healthy",
+        )
+    baseline = {joint: joint_sweep_of(one) for joint, one in bounds.data["sweep"].items()}
+    evidence, problems = list[Evidence](), list[str]()
+    for line in START_LIST:
+        yield Ask(f"Is it so: {line}?", ("yes", "no"), default="yes")
+    yield Progress(0.0, "bus, supply, temperatures")
+    problems += _at_rest(bench, config, evidence)
+    if problems:
+        return _finding(problems, evidence, {})
+    yield Progress(0.05, "IMU")
+    problems += _imu(bench, config, evidence)
+    yield Intent("sweep every joint slowly through its range, then twitch for 20 s, on the stand", moves=True)
+    now: dict[str, JointSweep] = {}
+    try:
+        run = yield from sweep(
+            engine_config(bench, imu=None), bench.folder.recordings / "check-sweep.mcap", "slow sweep"
+        )
+    except HardwareFault as fault:
+        problems.append(str(fault))
+        return _finding(problems, evidence, {})
+    limits = {motor.joint: (motor.min_rad, motor.max_rad) for motor in config.motors.values()}
+    now = analyse(run, limits)
+    problems += changed(baseline, now)
+    problems += loose({joint: one.lost for joint, one in now.items()}, config.bus.chain)
+    problems += _warm_or_weak(now, config)
+    for joint, one in now.items():
+        evidence.append(
+            Evidence(f"friction of {joint}", one.friction_nm, "N·m", f"slow sweep; then {baseline[joint].friction_nm}")
+        )
+    try:
+        twitch = yield from _twitch(bench)
+    except HardwareFault as fault:
+        problems.append(str(fault))
+    else:
+        problems += loose(_lost(twitch), config.bus.chain, problems)
+        problems += yield from _against_model(bench, twitch, evidence, problems)
+        yield from _outside(twitch, config)
+    return _finding(problems, evidence, {"sweep": {joint: one.as_dict() for joint, one in now.items()}})
+
+
+def changed(before: Mapping[str, JointSweep], now: Mapping[str, JointSweep]) -> list[str]:
+    """What two sweeps of one robot have different: joint, how much, and the likely part."""
+    words = []
+    for joint, new in now.items():
+        old = before.get(joint)
+        if old is None:
+            continue
+        if old.friction_nm is not None and new.friction_nm is not None:
+            grown = new.friction_nm - old.friction_nm
+            if new.friction_nm > FRICTION_FACTOR * old.friction_nm and grown > FRICTION_NM:
+                words.append(
+                    f"{joint}: friction {new.friction_nm:.3f} N·m, it was {old.friction_nm:.3f} → gear (thread-locker, a worn "
+                    "tooth), or the screws of its horn and idler too tight"
+                )
+            elif new.friction_nm < old.friction_nm / FRICTION_FACTOR - FRICTION_NM:
+                words.append(
+                    f"{joint}: friction {new.friction_nm:.3f} N·m, it was {old.friction_nm:.3f} → is its horn screw loose?"
+                )
+        if JOINTS[joint].kind == "knee" and old.weight_nm and new.weight_nm is not None:
+            share = new.weight_nm / old.weight_nm - 1
+            if abs(new.weight_nm - old.weight_nm) > WEIGHT_NM and abs(share) > WEIGHT_SHARE:
+                words.append(
+                    f"{joint}: its leg weighs {100 * abs(share):.0f} % {'less' if share < 0 else 'more'} than it did → "
+                    + (
+                        "a foot was lost, or a part of the lower leg"
+                        if share < 0
+                        else "something sticks to the lower leg"
+                    )
+                )
+        words += _stops(joint, old, new)
+    return words
+
+
+def _stops(joint: str, old: JointSweep, new: JointSweep) -> list[str]:
+    pairs = [(old.low_stop_rad, new.low_stop_rad), (old.high_stop_rad, new.high_stop_rad)]
+    shifts = [b - a for a, b in pairs if a is not None and b is not None]
+    gone = [b is None for a, b in pairs if a is not None]
+    middle = float(np.mean(shifts)) if shifts else 0.0
+    if len(shifts) == 2 and min(shifts) * max(shifts) > 0 and abs(middle) > ZERO_RAD:
+        return [_zero_words(joint, middle)]
+    if len(shifts) == 1 and any(gone) and abs(shifts[0]) > ZERO_RAD:
+        return [_zero_words(joint, shifts[0])]
+    if all(gone) and gone:
+        return [
+            f"{joint}: neither of its stops is where it was → its zero has changed by more than a few degrees, or its horn is loose"
+        ]
+    if any(abs(shift) > 2 * ZERO_RAD for shift in shifts):
+        return [
+            f"{joint}: one of its stops has moved by {math.degrees(max(shifts, key=abs)):+.1f}° → something is in its way"
+        ]
+    return []
+
+
+def _zero_words(joint: str, shift: float) -> str:
+    return (
+        f"{joint}: its zero has changed by {math.degrees(shift):+.1f}° (both stops moved) → horn screw or spline; then "
+        "`openant calib zeros`"
+    )
+
+
+def loose(lost: Mapping[str, float], chain: Sequence[Sequence[str]], known: Sequence[str] = ()) -> list[str]:
+    """Which connector loses contact: joint → share of answers lost, by how the cables run (by legs where unknown).
+
+    Args:
+        known: what was found before; a joint that is named there is not named again.
+    """
+    cables = chain or [[f"hip_{leg}", f"knee_{leg}"] for leg in ("rr", "fr", "fl", "rl")]
+    bad = {joint for joint, share in lost.items() if share > LOST_SHARE}
+    if not bad:
+        return []
+    if len(bad) > len(lost) / 2:
+        words = f"{len(bad)} of {len(lost)} servos lose answers while they move → the power plug, or the adapter's first cable"
+        return [] if words in known else [words]
+    out = []
+    for cable in cables:
+        there = [joint for joint in cable if joint in bad]
+        if there and not any(line.startswith(f"{there[0]}:") and "connector" in line for line in known):
+            first = cable.index(there[0])
+            between = f"between {cable[first - 1]} and {there[0]}" if first else f"from the board to {there[0]}"
+            out.append(
+                f"{there[0]}: {100 * lost[there[0]]:.1f} % of its answers were lost while it moved → a loose connector {between}"
+            )
+    return out
+
+
+def _lost(run: Run) -> dict[str, float]:
+    return {joint: float(np.mean(run.signal("ok", [joint], default=1.0) < 0.5)) for joint in run.joints}
+
+
+def _at_rest(bench: Bench, config: RobotConfig, evidence: list[Evidence]) -> list[str]:
+    """Who answers, with what voltage and temperature, and which hardware errors stand."""
+    problems = []
+    with opened_bus(bench) as bus:
+        servos = Servos(bus, robot_servos(config))
+        found = {motor.joint: bus.ping(motor.id, insist=True) for motor in config.motors.values()}
+        for joint, seen in found.items():
+            if seen is None:
+                problems.append(silence_words(bus, config.motors[joint], config))
+            elif seen.model_number != config.motors[joint].servo.number:
+                problems.append(
+                    f"{joint}: another servo model answers than the passport's → were two motors exchanged?"
+                )
+        if problems:
+            return problems
+        servos.set_torque(False)
+        for servo in servos.servos:
+            problems += [f"{servo.joint}: {e.name} → {e.advice}" for e in servos.hardware_errors(servo.joint)]
+        volts = {servo.joint: servos.read("present_input_voltage", servo.joint) for servo in servos.servos}
+        warm = {servo.joint: servos.read("present_temperature", servo.joint) for servo in servos.servos}
+    low = min(volts, key=lambda joint: volts[joint])
+    evidence += [
+        Evidence("lowest supply at rest", volts[low], "V", f"register 144 of {low}"),
+        Evidence(
+            "warmest servo", max(warm.values()), "°C", f"register 146 of {max(warm, key=lambda joint: warm[joint])}"
+        ),
+    ]
+    for joint, value in volts.items():
+        lowest, highest = config.motors[joint].servo.supply_range_v
+        if not lowest <= value <= highest + 0.5:
+            problems.append(
+                f"{joint}: is supplied with {value:.1f} V, it needs {lowest:.1f} to {highest:.1f} → supply and power plug"
+            )
+    for joint, value in warm.items():
+        if value > config.motors[joint].servo.temperature_limit_c - COOL_K:
+            problems.append(f"{joint}: is at {value:.0f} °C already → let it cool before the session")
+    return problems
+
+
+def _warm_or_weak(now: Mapping[str, JointSweep], config: RobotConfig) -> list[str]:
+    words = []
+    for joint, one in now.items():
+        model = config.motors[joint].servo
+        if one.temperature_c is not None and one.temperature_c > model.temperature_limit_c - COOL_K:
+            words.append(f"{joint}: {one.temperature_c:.0f} °C after a slow sweep → let it cool; is it blocked?")
+        if one.volts is not None and one.volts < model.supply_range_v[0]:
+            words.append(f"{joint}: its supply fell to {one.volts:.1f} V while it moved → power plug, or a weak supply")
+    return words
+
+
+def _imu(bench: Bench, config: RobotConfig, evidence: list[Evidence]) -> list[str]:
+    """Whether the flight controller answers, lies level and still; nothing where the robot has none."""
+    if bench.imu is None and config.ports.imu == "":
+        return []
+    try:
+        with opened_imu(bench) as (driver, clock):
+            end, rows = clock.now() + 1.0, list[tuple[float, ...]]()
+            while clock.now() < end:
+                sample = driver.read(clock.now() + 0.5)
+                rows.append((*sample.acc, *sample.gyro))
+    except HardwareFault as fault:
+        return [f"IMU: {fault}"]
+    seen = np.array(rows).mean(axis=0)
+    body = rotation(config.imu.mounting_rad)
+    acc, gyro = body @ seen[:3] - config.imu.acc_bias_m_s2, body @ seen[3:] - config.imu.gyro_bias_rad_s
+    norm = float(np.linalg.norm(acc))
+    lean = math.acos(max(-1.0, min(1.0, float(acc[2]) / norm))) if norm else math.pi
+    evidence += [
+        Evidence("norm of acc over gravity", norm / STANDARD_GRAVITY, "1", "IMU at rest"),
+        Evidence("lean of the torso", lean, "rad", "gravity in the body's frame"),
+        Evidence("gyro at rest", float(np.linalg.norm(gyro)), "rad/s", "less its bias"),
+    ]
+    words = []
+    if abs(norm / STANDARD_GRAVITY - 1) > GRAVITY_SHARE:
+        words.append(f"IMU: reads {norm:.2f} m/s² at rest → its scale has changed (new firmware?): `openant calib imu`")
+    if lean > LEAN_RAD:
+        words.append(
+            f"IMU: the torso leans by {math.degrees(lean):.0f}° → put it level, or the board has come loose: `openant calib imu`"
+        )
+    if float(np.linalg.norm(gyro)) > STILL_RAD_S:
+        words.append("IMU: the gyro turns at rest → was it moved while it was powered on? Power it off and on, still")
+    return words
+
+
+def _twitch(bench: Bench) -> Generator[Event, Answer, Run]:
+    """A short excitation on the stand, recorded; the recording."""
+    path = bench.folder.recordings / "check-twitch.mcap"
+    played = protocol("stand", TWITCH_S)
+    config = engine_config(bench)
+    joints = tuple(servo.joint for servo in config.servos)
+    space = CommandSpace.around_home(dict(config.limits_rad), list(joints))
+    commands = played.commands(space, config.rate_hz, 7)
+    limp = played.limp(space, config.rate_hz)
+    with EngineProcess(config) as engine:
+        engine.ask(messages.Torque(True))
+        engine.ask(messages.Ramp(commands[0]))
+        engine.ask(messages.Hold(0.5))
+        volts = engine.ask(messages.ReadRegister("present_input_voltage"))
+        facts = Facts(
+            joints=joints,
+            setup="stand",
+            protocol="twitch",
+            supply_v=round(float(np.mean(list(volts.values()))) * 0.1, 2),
+        )
+        engine.ask(messages.Record(str(path), facts, overwrite=True))
+        motion = messages.Play(commands, "twitch", limp if limp.any() else None)
+        yield from play_watched(engine, motion, len(commands) / config.rate_hz, "twitch")
+        engine.ask(messages.StopRecording())
+        engine.ask(messages.Torque(False))
+    return read_run(path)
+
+
+def _against_model(
+    bench: Bench, run: Run, evidence: list[Evidence], known: Sequence[str]
+) -> Generator[Event, Answer, list[str]]:
+    """Joints that the calibrated model simulates much worse than when it was made, besides those named already."""
+    gap = latest(bench.folder, "gap")
+    if gap is None or "by_joint_rad" not in gap.data:
+        yield Say("there is no gap check to compare the twitch with", "warn")
+        return []
+    model = bench.folder.model_path()
+    found = yield from relayed(lambda progress, notice: measure([run], model))
+    evidence.append(Evidence("position gap of the twitch", found.gaps["pos"], "rad", f"{model.name}, 0.5 s horizon"))
+    before = gap.data["by_joint_rad"]
+    named = {line.partition(":")[0] for line in known}
+    return [
+        f"{joint}: moves differently from its model ({1e3 * off:.1f} mrad, it was {1e3 * before[joint]:.1f}) → screws, gear, or a "
+        "part that was exchanged; `openant gap diagnose` says more"
+        for joint, off in gap_by_joint(found).items()
+        if joint in before and off > GAP_FACTOR * before[joint] and off - before[joint] > GAP_RAD and joint not in named
+    ]
+
+
+def _outside(run: Run, config: RobotConfig) -> Generator[Event, Answer, None]:
+    """Say which observations were outside the bounds that agents are normalised by."""
+    for name, (low, high) in config.observation.items():
+        values = run.column(name)
+        share = float(np.mean((values < low) | (values > high))) if np.isfinite(values).any() else 0.0
+        if share > 0.01:
+            yield Say(
+                f"{name} was outside its bounds {low:.3g} … {high:.3g} for {100 * share:.0f} % of the twitch", "warn"
+            )
+
+
+def _finding(problems: Sequence[str], evidence: Sequence[Evidence], data: Mapping[str, object]) -> Finding:
+    return Finding(
+        "check",
+        not problems,
+        "as the passport has it"
+        if not problems
+        else f"{len(problems)} thing{'s' if len(problems) > 1 else ''} changed",
+        tuple(evidence),
+        ""
+        if not problems
+        else "mend what is listed and check again; where it was meant, do the step that measures it again",
+        COMMAND,
+        data=dict(data),
+        problems=tuple(problems),
+    )
