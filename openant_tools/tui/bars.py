@@ -7,7 +7,7 @@ import math
 from rich.text import Text
 
 from openant_tools.procedure.step import Live
-from openant_tools.tui.marks import BLUE, plain
+from openant_tools.tui.marks import BLUE, plain, spelled
 
 __all__ = ["bars"]
 
@@ -16,17 +16,17 @@ def bars(live: Live, width: int) -> Text:
     """The values of a procedure's `Live`, each on its own scale where one is given, in lines of `width` columns."""
     text = Text(no_wrap=True, overflow="ellipsis")
     if live.words:
-        text.append(f"{live.words}\n")
+        text.append(f"{spelled(live.words)}\n")
     across = max(8, width - 52)
     full, empty, here = ("=", "-", "|") if plain() else ("━", "─", "●")
     for joint, value in live.values.items():
         low, high = live.low.get(joint), live.high.get(joint)
-        text.append(f"{joint:9}{value:+8.3f} {live.unit:5}", "bold")
+        text.append(f"{joint:9}{value:+8.3f} {spelled(live.unit):5}", "bold")
         if low is not None and high is not None and math.isfinite(value) and high > low:
             at = min(max(round((value - low) / (high - low) * (across - 1)), 0), across - 1)
             text.append(f"{low:+7.2f} ")
             text.append(full * at + here + empty * (across - 1 - at), BLUE)
             text.append(f" {high:+6.2f}")
-        text.append(f" {live.marks.get(joint, '')}\n")
+        text.append(f" {spelled(live.marks.get(joint, ''))}\n")
     text.rstrip()
     return text

@@ -8,9 +8,10 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Vertical, VerticalScroll
 from textual.screen import ModalScreen
-from textual.widgets import Markdown, OptionList, Static
+from textual.widgets import OptionList, Static
 
 from openant_tools.tui.choices import Choices
+from openant_tools.tui.prose import Prose
 
 __all__ = ["Help", "Question"]
 
@@ -26,7 +27,7 @@ class Help(ModalScreen[None]):
 
     def compose(self) -> ComposeResult:
         with VerticalScroll(id="help"):
-            yield Markdown(self._words)
+            yield Prose(self._words)
             yield Static("Esc closes this page, arrows move in it.", classes="note")
 
 
@@ -43,6 +44,9 @@ class Question(ModalScreen[int | None]):
         with Vertical(id="asked"):
             yield Static(self._words)
             yield Choices(*self._offered)
+
+    def on_mount(self) -> None:
+        self.query_one(Choices).highlighted = 0
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         self.dismiss(event.option_index)

@@ -10,7 +10,7 @@ from typing import Literal
 
 from rich.text import Text
 
-__all__ = ["BLUE", "MARKS", "Mark", "Name", "can_unicode", "mark", "marked", "plain"]
+__all__ = ["BLUE", "MARKS", "Mark", "Name", "can_unicode", "mark", "marked", "plain", "spelled"]
 
 Name = Literal["ok", "warn", "fail", "wait", "todo", "stale", "info", "off", "on"]
 
@@ -63,6 +63,18 @@ def plain(on: bool | None = None) -> bool:
     return not _unicode
 
 
+#: what stands in words and units → how it is spelled in ASCII
+_SPELLED = str.maketrans({
+    "→": "->", "…": "...", "°": " deg ", "×": "x", "–": "-", "—": "-", "−": "-", "²": "2", "·": "*", "μ": "u", "µ": "u",
+    "λ": "lambda", "τ": "tau", "±": "+-", "✓": "+", "✗": "x", "▲": "!", "“": '"', "”": '"', "’": "'", "Ω": "ohm",
+})  # fmt: skip
+
+
+def spelled(words: str) -> str:
+    """Words as this terminal can show them."""
+    return words if _unicode else words.translate(_SPELLED).encode("ascii", "replace").decode()
+
+
 def mark(name: Name) -> str:
     """The glyph alone."""
     return MARKS[name].glyph if _unicode else MARKS[name].ascii
@@ -71,5 +83,5 @@ def mark(name: Name) -> str:
 def marked(name: Name, words: str | None = None, width: int = 0) -> Text:
     """Glyph and word in the state's colour; `words` instead of the state's own."""
     entry = MARKS[name]
-    text = f"{mark(name)} {entry.word if words is None else words}"
+    text = f"{mark(name)} {entry.word if words is None else spelled(words)}"
     return Text(text.ljust(width), style=f"bold {entry.colour}" if name in ("fail", "on") else entry.colour)

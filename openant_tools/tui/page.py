@@ -11,7 +11,7 @@ from textual.screen import Screen
 from textual.widgets import Footer, Static
 
 from openant_tools.tui.leg_map import JointChosen, LegMap
-from openant_tools.tui.marks import MARKS, mark, marked
+from openant_tools.tui.marks import MARKS, mark, marked, spelled
 from openant_tools.tui.session import Session
 from openant_tools.tui.strips import JointStrips
 
@@ -82,7 +82,11 @@ class Page(Screen[None]):
         bar.display = bool(faults)
         if faults:
             more = f"  and {len(faults) - 1} more" if len(faults) > 1 else ""
-            bar.update(Text.assemble((f"{mark('fail')} FAULT {faults[0]}{more}  ", "bold"), ("F8: seen", "reverse")))
+            bar.update(
+                Text.assemble(
+                    (f"{mark('fail')} FAULT {spelled(str(faults[0]))}{more}  ", "bold"), ("F8: seen", "reverse")
+                )
+            )
         replay = session.replay
         line = self.query_one("#replay", Static)
         line.display = replay is not None

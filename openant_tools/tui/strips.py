@@ -16,12 +16,11 @@ from textual.strip import Strip
 from textual.widget import Widget
 
 from openant_tools.robot.joints import JOINT_NAMES
-from openant_tools.robot.kit import ANGLE_LIMIT_RAD
 from openant_tools.tui.braille import trace
 from openant_tools.tui.faults import condition
 from openant_tools.tui.feeds import WINDOW_S, History
 from openant_tools.tui.leg_map import JointChosen
-from openant_tools.tui.marks import BLUE, MARKS, mark, plain
+from openant_tools.tui.marks import BLUE, MARKS, mark, plain, spelled
 
 __all__ = ["SIGNALS", "JointStrips"]
 
@@ -45,7 +44,7 @@ class Signal:
 
 
 SIGNALS: tuple[Signal, ...] = (
-    Signal("angle", ("pos",), "rad", -ANGLE_LIMIT_RAD["knee"], ANGLE_LIMIT_RAD["knee"], "+6.2f"),
+    Signal("angle", ("pos",), "rad", -0.5, 0.5, "+6.2f"),
     Signal("velocity", ("vel",), "rad/s", -1.0, 1.0, "+6.2f"),
     Signal("effort (A, or share of full load)", ("cur", "load"), "", -0.2, 0.2, "+6.2f"),
     Signal("duty", ("pwm",), "of 1", -0.2, 0.2, "+6.2f"),
@@ -76,10 +75,10 @@ A gap in a trace is a time without an answer; nothing is drawn that was not meas
 All strips of a signal share one scale, which stands in the top line; it grows when a value leaves it.
 """
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("left", "signal(-1)", "Signal", key_display="←→"),
+        Binding("left", "signal(-1)", "Signal", key_display="left/right"),
         Binding("right", "signal(1)", "Signal", show=False),
         Binding("up", "choose(-1)", "Joint", show=False),
-        Binding("down", "choose(1)", "Joint", key_display="↑↓"),
+        Binding("down", "choose(1)", "Joint", key_display="up/down"),
     ]
     DEFAULT_CSS = "JointStrips { height: 1fr; min-height: 10; }"
 
@@ -132,7 +131,7 @@ All strips of a signal share one scale, which stands in the top line; it grows w
         height = max(1, min(3, (self.size.height - 2) // max(1, len(history.joints))))
         stop = float(history.t[-1]) if len(history.rows) else WINDOW_S
         grey = Style(color="#A8A8A8")
-        unit = chosen.unit.replace("°", "") if ascii_only else chosen.unit
+        unit = spelled(chosen.unit)
         title = f"{chosen.title} {unit}"
         scale = f"{low:.3g} ... {high:.3g} {unit}, {WINDOW_S:.0f} s"
         head = f"{'joint':9}{'servo':9}{title}"

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from rich.text import Text
 from textual.app import ComposeResult
 from textual.containers import Horizontal, VerticalScroll
-from textual.widgets import Markdown, OptionList
+from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
 
+from openant_tools.bringup.walk import WALK
+from openant_tools.procedure.finding import Finding
 from openant_tools.tui.choices import Choices
-from openant_tools.tui.marks import mark
+from openant_tools.tui.found import finding_lines
+from openant_tools.tui.marks import mark, marked
 from openant_tools.tui.page import Page
+from openant_tools.tui.prose import Prose
 
 __all__ = ["FindingsScreen"]
 
-NONE_YET = """\
-# Nothing found yet
-
-Each step of the walk leaves a finding here: one sentence, the numbers it rests on, and what to do next.
-The same stands in the robot's folder as JSON and Markdown.
-"""
+NONE_YET = (
+    "Nothing found yet.\n\nEach step of the walk leaves a finding here: one sentence, the numbers it rests on, and what "
+    "to do next. The same stands in the robot's folder as JSON and Markdown."
+)
 
 
 class FindingsScreen(Page):
@@ -39,7 +42,8 @@ kept in the robot's `findings/`, one a run of a step. The passport is the page t
         with Horizontal():
             yield Choices(id="list")
             with VerticalScroll(can_focus=True):
-                yield Markdown(id="text")
+                yield Static(id="finding")
+                yield Prose(id="passport")
 
     def on_mount(self) -> None:
         super().on_mount()
@@ -50,7 +54,7 @@ kept in the robot's `findings/`, one a run of a step. The passport is the page t
         if self._files:
             chooser.highlighted = 0
         else:
-            self.query_one(Markdown).update(NONE_YET)
+            self.query_one("#finding", Static).update(NONE_YET)
         chooser.focus()
 
     def _find(self) -> list[Path]:
@@ -58,15 +62,30 @@ kept in the robot's `findings/`, one a run of a step. The passport is the page t
         if folder is None:
             return []
         passport = folder.passport.with_suffix(".md")
-        found = sorted(folder.findings.glob("*-2*.md"), key=lambda path: path.stem.rpartition("-")[2], reverse=True)
+        found = sorted(folder.findings.glob("*-2*.json"), key=lambda path: path.stem.rpartition("-")[2], reverse=True)
         return [passport, *found] if passport.is_file() else found
 
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
+        path = self._files[event.option_index]
+        prose, finding = self.query_one(Prose), self.query_one("#finding", Static)
+        prose.display = path.suffix == ".md"
+        finding.display = not prose.display
         try:
-            words = self._files[event.option_index].read_text(encoding="utf-8")
-        except OSError as error:
-            words = f"It cannot be read: {error.strerror}."
-        self.query_one(Markdown).update(words)
+            content = path.read_text(encoding="utf-8")
+            if prose.display:
+                prose.show(content)
+            else:
+                finding.update(_page(Finding.of_json(json.loads(content))))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            prose.display, finding.display = False, True
+            finding.update(marked("fail", f"{path} cannot be read: {error}"))
+
+
+def _page(finding: Finding) -> Text:
+    title = WALK[finding.step].title if finding.step in WALK else finding.step
+    head = Text(f"{title}\n", style="bold")
+    text = Text("\n").join([head, *finding_lines(finding)])
+    return text.append(f"\n\n{finding.date:%Y-%m-%d %H:%M} UTC, {finding.command}")
 
 
 def _title(path: Path) -> Text:

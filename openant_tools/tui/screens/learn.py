@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from rich.text import Text
 from textual.app import ComposeResult
-from textual.containers import Vertical
-from textual.widgets import Input, OptionList, Static
+from textual.containers import Horizontal, Vertical
+from textual.widgets import Input, Label, OptionList, Static
 from textual.widgets.option_list import Option
 
 from openant_tools.tui.braille import trace
@@ -38,9 +38,14 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
 
     def body(self) -> ComposeResult:
         with Vertical(id="form"):
-            yield Static("Steps (of 0.12 s; 30000 are an hour of robot time), and the seed", classes="title")
-            yield Input("30000", type="integer", id="steps")
-            yield Input("0", type="integer", id="seed")
+            with Horizontal(classes="line"):
+                yield Label("steps")
+                yield Input("30000", type="integer", id="steps")
+                yield Label("of 0.12 s; 30000 are an hour of robot time")
+            with Horizontal(classes="line"):
+                yield Label("seed")
+                yield Input("0", type="integer", id="seed")
+                yield Label("of its chance; each has a run of its own")
             yield Choices(
                 *(Option(f"Train {name}: {_WORDS[name]}", id=name) for name in AGENTS),
                 Option("Stop and save", id="stop"),
@@ -51,7 +56,9 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
     def on_mount(self) -> None:
         super().on_mount()
         self.set_interval(REFRESH_S, self.draw_progress)
-        self.query_one("#choices").focus()
+        chooser = self.query_one("#choices", Choices)
+        chooser.highlighted = 0
+        chooser.focus()
         self.draw_progress()
 
     def on_input_submitted(self, event: Input.Submitted) -> None:

@@ -54,7 +54,9 @@ that has the columns of docs/recordings.md.
             stat = path.stat()
             when = datetime.datetime.fromtimestamp(stat.st_mtime).strftime("%d.%m.%Y %H:%M")
             chooser.add_option(Option(Text(f"{path.name:40.40} {stat.st_size / 1e6:7.1f} MB  {when}"), id=str(number)))
-        if not self._files:
+        if self._files:
+            chooser.highlighted = 0
+        else:
             self.note("No recordings yet: `openant sysid record` and the steps of the walk make them.")
         chooser.focus()
 

@@ -55,7 +55,9 @@ there, or a new place, and press `Enter`; then choose below whether to open it o
 
     def on_mount(self) -> None:
         super().on_mount()
-        self.query_one("#choices").focus()
+        chooser = self.query_one("#choices", Choices)
+        chooser.highlighted = 0
+        chooser.focus()
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
         self.query_one("#choices").focus()

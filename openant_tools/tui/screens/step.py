@@ -15,13 +15,14 @@ from textual.widgets.option_list import Option
 
 from openant_tools.bringup.walk import WALK, standing
 from openant_tools.errors import OpenAntError
-from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.step import Answer, Ask, Event, Hands, Intent, Live, Look, Progress, Say, Step
 from openant_tools.tui.bars import bars
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.dialogs import Question
+from openant_tools.tui.found import finding_lines
 from openant_tools.tui.leg_map import LegMap
-from openant_tools.tui.marks import MARKS, Name, mark, marked
+from openant_tools.tui.marks import MARKS, Name, mark, marked, plain, spelled
 from openant_tools.tui.page import Page
 from openant_tools.tui.screens.walk import standing_mark
 from openant_tools.tui.step_run import BY_VIRTUAL_HANDS, StepRun
@@ -110,7 +111,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
             if self._pending is not None:
                 text.append_text(marked("warn", "your turn"))
             elif progress is not None:
-                text.append(progress.words)
+                text.append(spelled(progress.words))
         elif self.session.folder is not None:
             one = standing(self.session.folder).get(self.step.name)
             text.append_text(standing_mark(one) if one is not None else marked("todo", ""))
@@ -180,22 +181,15 @@ and can be begun again: what it found or wrote before stays, and every write to 
         self.draw()
 
     def show_finding(self, finding: Finding, before: str = "") -> None:
-        self.say(marked("ok" if finding.ok else "fail", f"{before}{finding.what}"))
-        for problem in finding.problems:
-            self.say(Text(f"  {mark('warn')} {problem}", style=MARKS["warn"].colour))
-        for evidence in finding.evidence:
-            self.say(Text(f"  {_evidence(evidence)}"))
-        if finding.next_action:
-            self.say(Text(f"Next: {finding.next_action}", style="bold"))
+        for line in finding_lines(finding, before):
+            self.say(line)
 
     # ---- from the procedure --------------------------------------------------------------------------------------
 
     def _from_thread(self, event: Event) -> None:
         """Called in the procedure's thread: what changes many times a second waits for the next tick."""
-        if isinstance(event, Live):
-            self._live = event
-        elif isinstance(event, Progress):
-            self._progress = event
+        if isinstance(event, Live | Progress):
+            self.shown(event)
         else:
             self._to_screen(self.shown, event)
 
@@ -205,7 +199,11 @@ and can be begun again: what it found or wrote before stays, and every write to 
 
     def shown(self, event: Event) -> None:
         """Draw one event, and offer the answers that it takes."""
-        if isinstance(event, Say):
+        if isinstance(event, Live):
+            self._live = event
+        elif isinstance(event, Progress):
+            self._progress = event
+        elif isinstance(event, Say):
             self.say(marked(_LEVELS[event.level], event.words))
         elif isinstance(event, Look):
             self.say(Text("\n".join(part for part in (event.words, event.drawing) if part)))
@@ -307,12 +305,12 @@ and can be begun again: what it found or wrote before stays, and every write to 
         self._choices = choices
         question = self.query_one("#question", Static)
         question.display = bool(words)
-        question.update(Text(words, style="bold"))
+        question.update(Text(spelled(words), style="bold"))
         self.query_one("#value", Input).display = False
         chooser = self.query_one("#choices", Choices)
         chooser.clear_options()
         chooser.display = bool(choices)
-        chooser.add_options([Option(choice.words) for choice in choices])
+        chooser.add_options([Option(Text(spelled(choice.words))) for choice in choices])
         if choices:
             chooser.highlighted = chosen
             chooser.focus()
@@ -369,15 +367,9 @@ and can be begun again: what it found or wrote before stays, and every write to 
     def say(self, words: Text) -> None:
         """One more entry of the log."""
         log = self.query_one("#log", VerticalScroll)
-        log.mount(Static(words))
+        log.mount(Static(words if not plain() else Text(spelled(words.plain), words.style)))
         log.scroll_end(animate=False)
 
     def action_scroll(self, by: int) -> None:
         log = self.query_one("#log", VerticalScroll)
         log.scroll_relative(y=by * max(1, log.size.height - 1), animate=False)
-
-
-def _evidence(evidence: Evidence) -> str:
-    value = "unknown" if evidence.value is None else f"{evidence.value:.4g} {evidence.unit}".rstrip()
-    span = "" if evidence.low is None or evidence.high is None else f" ({evidence.low:.3g} ... {evidence.high:.3g})"
-    return f"{evidence.name}: {value}{span}, {evidence.source}"

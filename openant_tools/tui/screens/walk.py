@@ -15,7 +15,7 @@ from openant_tools.bringup.walk import WALK, Standing, standing
 from openant_tools.procedure.step import Step
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.leg_map import LegMap
-from openant_tools.tui.marks import Name, mark, marked
+from openant_tools.tui.marks import Name, mark, marked, plain, spelled
 from openant_tools.tui.page import Page
 
 __all__ = ["WalkScreen", "standing_mark"]
@@ -128,4 +128,4 @@ def _about(step: Step, one: Standing | None) -> Text:
         text.append(f"You need {step.table}.\n")
     moves = "the robot moves, after you say so" if step.moves else "nothing moves"
     text.append(f"Changes {step.changes or 'nothing'}; {moves}.")
-    return text
+    return text if not plain() else Text(spelled(text.plain))

@@ -1,0 +1,323 @@
+"""The terminal program: what each screen shows, and a builder who walks, hesitates, stops, and looks back."""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.text import Text
+from textual.pilot import Pilot
+
+from openant_tools.procedure.finding import Evidence, Finding, keep
+from openant_tools.procedure.step import Event, Hands, Intent, Live, RegisterChange, Say
+from openant_tools.recording.run import Facts, Run
+from openant_tools.recording.tables import read_run, write_table
+from openant_tools.robot.folder import RobotFolder, create_robot
+from openant_tools.robot.joints import JOINT_NAMES
+from openant_tools.tui.app import SCREENS, OpenAnt
+from openant_tools.tui.feeds import ReplayFeed
+from openant_tools.tui.marks import plain
+from openant_tools.tui.page import Page
+from openant_tools.tui.screens import settings
+from openant_tools.tui.screens.live import LiveScreen
+
+SIZES = [(80, 24), (120, 40)]
+#: of a test on a loaded machine
+PATIENCE_S = 60.0
+Press = Callable[["Pilot[int]"], Awaitable[None]]
+
+
+@pytest.fixture(autouse=True)
+def unicode_terminal() -> Iterator[None]:
+    plain(False)
+    yield
+    plain(False)
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> RobotFolder:
+    """A robot whose owner has walked the first steps: one is green, one is not."""
+    folder = create_robot(tmp_path / "my-ant")
+    day = datetime.datetime(2026, 11, 20, 9, 30, tzinfo=datetime.UTC)
+    keep(
+        Finding(
+            "connect", True, "the bus is /dev/ttyUSB0, the IMU /dev/ttyACM0",
+            (Evidence("latency timer", 1.0, "ms", "driver of /dev/ttyUSB0"),), "", "openant calib connect", date=day,
+        ),
+        folder,
+    )  # fmt: skip
+    keep(
+        Finding(
+            "estop", False, "torque stays on: do not go on",
+            (Evidence("still on after the stop key", 1.0, "", "register 64"),),
+            "pull the power plug", "openant calib estop",
+            date=day + datetime.timedelta(minutes=5), problems=("id 1: torque_enable reads 1",),
+        ),
+        folder,
+    )  # fmt: skip
+    return folder
+
+
+def a_run(folder: Path, seconds: float = 12.0) -> Run:
+    """A table as any software might write it: all joints swing, one falls silent for a second."""
+    t = np.arange(0.0, seconds, 0.02)
+    columns = {}
+    for k, joint in enumerate(JOINT_NAMES):
+        pos = 0.4 * np.sin(2 * np.pi * 0.4 * t + k)
+        if joint == "knee_fl":
+            pos[(t > 8) & (t < 9)] = np.nan
+        columns |= {f"pos.{joint}": pos, f"cmd.{joint}": pos.copy(), f"volt.{joint}": np.full(len(t), 11.8)}
+    run = Run("walk", Facts(tuple(JOINT_NAMES)), t, columns)
+    write_table(run, folder / "walk.parquet")
+    return read_run(folder / "walk.parquet")
+
+
+def frozen(app: OpenAnt, run: Run, at_s: float) -> ReplayFeed:
+    """A replay that stands still, shown by the app."""
+    feed = ReplayFeed(run, clock=lambda: 0.0)
+    feed.playing = False
+    app.session.play(feed)
+    feed.seek(at_s)
+    app.tick()
+    return feed
+
+
+def screen_text(app: OpenAnt) -> str:
+    """What stands on the screen, line by line."""
+    width, height = app.size
+    lines = app.screen._compositor.render_strips()
+    return "\n".join("".join(segment.text for segment in line) for line in lines[:height]) + "\n" * (width == 0)
+
+
+async def until(pilot: Pilot[int], what: Callable[[], bool]) -> None:
+    give_up = time.monotonic() + PATIENCE_S
+    while not what():
+        assert time.monotonic() < give_up, screen_text(pilot.app)  # type: ignore[arg-type]
+        await pilot.pause(0.02)
+    await pilot.pause()
+
+
+# ---- what the screens look like --------------------------------------------------------------------------------------
+
+
+async def _walk(pilot: Pilot[int]) -> None:
+    await pilot.pause()
+
+
+async def _step(pilot: Pilot[int]) -> None:
+    pilot.app.open_step("estop")  # type: ignore[attr-defined]
+    await pilot.pause()
+
+
+async def _go(pilot: Pilot[int], name: str) -> None:
+    pilot.app.action_go(name)  # type: ignore[attr-defined]
+    await pilot.pause()
+
+
+#: what procedures say and ask
+EVENTS: dict[str, tuple[Event, ...]] = {
+    "intent": (
+        Say("one servo answers, at 57600 baud", "ok"),
+        Say("its firmware is old: no fast reads", "warn"),
+        Intent(
+            "make this XC430-W240-T (id 1, 57600 baud, firmware 46) the rear right hip",
+            (RegisterChange("hip_rr", "id", 1, 10), RegisterChange("hip_rr", "baud_rate", 1, 3)),
+            moves=True,
+        ),
+    ),
+    "bars": (
+        Hands("Move each joint by hand to both of its stops.", "turn", while_watching=True),
+        Live(
+            {joint: 0.1 * k - 0.4 for k, joint in enumerate(JOINT_NAMES)}, "rad", "reached so far",
+            dict.fromkeys(JOINT_NAMES, -1.3), dict.fromkeys(JOINT_NAMES, 1.2), {"knee_fl": "upper stop missing"},
+        ),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
+@pytest.mark.parametrize("name", ["walk", *SCREENS, "step", "intent", "bars", "help", "jump", "palette"])
+def test_every_screen_looks_as_it_did(
+    name: str,
+    size: tuple[int, int],
+    robot: RobotFolder,
+    snap_compare: Callable[..., bool],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("TEXTUAL_ANIMATIONS", "none")
+    monkeypatch.setattr(settings, "_facts", lambda: Text("openant-tools 1, textual 8\nPython 3 on Linux"))
+    monkeypatch.setenv("TZ", "UTC")
+    time.tzset()
+    monkeypatch.chdir(robot.path.parent)
+    run = a_run(robot.path.parent)
+    write_table(run, robot.recordings / "walk.csv")
+    os.utime(robot.recordings / "walk.csv", (1_795_000_000, 1_795_000_000))
+    curve = robot.runs / "sac-0" / "learning_curve.csv"
+    curve.parent.mkdir(parents=True)
+    rows = [f"{step},{0.12 * step:.2f},{0.04 * (1 - np.exp(-step / 8000)):.5f}" for step in range(100, 12_001, 100)]
+    curve.write_text("\n".join(["step,seconds,average_reward_m_s", *rows]) + "\n")
+    app = OpenAnt(Path("my-ant"), ticking=False)
+
+    async def before(pilot: Pilot[int]) -> None:
+        if name in SCREENS:
+            await _go(pilot, name)
+        elif name in ("step", "intent", "bars"):
+            await _step(pilot)
+            for event in EVENTS.get(name, ()):
+                app.screen.shown(event)  # type: ignore[attr-defined]
+            app.screen.draw()  # type: ignore[attr-defined]
+        elif name in ("help", "jump", "palette"):
+            await pilot.press({"help": "f1", "jump": "ctrl+o", "palette": "ctrl+p"}[name])
+        if name == "live":
+            app.session.selected = "knee_fl"
+            frozen(app, run, 10.0)
+        await pilot.pause()
+
+    assert snap_compare(app, terminal_size=size, run_before=before)
+
+
+def test_without_unicode_every_screen_is_ascii(robot: RobotFolder) -> None:
+    plain(True)
+    run = a_run(robot.path.parent)
+
+    async def look() -> None:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(80, 24)) as pilot:
+            await pilot.pause()
+            seen = {"walk": screen_text(app)}
+            frozen(app, run, 10.0)
+            for name in SCREENS:
+                app.action_go(name)
+                await pilot.pause()
+                seen[name] = screen_text(app)
+            app.open_step("estop")
+            await pilot.pause()
+            seen["step"] = screen_text(app)
+        for name, text in seen.items():
+            strange = {character for character in text if ord(character) > 126}
+            assert not strange, (name, strange)
+        assert "ok" in seen["walk"]
+        assert "no" in seen["walk"]
+
+    asyncio.run(look())
+
+
+def test_every_widget_that_takes_keys_explains_itself(robot: RobotFolder) -> None:
+    async def look() -> None:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(120, 40)) as pilot:
+            for name in ["walk", *SCREENS]:
+                if name != "walk":
+                    await _go(pilot, name)
+                assert isinstance(app.screen, Page)
+                assert app.screen.focus_chain, name
+                await pilot.press("f1")
+                await pilot.pause()
+                assert "STOP" in screen_text(app), name
+                assert len(screen_text(app).split()) > 60, name
+                await pilot.press("escape")
+
+    asyncio.run(look())
+
+
+def test_only_the_command_line_loads_textual_and_only_when_asked() -> None:
+    code = "import sys, openant_tools.cli, openant_tools.bringup.walk; print('textual' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_without_a_terminal_openant_prints_its_manual() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "openant_tools.cli"], stdin=subprocess.DEVNULL, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert "the terminal program" in done.stderr
+
+
+def test_options_of_the_terminal_program_before_a_command_are_refused() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "openant_tools.cli", "--robot", "x", "rec"], capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert "give them after it" in done.stderr
+
+
+# ---- a recording on every screen -------------------------------------------------------------------------------------
+
+
+def test_a_recording_plays_on_every_screen_and_can_be_stepped(robot: RobotFolder) -> None:
+    run = a_run(robot.path.parent)
+    robot.recordings.mkdir(exist_ok=True)
+    write_table(run, robot.recordings / "walk.csv")
+
+    async def look() -> None:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(80, 24)) as pilot:
+            await pilot.press("r")
+            await pilot.pause()
+            await pilot.press("enter")
+            await until(pilot, lambda: isinstance(app.screen, LiveScreen) and app.session.replay is not None)
+            replay = app.session.replay
+            assert replay is not None
+            await pilot.press("p")
+            assert not replay.playing
+            replay.seek(8.5)
+            app.tick()
+            await pilot.pause()
+            assert "8.5 of 12.0 s" in screen_text(app)
+            knee = next(line for line in screen_text(app).splitlines() if line.startswith("knee_fl"))
+            assert "silent" in knee
+            assert app.session.faults.unseen == (), "what a recording shows is no fault of now"
+            await pilot.press("right_square_bracket")
+            app.tick()
+            assert replay.position_s == pytest.approx(12.0 - 0.02)
+            await pilot.press("comma")
+            assert replay.position_s == pytest.approx(11.88)
+            for name in SCREENS:
+                await _go(pilot, name)
+                assert "of 12.0 s" in screen_text(app), name
+            await _go(pilot, "live")
+            await pilot.press("x")
+            await pilot.pause()
+            assert app.session.replay is None
+            assert "of 12.0 s" not in screen_text(app)
+
+    asyncio.run(look())
+
+
+def test_a_run_that_is_none_is_refused_in_words(robot: RobotFolder, tmp_path: Path) -> None:
+    (tmp_path / "none.csv").write_text("a,b\n1,2\n")
+
+    async def look() -> None:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(120, 40)) as pilot:
+            await pilot.press("r")
+            await pilot.press("n")
+            await pilot.press(*str(tmp_path / "none.csv"), "enter")
+            await until(pilot, lambda: "there is no column t" in screen_text(app))
+
+    asyncio.run(look())
+
+
+def test_a_fault_stays_until_it_has_been_seen(robot: RobotFolder) -> None:
+    async def look() -> None:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(80, 24)) as pilot:
+            app.session.faults.note("knee_fl", "does not answer")
+            app.session.faults.is_over("knee_fl")
+            for name in ["findings", "learn"]:
+                await _go(pilot, name)
+                assert "FAULT knee_fl: does not answer (over now)" in screen_text(app)
+            await pilot.press("f8")
+            await pilot.pause()
+            assert "FAULT" not in screen_text(app)
+
+    asyncio.run(look())
