@@ -32,7 +32,7 @@ from openant_tools.blind.score import Case, read, score, wilson
 from openant_tools.blind.score_report import score_report, write_docs
 from openant_tools.blind.simulate import simulate
 from openant_tools.blind.sizes import KINDS, SIZES, STANDARD, size_table
-from openant_tools.blind.through_bus import scenario_of
+from openant_tools.blind.through_bus import record_through_bus, scenario_of
 from openant_tools.cli.gap import gap
 from openant_tools.errors import BadInput
 from openant_tools.recording.tables import read_run
@@ -160,6 +160,22 @@ def test_a_late_robot_is_late_and_only_where_it_is(short: tuple[Motion, ...]) ->
     # The same robot in other company is the same robot.
     alone = simulate(robots[1:], short[0], 0)[0]
     np.testing.assert_allclose(logged(robots[1], short[0], 0, alone).signal("pos"), slow.signal("pos"))
+
+
+def test_the_virtual_robots_bus_gives_the_same_robot_within_what_two_simulators_differ(
+    short: tuple[Motion, ...],
+) -> None:
+    late = ill("action_delay", ("knee_fl",), delay_s=0.06)
+    healthy, slow = (record_through_bus(answer, short[:1])[0] for answer in (HEALTHY, late))
+    at = list(JOINTS).index("knee_fl")
+    off = np.sqrt(np.mean((healthy.signal("pos") - slow.signal("pos")) ** 2, axis=0))
+    assert off[at] > 0.02
+    assert np.delete(off, at).max() < 0.003
+    robot = true_robot(HEALTHY)
+    other = logged(robot, short[0], 0, simulate([robot], short[0], 0)[0])
+    assert set(healthy.columns) == set(other.columns)
+    assert np.sqrt(np.mean((healthy.signal("pos") - other.signal("pos")) ** 2)) < 0.012
+    assert (healthy.column("cmd_t") < healthy.t).all()
 
 
 @pytest.mark.parametrize("name", ["mount_resonance", "rubber_band", "loose_battery", "uneven_floor", "slipping_horn"])

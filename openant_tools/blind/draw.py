@@ -32,8 +32,8 @@ OUTSIDE: Mapping[str, str] = {
 }
 
 #: Effects that the batch simulator has to make: the virtual robot gives them another form (speed_limit brakes always,
-#: viscous_nonlinear replaces the linear part), starts every time cold, or films nothing.
-_BATCH_ONLY = frozenset({"speed_limit", "viscous_nonlinear", "thermal_derating", "tracker_scale"})
+#: viscous_nonlinear replaces the linear part), or its host samples without delay.
+_BATCH_ONLY = frozenset({"speed_limit", "viscous_nonlinear", "tracker_scale"})
 #: Pairs that no record tells apart, or that are one fault told twice.
 _TWINS = (
     {"action_delay", "sensor_delay"}, {"stiffness_error", "weak_joint"}, {"coulomb_friction", "stribeck_friction"},
@@ -162,7 +162,7 @@ def draw_answers(count: int, seed: int, mix: Mix | None = None) -> list[Answer]:
             answer = replace(answer, tracker=True)
         possible = not answer.outside and not any(_batch_only(drawn) for drawn in answer.effects)
         if possible and chance.random() < mix.virtual:
-            answer = replace(answer, maker="virtual", tracker=False)
+            answer = replace(answer, maker="virtual")
         answers.append(answer)
     return answers
 

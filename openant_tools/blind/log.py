@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from openant_tools.blind.commands import RATE_HZ, Motion
 from openant_tools.blind.mechanics import STEP_S
-from openant_tools.blind.robot import TrueRobot
+from openant_tools.blind.robot import Senses, TrueRobot
 from openant_tools.blind.simulate import Trace
 from openant_tools.recording.run import Facts, Run
 from openant_tools.robot.control_table import AMPERE_PER_COUNT
@@ -19,7 +19,7 @@ from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import PLATFORM_PWM_LIMIT_COUNTS, kit
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE, RAD_S_PER_COUNT
 
-__all__ = ["RESOLUTION", "facts_of", "logged"]
+__all__ = ["RESOLUTION", "facts_of", "imu_columns", "logged", "tracker_columns"]
 
 Array = NDArray[np.float64]
 
@@ -89,10 +89,9 @@ def logged(robot: TrueRobot, motion: Motion, number: int, trace: Trace) -> Run:
         columns[f"volt.{name}"], columns[f"temp.{name}"] = np.round(volts, 1), case[:, j]
         columns[f"torque.{name}"] = 1.0 - motion.limp[:, j]
         columns[f"ok.{name}"] = np.ones(len(last))
-    for name, values in _imu(robot, trace, plan.row, chance).items():
-        columns[name] = values
+    columns.update(imu_columns(senses, _imu_seen(trace, plan.row - robot.clocks.imu_s), chance))
     if trace.base is not None and robot.tracker:
-        columns.update(_base(robot, trace, plan.row, chance))
+        columns.update(tracker_columns(senses, _between(trace.base, plan.row - senses.tracker_s), chance))
     columns["cmd_t"] = plan.cmd_t
     return Run(motion.name, facts_of(motion), plan.t, columns)
 
@@ -115,32 +114,37 @@ def _rotation(vector: Array) -> Array:
     return out
 
 
-def _imu(robot: TrueRobot, trace: Trace, row: Array, chance: np.random.Generator) -> dict[str, Array]:
-    senses = robot.senses
+def imu_columns(senses: Senses, true: Array, chance: np.random.Generator) -> dict[str, NDArray[Any]]:
+    """Gyro and accelerometer as logged: turned by the mounting, biased, noisy, rounded; `true` (rows, 6)."""
     turn = _rotation(senses.mount_rad)
-    columns = {}
-    for name, part, hz, bias, noise, count in (
-        ("gyro", slice(0, 3), GYRO_HZ, senses.gyro_bias, senses.gyro_noise, GYRO_COUNT),
-        ("acc", slice(3, 6), ACC_HZ, senses.acc_bias, senses.acc_noise, ACC_COUNT),
+    columns: dict[str, NDArray[Any]] = {}
+    for name, part, bias, noise, count in (
+        ("gyro", slice(0, 3), senses.gyro_bias, senses.gyro_noise, GYRO_COUNT),
+        ("acc", slice(3, 6), senses.acc_bias, senses.acc_noise, ACC_COUNT),
     ):
-        share = 1 - math.exp(-2 * math.pi * hz * STEP_S)
-        raw = trace.imu[:, part].astype(float)
-        smooth = lfilter([share], [1, share - 1], raw, axis=0, zi=(1 - share) * raw[:1])[0]
         # The board is turned by `mount`: what it reads is the body's vector in its own axes.
-        seen = _between(smooth.astype(np.float32), row - robot.clocks.imu_s) @ turn + bias
-        seen += noise * chance.standard_normal(seen.shape)
+        seen = true[:, part] @ turn + bias
+        seen = seen + noise * chance.standard_normal(seen.shape)
         for axis, values in zip("xyz", seen.T, strict=True):
             columns[f"{name}.{axis}"] = np.rint(values / count) * count
     return columns
 
 
-def _base(robot: TrueRobot, trace: Trace, row: Array, chance: np.random.Generator) -> dict[str, Array]:
-    assert trace.base is not None
-    senses = robot.senses
-    pose = _between(trace.base, row - senses.tracker_s)
-    quaternion = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
-    w, x, y, z = quaternion.T
+def tracker_columns(senses: Senses, pose: Array, chance: np.random.Generator) -> dict[str, NDArray[Any]]:
+    """Place and heading as logged, of true poses (rows, 7)."""
+    w, x, y, z = (pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)).T
     yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))) + senses.tracker_yaw
-    place = senses.tracker_scale * pose[:, :3] + senses.tracker_m * chance.standard_normal((len(row), 3))
-    yaw = yaw + senses.tracker_rad * chance.standard_normal(len(row))
+    place = senses.tracker_scale * pose[:, :3] + senses.tracker_m * chance.standard_normal((len(pose), 3))
+    yaw = yaw + senses.tracker_rad * chance.standard_normal(len(pose))
     return {"base.x": place[:, 0], "base.y": place[:, 1], "base.z": place[:, 2], "base.yaw": yaw}
+
+
+def _imu_seen(trace: Trace, at: Array) -> Array:
+    """(rows, 6) behind the IMU's low-pass filters."""
+    parts = []
+    for part, hz in ((slice(0, 3), GYRO_HZ), (slice(3, 6), ACC_HZ)):
+        share = 1 - math.exp(-2 * math.pi * hz * STEP_S)
+        raw = trace.imu[:, part].astype(float)
+        smooth = lfilter([share], [1, share - 1], raw, axis=0, zi=(1 - share) * raw[:1])[0]
+        parts.append(_between(smooth.astype(np.float32), at))
+    return np.hstack(parts)

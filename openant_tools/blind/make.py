@@ -11,7 +11,7 @@ from typing import Any
 import tomlkit
 from joblib import Parallel, delayed
 
-from openant_tools.blind.answers import write_answers
+from openant_tools.blind.answers import read_answers, write_answers
 from openant_tools.blind.commands import Motion, motions
 from openant_tools.blind.draw import Answer, Mix, draw_answers
 from openant_tools.blind.log import logged
@@ -83,7 +83,8 @@ def make_set(
     drawn = list(answers) if answers is not None else draw_answers(count, seed, mix)
     motion_seed = seed if motion_seed is None else motion_seed
     played = motions(motion_seed)
-    commitment = _claim(out, drawn, {"robots": len(drawn), "seed": seed, "motion_seed": motion_seed}, commit, mix, key)
+    facts = {"robots": len(drawn), "seed": seed, "motion_seed": motion_seed}
+    commitment, drawn = _claim(out, drawn, facts, commit, mix, key)
     write_text(out / "model.xml", nominal_mjcf("standard"))
     todo = [k for k in range(len(drawn)) if not _done(out / _name(k), played)]
     by_batch = [k for k in todo if drawn[k].maker == "batch"]
@@ -106,9 +107,9 @@ def _done(folder: Path, played: Sequence[Motion]) -> bool:
 
 
 def _claim(
-    out: Path, answers: Sequence[Answer], drawn: dict[str, int], commit: str | None, mix: Mix, key: bytes | None
-) -> str:
-    """Write the set's facts and its answers, or see that they are the same set's; their commitment."""
+    out: Path, answers: list[Answer], drawn: dict[str, int], commit: str | None, mix: Mix, key: bytes | None
+) -> tuple[str, list[Answer]]:
+    """Write the set's facts and its answers, or see that it is the same set and take those that it has; their commitment."""
     path = out / "set.toml"
     facts: dict[str, Any] = {"schema": SCHEMA, **drawn}
     if commit:
@@ -118,12 +119,13 @@ def _claim(
         there = tomlkit.parse(path.read_text(encoding="utf-8")).unwrap()
         if {name: there.get(name) for name in facts} != facts:
             raise BadInput("another set is here already", where=out, remedy="name another folder")
-        return str(there["commitment"])
+        # What was sealed stays true, however a later version of this code would draw.
+        return str(there["commitment"]), list(read_answers(out, key, str(there["commitment"])).values())
     if out.exists() and any(out.iterdir()):
         raise BadInput("the folder is not empty", where=out, remedy="name a new one")
     facts["commitment"] = write_answers(out, [_name(k) for k in range(len(answers))], answers, key)
     write_text(path, tomlkit.dumps(facts))
-    return str(facts["commitment"])
+    return str(facts["commitment"]), answers
 
 
 def _make_batch(out: Path, batch: Sequence[tuple[int, Answer]], played: Sequence[Motion]) -> None:
