@@ -131,7 +131,7 @@ def _one(
         return _Wrong(f"{motor.joint}: reads back {values} instead of {wanted} → power it off and on and try again")
     yield from nudge(servos, motor.joint)
     if (
-        yield Ask(f"Did this servo blink and turn? It is the {words} from now on.", ("yes", "no"), default="yes")
+        yield Ask(f"Did this servo, and only this one, blink and turn? It is the {words} from now on.", ("yes", "no"), default="yes")
     ) != "yes":
         return _Wrong(
             f"{motor.joint}: id {motor.id} answered, but the servo at hand did not move → another one is on the cable, or its "
@@ -163,7 +163,7 @@ def _not_one(found: Scan, motor: Motor, motors: Sequence[Motor], config: RobotCo
         return _Wrong(f"{motor.joint}: {len(found.servos)} servos answer: {others} → pull the cable of {pull}")
     seen = found.servos[0]
     if seen.model_number != motor.servo.number:
-        places = sorted({JOINTS[m.joint].kind for m in motors if m.servo.number == seen.model_number})
+        places = sorted({JOINTS[m.joint].kind for m in config.motors.values() if m.servo.number == seen.model_number})
         belongs = f"it belongs into a {places[0]}" if places else "this kit has none of these"
         return _Wrong(f"{motor.joint}: this is a {seen.model}, but the place is for a {motor.model} → {belongs}")
     return None

@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 GRAVITY = 9.81
 #: kg·m², the horn of a motor that lies in the box.
 HORN_KG_M2 = 2e-5
+#: rad, by which successive angles never come near each other again
+GOLDEN_ANGLE = 2.399963
 #: m, centre of the torso when it lies on the floor with its legs straight.
 LYING_HEIGHT = 0.078
 
@@ -127,7 +129,9 @@ class Body:
         mujoco.mj_resetData(self.model, self.data)
         s = self.settings
         for k, name in enumerate(self.joints):
-            self.q[k] = s.pose_rad.get(name, 0.0)
+            # Bare motors lie in their box at whatever angle they were last turned to: here one of each, far from the seam.
+            anywhere = 1.5 * math.sin(GOLDEN_ANGLE * (k + 1)) if s.setup == "loose" else 0.0
+            self.q[k] = s.pose_rad.get(name, anywhere)
         if self.on_floor:
             half = s.heading_rad / 2
             self.data.qpos[:7] = (*s.position_m, LYING_HEIGHT, math.cos(half), 0.0, 0.0, math.sin(half))

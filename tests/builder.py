@@ -1,0 +1,128 @@
+"""A builder at a virtual robot: a face that grants and answers, and hands that do what they are asked, or almost."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from openant_tools.bringup.virtual_hands import VirtualHands
+from openant_tools.procedure.finding import Finding
+from openant_tools.procedure.step import (
+    Answer,
+    Ask,
+    Bench,
+    Event,
+    Hands,
+    Intent,
+    Live,
+    Look,
+    Procedure,
+    Progress,
+    Say,
+    drive,
+)  # fmt: skip
+from openant_tools.robot.folder import RobotFolder, create_robot
+from openant_tools.virtual.scenario import parse_scenario
+from openant_tools.virtual.server import Server
+from openant_tools.virtual.start import assemble
+
+
+class Builder:
+    """Grants, takes defaults unless told otherwise, and remembers every word.
+
+    Args:
+        answers: a part of a question → the answer to it.
+        before: called before each event is answered; may raise, or do something to the robot.
+    """
+
+    def __init__(
+        self,
+        control: str,
+        answers: Mapping[str, Answer] | None = None,
+        mistakes: Mapping[str, str] | None = None,
+        before: Callable[[Event], None] | None = None,
+    ) -> None:
+        self.hands = VirtualHands(control, mistakes)
+        self.answers, self.before = dict(answers or {}), before
+        self.events = list[Event]()
+
+    def answer(self, event: Event) -> Answer:
+        self.events.append(event)
+        if self.before is not None:
+            self.before(event)
+        match event:
+            case Intent():
+                return True
+            case Hands():
+                self.hands.do(event)
+                return True
+            case Ask():
+                return next((a for part, a in self.answers.items() if part in event.question), event.default)
+        return None
+
+    @property
+    def said(self) -> str:
+        """Everything that was shown, one line an event."""
+        words = []
+        for event in self.events:
+            match event:
+                case Say() | Intent() | Hands() | Progress() | Look() | Live():
+                    words.append(event.words)
+                case Ask():
+                    words.append(event.question)
+        return "\n".join(words)
+
+    @property
+    def granted(self) -> list[str]:
+        """Every register change that was granted, in words."""
+        return [str(change) for event in self.events if isinstance(event, Intent) for change in event.registers]
+
+
+class Robot:
+    """A served virtual robot and the folder that a builder keeps for it."""
+
+    def __init__(self, server: Server, folder: RobotFolder) -> None:
+        self.server, self.folder = server, folder
+        found = server.addresses
+        self.control = str(found["control"])
+        self.bench = Bench(folder, str(found["bus"]), str(found["imu"]), found["camera"], self.control)
+
+    def builder(self, **more: Any) -> Builder:
+        return Builder(self.control, **more)
+
+    def do(self, procedure: Procedure, builder: Builder | None = None) -> tuple[Finding, Builder]:
+        """Run a procedure; its finding, and who ran it."""
+        builder = builder or self.builder()
+        try:
+            return drive(procedure, builder), builder
+        finally:
+            builder.hands.close()
+
+    def torque(self) -> list[bool]:
+        """Whether each servo of the real robot behind the wire has torque."""
+        return [bool(servo.torque) for servo in self.server.world.servos]
+
+    def register(self, joint: str, name: str) -> int:
+        """What really stands in a servo's memory."""
+        world = self.server.world
+        servo = world.servos[world.joints.index(joint)]
+        item = servo.model.register(name)
+        return item.decode(bytes(servo.memory[item.address : item.end]))
+
+
+@contextlib.contextmanager
+def robot(folder: Path, *, camera: bool = False, kit: str = "standard", **table: Any) -> Iterator[Robot]:
+    """A virtual robot of a scenario's tables, in stepped time, served by a thread of this process."""
+    server = assemble(parse_scenario(table), clock="stepped", camera=camera)
+    stop = threading.Event()
+    thread = threading.Thread(target=server.run, args=(stop.is_set,))
+    thread.start()
+    try:
+        yield Robot(server, RobotFolder.at(folder) if (folder / "robot.toml").is_file() else create_robot(folder, kit))
+    finally:
+        stop.set()
+        thread.join()
+        server.close()

@@ -1,0 +1,392 @@
+"""A builder brings a robot up, and makes the mistakes that builders make: the right words appear, nothing moves unasked."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from builder import robot
+from hypothesis import given
+from hypothesis import strategies as st
+
+from openant_tools.calib.bounds import Unwrapped
+from openant_tools.calib.centre import centre
+from openant_tools.calib.comms_health import comms_health
+from openant_tools.calib.connect import connect
+from openant_tools.calib.estop import estop
+from openant_tools.calib.ids import ids
+from openant_tools.calib.imu import POSES, imu, mounting
+from openant_tools.calib.inventory import inventory
+from openant_tools.calib.legs import legs
+from openant_tools.calib.undo import undo
+from openant_tools.calib.zeros import straight, zeros
+from openant_tools.comms.body_imu import rotation
+from openant_tools.errors import HardwareFault
+from openant_tools.procedure.journal import Journal
+from openant_tools.procedure.step import Declined, Event, Hands, Intent, Progress, drive
+from openant_tools.robot.joints import JOINT_NAMES, JOINTS
+
+LOOSE = {"robot": {"setup": "loose"}}
+HIP = ("hip_rr",)
+
+
+# ---- connect, stop key ------------------------------------------------------------------------------------------------
+
+
+def test_connect_finds_bus_and_imu_and_keeps_no_port_of_a_virtual_robot(tmp_path):
+    with robot(tmp_path / "ant") as ant:
+        finding, _ = ant.do(connect(ant.bench))
+        assert finding.ok
+        assert finding.data["imu"] == ant.bench.imu
+        assert ant.folder.config().ports.bus == ""
+
+
+def test_connect_says_where_the_servos_answer_instead_of_the_imu(tmp_path):
+    with robot(tmp_path / "ant") as ant:
+        finding, _ = ant.do(connect(replace(ant.bench, imu="/nowhere")))
+        assert not finding.ok
+        assert "IMU: /nowhere: there is no such port" in finding.problems[0]
+
+
+def test_the_stop_key_is_proven_on_a_factory_fresh_servo(tmp_path):
+    with robot(tmp_path / "ant", **LOOSE) as ant:
+        finding, builder = ant.do(estop(ant.bench))
+        assert finding.ok, finding
+        assert "Plug one servo in" in builder.said
+        assert not any(ant.torque())
+
+
+def test_without_power_the_stop_key_cannot_be_proven(tmp_path):
+    with robot(tmp_path / "ant", **LOOSE) as ant:
+        builder = ant.builder()
+        builder.hands.do = lambda hands: None  # type: ignore[method-assign]
+        with pytest.raises(HardwareFault, match="no servo answers at any baud rate"):
+            ant.do(estop(ant.bench), builder)
+
+
+# ---- ids --------------------------------------------------------------------------------------------------------------
+
+
+def test_eight_servos_from_the_box_get_their_ids_and_undo_takes_one_back(tmp_path):
+    with robot(tmp_path / "ant", **LOOSE) as ant:
+        finding, builder = ant.do(ids(ant.bench))
+        assert finding.ok, finding
+        assert [ant.register(joint, "id") for joint in JOINT_NAMES] == [joint.id for joint in JOINTS.values()]
+        assert {ant.register(joint, "baud_rate") for joint in JOINT_NAMES} == {3}
+        assert "hip_rr: id 1 → 10" in builder.granted
+        assert not any(ant.torque())
+        entries = Journal(ant.folder.journal).open_entries()
+        assert len(entries) == 24
+        assert entries[0].write.old == 250
+        hands = ant.builder().hands
+        hands.do(Hands("", "plug", "hip_rr"))
+        ant.server.world.advance(ant.server.world.now + 1.0)
+        finding, _ = ant.do(undo(replace(ant.bench, joints=HIP)))
+        assert finding.ok, finding
+        assert (ant.register("hip_rr", "id"), ant.register("hip_rr", "baud_rate")) == (1, 1)
+        assert ant.register("knee_rr", "id") == 11
+
+
+def test_nothing_is_written_unless_it_is_granted(tmp_path):
+    with robot(tmp_path / "ant", **LOOSE) as ant:
+
+        class Refusing:
+            def __init__(self) -> None:
+                self.builder = ant.builder()
+
+            def answer(self, event: Event):
+                return False if isinstance(event, Intent) else self.builder.answer(event)
+
+        with pytest.raises(Declined, match="make this XC430-W240-T"):
+            drive(ids(ant.bench), Refusing())
+        assert ant.register("hip_rr", "id") == 1
+        assert not ant.folder.journal.exists()
+
+
+def test_two_motors_plugged_at_once_are_told_apart_from_one(tmp_path):
+    with robot(tmp_path / "ant", **LOOSE) as ant:
+        builder = ant.builder()
+        whole = builder.hands.do
+
+        def both(hands: Hands) -> None:
+            whole(hands)
+            if hands.task == "plug":
+                whole(replace(hands, joint="hip_fr"))
+
+        builder.hands.do = both  # type: ignore[method-assign]
+        finding, _ = ant.do(ids(replace(ant.bench, joints=HIP)), builder)
+        assert not finding.ok
+        assert ant.register("hip_rr", "id") == 1
+        assert "hip_rr: two servos answer at once" in finding.problems[0]
+        assert "unplug all but one" in finding.problems[0]
+
+
+def test_a_servo_that_stayed_on_the_cable_is_named_as_the_one_to_pull(tmp_path):
+    with robot(tmp_path / "ant", **LOOSE) as ant:
+        builder = ant.builder()
+        whole = builder.hands.do
+        builder.hands.do = lambda hands: None if hands.task == "unplug" and hands.joint else whole(hands)  # type: ignore
+        finding, _ = ant.do(ids(replace(ant.bench, joints=("hip_rr", "knee_rr"))), builder)
+        assert "knee_rr: 2 servos answer" in finding.problems[0]
+        assert "pull the cable of hip_rr" in finding.problems[0]
+
+
+def test_the_wrong_model_is_named_with_the_place_that_it_belongs_to(tmp_path):
+    with robot(tmp_path / "ant", **LOOSE) as ant:
+        builder = ant.builder(mistakes={"hip_rr": "knee_rr"})
+        finding, _ = ant.do(ids(replace(ant.bench, joints=HIP)), builder)
+        assert not finding.ok
+        assert ant.register("knee_rr", "id") == 1
+        assert (
+            "this is a XM430-W350-T, but the place is for a XC430-W240-T → it belongs into a knee"
+            in finding.problems[0]
+        )
+
+
+def test_a_servo_left_at_4_5_megabaud_is_found_from_the_box(tmp_path):
+    with robot(tmp_path / "ant", **LOOSE, servo=[{"joint": "hip_rr", "baud": 4_500_000}]) as ant:
+        finding, builder = ant.do(ids(replace(ant.bench, joints=HIP)))
+        assert finding.ok
+        assert ant.register("hip_rr", "baud_rate") == 3
+        assert "4500000 baud" in builder.said
+
+
+def test_the_cable_out_in_mid_step_leaves_words_and_the_step_can_be_repeated(tmp_path):
+    with robot(tmp_path / "ant", **LOOSE) as ant:
+        pulled = []
+
+        def pull(event: Event) -> None:
+            if isinstance(event, Intent) and not pulled:
+                pulled.append(True)
+                builder.hands.do(Hands("", "unplug", "hip_rr"))
+
+        builder = ant.builder(before=pull)
+        with pytest.raises(HardwareFault, match=r"hip_rr \(id 1\) does not answer at 57600"):
+            ant.do(ids(replace(ant.bench, joints=HIP)), builder)
+        finding, _ = ant.do(ids(replace(ant.bench, joints=HIP)))
+        assert finding.ok
+        assert ant.register("hip_rr", "id") == 10
+
+
+def test_wired_servos_whose_ids_are_exchanged_are_renamed_without_ever_clashing(tmp_path):
+    swapped = [{"joint": "hip_rr", "id": 20}, {"joint": "hip_fr", "id": 10}]
+    with robot(tmp_path / "ant", servo=swapped) as ant:
+        finding, _ = ant.do(ids(ant.bench))
+        assert (
+            finding.what == "every servo has its id already"
+        )  # models and ids are those of an Ant: only hands can tell
+        (tmp_path / "ant" / "journal.jsonl").unlink(missing_ok=True)
+    with robot(tmp_path / "bee", servo=[{"joint": "hip_rr", "id": 50}]) as ant:
+        finding, builder = ant.do(ids(ant.bench))
+        assert finding.ok
+        assert ant.register("hip_rr", "id") == 10
+        assert "Which joint is id 50" in builder.said
+
+
+# ---- centring, legs ---------------------------------------------------------------------------------------------------
+
+
+def set_up(**more):
+    """Loose servos with their ids, as the step Motor IDs leaves them."""
+    servos = [{"joint": j.name, "id": j.id, "baud": 1_000_000, "return_delay_time": 0} for j in JOINTS.values()]
+    return {"robot": {"setup": "loose", "pose": {"hip_rr": 0.5}}, "servo": servos, **more}
+
+
+def test_horns_go_on_at_half_a_turn_and_the_drawing_says_which_way(tmp_path):
+    with robot(tmp_path / "ant", **set_up()) as ant:
+        finding, builder = ant.do(centre(replace(ant.bench, joints=("hip_rr", "knee_rr"))))
+        assert finding.ok, finding
+        assert "turn hip_rr slowly from 209° to 180°" in builder.said
+        assert not any(ant.torque())
+        assert abs(ant.server.world.body.q[0]) < 0.03
+
+
+def test_legs_are_proven_one_by_one_and_a_bad_cable_is_named(tmp_path):
+    fault = [{"cause": "bad_cable", "where": "knee_fr", "fraction": 0.2}]
+    with robot(tmp_path / "ant", fault=fault) as ant:
+        finding, _ = ant.do(legs(replace(ant.bench, joints=("hip_fr", "hip_fl"))))
+        assert finding.data["proven"] == ["fl"]
+        assert "front right leg" in finding.problems[0]
+        assert "look at the cable" in finding.problems[0]
+
+
+# ---- inventory --------------------------------------------------------------------------------------------------------
+
+
+def test_what_differs_is_shown_mended_and_can_be_undone(tmp_path):
+    odd = [{"joint": "knee_fl", "drive_mode": 1, "shutdown": 0x3D, "return_delay_time": 250}]
+    with robot(tmp_path / "ant", servo=odd) as ant:
+        finding, builder = ant.do(inventory(ant.bench))
+        assert finding.ok
+        assert "knee_fl: drive_mode 1 → 0" in builder.granted
+        assert (ant.register("knee_fl", "drive_mode"), ant.register("knee_fl", "pwm_limit")) == (0, 442)
+        assert ant.folder.config().bus.return_delay_s == 0.0
+        finding, _ = ant.do(undo(ant.bench))
+        assert finding.ok
+        assert ant.register("knee_fl", "drive_mode") == 1
+
+
+def test_what_is_accepted_stays_and_is_kept(tmp_path):
+    with robot(tmp_path / "ant", servo=[{"joint": "knee_fl", "shutdown": 0x3D}]) as ant:
+        finding, _ = ant.do(inventory(ant.bench), ant.builder(answers={"What to do": "accept"}))
+        assert ant.register("knee_fl", "shutdown") == 0x3D
+        assert ant.register("hip_rr", "pwm_limit") == 885
+        assert any("knee_fl: shutdown is 61, expected 52 → accepted" in problem for problem in finding.problems)
+
+
+def test_a_baud_rate_left_behind_is_named_and_mended(tmp_path):
+    with robot(tmp_path / "ant", servo=[{"joint": "knee_fl", "baud": 4_500_000}]) as ant:
+        finding, builder = ant.do(inventory(ant.bench))
+        assert finding.ok
+        assert ant.register("knee_fl", "baud_rate") == 3
+        assert "knee_fl (id 31) answers at 4500000 baud: its rate was left there" in builder.said
+
+
+def test_a_hip_and_a_knee_that_are_swapped_are_named_together(tmp_path):
+    swapped = [
+        {"joint": "hip_rr", "id": 11},
+        {"joint": "knee_rr", "id": 10},
+    ]
+    with robot(tmp_path / "ant", servo=swapped) as ant:
+        finding, _ = ant.do(inventory(ant.bench))
+        assert not finding.ok
+        assert any("hip_rr and knee_rr are swapped" in problem for problem in finding.problems)
+
+
+def test_a_silent_knee_names_the_cable_behind_its_hip(tmp_path):
+    with robot(tmp_path / "ant") as ant:
+        ant.server.world.plug(1, False)
+        finding, _ = ant.do(inventory(ant.bench))
+        assert not finding.ok
+        assert "look at the cable between hip_rr and knee_rr" in finding.problems[0]
+
+
+def test_old_firmware_is_said_with_what_it_lacks(tmp_path):
+    with robot(tmp_path / "ant", servo=[{"joint": "hip_rr", "firmware": 41}]) as ant:
+        _, builder = ant.do(inventory(ant.bench))
+        assert "hip_rr has firmware 41, without clearing of turns" in builder.said
+
+
+# ---- zeros ------------------------------------------------------------------------------------------------------------
+
+FAST = ("hip_rr", "knee_rr", "hip_fr")
+
+
+def test_a_well_built_robot_has_its_zeros_on_the_grid(tmp_path):
+    zero = [{"effect": "zero_offset", "joints": ["knee_rr"], "parameters": {"angle_rad": 0.03}}]
+    with robot(tmp_path / "ant", effect=zero) as ant:
+        finding, _ = ant.do(zeros(replace(ant.bench, joints=FAST)))
+        assert finding.ok and not finding.problems, finding
+        assert ant.folder.config().motors["knee_rr"].zero_offset_rad == pytest.approx(math.pi + 0.03, abs=0.004)
+        assert not any(ant.torque())
+
+
+def test_a_wrong_spline_a_mirrored_leg_and_exchanged_ids_are_all_named(tmp_path):
+    built = [
+        {"joint": "knee_rr", "spline_offset": 1},
+        {"joint": "hip_rr", "id": 20},
+        {"joint": "hip_fr", "id": 10, "reversed": True},
+    ]
+    with robot(tmp_path / "ant", servo=built) as ant:
+        finding, builder = ant.do(zeros(replace(ant.bench, joints=FAST)))
+        problems = "\n".join(finding.problems)
+        assert "hip_fr and hip_rr are swapped" in problems
+        assert "knee_rr: its horn is on the wrong spline, 1 × 45° beyond" in problems
+        assert "hip_fr: reversed" in problems
+        motors = ant.folder.config().motors
+        assert (motors["hip_rr"].id, motors["hip_fr"].id, motors["hip_fr"].direction) == (20, 10, -1)
+        assert finding.ok, builder.said  # robot.toml follows how it is built, and every nudge went the right way
+
+
+def test_a_leg_that_is_not_straight_is_named(tmp_path):
+    crooked = [{"effect": "zero_offset", "joints": ["knee_rr"], "parameters": {"angle_rad": 0.3}}]
+    with robot(tmp_path / "ant", effect=crooked) as ant:
+        finding, _ = ant.do(zeros(replace(ant.bench, joints=("knee_rr",))))
+        assert not finding.ok
+        assert "knee_rr: +17.2° beside the grid" in finding.problems[0]
+
+
+def test_ctrl_c_in_the_midst_of_nudges_leaves_torque_off(tmp_path):
+    with robot(tmp_path / "ant") as ant:
+
+        def interrupt(event: Event) -> None:
+            if isinstance(event, Progress) and "nudging" in event.words:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(zeros(replace(ant.bench, joints=HIP)), ant.builder(before=interrupt))
+        assert not any(ant.torque())
+
+
+@given(eighths=st.integers(-3, 3), off=st.floats(-0.35, 0.35))
+def test_the_grid_of_horns_finds_spline_and_residual(eighths, off):
+    seen = straight(math.pi + eighths * math.pi / 4 + off)
+    assert seen.eighths == eighths
+    assert seen.residual_rad == pytest.approx(off, abs=1e-9)
+
+
+@given(start=st.floats(-3, 3), turns=st.lists(st.floats(-3.0, 3.0), min_size=1, max_size=20))
+def test_an_encoder_is_followed_over_its_seam(start, turns):
+    track, angle = Unwrapped(), start
+    first = track.add(start % (2 * math.pi))
+    for turn in turns:
+        angle += turn
+        last = track.add(angle % (2 * math.pi))
+    assert last - first == pytest.approx(angle - start, abs=1e-6)
+
+
+# ---- IMU --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_board_mounted_a_quarter_turn_round_is_found_and_taken_into_account(tmp_path):
+    with robot(tmp_path / "ant", imu={"mount_rpy": [0.0, 0.0, math.pi / 2]}) as ant:
+        finding, _ = ant.do(imu(ant.bench))
+        assert finding.ok, finding
+        assert any("mounted rotated by 90° about z (up)" in problem for problem in finding.problems)
+        assert ant.folder.config().imu.mounting_rad == pytest.approx((0, 0, math.pi / 2), abs=0.02)
+
+
+def test_a_wrong_scale_of_the_accelerometer_is_said(tmp_path):
+    with robot(tmp_path / "ant", imu={"acc_scale": [1.15, 1.15, 1.15]}) as ant:
+        finding, _ = ant.do(imu(ant.bench))
+        assert not finding.ok
+        assert "IMU scale: |acc| at rest is 11.28 m/s² instead of 9.81" in finding.problems[0]
+        assert ant.folder.config().imu.acc_counts_per_g == 0.0
+
+
+def test_a_scale_that_the_firmware_does_not_promise_is_named(tmp_path):
+    with robot(tmp_path / "ant", imu={"acc_scale": [0.25, 0.25, 0.25], "acc_noise": 0.005}) as ant:
+        finding, _ = ant.do(imu(ant.bench))
+        assert "Gravity says 512 LSB/g where API 1.46 promises" in "\n".join(finding.problems)
+
+
+def test_poses_that_were_not_held_give_low_confidence_and_write_nothing(tmp_path):
+    with robot(tmp_path / "ant") as ant:
+        builder = ant.builder(answers={"low confidence": "no"})
+        whole = builder.hands.do
+        builder.hands.do = lambda hands: whole(replace(hands, path_rad=tuple(0.6 * x for x in hands.path_rad)))  # type: ignore
+        finding, _ = ant.do(imu(ant.bench), builder)
+        assert not finding.ok
+        assert "low confidence in the mounting" in "\n".join(finding.problems)
+        assert ant.folder.config().imu.acc_counts_per_g == 0.0
+
+
+@given(vector=st.tuples(*[st.floats(-1.8, 1.8)] * 3))
+def test_three_poses_give_back_any_mounting(vector):
+    known = np.array([pose.up for pose in POSES])
+    found = mounting(known @ rotation(vector), known)
+    assert np.allclose(found.rotation, rotation(vector), atol=1e-6)
+    assert np.allclose(rotation(found.vector_rad), found.rotation, atol=1e-6)
+    assert found.confidence == "high"
+
+
+# ---- bus health -------------------------------------------------------------------------------------------------------
+
+
+def test_a_servo_that_loses_answers_is_named(tmp_path):
+    with robot(tmp_path / "ant", fault=[{"cause": "bad_servo", "where": "hip_fl", "fraction": 0.05}]) as ant:
+        finding, _ = ant.do(comms_health(ant.bench))
+        assert not finding.ok
+        assert finding.problems[0].startswith("hip_fl:")
