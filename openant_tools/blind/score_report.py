@@ -204,4 +204,8 @@ _HOW = (
     "**How it is counted.** A right name is the verdict itself; `ambiguous` is right of small effects only. A small effect may be",
     "called none where its size lies within 2.5 times a tolerance that the catalogue states. Any verdict but none is a false alarm",
     "on a healthy robot. A diagnosis that is refused counts as wrong.",
+    "",
+    "**Over machines.** `pip install 'openant-tools[dask]'` and `dask worker` on each, `dask scheduler` on one, then",
+    "`openant gap blind run SET --backend dask --scheduler tcp://HOST:8786`; all see SET under the same path. What was stopped goes",
+    "on where it was.",
 )
