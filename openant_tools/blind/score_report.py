@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = ["score_report", "table_lines", "write_docs"]
 
-#: names on the confusion picture beyond the diagonal
-MOST = 60
 _COLUMNS = ["what", "result", "95 %", "n", "first", "then", "reached"]
 
 

@@ -58,9 +58,7 @@ class Trace:
     base: Single | None
 
 
-def simulate(
-    robots: Sequence[TrueRobot], motion: Motion, number: int, tick: Callable[[float], None] = lambda share: None
-) -> list[Trace]:
+def simulate(robots: Sequence[TrueRobot], motion: Motion, number: int) -> list[Trace]:
     """Play one motion, the `number`-th of the session, on each of the robots."""
     chances = [np.random.default_rng([robot.seed, number]) for robot in robots]
     plans = [schedule(robot.clocks, motion, STEP_S, chance) for robot, chance in zip(robots, chances, strict=True)]
@@ -85,8 +83,6 @@ def simulate(
         volts[k] = drives.volts[:, 0]
         bodies.step(gear)
         bodies.look(imu[k], None if base is None else base[k])
-        if k % 1000 == 0:
-            tick(k / steps)
     return [
         Trace(
             plans[b], position[:, b], velocity[:, b], current[:, b], duty[:, b], volts[:, b],
@@ -103,12 +99,7 @@ class _Bodies:
         self.floor = motion.setup == "floor"
         self.worlds = [build(robot.mechanics, motion.setup, motion.heading_rad) for robot in robots]
         self.q, self.v = np.empty((len(robots), 8)), np.empty((len(robots), 8))
-        self._rows = [np.array([model.joint(name).qposadr[0] for name in JOINTS]) for model, _ in self.worlds]
-        self._dofs = [np.array([model.joint(name).dofadr[0] for name in JOINTS]) for model, _ in self.worlds]
-        self._plain = [
-            (slice(rows[0], rows[0] + 8), slice(dofs[0], dofs[0] + 8)) if rows[-1] - rows[0] == 7 else (rows, dofs)
-            for rows, dofs in zip(self._rows, self._dofs, strict=True)
-        ]
+        self._places = [_places(model) for model, _ in self.worlds]
         self._pulls = [
             _pull(robot, model) if self.floor else None for robot, (model, _) in zip(robots, self.worlds, strict=True)
         ]
@@ -116,7 +107,7 @@ class _Bodies:
 
     def _read(self) -> None:
         for b, (_, data) in enumerate(self.worlds):
-            rows, dofs = self._plain[b]
+            rows, dofs = self._places[b]
             self.q[b], self.v[b] = data.qpos[rows], data.qvel[dofs]
 
     def step(self, torque: Array) -> None:
@@ -125,7 +116,7 @@ class _Bodies:
             pull = self._pulls[b]
             if pull is not None:
                 pull(data)
-            rows, dofs = self._plain[b]
+            rows, dofs = self._places[b]
             data.qfrc_applied[dofs] = torque[b]
             step(model, data)
             self.q[b] = data.qpos[rows]
@@ -137,6 +128,15 @@ class _Bodies:
             imu[b] = data.sensordata[:6]
             if base is not None:
                 base[b] = data.qpos[:7]
+
+
+def _places(model: mujoco.MjModel) -> tuple[Any, Any]:
+    """Where the joints are among coordinates and velocities: a slice, which is a view, unless something lies between."""
+    rows = np.array([model.joint(name).qposadr[0] for name in JOINTS])
+    dofs = np.array([model.joint(name).dofadr[0] for name in JOINTS])
+    if (np.diff(rows) == 1).all():
+        return slice(rows[0], rows[0] + 8), slice(dofs[0], dofs[0] + 8)
+    return rows, dofs
 
 
 def _pull(robot: TrueRobot, model: mujoco.MjModel) -> Callable[[mujoco.MjData], None] | None:
