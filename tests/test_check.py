@@ -1,0 +1,162 @@
+"""The daily check: green on a robot that has not changed; names joint and part where something has."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from builder import Robot, robot
+
+from openant_tools.bringup.check import changed, check, loose
+from openant_tools.calib.sweep import JointSweep, analyse, joint_sweep_of, sweep
+from openant_tools.calib.wires import engine_config
+from openant_tools.errors import BadInput
+from openant_tools.procedure.finding import Finding, keep
+from openant_tools.procedure.step import Event, Progress
+from openant_tools.robot.folder import create_robot
+from openant_tools.robot.joints import JOINT_NAMES
+
+HEALTHY = {
+    joint: JointSweep(
+        joint, 0.04, 0.002, 0.025 if joint.startswith("knee") else 0.0, 0.004, -0.787 if "hip" in joint else -1.223,
+        0.787 if "hip" in joint else 1.223, 0.0, 27.0, 11.9,
+    )
+    for joint in JOINT_NAMES
+}  # fmt: skip
+
+
+def now(joint: str, **different: object) -> list[str]:
+    return changed(HEALTHY, {**HEALTHY, joint: replace(HEALTHY[joint], **different)})
+
+
+def test_nothing_changed_is_nothing_said():
+    assert changed(HEALTHY, HEALTHY) == [] == loose(dict.fromkeys(JOINT_NAMES, 0.0), ())
+
+
+def test_doubled_friction_names_the_joint_and_its_gear():
+    (words,) = now("hip_fl", friction_nm=0.08)
+    assert words.startswith("hip_fl: friction 0.080 N·m, it was 0.040 → gear")
+
+
+def test_friction_within_what_a_sweep_repeats_to_is_no_finding():
+    assert now("hip_fl", friction_nm=0.050) == []
+
+
+def test_a_lost_foot_is_a_lighter_leg():
+    (words,) = now("knee_rr", weight_nm=0.019)
+    assert "knee_rr: its leg weighs 24 % less" in words
+    assert "a foot was lost" in words
+
+
+def test_both_stops_moved_is_a_changed_zero():
+    (words,) = now("hip_rl", low_stop_rad=-0.737, high_stop_rad=0.837)
+    assert words.startswith("hip_rl: its zero has changed by +2.9° (both stops moved) → horn screw or spline")
+
+
+def test_one_stop_moved_is_something_in_the_way():
+    (words,) = now("knee_fl", high_stop_rad=1.0)
+    assert "one of its stops has moved by -12.8°" in words
+
+
+def test_a_horn_on_another_spline_moves_both_stops_out_of_reach():
+    (words,) = now("knee_fl", low_stop_rad=None, high_stop_rad=None)
+    assert "neither of its stops is where it was" in words
+
+
+@pytest.mark.parametrize(
+    ("lost", "chain", "where"),
+    [
+        ({"knee_fl": 0.02}, (), "knee_fl: 2.0 % of its answers were lost while it moved → a loose connector between hip_fl and knee_fl"),
+        ({"hip_fl": 0.02, "knee_fl": 0.02}, (), "a loose connector from the board to hip_fl"),
+        ({"hip_fl": 0.02}, (("knee_fl", "hip_fl"),), "a loose connector between knee_fl and hip_fl"),
+        (dict.fromkeys(JOINT_NAMES, 0.02), (), "8 of 8 servos lose answers while they move → the power plug"),
+    ],
+)  # fmt: skip
+def test_a_loose_connector_is_named_by_how_the_cables_run(lost, chain, where):
+    (words,) = loose(dict.fromkeys(JOINT_NAMES, 0.0) | lost, chain)
+    assert where in words
+
+
+def test_without_a_baseline_it_says_how_to_get_one(tmp_path):
+    with robot(tmp_path / "ant") as ant, pytest.raises(BadInput, match="there is nothing to compare with yet"):
+        ant.do(check(ant.bench))
+
+
+def keep_baseline(ant: Robot) -> None:
+    """What the step Observation bounds keeps of a healthy robot, by its sweep alone."""
+    path = ant.folder.recordings / "sweep.mcap"
+
+    def sweeping():
+        run = yield from sweep(engine_config(ant.bench, imu=None), path, "slow sweep")
+        limits = {motor.joint: (motor.min_rad, motor.max_rad) for motor in ant.folder.config().motors.values()}
+        swept = {joint: one.as_dict() for joint, one in analyse(run, limits).items()}
+        return Finding("bounds", True, "", (), "", "", data={"sweep": swept})
+
+    finding, _ = ant.do(sweeping())
+    keep(finding, ant.folder)
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory):
+    """The folder of a robot whose healthy sweep is known."""
+    folder = tmp_path_factory.mktemp("known") / "ant"
+    with robot(folder) as ant:
+        keep_baseline(ant)
+    return folder
+
+
+@pytest.mark.slow
+def test_an_unchanged_robot_is_green(known):
+    with robot(known) as ant:
+        finding, _ = ant.do(check(ant.bench))
+        assert (finding.ok, finding.problems) == (True, ())
+        assert joint_sweep_of(finding.data["sweep"]["hip_rr"]).friction_nm == pytest.approx(0.04, abs=0.01)
+        assert not any(ant.torque())
+
+
+@pytest.mark.slow
+def test_four_things_that_went_wrong_are_named_each_at_its_joint(known):
+    effects = [
+        {"effect": "coulomb_friction", "joints": ["hip_rr"], "parameters": {"torque_nm": 0.1}},
+        {"effect": "link_mass", "joints": ["knee_fr"], "parameters": {"scale": 0.75}},
+        {"effect": "zero_offset", "joints": ["hip_rl"], "parameters": {"angle_rad": 0.05}},
+    ]
+    fault = [{"cause": "broken_wire", "where": "knee_fl", "depends_on": "knee_fl", "above_rad": 0.9, "flicker": 0.8}]
+    with robot(known, effect=effects, fault=fault) as ant:
+        finding, _ = ant.do(check(ant.bench))
+        words = "\n".join(finding.problems)
+        assert "hip_rr: friction" in words
+        assert "knee_fr: its leg weighs 2" in words
+        assert "hip_rl: its zero has changed by" in words
+        assert "a loose connector between hip_fl and knee_fl" in words
+        assert not finding.ok
+
+
+@pytest.mark.slow
+def test_a_servo_that_falls_silent_during_the_check_is_named(known):
+    with robot(known) as ant:
+
+        def pull(event: Event) -> None:
+            if isinstance(event, Progress) and event.words == "slow sweep":
+                ant.builder().hands._remote.ask("unplug", joint="hip_fl")
+
+        finding, _ = ant.do(check(ant.bench), ant.builder(before=pull))
+        assert not finding.ok
+        assert "hip_fl (id 30) has not answered" in "\n".join(finding.problems)
+
+
+def test_a_servo_that_does_not_answer_is_named_before_anything_moves(known_folder):
+    with robot(known_folder) as ant:
+        ant.server.world.plug(1, False)
+        finding, _ = ant.do(check(ant.bench))
+        assert not finding.ok
+        assert "look at the cable between hip_rr and knee_rr" in finding.problems[0]
+        assert not any(ant.torque())
+
+
+@pytest.fixture
+def known_folder(tmp_path):
+    folder = create_robot(tmp_path / "ant")
+    swept = {joint: one.as_dict() for joint, one in HEALTHY.items()}
+    keep(Finding("bounds", True, "", (), "", "", data={"sweep": swept}), folder)
+    return folder.path
