@@ -8,31 +8,38 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from rich.text import Text
 from textual.pilot import Pilot
 
+from openant_tools.comms import messages
+from openant_tools.comms.clock import VirtualControl
 from openant_tools.procedure.finding import Evidence, Finding, keep
 from openant_tools.procedure.step import Event, Hands, Intent, Live, RegisterChange, Say
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run, write_table
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
-from openant_tools.tui.app import SCREENS, OpenAnt
+from openant_tools.tui.app import SCENARIOS, SCREENS, OpenAnt
+from openant_tools.tui.choices import Choices
 from openant_tools.tui.feeds import ReplayFeed
 from openant_tools.tui.marks import plain
 from openant_tools.tui.page import Page
 from openant_tools.tui.screens import settings
 from openant_tools.tui.screens.live import LiveScreen
+from openant_tools.tui.screens.step import StepScreen
+from openant_tools.tui.screens.walk import WalkScreen
+from openant_tools.tui.training import Training, read_curve
+from openant_tools.virtual.process import virtual_robot
 
 SIZES = [(80, 24), (120, 40)]
 #: of a test on a loaded machine
 PATIENCE_S = 60.0
-Press = Callable[["Pilot[int]"], Awaitable[None]]
 
 
 @pytest.fixture(autouse=True)
@@ -321,3 +328,217 @@ def test_a_fault_stays_until_it_has_been_seen(robot: RobotFolder) -> None:
             assert "FAULT" not in screen_text(app)
 
     asyncio.run(look())
+
+
+# ---- a builder and a virtual robot -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def box() -> Iterator[Mapping[str, str | None]]:
+    """Eight motors in their boxes, in stepped time."""
+    with virtual_robot(str(SCENARIOS / "loose.toml"), clock="stepped") as found:
+        yield found
+
+
+@pytest.fixture
+def loose(box: Mapping[str, str | None]) -> Iterator[Mapping[str, str | None]]:
+    """The same, all unplugged when the test has ended."""
+    yield box
+    with_control(box, lambda control: [control.ask("unplug", joint=joint) for joint in JOINT_NAMES])
+
+
+def with_control(robot: Mapping[str, str | None], do: Callable[[VirtualControl], Any]) -> Any:
+    control = VirtualControl(str(robot["control"]))
+    try:
+        return do(control)
+    finally:
+        control.close()
+
+
+def torques(robot: Mapping[str, str | None]) -> list[bool]:
+    state = with_control(robot, lambda control: control.ask("state"))
+    return [bool(on) for on in state["torque_enable"].values()]
+
+
+def offered(app: OpenAnt) -> list[str]:
+    """The lines to choose from."""
+    screen = app.screen
+    return [choice.words for choice in screen._choices] if isinstance(screen, StepScreen) else []
+
+
+async def choose(pilot: Pilot[int], words: str) -> None:
+    """Go to the line that begins so with the arrow keys, and press Enter."""
+    app = cast(OpenAnt, pilot.app)
+    await until(pilot, lambda: any(line.startswith(words) for line in offered(app)))
+    chooser = app.screen.query_one("#choices", Choices)
+    at = next(k for k, line in enumerate(offered(app)) if line.startswith(words))
+    for _ in range(abs(at - (chooser.highlighted or 0))):
+        await pilot.press("down" if at > (chooser.highlighted or 0) else "up")
+    await pilot.press("enter")
+    await pilot.pause()
+
+
+def test_the_first_steps_from_the_box_and_the_terminal_closed_and_opened_again(
+    tmp_path: Path, loose: Mapping[str, str | None]
+) -> None:
+    async def build() -> None:
+        app = OpenAnt(tmp_path)
+        app.session.virtual = loose
+        async with app.run_test(size=(80, 24)) as pilot:
+            await pilot.press("enter")
+            await pilot.pause()
+            assert "All that is found out about a robot is kept in a folder" in screen_text(app)
+            await pilot.press("enter")
+            await choose(pilot, "Begin")
+            await choose(pilot, "Next: Emergency stop")
+            await choose(pilot, "Begin")
+            await choose(pilot, "Let the virtual robot's hands do it")
+            await choose(pilot, "Yes, do it")
+            await until(pilot, lambda: "stop" in offered(app))
+            assert any(torques(loose))
+            await pilot.press("space")
+            await until(pilot, lambda: "Next: Motor IDs" in offered(app))
+            assert not any(torques(loose))
+            await pilot.press("escape")
+            await pilot.pause()
+            assert screen_text(app).count("✓ ok") == 2
+        app.session.close()
+
+    async def look_again() -> None:
+        app = OpenAnt(tmp_path / "my-ant", ticking=False)
+        async with app.run_test(size=(80, 24)) as pilot:
+            await pilot.pause()
+            assert screen_text(app).count("✓ ok") == 2
+            assert "Motor IDs  about 10 min" in screen_text(app), "it goes on where it stopped"
+
+    asyncio.run(build())
+    asyncio.run(look_again())
+
+
+async def _to_the_first_motor(pilot: Pilot[int], app: OpenAnt) -> None:
+    app.open_step("ids")
+    await choose(pilot, "Begin")
+    await until(pilot, lambda: "It is done already" in offered(app))
+    assert "Plug in one servo for the rear right hip" in screen_text(app)
+
+
+def test_nothing_is_written_that_was_not_granted(robot: RobotFolder, loose: Mapping[str, str | None]) -> None:
+    before = with_control(loose, lambda control: control.ask("state"))["id"]
+
+    async def refuse() -> None:
+        app = OpenAnt(robot.path)
+        app.session.virtual = loose
+        async with app.run_test(size=(120, 40)) as pilot:
+            await _to_the_first_motor(pilot, app)
+            await choose(pilot, "Let the virtual robot's hands do it")
+            await until(pilot, lambda: "Yes, do it" in offered(app))
+            assert "hip_rr: id 1 → 10" in screen_text(app)
+            assert "The robot moves." in screen_text(app)
+            await choose(pilot, "No, leave everything as it is")
+            await choose(pilot, "Back to the walk")
+            assert isinstance(app.screen, WalkScreen)
+        app.session.close()
+
+    asyncio.run(refuse())
+    assert with_control(loose, lambda control: control.ask("state"))["id"] == before
+    assert not robot.journal.exists()
+    assert not list(robot.findings.glob("ids-*"))
+
+
+def test_two_motors_plugged_at_once_are_told_in_words(robot: RobotFolder, loose: Mapping[str, str | None]) -> None:
+    async def mistake() -> None:
+        app = OpenAnt(robot.path)
+        app.session.virtual = loose
+        async with app.run_test(size=(120, 40)) as pilot:
+            await _to_the_first_motor(pilot, app)
+            for joint in ("hip_rr", "hip_fr"):
+                with_control(loose, lambda control, joint=joint: control.ask("plug", joint=joint))
+            await choose(pilot, "It is done already")
+            await until(pilot, lambda: "try again" in offered(app))
+            assert "two servos answer at once" in screen_text(app)
+            await pilot.press("escape")
+            await pilot.pause()
+            assert "Leave this step?" in screen_text(app)
+            await pilot.press("enter")
+            await until(pilot, lambda: isinstance(app.screen, WalkScreen))
+        app.session.close()
+
+    asyncio.run(mistake())
+    assert not any(torques(loose))
+    assert not robot.journal.exists()
+
+
+def test_the_stop_key_ends_a_step_wherever_it_is(robot: RobotFolder, loose: Mapping[str, str | None]) -> None:
+    async def stop() -> None:
+        app = OpenAnt(robot.path)
+        app.session.virtual = loose
+        async with app.run_test(size=(80, 24)) as pilot:
+            await _to_the_first_motor(pilot, app)
+            await pilot.press("f1", "space")
+            await pilot.press("escape")
+            await until(pilot, lambda: "Begin again" in offered(app))
+            assert "stopped by hand" in screen_text(app)
+            await choose(pilot, "Begin again")
+            await until(pilot, lambda: "It is done already" in offered(app))
+            await pilot.press("space")
+            await until(pilot, lambda: "Begin again" in offered(app))
+        app.session.close()
+
+    asyncio.run(stop())
+    assert not any(torques(loose))
+
+
+def test_a_robot_is_watched_live_and_the_stop_key_lets_it_go(tmp_path: Path) -> None:
+    scenario = tmp_path / "blind.toml"
+    scenario.write_text("[camera]\npresent = false\n")
+
+    async def watch() -> None:
+        app = OpenAnt(create_robot(tmp_path / "my-ant").path, virtual=str(scenario))
+        async with app.run_test(size=(120, 40)) as pilot:
+            await pilot.press("c")
+            await until(pilot, lambda: len(app.session.history.rows) > 50)
+            assert app.session.virtual is not None
+            assert "torque off" in screen_text(app)
+            assert "live" in screen_text(app)
+            engine = app.session._engine
+            assert engine is not None
+            engine.ask(messages.Torque(True))
+            assert all(torques(app.session.virtual))
+            await until(pilot, lambda: "torque ON" in screen_text(app))
+            await pilot.press("space")
+            await until(pilot, lambda: "torque off" in screen_text(app))
+            assert not any(torques(app.session.virtual))
+            assert "stopped by hand" in screen_text(app), "it stays until it has been seen"
+            with_control(
+                app.session.virtual, lambda control: control.ask("fault", cause="broken_wire", where="knee_rl")
+            )
+            await until(pilot, lambda: any(fault.where == "knee_rl" for fault in app.session.faults.unseen))
+        app.session.close()
+
+    asyncio.run(watch())
+
+
+def test_ctrl_c_leaves_with_130_and_nothing_running(robot: RobotFolder, loose: Mapping[str, str | None]) -> None:
+    async def leave() -> int | None:
+        app = OpenAnt(robot.path)
+        app.session.virtual = loose
+        async with app.run_test(size=(80, 24)) as pilot:
+            await _to_the_first_motor(pilot, app)
+            await pilot.press("ctrl+c")
+            await until(pilot, lambda: app.return_code is not None)
+        app.session.close()
+        return app.return_code
+
+    assert asyncio.run(leave()) == 130
+    assert not any(torques(loose))
+
+
+def test_training_is_the_command_that_one_would_type(robot: RobotFolder) -> None:
+    training = Training("sac", robot.path, 2000, 1, robot.runs / "sac-1")
+    assert (
+        training.command == f"openant train sac --robot {robot.path} --steps 2000 --seed 1 --out {robot.runs / 'sac-1'}"
+    )
+    assert read_curve(robot.runs / "sac-1") == []
+    training.folder.mkdir(parents=True)
+    (training.folder / "learning_curve.csv").write_text("step,seconds,average_reward_m_s\n100,12.0,0.01\n200,2")
+    assert [point.step for point in read_curve(training.folder)] == [100]

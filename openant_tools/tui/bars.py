@@ -17,7 +17,8 @@ def bars(live: Live, width: int) -> Text:
     text = Text(no_wrap=True, overflow="ellipsis")
     if live.words:
         text.append(f"{spelled(live.words)}\n")
-    across = max(8, width - 52)
+    longest = max((len(mark) for mark in live.marks.values()), default=0)
+    across = max(8, width - 42 - longest)
     full, empty, here = ("=", "-", "|") if plain() else ("━", "─", "●")
     for joint, value in live.values.items():
         low, high = live.low.get(joint), live.high.get(joint)

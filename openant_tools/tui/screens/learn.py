@@ -41,11 +41,11 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
             with Horizontal(classes="line"):
                 yield Label("steps")
                 yield Input("30000", type="integer", id="steps")
-                yield Label("of 0.12 s; 30000 are an hour of robot time")
+                yield Label("of 0.12 s; 30000 are an hour of robot time", classes="after")
             with Horizontal(classes="line"):
                 yield Label("seed")
                 yield Input("0", type="integer", id="seed")
-                yield Label("of its chance; each has a run of its own")
+                yield Label("of its chance; each has a run of its own", classes="after")
             yield Choices(
                 *(Option(f"Train {name}: {_WORDS[name]}", id=name) for name in AGENTS),
                 Option("Stop and save", id="stop"),
