@@ -7,7 +7,7 @@ DEMO   ?= demo-robot
 # two workers: what CI has, and any laptop
 PYTEST_ARGS ?= -n 2
 
-.PHONY: demo test lint types contracts pytest pictures clean
+.PHONY: demo test lint types contracts pytest pictures tour clean
 
 demo: $(VENV)/.all
 	$(BIN)/openant demo --robot $(DEMO)
@@ -36,6 +36,10 @@ $(VENV)/.all: pyproject.toml constraints.txt
 $(VENV)/.dev: $(VENV)/.all
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,dev]'
 	@touch $@
+
+# docs/tour.md and its pictures: the terminal program itself, walked with a virtual robot.
+tour: $(VENV)/.all
+	$(BIN)/python -m openant_tools.tui.tour docs
 
 # The README's picture is the demo's own.
 pictures: demo

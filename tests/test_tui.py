@@ -363,7 +363,7 @@ def torques(robot: Mapping[str, str | None]) -> list[bool]:
 def offered(app: OpenAnt) -> list[str]:
     """The lines to choose from."""
     screen = app.screen
-    return [choice.words for choice in screen._choices] if isinstance(screen, StepScreen) else []
+    return [choice.words for choice in screen.choices] if isinstance(screen, StepScreen) else []
 
 
 async def choose(pilot: Pilot[int], words: str) -> None:

@@ -33,12 +33,13 @@ class VirtualBox:
 
 
 @contextlib.contextmanager
-def virtual_box(source: str, folder: Path) -> Iterator[VirtualBox]:
-    """A robot of loose motors, or a scenario's, in stepped time; or one that runs already.
+def virtual_box(source: str, folder: Path, clock: str | None = "stepped") -> Iterator[VirtualBox]:
+    """A robot of loose motors, or a scenario's; or one that runs already.
 
     Args:
         source: as `--virtual` gives it.
         folder: of the robot; the scenario and the servos' memory are kept there.
+        clock: "stepped", or "real" for people who watch.
     """
     kit = "standard"
     if source == VIRTUAL_DEFAULT or source.endswith(".toml"):
@@ -49,7 +50,7 @@ def virtual_box(source: str, folder: Path) -> Iterator[VirtualBox]:
             folder.mkdir(parents=True, exist_ok=True)
             path.write_text(tomlkit.dumps(document), encoding="utf-8")
             source = str(path)
-    with virtual_robot(source, clock="stepped") as found, contextlib.ExitStack() as stack:
+    with virtual_robot(source, clock=clock) as found, contextlib.ExitStack() as stack:
         control = str(found["control"])
         hands = VirtualHands(control)
         stack.callback(hands.close)

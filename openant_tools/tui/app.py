@@ -62,6 +62,21 @@ UNDO = Step(
     changes="registers back to what they were",
 )
 
+CHECK = Step(
+    "check",
+    "Daily check",
+    "Two minutes before a session: bus, supply, zeros, friction of each joint, IMU, heat, and what changed since the passport.",
+    "openant_tools.bringup.check:check",
+    needs=("bounds",),
+    table="the robot on its stand, as it will be used",
+    changes="nothing",
+    moves=True,
+    minutes=2,
+)
+
+#: steps outside the walk
+EXTRA: Mapping[str, Step] = {step.name: step for step in (CHECK, UNDO)}
+
 SCREENS: Mapping[str, tuple[type[Page], str]] = {
     "live": (LiveScreen, "All joints live, torque off"),
     "findings": (FindingsScreen, "What was found out about this robot; its passport"),
@@ -70,9 +85,9 @@ SCREENS: Mapping[str, tuple[type[Page], str]] = {
     "settings": (SettingsScreen, "The robot's folder, how it looks, what this machine has"),
 }
 
-#: words → scenario, of the virtual robots that can be chosen
-VIRTUAL_ROBOTS: tuple[tuple[str, str], ...] = (
-    ("Loose motors, fresh from the factory: the walk from its beginning", str(SCENARIOS / "loose.toml")),
+#: words → source for `Session.start_virtual`, of the virtual robots that can be chosen
+VIRTUAL_ROBOTS: tuple[tuple[str, str | None], ...] = (
+    ("Loose motors in their box, for the walk from its beginning (kept in this folder)", None),
     ("A healthy robot on its stand, ids and zeros as they should be", VIRTUAL_DEFAULT),
     ("A healthy robot on the floor, under its camera", str(SCENARIOS / "floor.toml")),
 )
@@ -112,10 +127,10 @@ class OpenAnt(App[int]):
         Binding("ctrl+p", "command_palette", "All", key_display="^P"),
         Binding("f8", "see", "Seen", show=False),
         Binding("p", "pause", "Pause", show=False),
-        Binding("comma", "step(-0.1)", show=False),
-        Binding("full_stop", "step(0.1)", show=False),
-        Binding("left_square_bracket", "step(-5)", show=False),
-        Binding("right_square_bracket", "step(5)", show=False),
+        Binding("comma", "seek(-0.1)", show=False),
+        Binding("full_stop", "seek(0.1)", show=False),
+        Binding("left_square_bracket", "seek(-5)", show=False),
+        Binding("right_square_bracket", "seek(5)", show=False),
         Binding("less_than_sign", "speed(0.5)", show=False),
         Binding("greater_than_sign", "speed(2)", show=False),
         Binding("x", "end_replay", show=False),
@@ -260,11 +275,14 @@ class OpenAnt(App[int]):
         if running is not None and not instead:
             self.notify(f"{running.step.title} is still running: leave it first", severity="warning")
             return
-        screen = StepScreen(UNDO if name == UNDO.name else WALK[name])
+        screen = StepScreen(EXTRA[name] if name in EXTRA else WALK[name])
         if instead:
             self.switch_screen(screen)
         else:
             self.push_screen(screen)
+
+    def action_step(self, name: str) -> None:
+        self.open_step(name)
 
     def action_jump(self) -> None:
         if not isinstance(self.screen, Jump):
@@ -297,7 +315,8 @@ class OpenAnt(App[int]):
             yield SystemCommand(kind.TITLE, words, partial(self.action_go, name))
         for name, step in WALK.items():
             yield SystemCommand(f"Step: {step.title}", step.does, partial(self.open_step, name))
-        yield SystemCommand("Undo", UNDO.does, lambda: self.open_step(UNDO.name))
+        for name, step in EXTRA.items():
+            yield SystemCommand(step.title, step.does, partial(self.open_step, name))
         yield SystemCommand("Watch the robot", "Live strips, torque off", self.action_watch)
         yield SystemCommand("Virtual robot", "Start one, or end the one that runs", self.action_virtual)
         yield SystemCommand("Faults seen", "Take them off the screen", self.action_see)
@@ -322,7 +341,7 @@ class OpenAnt(App[int]):
         if choice is not None:
             self.start_virtual(VIRTUAL_ROBOTS[choice][1])
 
-    def start_virtual(self, source: str) -> None:
+    def start_virtual(self, source: str | None) -> None:
         """Start a virtual robot and tell the first screen."""
         self._in_background(
             "starting a virtual robot", lambda: self.session.start_virtual(source, self._clock), self.refresh_walk
@@ -372,7 +391,7 @@ class OpenAnt(App[int]):
         self.action_go("live")
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        if action in ("pause", "step", "speed", "end_replay"):
+        if action in ("pause", "seek", "speed", "end_replay"):
             return self.session.replay is not None
         return True
 
@@ -381,7 +400,7 @@ class OpenAnt(App[int]):
         if replay is not None:
             replay.playing = not replay.playing
 
-    def action_step(self, seconds: float) -> None:
+    def action_seek(self, seconds: float) -> None:
         replay = self.session.replay
         if replay is not None:
             replay.seek(replay.position_s + seconds)

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from openant_tools.bringup.virtual_box import virtual_box
+from openant_tools.bringup.walk import standing
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig, Notice, Stopped
 from openant_tools.comms.release import release_all
@@ -20,7 +22,7 @@ from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.faults import Faults
 from openant_tools.tui.feeds import Feed, History, LiveFeed, ReplayFeed
 from openant_tools.tui.training import Training
-from openant_tools.virtual.process import virtual_robot
+from openant_tools.virtual.process import VIRTUAL_DEFAULT, virtual_robot
 
 __all__ = ["Session"]
 
@@ -87,8 +89,13 @@ class Session:
         bus, imu, camera, control = (self.virtual[key] for key in ("bus", "imu", "camera", "control"))
         return Bench(folder, bus, imu, camera, control)
 
-    def start_virtual(self, source: str, clock: str | None = "real") -> None:
+    def start_virtual(self, source: str | None, clock: str | None = "real") -> None:
         """Start a virtual robot, or use a running one, in place of whatever was there; takes seconds.
+
+        Args:
+            source: as `virtual.process.virtual_robot` takes it; None for the box of loose motors that belongs to this
+                folder, whose servos remember what was written to them, and which is built as far as the walk got.
+            clock: of a robot that is started here.
 
         Raises:
             OpenAntError: it cannot be started.
@@ -97,7 +104,14 @@ class Session:
             self._disconnect()
             self._virtual_process.close()
             self.virtual = None
-            self.virtual = self._virtual_process.enter_context(virtual_robot(source, clock=clock))
+            folder = self.folder
+            if source is None and folder is not None:
+                box = self._virtual_process.enter_context(virtual_box(VIRTUAL_DEFAULT, folder.path, clock))
+                box.hands.resume(standing(folder)["legs"].state == "ok")
+                self.virtual = {"bus": box.bus, "imu": box.imu, "camera": box.camera, "control": box.control}
+            else:
+                process = virtual_robot(source or VIRTUAL_DEFAULT, clock=clock)
+                self.virtual = self._virtual_process.enter_context(process)
 
     def end_virtual(self) -> None:
         with self._busy:

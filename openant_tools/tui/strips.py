@@ -113,6 +113,7 @@ All strips of a signal share one scale, which stands in the top line; it grows w
 
     def on_resize(self) -> None:
         self._redraw()
+        self.refresh()
 
     def render_line(self, y: int) -> Strip:
         return self._lines[y] if y < len(self._lines) else Strip.blank(self.size.width, self.rich_style)

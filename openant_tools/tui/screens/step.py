@@ -16,6 +16,7 @@ from textual.widgets.option_list import Option
 from openant_tools.bringup.walk import WALK, standing
 from openant_tools.errors import OpenAntError
 from openant_tools.procedure.finding import Finding
+from openant_tools.procedure.journal import Journal
 from openant_tools.procedure.step import Answer, Ask, Event, Hands, Intent, Live, Look, Progress, Say, Step
 from openant_tools.tui.bars import bars
 from openant_tools.tui.choices import Choices
@@ -65,7 +66,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
         self.step = step
         self.title = step.title
         self._run: StepRun | None = None
-        self._choices: list[Choice] = []
+        self.choices: list[Choice] = []
         self._pending: Event | None = None
         self._progress: Progress | None = None
         self._live: Live | None = None
@@ -177,8 +178,18 @@ and can be begun again: what it found or wrote before stays, and every write to 
             if following is not None:
                 forward = Choice(f"Next: {WALK[following].title}", lambda: self.ant.open_step(following, instead=True))
                 choices = [forward, *choices] if finding.ok else [again, forward, self._back()]
+            if self._wrote():
+                choices.append(Choice("Undo what was written last", lambda: self.ant.open_step("undo", instead=True)))
             self.offer(finding.next_action, choices)
         self.draw()
+
+    def _wrote(self) -> bool:
+        """Whether the journal holds a write of this step that nothing has taken back."""
+        folder = self.session.folder
+        if folder is None:
+            return False
+        left = Journal(folder.journal).open_entries()
+        return bool(left) and left[-1].command.endswith(f" {self.step.name}")
 
     def show_finding(self, finding: Finding, before: str = "") -> None:
         for line in finding_lines(finding, before):
@@ -210,8 +221,10 @@ and can be begun again: what it found or wrote before stays, and every write to 
             if event.picture is not None:
                 self.say(Text(f"picture: {event.picture}"))
         elif isinstance(event, Intent):
+            self._live = None
             self._intend(event)
         elif isinstance(event, Ask):
+            self._live = None
             self._ask(event)
         elif isinstance(event, Hands):
             self._hands(event)
@@ -302,7 +315,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
 
     def offer(self, words: str, choices: list[Choice], chosen: int = 0) -> None:
         """Put lines to choose from below the log."""
-        self._choices = choices
+        self.choices = choices
         question = self.query_one("#question", Static)
         question.display = bool(words)
         question.update(Text(spelled(words), style="bold"))
@@ -318,7 +331,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
             self.query_one("#log").focus()
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
-        self._choices[event.option_index].do()
+        self.choices[event.option_index].do()
 
     def on_key(self, event: object) -> None:
         if getattr(event, "key", "") == "enter" and self._run is not None and self._pending is None:

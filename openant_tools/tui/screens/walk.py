@@ -21,7 +21,7 @@ from openant_tools.tui.page import Page
 __all__ = ["WalkScreen", "standing_mark"]
 
 _MARKS: dict[str, Name] = {"todo": "todo", "ok": "ok", "failed": "fail", "stale": "stale"}
-VIRTUAL = "virtual"
+CHECK, VIRTUAL = "check", "virtual"
 
 
 def standing_mark(one: Standing) -> Text:
@@ -56,6 +56,8 @@ class WalkScreen(Page):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("v", "app.virtual", "Virtual"),
         Binding("c", "app.watch", "Live"),
+        Binding("k", "app.step('check')", "Check", show=False),
+        Binding("u", "app.step('undo')", "Undo", show=False),
         Binding("f", "app.go('findings')", "Findings"),
         Binding("r", "app.go('recordings')", "Replay"),
         Binding("t", "app.go('learn')", "Learn"),
@@ -89,6 +91,7 @@ class WalkScreen(Page):
         for n, (name, step) in enumerate(WALK.items(), 1):
             state = standing_mark(self._standing[name]) if name in self._standing else marked("todo")
             walk.add_option(Option(Text.assemble(f"{n:2} {step.title:21} ", state), id=name))
+        walk.add_option(Option(Text(" k Daily check", style="bold"), id=CHECK))
         offer = "End the virtual robot" if self.session.virtual is not None else "Start a virtual robot"
         walk.add_option(Option(Text(f" v {offer}", style="bold"), id=VIRTUAL))
         first = next((k for k, name in enumerate(WALK) if self._state(name) != "ok"), 0)
@@ -101,6 +104,8 @@ class WalkScreen(Page):
         about = self.query_one("#about", Static)
         if event.option_id is None or event.option_id == VIRTUAL:
             about.update(_ABOUT_VIRTUAL)
+        elif event.option_id == CHECK:
+            about.update(_ABOUT_CHECK)
         else:
             about.update(_about(WALK[event.option_id], self._standing.get(event.option_id)))
 
@@ -111,6 +116,11 @@ class WalkScreen(Page):
             self.ant.open_step(event.option_id)
 
 
+_ABOUT_CHECK = Text.assemble(
+    ("Daily check", "bold"),
+    "  about 2 min\nBefore each session: the joint and the likely part, where something is not as it was when the passport "
+    "was written.",
+)
 _ABOUT_VIRTUAL = Text.assemble(
     ("Virtual robot\n", "bold"),
     "Servos, flight controller and camera in software, behind real ports and protocols. Walk through all steps with it "
