@@ -24,6 +24,8 @@ __all__ = ["EffectValues", "laws_of", "rollout"]
 Array = NDArray[np.float64]
 #: steps whose commands are laid out at a time
 CHUNK = 256
+#: joints of all simulations together from which a step is worth more than one thread
+WORTH_THREADS = 200
 #: (effect, parameter) → value per joint, (joints,)
 EffectValues = Mapping[tuple[str, str], Array]
 
@@ -68,7 +70,10 @@ def rollout(
     plant, segments, nv = rollouts.plant, rollouts.segments, len(models)
     lengths = np.array([len(segment.control) for segment in segments])
     longest = int(lengths[0])
-    batch, servos = batch_of(plant, [rollouts.lean(model) for model in models], len(segments), rollouts.nthread)
+    # Threads meet after every step: what few joints take is less than waiting for each other.
+    few = len(segments) * nv * len(plant.joints) < WORTH_THREADS
+    lean = [rollouts.lean(model) for model in models]
+    batch, servos = batch_of(plant, lean, len(segments), 1 if few else rollouts.nthread)
     batch.state[:] = np.repeat([segment.state for segment in segments], nv, axis=0)
     batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
     ctrl, time = batch.bind("ctrl"), np.zeros(len(segments) * nv)

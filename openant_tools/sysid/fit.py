@@ -865,7 +865,8 @@ class Problem:
                 moved[members] += step[members]
                 variants.append(moved)
         n = len(self._colours)
-        if coarse:
+        coarse &= any(data.coarse is not data for data in self.datasets)
+        if coarse and not central:
             variants.append(u)  # what both differ from must be stepped alike
         self.evaluations += len(variants)
         apart = np.ones((n, point.residual.shape[1]))

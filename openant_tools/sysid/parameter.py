@@ -105,8 +105,14 @@ def apply(plant: Plant, parameters: Sequence[Parameter], u: Array) -> mujoco.MjM
             kind.write(model, plant, j, parameter.value(nominal, float(value)))
         constants |= kind.constants
     if constants:
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        mujoco.mj_setConst(model, _scratch(plant.model))
     return model
+
+
+@lru_cache(maxsize=8)
+def _scratch(model: mujoco.MjModel) -> mujoco.MjData:
+    """Data of a model and of all of its layout, to compute in: making them takes longer than what is computed."""
+    return mujoco.MjData(model)
 
 
 @dataclass(frozen=True)
