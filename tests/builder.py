@@ -114,13 +114,13 @@ class Robot:
 
 
 @contextlib.contextmanager
-def robot(folder: Path, *, camera: bool = False, kit: str = "standard", **table: Any) -> Iterator[Robot]:
+def robot(folder: Path, *, sees: bool = False, kit: str = "standard", **table: Any) -> Iterator[Robot]:
     """A virtual robot of a scenario's tables, in stepped time, served by a thread of this process."""
-    server = assemble(parse_scenario(table), clock="stepped", camera=camera)
+    server = assemble(parse_scenario(table), clock="stepped", camera=sees)
     stop = threading.Event()
     thread = threading.Thread(target=server.run, args=(stop.is_set,))
     thread.start()
-    try:
+    try:  # what fails from here on must not leave the thread behind
         yield Robot(server, RobotFolder.at(folder) if (folder / "robot.toml").is_file() else create_robot(folder, kit))
     finally:
         stop.set()

@@ -11,6 +11,7 @@ from builder import robot
 from hypothesis import given
 from hypothesis import strategies as st
 
+from openant_tools.calib.arena import LYING_M, STANDING_M, arena, judge_sizes
 from openant_tools.calib.bounds import Unwrapped
 from openant_tools.calib.centre import centre
 from openant_tools.calib.comms_health import comms_health
@@ -26,6 +27,7 @@ from openant_tools.comms.body_imu import rotation
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import Journal
 from openant_tools.procedure.step import Declined, Event, Hands, Intent, Progress, drive
+from openant_tools.robot.config import Camera
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
 
 LOOSE = {"robot": {"setup": "loose"}}
@@ -380,6 +382,64 @@ def test_three_poses_give_back_any_mounting(vector):
     assert np.allclose(found.rotation, rotation(vector), atol=1e-6)
     assert np.allclose(rotation(found.vector_rad), found.rotation, atol=1e-6)
     assert found.confidence == "high"
+
+
+# ---- arena ------------------------------------------------------------------------------------------------------------
+
+
+def heights(body: float = 1.0, origin: float = 1.0) -> tuple[str, float | None]:
+    """What is judged where the declared sizes are this many times the true ones."""
+    setup, camera, tag = Camera(), 2.0, 0.085
+
+    def seen(true_m: float) -> float:
+        return origin * camera - body * (camera - true_m - tag) - tag
+
+    found = judge_sizes(seen(LYING_M), seen(STANDING_M), origin * camera, tag, setup)
+    return found.wrong, found.size_m
+
+
+def test_sizes_that_agree_are_right():
+    assert heights() == ("", None)
+
+
+@given(factor=st.floats(1.3, 2.0) | st.floats(0.4, 0.75))
+def test_the_tag_whose_size_is_wrong_is_told_from_the_other(factor):
+    wrong, size = heights(body=factor)
+    assert wrong == "body"
+    assert size == pytest.approx(0.045 / factor, rel=0.01)
+    wrong, size = heights(origin=factor)
+    assert wrong == "origin"
+    assert size == pytest.approx(0.10 / factor, rel=0.05)
+
+
+def test_without_a_camera_the_arena_says_what_is_missing(tmp_path):
+    with robot(tmp_path / "ant") as ant:
+        finding, _ = ant.do(arena(replace(ant.bench, camera=None)))
+        assert finding.ok
+        assert "no camera → floor experiments on the robot need one" in finding.problems
+
+
+@pytest.mark.slow
+def test_the_arena_is_measured_by_the_robot_itself(tmp_path):
+    with robot(tmp_path / "ant", sees=True, camera={"body": {"yaw": 0.3}}) as ant:
+        finding, _ = ant.do(arena(ant.bench))
+        assert finding.ok, finding
+        assert finding.data["centre_m"] == pytest.approx([0.75, -0.30], abs=0.02)
+        camera = ant.folder.config().camera
+        assert camera.body_tag_id == 12
+        assert camera.body_tag_yaw_rad == pytest.approx(0.3, abs=0.05)
+        assert "glued" in finding.problems[0]
+
+
+@pytest.mark.slow
+def test_a_wrong_tag_size_is_named_with_what_it_really_is(tmp_path):
+    with robot(tmp_path / "ant", sees=True, camera={"body": {"size": 0.03}}) as ant:
+        finding, _ = ant.do(arena(ant.bench))
+        assert not finding.ok
+        assert (
+            "the body's tag is declared 45 mm, but everything fits only if its edge is about 30 mm"
+            in finding.problems[0]
+        )
 
 
 # ---- bus health -------------------------------------------------------------------------------------------------------

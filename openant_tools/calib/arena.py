@@ -1,11 +1,365 @@
-"""Arena."""
+"""Arena: lens, tags, where the circle is, and how late the picture is; the robot itself is the ruler.
+
+Where the camera stands follows from the origin's tag alone, and how far the body's tag is from its own size. The robot
+lies on its belly, so that its tag's height is known: the two distances agree only if the two sizes do. Then it stands up,
+by a height that its legs give: how much nearer the tag seems to come tells which of the two sizes is the wrong one. At
+last it turns to and fro, and the gyro tells how late the camera's heading is.
+"""
 
 from __future__ import annotations
 
-from openant_tools.procedure.finding import Finding
-from openant_tools.procedure.step import Bench, Procedure, Say
+import math
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.calib.sweep import play_watched
+from openant_tools.calib.wires import engine_config, rest
+from openant_tools.comms import messages
+from openant_tools.comms.body_camera import CameraConfig
+from openant_tools.comms.camera import Camera, CameraInfo, CameraSettings
+from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
+from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics, calibrate
+from openant_tools.comms.latency import camera_latency
+from openant_tools.comms.setup import camera_of_robot
+from openant_tools.comms.tags import TagDetector, tag_pose
+from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.step import Answer, Ask, Bench, Event, Hands, Intent, Procedure, Progress, Say
+from openant_tools.recording.reader import Recording, read_recording
+from openant_tools.recording.run import Facts
+from openant_tools.robot.config import Camera as CameraFacts
+from openant_tools.robot.config import Provenance, RobotConfig
+from openant_tools.robot.joints import JOINTS
+from openant_tools.robot.kit import HOME_RAD
+
+__all__ = ["arena", "judge_sizes"]
+
+COMMAND = "openant calib arena"
+Array = NDArray[np.float64]
+
+PICTURES = 12
+#: m, the torso's centre while the robot lies on its belly, and stands in its home pose (facts/robot.md, section 6).
+LYING_M, STANDING_M = 0.076, 0.148
+#: Sizes that agree do so within this share; the tags that people confuse are 0.03, 0.045, 0.06 and 0.10 m.
+SIZE_SHARE = 0.08
+#: A builder places a robot by eye within this.
+BY_EYE_RAD = math.radians(8)
+#: Turning to and fro: all hips together, feet on the floor.
+WIGGLE_RAD, WIGGLE_HZ, WIGGLE_S, HOLD_S = 0.35, 0.8, 6.0, 1.5
+#: s; stamps that are as good as this are left as they are
+LATE_S = 0.008
+#: m; the circle of the platform's task
+RADIUS_M = 0.3
+#: Views of a ChArUco board, and the longest wait for the next one that differs, s.
+VIEWS, VIEW_S = 10, 60.0
+#: as `calibrate` calls its source
+BOARD = "ChArUco board"
+FOV_WORDS = "the declared field of view is good to a few mm near the picture's middle, 10 to 20 mm in height"
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Whether the tags' sizes agree.
+
+    Attributes:
+        ratio: distance of the body's tag by its size over that by its known height; 1 where both sizes are right.
+        step_ratio: height that it seems to rise over the height that the legs give; in the body tag's scale.
+        wrong: "body" or "origin" where they do not agree; "" where they do.
+        size_m: what the wrong one's edge really is.
+    """
+
+    ratio: float
+    step_ratio: float
+    wrong: str
+    size_m: float | None
+
+
+def judge_sizes(lying_m: float, standing_m: float, camera_m: float, tag_m: float, setup: CameraFacts) -> Sizes:
+    """Compare measured heights of the torso with those that the robot's build gives.
+
+    Args:
+        lying_m, standing_m: the torso's height as the tags tell it. camera_m: the camera's, as the origin's tag tells it.
+        tag_m: the body tag's height over the torso's centre. setup: the declared sizes.
+    """
+    ratio = (camera_m - lying_m - tag_m) / (camera_m - LYING_M - tag_m)
+    step = (standing_m - lying_m) / (STANDING_M - LYING_M)
+    if abs(ratio - 1) <= SIZE_SHARE:
+        return Sizes(ratio, step, "", None)
+    # Were the body's size wrong, the rise would be wrong by the same ratio; were the origin's, it would be right.
+    if abs(step - ratio) < abs(step - 1):
+        return Sizes(ratio, step, "body", setup.body_tag_size_m / ratio)
+    # The body's distance is true then, and with it the camera's height: that distance above the known tag.
+    true_camera_m = camera_m - lying_m + LYING_M
+    return Sizes(ratio, step, "origin", setup.origin_tag_size_m * true_camera_m / camera_m)
 
 
 def arena(bench: Bench) -> Procedure:
-    yield Say("todo")
-    return Finding("arena", True, "todo", (), "", "openant calib arena")
+    """Look, measure, judge, write `[camera]`.
+
+    Raises:
+        HardwareFault: there is no camera, or the tags are not in its picture.
+    """
+    config = bench.folder.config()
+    where: str | int = bench.camera if bench.camera is not None else config.ports.camera
+    if where == "":
+        named = yield Ask("Which camera? (a number, or what OpenCV opens; empty: none)", unit="text", default="")
+        where = named if isinstance(named, str) else ""
+    if where == "":
+        return Finding(
+            "arena", True, "there is no camera; the robot learns without an arena in simulation only", (),
+            "name a camera with --camera and run it again before learning on the robot", COMMAND,
+            problems=("no camera → floor experiments on the robot need one",),
+        )  # fmt: skip
+    problems, values = list[str](), dict[str, object]()
+    yield Progress(0.0, f"looking through {where}")
+    info, lens, seen, words = yield from _look(bench, config, where)
+    problems += words
+    origin_id, body_id = config.camera.origin_tag_id, config.camera.body_tag_id
+    if origin_id not in seen:
+        raise HardwareFault(
+            f"the origin's tag {origin_id} ({config.camera.tag_family}) is not in the picture (seen: {sorted(seen) or 'none'})",
+            where=str(where), remedy="lay it flat into view; is the family right, the light even, the picture sharp?",
+        )  # fmt: skip
+    others = sorted(id for id in seen if id != origin_id)
+    if body_id not in others:
+        if not others:
+            yield Hands("Put the robot on the floor, under the camera.", "place", setup="floor")
+            rest(bench)
+            info, lens, seen, _ = yield from _look(bench, config, where)
+            others = sorted(id for id in seen if id != origin_id)
+        if not others:
+            raise HardwareFault(
+                "the robot's tag is not in the picture", where=str(where), remedy="put the robot under the camera"
+            )
+        answer = yield Ask("Which tag does the robot wear?", unit="number of the tag", default=float(others[0]))
+        body_id = int(answer) if isinstance(answer, float) else others[0]
+    setup = replace(config.camera, body_tag_id=body_id)
+    origin = tag_pose(seen[origin_id], setup.origin_tag_size_m, lens)
+    if not origin:
+        raise HardwareFault("the corners of the origin's tag make no square", where=str(where), remedy="lay it flat")
+    rotation, position = origin[0]
+    camera_m = abs(float(rotation[:, 2] @ position))
+    if float(np.linalg.norm(position)) > 1.5 * camera_m:
+        problems.append("the camera looks at the floor from the side → hang it straight above, distances get better")
+
+    yield Hands(
+        "Put the robot on its belly at the circle's centre, legs straight out, its nose along the up-direction of the origin's tag.",
+        "place",
+        setup="floor",
+    )
+    rest(bench)
+    yield Intent(
+        "let the robot stand up, turn to and fro for 6 s with its feet in place, and lie down again", moves=True
+    )
+    yield Say(FOV_WORDS if lens.source not in ("robot.toml", BOARD) else "the lens is calibrated")
+    record = yield from _stand_and_wiggle(bench, config, replace(setup, latency_s=None), where, lens)
+    lying, standing = _between(record, "lying"), _between(record, "standing")
+    sizes = judge_sizes(_height(lying), _height(standing), camera_m, config.camera.body_tag_position_m[2], setup)
+    if sizes.wrong:
+        declared = setup.body_tag_size_m if sizes.wrong == "body" else setup.origin_tag_size_m
+        problems.append(
+            f"tag size: the {sizes.wrong}'s tag is declared {1e3 * declared:.0f} mm, but everything fits only if its edge is about "
+            f"{1e3 * (sizes.size_m or 0.0):.0f} mm → measure it, correct camera.{sizes.wrong}_tag_size_m in robot.toml, run it again"
+        )
+    yaw = _mean_angle(lying["yaw"])
+    if abs(yaw) > BY_EYE_RAD:
+        problems.append(
+            f"the robot's tag is glued {math.degrees(yaw):+.0f}° askew (or the robot was) → camera.body_tag_yaw_rad takes it into account"
+        )
+    if lens.source == BOARD:
+        values |= {
+            "camera.size_px": [lens.width, lens.height],
+            "camera.focal_px": [round(lens.fx, 3), round(lens.fy, 3)],
+            "camera.centre_px": [round(lens.cx, 3), round(lens.cy, 3)],
+            "camera.distortion": [round(k, 6) for k in lens.distortion],
+        }
+        evidence_of_lens = [Evidence("reprojection error", lens.rms_px, "px", f"{VIEWS} views of a ChArUco board")]
+    else:
+        evidence_of_lens = []
+    values["camera.body_tag_id"] = body_id
+    values["camera.body_tag_yaw_rad"] = round(config.camera.body_tag_yaw_rad + yaw, 4)
+    turning = _between(record, "wiggle")
+    evidence = [
+        *evidence_of_lens,
+        Evidence("camera's height", camera_m, "m", "pose of the origin's tag"),
+        Evidence("distance by size over distance by height", sizes.ratio, "1", "lying robot"),
+        Evidence("rise seen over rise by legs", sizes.step_ratio, "1", "standing up"),
+        Evidence("tag yaw", yaw, "rad", "robot placed along the origin's tag"),
+    ]
+    latency_s: float | None = None
+    try:
+        late = camera_latency(turning["t"], turning["yaw"], record.imu.t, record.imu.columns["gyro.z"])
+    except (BadInput, KeyError) as error:
+        problems.append(f"latency: {error} → is the IMU step done? does the robot turn?")
+    else:
+        latency_s = info.latency_s + late.latency_s
+        evidence += [
+            Evidence("stamps are late by", late.latency_s, "s", f"gyro against tag heading; stamps: {info.latency_source}",
+                     late.latency_s - 2 * late.latency_error_s, late.latency_s + 2 * late.latency_error_s),
+            Evidence("camera angle over gyro angle", late.scale, "1", "the same motion"),
+        ]  # fmt: skip
+        if abs(late.scale - 1) > 0.1:
+            problems.append(
+                f"gyro and camera disagree by {100 * (late.scale - 1):+.0f} % about the same turn → run `openant calib imu`"
+            )
+        if abs(late.latency_s) > LATE_S and latency_s > 0:
+            values["camera.latency_s"] = round(latency_s, 4)
+    radius = yield Ask("Radius of the circle?", unit="m", default=RADIUS_M, low=0.1, high=5.0)
+    centre = [round(float(np.median(lying[axis])), 4) for axis in ("x", "y")]
+    yield Hands("Put it back on its stand.", "place", setup="stand")
+    rest(bench)
+    bench.folder.update(values, provenance=Provenance("measured", COMMAND, bench.folder.relative(_path(bench))))
+    ok = not sizes.wrong and latency_s is not None
+    return Finding(
+        "arena",
+        ok,
+        f"camera at {camera_m:.2f} m, tags {origin_id} and {body_id}"
+        + ("" if latency_s is None else f", picture stamps {1e3 * abs(late.latency_s):.0f} ms off"),
+        tuple(evidence),
+        "" if ok else "mend what is listed and run it again",
+        COMMAND,
+        data={
+            "centre_m": centre,
+            "radius_m": radius,
+            "camera": str(where),
+            "sizes": vars(sizes),
+            "latency_s": latency_s,
+        },
+        problems=tuple(problems),
+    )
+
+
+def _clock(bench: Bench) -> Clock:
+    if bench.control is not None:
+        remote = VirtualControl(bench.control)
+        if remote.ask("now")["stepped"]:
+            return SteppedClock(remote)
+    return RealClock()
+
+
+def _look(
+    bench: Bench, config: RobotConfig, where: str | int
+) -> Generator[Event, Answer, tuple[CameraInfo, Intrinsics, dict[int, Array], list[str]]]:
+    """What the camera gives, the lens, each tag's corners (4, 2) over a few pictures, and what is odd about the camera."""
+    clock = _clock(bench)
+    camera = Camera(CameraSettings(where, exposure=config.camera.exposure, focus=config.camera.focus), clock)
+    try:
+        info = camera.open()
+        lens, words = yield from _lens(camera, clock, config, where, info.width, info.height)
+        detector, corners = TagDetector(config.camera.tag_family), dict[int, list[Array]]()
+        for _ in range(PICTURES):
+            frame = camera.wait(clock.now() + 2.0)
+            gray = np.asarray(frame.image if frame.image.ndim == 2 else frame.image.mean(axis=2), np.uint8)
+            for tag in detector.detect(gray):
+                if tag.hamming == 0 and tag.margin >= 5.0:
+                    corners.setdefault(tag.id, []).append(tag.corners)
+    finally:
+        camera.close()
+    seen = {id: np.median(np.array(all_), axis=0) for id, all_ in corners.items() if len(all_) >= PICTURES // 3}
+    return info, lens, seen, [*words, *(f"camera: {note}" for note in info.notes)]
+
+
+def _lens(
+    camera: Camera, clock: Clock, config: RobotConfig, where: str | int, width: int, height: int
+) -> Generator[Event, Answer, tuple[Intrinsics, list[str]]]:
+    known = camera_of_robot(
+        replace(config, camera=replace(config.camera, body_tag_id=max(config.camera.body_tag_id, 1))), where
+    )
+    if known is not None and known.intrinsics is not None:
+        return known.intrinsics.scaled(width, height), []
+    declared = Intrinsics.from_diagonal_fov(width, height, math.degrees(config.camera.fov_diagonal_rad))
+    choice = yield Ask(
+        f"The lens is not calibrated: {FOV_WORDS}. Calibrate it with a ChArUco board?", ("no", "yes"), default="no"
+    )
+    if choice != "yes":
+        return declared, []
+    board, pictures, last = CharucoBoard(), list[NDArray[np.uint8]](), None
+    yield Hands(
+        f"Show the board to the camera in {VIEWS} ways: tilted 30° and more, in every corner of the picture.",
+        "free",
+        while_watching=True,
+    )
+    give_up = clock.now() + VIEW_S
+    while len(pictures) < VIEWS and clock.now() < give_up:
+        frame = camera.wait(clock.now() + 2.0)
+        gray = np.asarray(frame.image.mean(axis=2) if frame.image.ndim == 3 else frame.image, np.uint8)
+        found = board.corners(gray)
+        if found is None or (last is not None and abs(found[0].mean(axis=0) - last).max() < 0.05 * width):
+            continue
+        last, give_up = found[0].mean(axis=0), clock.now() + VIEW_S
+        pictures.append(gray)
+        yield Progress(len(pictures) / VIEWS, f"view {len(pictures)} of {VIEWS}")
+    if len(pictures) < VIEWS:
+        return declared, [f"only {len(pictures)} views of the board were seen → the declared field of view is used"]
+    return calibrate(pictures, board), []
+
+
+def _path(bench: Bench) -> Path:
+    return bench.folder.recordings / "arena.mcap"
+
+
+def _stand_and_wiggle(
+    bench: Bench, config: RobotConfig, setup: CameraFacts, where: str | int, lens: Intrinsics
+) -> Generator[Event, Answer, Recording]:
+    """Lie, stand, turn to and fro, lie: one recording, its phases in the facts."""
+    seen = camera_of_robot(replace(config, camera=setup), where)
+    assert seen is not None
+    camera: CameraConfig = replace(seen, intrinsics=lens)
+    path = _path(bench)
+    with EngineProcess(engine_config(bench, camera=camera)) as engine:
+        names = tuple(servo.joint for servo in engine.config.servos)
+        rate = engine.config.rate_hz
+        low, high = np.array([engine.config.limits_rad[name] for name in names]).T
+        lying = np.clip(np.asarray(engine.description["position"], float), low, high)
+        home = np.array([HOME_RAD[JOINTS[name].kind] for name in names])
+        hips = np.array([JOINTS[name].kind == "hip" for name in names])
+        up = _minimum_jerk(lying, home, 2.0, rate)
+        t = np.arange(round(WIGGLE_S * rate)) / rate
+        fade = np.clip(np.minimum(t, t[-1] - t) / 0.5, 0.0, 1.0)
+        wiggle = home + np.outer(WIGGLE_RAD * fade * np.sin(2 * np.pi * WIGGLE_HZ * t), hips)
+        still = round(HOLD_S * rate)
+        played = np.concatenate(
+            [np.repeat(lying[None], still, 0), up, np.repeat(home[None], still, 0), wiggle, up[::-1]]
+        )
+        marks = np.cumsum([0, still, len(up), still, len(t)]) / rate
+        phases = {"lying": [0.2, marks[1]], "standing": [marks[2] + 0.5, marks[3]], "wiggle": [marks[3], marks[4]]}
+        engine.ask(messages.Torque(True))
+        facts = Facts(joints=names, setup="floor", protocol="arena", extra={"phases": phases})
+        engine.ask(messages.Record(str(path), facts, overwrite=True))
+        yield from play_watched(engine, messages.Play(played, "arena"), len(played) / rate, "standing up and turning")
+        engine.ask(messages.StopRecording())
+        engine.ask(messages.Torque(False))
+    return read_recording(path)
+
+
+def _minimum_jerk(start: Array, end: Array, seconds: float, rate_hz: float) -> Array:
+    share = np.arange(round(seconds * rate_hz)) / (seconds * rate_hz)
+    smooth = share**3 * (10 - 15 * share + 6 * share**2)
+    return np.asarray(start + smooth[:, None] * (end - start), float)
+
+
+def _between(record: Recording, phase: str) -> dict[str, Array]:
+    """t, x, y, z, yaw of the poses within a phase; raises HardwareFault where the tag was lost."""
+    begin, end = record.run.facts.extra["phases"][phase]
+    t = record.pose.t - record.run.t[0]
+    rows = (t >= begin) & (t < end)
+    if rows.sum() < 10:
+        raise HardwareFault(
+            f"the robot's tag was seen in {int(rows.sum())} pictures while it was {phase}",
+            remedy="light, focus, and both tags in view",
+        )
+    columns = record.pose.columns
+    return {"t": record.pose.t[rows], **{name: columns[f"base.{name}"][rows] for name in ("x", "y", "z", "yaw")}}
+
+
+def _height(poses: dict[str, Array]) -> float:
+    return float(np.nanmedian(poses["z"]))
+
+
+def _mean_angle(angles: Array) -> float:
+    return math.atan2(float(np.nanmean(np.sin(angles))), float(np.nanmean(np.cos(angles))))

@@ -131,7 +131,11 @@ def _one(
         return _Wrong(f"{motor.joint}: reads back {values} instead of {wanted} → power it off and on and try again")
     yield from nudge(servos, motor.joint)
     if (
-        yield Ask(f"Did this servo, and only this one, blink and turn? It is the {words} from now on.", ("yes", "no"), default="yes")
+        yield Ask(
+            f"Did this servo, and only this one, blink and turn? It is the {words} from now on.",
+            ("yes", "no"),
+            default="yes",
+        )
     ) != "yes":
         return _Wrong(
             f"{motor.joint}: id {motor.id} answered, but the servo at hand did not move → another one is on the cable, or its "
