@@ -1,0 +1,245 @@
+"""A diagnosis put to use: the model with the effects that were found, and a file of those that MuJoCo has no feature for."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from lxml import etree
+from numpy.typing import NDArray
+
+from openant_tools.effects.catalogue import catalogue as acting
+from openant_tools.effects.entries import as_toml, entries_of
+from openant_tools.errors import BadInput
+from openant_tools.files import write_text
+from openant_tools.gap.cause import catalogue
+from openant_tools.gap.diagnosis import Diagnosis, Found
+from openant_tools.gap.native import Edit, edit
+from openant_tools.gap.robot import Reference, Robot
+from openant_tools.model.mjcf import document_text, write_model
+from openant_tools.model.plant import Plant, Setup, load_plant, world_bodies
+from openant_tools.robot.config import Effect, Provenance
+from openant_tools.robot.folder import RobotFolder
+from openant_tools.sysid.kinds import KINDS
+
+__all__ = ["Applied", "apply", "robot_of", "write_robot"]
+
+#: laws that a written model carries by itself
+NATIVE_LAWS = ("cogging", "stribeck_friction", "viscous_nonlinear")
+#: rad: farther than any joint of a legged robot goes
+ANYWHERE_RAD = 10.0
+#: kinds of a diagnosis' calibration that are factors
+FACTORS = ("stiffness", "damping", "torque_limit", "armature", "link_mass")
+
+
+@dataclass(frozen=True)
+class Applied:
+    """What was written.
+
+    Attributes:
+        written: the files.
+        carried: lines on what stands where.
+        notes: lines on what is not as it was simulated.
+    """
+
+    written: tuple[Path, ...]
+    carried: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def apply(found: Diagnosis, model: Path, out: Path, *, robot: Path | None = None) -> Applied:
+    """Write the improved model of a diagnosis, and beside it what MuJoCo does not carry.
+
+    Args:
+        model: the MJCF that was diagnosed. out: the file to make.
+        robot: a robot's folder whose robot.toml gets the effects and names the model, in place of a file beside it.
+
+    Raises:
+        BadInput: the model lacks a joint of the diagnosis, or keeps one where it cannot be edited.
+    """
+    folder = None if robot is None else RobotFolder.at(robot)
+    plant = load_plant(model, None, Setup.FLOOR)
+    selected = [one for one in found.effects if one.effect in found.selected and (one.parameters or one.coordinates)]
+    improved = robot_of(plant, selected, found.calibration)
+    edited = write_robot(model, improved, out, note=f"Written by `openant gap apply`: {found.verdict}")
+    entries = _entries(plant, selected, improved)
+    written = [out]
+    beside = out.with_name(f"{out.stem}.effects.toml")
+    if folder is not None:
+        _into_folder(folder, out, entries, found)
+        written.append(folder.config_file)
+    elif entries:
+        write_text(beside, as_toml(entries, f"What MuJoCo has no feature for; goes with {out.name}"))
+        written.append(beside)
+    else:
+        beside.unlink(missing_ok=True)  # of an earlier diagnosis, which would act beside this model
+    where = "robot.toml" if folder is not None else beside.name
+    carried = [
+        f"{one.effect} ({_where(one)}): "
+        + (where if any(entry.effect == one.effect for entry in entries) else f"MuJoCo, in {out.name}")
+        for one in selected
+    ]
+    if not selected:
+        carried.append("no effect was selected: the model is the given one, calibrated as far as the diagnosis went")
+    idle = [
+        f"{entry.effect} does not act between steps yet: it stands in {where}, not enabled"
+        for entry in entries
+        if not entry.enabled
+    ]
+    return Applied(tuple(written), tuple(carried), (*edited.notes, *idle))
+
+
+def robot_of(
+    plant: Plant, selected: tuple[Found, ...] | list[Found], calibration: Mapping[str, Mapping[str, float]]
+) -> Robot:
+    """The robot that a diagnosis says this is.
+
+    Args:
+        plant: the given model.
+        selected: its effects, entered by their parameters.
+        calibration: kind → joint → factor, or amount of what has none.
+
+    Raises:
+        BadInput: an effect that is not in the catalogue, a joint that is not in the model, a parameter that is missing.
+    """
+    n = len(plant.joints)
+    reach = np.full(n, ANYWHERE_RAD)
+    reference = Reference.of(
+        plant, floor=True, imu=True, tracker=True, speed=np.ones(n), low=-reach, high=reach
+    )  # fmt: skip
+    robot = Robot(n, -reach, reach)
+    for kind, values in calibration.items():
+        for joint, value in values.items():
+            j = _rows(plant, (joint,), kind)
+            if kind in FACTORS:
+                robot.factor(kind)[j] *= value
+            elif kind == "coulomb_friction":
+                robot.more(kind)[j] += value
+            elif kind == "zero_offset":
+                robot.zero[j] += value
+            elif kind == "delay":
+                robot.delay[j] = np.maximum(robot.delay[j] + value, 0.0)  # nothing acts before it was sent
+            else:
+                raise BadInput(f"the diagnosis calibrates {kind!r}", remedy=f"known are {', '.join(FACTORS)}")
+    for one in selected:
+        cause = catalogue().get(one.effect)
+        if cause is None:
+            raise BadInput(f"no effect is called {one.effect!r}", remedy="see the catalogue in docs/gap.md")
+        joints = np.arange(n) if isinstance(one.joints, str) else _rows(plant, one.joints, one.effect)
+        given = {name: span.value for name, span in one.parameters.items()}
+        try:
+            values = cause.restored(given, one.coordinates, reference, joints)
+            cause.enter(robot, joints, values)
+        except KeyError as error:
+            raise BadInput(
+                f"{one.effect} lacks its parameter {error}", remedy="make the diagnosis anew with this version"
+            ) from None
+    robot.delay[:] = np.maximum(robot.delay, 0.0)
+    return robot
+
+
+def write_robot(source: Path, robot: Robot, out: Path, *, note: str) -> Edit:
+    """Write an MJCF that moves as this robot does, by MuJoCo's own features as far as those go (formats, section 5).
+
+    Raises:
+        BadInput: the source cannot be edited so that it compiles to this.
+    """
+    plant = load_plant(source, None, Setup.FLOOR)
+    variant = _variant(plant, robot)
+    partial = out.with_name(f".{out.name}.partial.xml")
+    hinged = bool(robot.play.any() or robot.compliance.any())
+    if hinged:
+        note += ". It has hinges beside the servos' own: for openant_env and plain MuJoCo, not for code that counts coordinates"
+    try:
+        write_model(source, variant, partial, note=note)
+        written = load_plant(partial, plant.joints, Setup.FLOOR)
+        tree = etree.parse(str(partial), etree.XMLParser(remove_blank_text=False))
+        done = edit(tree.getroot(), written, robot)
+        if hinged:
+            _lengthen_keys(tree.getroot(), written, done)
+        write_text(partial, document_text(tree))
+        for setup in Setup:
+            load_plant(partial, plant.joints, setup)
+    finally:
+        partial.unlink(missing_ok=True)
+    write_text(out, document_text(tree))
+    return done
+
+
+def _variant(plant: Plant, robot: Robot) -> mujoco.MjModel:
+    """What of a robot a compiled model of the same layout says, but for what is written as a body or option of its own."""
+    plain = robot.copy()
+    plain.payload_kg, plain.tilt = 0.0, np.zeros(2)
+    variant = plain.model(plant)
+    zero = KINDS["zero_offset"]
+    for j in np.flatnonzero(robot.zero):
+        zero.write(variant, plant, int(j), zero.read(variant, plant, int(j)) + float(robot.zero[j]))
+    if robot.adhesion_n:
+        of_world = np.isin(variant.geom_bodyid, list(world_bodies(variant)))
+        feet = ~of_world & ((variant.geom_contype | variant.geom_conaffinity) != 0)
+        variant.geom_adhesion[feet] = robot.adhesion_n
+    return variant
+
+
+def _lengthen_keys(root: etree._Element, plant: Plant, done: Edit) -> None:
+    """Keyframes count coordinates: those of the added hinges are 0."""
+    added: list[tuple[int, int]] = []
+    for joint, hinges in done.hinges.items():
+        j = plant.joints.index(joint)
+        added.append((int(plant.qpos[j]) + 1, len(hinges)))
+    dofs = {int(plant.qpos[k]) + 1: int(plant.dof[k]) + 1 for k in range(len(plant.joints))}
+    for key in root.iter("key"):
+        for name, of in (("qpos", lambda at: at), ("qvel", dofs.__getitem__)):
+            numbers = str(key.get(name) or "").split()
+            if numbers:
+                for at, count in sorted(added, reverse=True):
+                    numbers[of(at) : of(at)] = ["0"] * count
+                key.set(name, " ".join(numbers))
+
+
+def _entries(plant: Plant, selected: list[Found], robot: Robot) -> list[Effect]:
+    """What stands beside the model: laws that act between steps, and what does not act yet."""
+    laws: dict[tuple[str, str], NDArray[np.float64]] = {
+        key: values for key, values in robot.laws.items() if key[0] not in NATIVE_LAWS
+    }
+    entries = [
+        Effect(entry.effect, "all" if acting()[entry.effect].shared else entry.joints, entry.parameters)
+        for entry in entries_of(laws, plant.joints)
+    ]
+    for one in selected:
+        if catalogue()[one.effect].native or any(entry.effect == one.effect for entry in entries):
+            continue
+        values = {name: float(f"{span.value:.6g}") for name, span in one.parameters.items()}
+        entries.append(Effect(one.effect, one.joints, values, enabled=False))
+    return entries
+
+
+def _into_folder(folder: RobotFolder, out: Path, entries: list[Effect], found: Diagnosis) -> None:
+    now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+    recording = ", ".join(found.runs)
+    considered = {one.effect for one in found.effects}
+    beside = [entry for entry in folder.config().effects if entry.effect not in considered]
+    folder.update(
+        {"model": folder.relative(out.resolve())},
+        provenance={"model": Provenance("fitted", "openant gap apply", recording, now)},
+        effects=[*beside, *entries],
+    )
+
+
+def _rows(plant: Plant, joints: tuple[str, ...], what: str) -> NDArray[np.int64]:
+    for joint in joints:
+        if joint not in plant.joints:
+            raise BadInput(
+                f"the diagnosis says {what} of {joint!r}, which the model does not have",
+                where=plant.path,
+                remedy="name the model that was diagnosed with --model",
+            )
+    return np.array([plant.joints.index(joint) for joint in joints], np.int64)
+
+
+def _where(one: Found) -> str:
+    return one.joints if isinstance(one.joints, str) else ", ".join(one.joints)

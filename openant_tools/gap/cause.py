@@ -1,0 +1,178 @@
+"""What a cause of a gap is: an effect of the catalogue as a hypothesis about a robot."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.gap.robot import Reference, Robot
+
+__all__ = ["Cause", "Quantity", "Scope", "Values", "amount", "catalogue", "factor", "rate", "shape"]
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+#: parameter → value, in the catalogue's units
+Values = Mapping[str, float]
+Scale = Callable[[Reference, Ints], float]
+
+
+class Scope(StrEnum):
+    """What a cause may belong to (effects.md)."""
+
+    JOINT = "j"
+    SERVO = "g"
+    ALL = "a"
+    BODY = "b"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One parameter of a cause, and the coordinate x in which it is drawn and fitted: x = 0 is the absence of the effect.
+
+    Attributes:
+        name, unit: of the value, as in the catalogue.
+        value: x, and the scale of the robot and joints at hand, to the value; back: the other way round.
+        small, large: |x| just beyond what robots of one build differ by, and of a robot that is clearly ill.
+        signed: x may be negative.
+        scale: what an x of 1 means on this robot.
+        shape: it says how an effect acts, not how much: never absent, drawn between small and large.
+    """
+
+    name: str
+    unit: str
+    value: Callable[[float, float], float]
+    back: Callable[[float, float], float]
+    small: float
+    large: float
+    signed: bool
+    scale: Scale
+    shape: bool = False
+
+
+def _one(reference: Reference, joints: Ints) -> float:
+    return 1.0
+
+
+def amount(name: str, unit: str, small: float, large: float, *, signed: bool = False, scale: Scale = _one) -> Quantity:
+    """A value that is 0 where the effect is absent."""
+    return Quantity(name, unit, lambda x, s: s * x, lambda v, s: v / s, small, large, signed, scale)
+
+
+def factor(name: str, small: float, large: float) -> Quantity:
+    """A factor, 1 where the effect is absent; |x| is the size of its logarithm."""
+    return Quantity(name, "1", lambda x, s: float(np.exp(x)), lambda v, s: float(np.log(v)), small, large, True, _one)
+
+
+def rate(name: str, unit: str, small: float, large: float, scale: Scale) -> Quantity:
+    """A limit, infinite where the effect is absent; x is the scale over it."""
+    return Quantity(
+        name, unit, lambda x, s: s / x if x > 0 else float("inf"), lambda v, s: s / v, small, large, False, scale
+    )
+
+
+def shape(name: str, unit: str, low: float, high: float) -> Quantity:
+    """A parameter of how it acts."""
+    return Quantity(name, unit, lambda x, s: x, lambda v, s: v, low, high, False, _one, shape=True)
+
+
+def everywhere(reference: Reference) -> bool:
+    """It can show on any robot."""
+    return True
+
+
+@dataclass(frozen=True)
+class Cause:
+    """An effect of the catalogue as a hypothesis.
+
+    Attributes:
+        name, family: of the catalogue. words: what happens, for people.
+        scopes: what it may belong to.
+        quantities: its parameters.
+        enter: changes a robot so that it has the effect: (robot, indices of joints, values).
+        native: whether a written MJCF carries it with MuJoCo's own features.
+        together: sizes share one magnitude in a random direction (a vector); else each is drawn by itself.
+        shows: whether it can show on what was recorded.
+        signal: the signal of the log that it acts on, where that is not the motion itself.
+        stated: from the quantities to the catalogue's parameters, where those are not the same.
+        restored: from a diagnosis' parameters back to the quantities, with what its coordinates were.
+    """
+
+    name: str
+    family: str
+    words: str
+    scopes: tuple[Scope, ...]
+    quantities: tuple[Quantity, ...]
+    enter: Callable[[Robot, Ints, Values], None]
+    native: bool
+    together: bool = False
+    shows: Callable[[Reference], bool] = everywhere
+    signal: str | None = None
+    stated: Callable[[Values, Reference, Ints], dict[str, float]] = lambda values, reference, joints: dict(values)
+    restored: Callable[[Values, Values, Reference, Ints], dict[str, float]] = lambda given, x, reference, joints: dict(
+        given
+    )
+
+    def values(self, x: Mapping[str, float], reference: Reference, joints: Ints) -> dict[str, float]:
+        """The parameters at a point of the coordinates."""
+        return {q.name: q.value(x[q.name], q.scale(reference, joints)) for q in self.quantities}
+
+    def starts(self, strength: float) -> list[dict[str, float]]:
+        """Coordinates of one size in every direction that matters: either sign, each part of a vector by itself."""
+        sizes = [q for q in self.quantities if not q.shape]
+        size = {q.name: q.small * (q.large / q.small) ** strength for q in sizes}
+        shapes = {q.name: float(np.sqrt(q.small * q.large)) for q in self.quantities if q.shape}
+        out = []
+        if self.together:
+            for one in sizes:
+                for sign in (1.0, -1.0) if one.signed else (1.0,):
+                    out.append({q.name: sign * size[q.name] if q is one else 0.0 for q in sizes} | shapes)
+            return out
+        first = sizes[0]
+        for sign in (1.0, -1.0) if first.signed else (1.0,):
+            # What comes beside the first is nothing where it may have either sign.
+            rest = {q.name: 0.0 if q.signed else size[q.name] for q in sizes[1:]}
+            out.append({first.name: sign * size[first.name], **rest, **shapes})
+        return out
+
+    def draw(self, rng: np.random.Generator, strength: float) -> dict[str, float]:
+        """Coordinates of a random size.
+
+        Args:
+            strength: 0 just beyond tolerance … 1 clearly ill.
+        """
+        sizes = [q for q in self.quantities if not q.shape]
+        direction = rng.normal(size=len(sizes))
+        direction /= np.linalg.norm(direction)
+        out = {}
+        for k, q in enumerate(sizes):
+            own = strength if self.together else float(np.clip(strength + rng.normal(0, 0.15), 0, 1))
+            size = q.small * (q.large / q.small) ** own
+            if self.together:
+                size *= direction[k] if q.signed else abs(direction[k])
+            elif q.signed and rng.random() < 0.5:
+                size = -size
+            out[q.name] = float(size)
+        for q in self.quantities:
+            if q.shape:
+                out[q.name] = float(q.small * (q.large / q.small) ** rng.random())
+        return out
+
+
+@cache
+def catalogue() -> dict[str, Cause]:
+    """Name → cause, of every module of `gap.causes`, in the order of their names."""
+    from openant_tools.gap import causes
+
+    found = {}
+    for module in sorted(pkgutil.iter_modules(causes.__path__), key=lambda module: module.name):
+        one = getattr(importlib.import_module(f"{causes.__name__}.{module.name}"), "CAUSE", None)
+        if isinstance(one, Cause):
+            found[one.name] = one
+    return found

@@ -1,0 +1,27 @@
+"""Dry friction is not what the model says."""
+
+from __future__ import annotations
+
+from openant_tools.gap.cause import Cause, Ints, Scope, Values, amount
+from openant_tools.gap.robot import Reference, Robot
+
+__all__ = ["CAUSE"]
+
+
+def _torque(reference: Reference, joints: Ints) -> float:
+    return float(reference.torque[joints].mean())
+
+
+def _enter(robot: Robot, joints: Ints, values: Values) -> None:
+    robot.more("coulomb_friction")[joints] += values["torque_nm"]
+
+
+CAUSE = Cause(
+    name="coulomb_friction",
+    family="friction",
+    words="dry friction is not what the model says",
+    scopes=(Scope.JOINT, Scope.SERVO, Scope.ALL),
+    quantities=(amount("torque_nm", "N·m", 0.025, 0.22, signed=True, scale=_torque),),
+    enter=_enter,
+    native=True,
+)

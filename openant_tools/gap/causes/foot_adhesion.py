@@ -1,0 +1,28 @@
+"""Feet stick to the floor."""
+
+from __future__ import annotations
+
+from openant_tools.gap.cause import Cause, Ints, Scope, Values, amount
+from openant_tools.gap.robot import Reference, Robot
+
+__all__ = ["CAUSE"]
+
+
+def _weight(reference: Reference, joints: Ints) -> float:
+    return 9.81 * reference.robot_kg / 2
+
+
+def _enter(robot: Robot, joints: Ints, values: Values) -> None:
+    robot.adhesion_n += values["force_n"]
+
+
+CAUSE = Cause(
+    name="foot_adhesion",
+    family="contact",
+    words="feet stick to the floor",
+    scopes=(Scope.BODY,),
+    quantities=(amount("force_n", "N", 0.05, 0.5, scale=_weight),),
+    enter=_enter,
+    native=True,
+    shows=lambda reference: reference.floor,
+)

@@ -1,0 +1,26 @@
+"""A servo whose gain and torque have fallen together."""
+
+from __future__ import annotations
+
+from openant_tools.gap.cause import Cause, Ints, Scope, Values, amount
+from openant_tools.gap.robot import Robot
+
+__all__ = ["CAUSE"]
+
+
+def _enter(robot: Robot, joints: Ints, values: Values) -> None:
+    robot.factor("stiffness")[joints] *= 1 - values["loss"]
+    robot.factor("torque_limit")[joints] *= 1 - values["loss"]
+
+
+CAUSE = Cause(
+    name="weak_joint",
+    family="gain",
+    words="gain and torque have fallen together",
+    scopes=(Scope.JOINT,),
+    quantities=(amount("loss", "1", 0.18, 0.7),),
+    enter=_enter,
+    native=True,
+    stated=lambda values, reference, joints: {"scale": 1 - values["loss"]},
+    restored=lambda given, x, reference, joints: {"loss": 1 - given["scale"]},
+)

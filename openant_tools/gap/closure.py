@@ -1,0 +1,318 @@
+"""How far the gap closes on runs that were not used: the model re-fitted within tolerance, with causes and without.
+
+Everything is judged as the gap is defined (formats, section 3): re-initialised from measurement, positions, held-out runs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.gap.explain import Hypothesis
+from openant_tools.gap.protocol import Played, Protocol
+from openant_tools.gap.robot import Robot
+from openant_tools.gap.simulation import simulate
+from openant_tools.gap.tolerance import COULOMB_NM, DELAY_S, FACTORS, ZERO_RAD
+from openant_tools.model.floor import floors
+from openant_tools.model.gap import HORIZON_S, excess
+from openant_tools.model.plant import Setup
+from openant_tools.model.rollout import Rollouts
+
+__all__ = ["Closure", "Refit", "Windows", "closures"]
+
+Array = NDArray[np.float64]
+
+#: standard deviation of a prior, as a share of the tolerance; and where it ends
+SPREAD, END = 0.6, 1.3
+#: rows (of some tens of milliseconds each) of one window say about as much as one: errors within it go together
+INDEPENDENT_S = 0.5
+#: standard deviation that sizes of causes keep from where they were found, as a share
+POLISH = 0.3
+ITERATIONS = 2
+
+
+@dataclass(frozen=True)
+class Refit:
+    """A model re-fitted within tolerance, with causes.
+
+    Attributes:
+        x: of each part of the hypothesis, its coordinates. nuisance: what else moved, in tolerances, see `Windows.names`.
+    """
+
+    hypothesis: Hypothesis
+    x: tuple[Mapping[str, float], ...]
+    nuisance: Array
+
+
+@dataclass(frozen=True)
+class Closure:
+    """What a hypothesis leaves of the gap on runs that its fit had not seen.
+
+    Attributes:
+        after: rad. closed: share of the excess that is gone; low, high: over the runs, 95 %.
+        worst: the least closed of any run that had a gap.
+        refit: on all training runs together.
+    """
+
+    after: float
+    closed: float
+    low: float
+    high: float
+    worst: float
+    refit: Refit
+
+
+@dataclass(frozen=True)
+class _Nuisance:
+    name: str
+    joints: tuple[int, ...]
+    tolerance: float
+
+    def enter(self, robot: Robot, u: float) -> None:
+        at = list(self.joints)
+        if self.name in FACTORS:
+            robot.factor(self.name)[at] *= np.exp(u * self.tolerance)
+        elif self.name == "coulomb_friction":
+            robot.more(self.name)[at] += u * self.tolerance
+        elif self.name == "zero_offset":
+            robot.zero[at] += u * self.tolerance
+        else:
+            robot.delay[at] += u * self.tolerance
+
+
+class Windows:
+    """Runs cut into windows, and what of the model is re-fitted on them.
+
+    Args:
+        protocol: the robot and its runs, at the model's own step.
+    """
+
+    def __init__(self, protocol: Protocol) -> None:
+        self.protocol = protocol
+        self.names = _nuisances(protocol)
+        self._rollouts = [Rollouts(one.plant, [one.run], HORIZON_S) for one in protocol.runs]
+        coarse = protocol.coarse()
+        self._quick = [Rollouts(one.plant, [one.run], HORIZON_S) for one in coarse.runs]
+        self._measured = [one.run.signal("pos", protocol.joints) for one in protocol.runs]
+        self.floor = floors([one.run for one in protocol.runs], protocol.joints)[0]
+        self._sigma = np.maximum(np.maximum(self.floor, 2e-4), 0.0)
+        self.fitted = [k for k, one in enumerate(protocol.runs) if one.plant.setup is Setup.STAND] or list(
+            range(len(protocol.runs))
+        )
+
+    def robot(self, refit: Refit | None) -> Robot:
+        reference = self.protocol.reference
+        robot = Robot(len(self.protocol.joints), reference.low, reference.high)
+        if refit is None:
+            return robot
+        for part, x in zip(refit.hypothesis, refit.x, strict=True):
+            joints = np.array(part.joints)
+            part.definition.enter(robot, joints, part.definition.values(x, reference, joints))
+        for one, u in zip(self.names, refit.nuisance, strict=True):
+            if u:
+                one.enter(robot, float(u))
+        return robot
+
+    def errors(self, k: int, refits: Sequence[Refit | None], *, quick: bool = False) -> Array:
+        """(refits, rows, joints) rad, measured minus simulated on run k."""
+        rollouts = (self._quick if quick else self._rollouts)[k]
+        found = simulate(rollouts, [self.robot(refit) for refit in refits], signals=("pos",)).signals["pos"]
+        out: Array = self._measured[k][None] - found.astype(np.float64)
+        return out
+
+    def refit(self, start: Refit, leave_out: Sequence[Sequence[int]]) -> list[Refit]:
+        """Fit within tolerance, and polish sizes, once for each set of runs to leave out.
+
+        All share one linearisation, at what is found on all runs.
+        """
+        centre = _vector(start)
+        scale = np.concatenate([np.maximum(POLISH * np.abs(centre), 1e-3), np.full(len(self.names), SPREAD)])
+        u = np.concatenate([centre, start.nuisance])
+        prior = np.concatenate([centre, np.zeros(len(self.names))])
+        blocks: list[tuple[Array, Array]] = []
+        for _ in range(ITERATIONS):
+            blocks = [
+                self._normal(k, start, u) if k in self.fitted else _nothing(len(u)) for k in range(len(self._quick))
+            ]
+            u = self._solve(u, prior, scale, blocks, ())
+        return [_from(start, self._solve(u, prior, scale, blocks, out, again=True)) for out in leave_out]
+
+    def _solve(
+        self,
+        u: Array,
+        prior: Array,
+        scale: Array,
+        blocks: Sequence[tuple[Array, Array]],
+        out: Sequence[int],
+        again: bool = False,
+    ) -> Array:
+        normal, gradient = np.diag(1 / scale**2), (u - prior) / scale**2
+        for k, (more, slope) in enumerate(blocks):
+            if k not in out:
+                normal, gradient = normal + more, gradient + slope
+        if again:
+            # The blocks were made before the last step: bring their gradients to where it led.
+            for k, (more, _) in enumerate(blocks):
+                if k not in out:
+                    gradient = gradient + more @ (u - self._at)
+        else:
+            self._at = u.copy()
+        step = -np.linalg.solve(normal, gradient)
+        found = u + step
+        low, high = np.full(len(u), -END), np.full(len(u), END)
+        n = len(u) - len(self.names)
+        low[:n] = np.where(prior[:n] >= 0, 0.0, 2.5 * prior[:n])
+        high[:n] = np.where(prior[:n] >= 0, 2.5 * prior[:n], 0.0)
+        clipped: Array = np.clip(found, low, high)
+        return clipped
+
+    def _normal(self, k: int, start: Refit, u: Array) -> tuple[Array, Array]:
+        """Normal matrix and gradient of run k at a point."""
+        one = self.protocol.runs[k]
+        columns = self._colours(one, start)
+        steps = np.concatenate(
+            [np.maximum(0.05 * np.abs(u[: len(u) - len(self.names)]), 1e-3), np.full(len(self.names), 0.3)]
+        )
+        refits = [_from(start, u)]
+        for members in columns:
+            moved = u.copy()
+            for p, _ in members:
+                moved[p] += steps[p]
+            refits.append(_from(start, moved))
+        errors = self.errors(k, refits, quick=True)
+        period = float(np.median(np.diff(one.run.t)))
+        weight = 1 / (self._sigma * np.sqrt(max(1.0, INDEPENDENT_S / period)))
+        base = np.nan_to_num(errors[0]) * weight
+        tangent = np.zeros((len(u), base.size), np.float32)
+        for row, members in enumerate(columns, 1):
+            change = np.nan_to_num(errors[row] - errors[0]) * weight
+            for p, mask in members:
+                tangent[p] = (np.where(mask, change, 0.0) / steps[p]).ravel()
+        return (tangent @ tangent.T).astype(np.float64), (tangent @ base.ravel().astype(np.float32)).astype(np.float64)
+
+    def _colours(self, one: Played, start: Refit) -> list[list[tuple[int, NDArray[np.bool_]]]]:
+        """Coordinates that one simulation can vary, because on the stand legs do not move each other."""
+        everywhere = np.ones(len(self.protocol.joints), bool)
+        out: list[list[tuple[int, NDArray[np.bool_]]]] = []
+        n = 0
+        for part in start.hypothesis:
+            for _ in part.definition.quantities:
+                out.append([(n, everywhere)])
+                n += 1
+        tree, used = one.plant.tree, []
+        for k, nuisance in enumerate(self.names):
+            mine = {int(tree[j]) for j in nuisance.joints} if one.plant.setup is Setup.STAND else set(tree.tolist())
+            mask = np.isin(tree, list(mine))
+            for trees, members in used:
+                if not trees & mine:
+                    trees |= mine
+                    members.append((n + k, mask))
+                    break
+            else:
+                used.append((mine, [(n + k, mask)]))
+        return out + [members for _, members in used]
+
+
+def closures(
+    windows: Windows, starts: Sequence[Refit], held_out: Sequence[int], training: Sequence[int]
+) -> tuple[float, float, list[Closure]]:
+    """The gap before, the floor (rad), and what each hypothesis leaves.
+
+    Args:
+        held_out: runs that nothing was fitted on; empty to leave out each in turn.
+        training: the runs to fit on.
+    """
+    judged = list(held_out) or list(range(len(windows.protocol.runs)))
+    folds = [tuple(held_out)] if held_out else [(k,) for k in judged]
+    refits: list[list[Refit]] = []
+    for start in starts:
+        refits.append(windows.refit(start, [*folds, tuple(held_out)]))
+    squares = np.zeros((len(starts) + 1, len(judged)))
+    counts = np.zeros(len(judged))
+    for n, k in enumerate(judged):
+        fold = 0 if held_out else n
+        errors = windows.errors(k, [None, *(mine[fold] for mine in refits)])
+        good = np.isfinite(errors).all(axis=0)
+        squares[:, n] = np.square(errors[:, good]).sum(axis=1)
+        counts[n] = good.sum()
+    floor = float(np.sqrt(np.mean(windows.floor**2)))
+    before = float(np.sqrt(squares[0].sum() / counts.sum()))
+    out = []
+    for s in range(len(starts)):
+        after = float(np.sqrt(squares[s + 1].sum() / counts.sum()))
+        low, high = _interval(squares[0], squares[s + 1], counts, floor)
+        each = [
+            _closed(np.sqrt(a / c), np.sqrt(b / c), floor)
+            for a, b, c in zip(squares[0], squares[s + 1], counts, strict=True)
+            if np.sqrt(a / c) > 1.5 * floor
+        ]
+        out.append(
+            Closure(after, _closed(before, after, floor), low, high, min(each, default=float("nan")), refits[s][-1])
+        )
+    return before, floor, out
+
+
+def _closed(before: float, after: float, floor: float) -> float:
+    there = excess(before, floor)
+    return 1 - excess(after, floor) / there if there > 0 else 0.0
+
+
+def _interval(before: Array, after: Array, counts: Array, floor: float) -> tuple[float, float]:
+    """95 % of the closure over runs drawn with replacement."""
+    rng = np.random.default_rng(0)
+    draws = rng.integers(len(counts), size=(400, len(counts)))
+    values = []
+    for draw in draws:
+        total = counts[draw].sum()
+        values.append(
+            _closed(float(np.sqrt(before[draw].sum() / total)), float(np.sqrt(after[draw].sum() / total)), floor)
+        )
+    low, high = np.quantile(values, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def _nuisances(protocol: Protocol) -> list[_Nuisance]:
+    """What may move within tolerance: per joint what is a joint's, per servo model what is a servo's."""
+    out = []
+    joints = range(len(protocol.joints))
+    for kind in ("stiffness", "damping", "torque_limit"):
+        if kind != "torque_limit" or np.isfinite(protocol.reference.limit).all():
+            out += [_Nuisance(kind, (j,), FACTORS[kind]) for j in joints]
+    out += [
+        _Nuisance("coulomb_friction", (j,), COULOMB_NM * min(1.0, float(protocol.reference.torque[j]) / 0.2))
+        for j in joints
+    ]
+    out += [_Nuisance("zero_offset", (j,), ZERO_RAD) for j in joints]
+    for group in protocol.servos():
+        out.append(_Nuisance("armature", tuple(group), FACTORS["armature"]))
+        out.append(_Nuisance("link_mass", tuple(group), FACTORS["link_mass"]))
+    out.append(_Nuisance("delay", tuple(joints), DELAY_S))
+    return out
+
+
+def nothing(windows: Windows) -> Refit:
+    """No cause at all, only what tolerances let move."""
+    return Refit((), (), np.zeros(len(windows.names)))
+
+
+def _nothing(n: int) -> tuple[Array, Array]:
+    return np.zeros((n, n)), np.zeros(n)
+
+
+def _vector(refit: Refit) -> Array:
+    return np.array(
+        [x[q.name] for part, x in zip(refit.hypothesis, refit.x, strict=True) for q in part.definition.quantities]
+    )
+
+
+def _from(start: Refit, u: Array) -> Refit:
+    at, x = 0, []
+    for part in start.hypothesis:
+        names = [q.name for q in part.definition.quantities]
+        x.append(dict(zip(names, map(float, u[at : at + len(names)]), strict=True)))
+        at += len(names)
+    return dataclasses.replace(start, x=tuple(x), nuisance=u[at:])

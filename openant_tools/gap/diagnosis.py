@@ -1,0 +1,166 @@
+"""A diagnosis as it is handed on: JSON of formats, section 2, and back."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from openant_tools.errors import BadInput
+
+__all__ = ["AMBIGUOUS", "NONE", "SCHEMA", "UNEXPLAINED", "Diagnosis", "Found", "Span", "read_diagnosis"]
+
+SCHEMA = "openant.gap/1"
+NONE, AMBIGUOUS, UNEXPLAINED = "none", "ambiguous", "unexplained"
+
+
+@dataclass(frozen=True)
+class Span:
+    """A parameter with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Found:
+    """One effect considered.
+
+    Attributes:
+        joints: names, or "all" or "body".
+        probability: the judge's, that it is present beyond tolerance.
+        gap_closed: share of the excess gap that it alone closes on held-out runs, with its interval; None where it was not
+            tried by itself.
+        native: whether a written MJCF carries it.
+        coordinates: of its fit, by which it is entered into simulations again.
+    """
+
+    effect: str
+    joints: tuple[str, ...] | str
+    parameters: Mapping[str, Span]
+    probability: float
+    gap_closed: float | None
+    gap_closed_low: float | None
+    gap_closed_high: float | None
+    native: bool
+    coordinates: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What is wrong with a simulation, as far as runs can tell.
+
+    Attributes:
+        effects: every one considered, best first.
+        selected: those that go into the improved model, first the one whose removal costs most.
+        ambiguous_with: sets that these runs cannot tell apart.
+        gap: "before", "after", "floor" in rad, "signals" besides.
+        where: shares of the excess, largest first.
+        calibration: kind → joint → factor or amount that the re-fit within tolerance found, for the improved model.
+        notes: what it rests on, and what more signals would add.
+    """
+
+    model: str
+    runs: tuple[str, ...]
+    held_out: tuple[str, ...]
+    verdict: str
+    confidence: float
+    effects: tuple[Found, ...]
+    selected: tuple[str, ...]
+    ambiguous_with: tuple[tuple[str, ...], ...]
+    next_experiment: str | None
+    gap: Mapping[str, Any]
+    where: Sequence[Mapping[str, Any]]
+    calibration: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    removal: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """As formats, section 2, has it; what is ours alone comes after."""
+        return {
+            "schema": SCHEMA,
+            "model": self.model,
+            "runs": list(self.runs),
+            "held_out": list(self.held_out),
+            "verdict": self.verdict,
+            "confidence": round(self.confidence, 4),
+            "effects": [
+                {
+                    "effect": one.effect,
+                    "joints": one.joints if isinstance(one.joints, str) else list(one.joints),
+                    "parameters": {
+                        name: {"value": _number(span.value), "low": _number(span.low), "high": _number(span.high)}
+                        for name, span in one.parameters.items()
+                    },
+                    "probability": round(one.probability, 4),
+                    "gap_closed": _number(one.gap_closed),
+                    "gap_closed_low": _number(one.gap_closed_low),
+                    "gap_closed_high": _number(one.gap_closed_high),
+                    "native": one.native,
+                    "coordinates": {name: _number(value) for name, value in one.coordinates.items()},
+                }
+                for one in self.effects
+            ],
+            "selected": list(self.selected),
+            "ambiguous_with": [list(group) for group in self.ambiguous_with],
+            "next_experiment": self.next_experiment,
+            "gap": dict(self.gap),
+            "where": [dict(place) for place in self.where],
+            "calibration": {kind: dict(values) for kind, values in self.calibration.items()},
+            "removal": {name: _number(value) for name, value in self.removal.items()},
+            "notes": list(self.notes),
+        }
+
+
+def read_diagnosis(path: Path) -> Diagnosis:
+    """A diagnosis from its JSON; raises BadInput where it is none."""
+    try:
+        text = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BadInput(
+            error.strerror or str(error), where=path, remedy="name the JSON of `openant gap diagnose`"
+        ) from None
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise BadInput(f"is not JSON: {error}", where=path, remedy="name the JSON of `openant gap diagnose`") from None
+    if not isinstance(text, dict) or text.get("schema") != SCHEMA:
+        raise BadInput(
+            f"is no diagnosis (schema {SCHEMA!r})", where=path, remedy="name the JSON of `openant gap diagnose`"
+        )
+    try:
+        effects = tuple(
+            Found(
+                effect=str(one["effect"]),
+                joints=one["joints"] if isinstance(one["joints"], str) else tuple(one["joints"]),
+                parameters={
+                    name: Span(float(span["value"]), float(span["low"]), float(span["high"]))
+                    for name, span in one["parameters"].items()
+                },
+                probability=float(one["probability"]),
+                gap_closed=one["gap_closed"],
+                gap_closed_low=one["gap_closed_low"],
+                gap_closed_high=one["gap_closed_high"],
+                native=bool(one["native"]),
+                coordinates={name: float(value) for name, value in one.get("coordinates", {}).items()},
+            )
+            for one in text["effects"]
+        )
+        return Diagnosis(
+            model=str(text["model"]), runs=tuple(text["runs"]), held_out=tuple(text["held_out"]),
+            verdict=str(text["verdict"]), confidence=float(text["confidence"]), effects=effects,
+            selected=tuple(text["selected"]), ambiguous_with=tuple(tuple(group) for group in text["ambiguous_with"]),
+            next_experiment=text["next_experiment"], gap=text["gap"], where=text["where"],
+            calibration=text.get("calibration", {}), removal=text.get("removal", {}), notes=tuple(text.get("notes", ())),
+        )  # fmt: skip
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadInput(
+            f"lacks or misstates {error}", where=path, remedy="make it anew with `openant gap diagnose`"
+        ) from None
+
+
+def _number(value: float | None) -> float | None:
+    """A JSON number; what is infinite or unknown has none."""
+    return float(f"{value:.6g}") if value is not None and math.isfinite(value) else None

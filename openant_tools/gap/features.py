@@ -1,0 +1,202 @@
+"""What a judge looks at: how a robot's log differs from the simulation's, in pieces long enough to be steady.
+
+Single samples on the floor chatter (a gram more moves them by many deviations), so that differences are averaged over
+blocks; what scatters within a block enters as the logarithm of its size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.gap.robot import Robot
+from openant_tools.model.plant import Setup
+from openant_tools.recording.run import Run
+
+__all__ = ["COLUMNS", "Layout", "Signals", "logged", "with_noise"]
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+#: signal → (robots, rows, columns)
+Signals = Mapping[str, Floats]
+
+#: signals of the body → their columns in a run
+COLUMNS: Mapping[str, tuple[str, ...]] = {
+    "gyro": ("gyro.x", "gyro.y", "gyro.z"),
+    "acc": ("acc.x", "acc.y", "acc.z"),
+    "base": ("base.x", "base.y", "base.z"),
+    "yaw": ("base.yaw",),
+}
+#: what a servo says of its torque, best first; none in N·m, so that all are brought to the model's own scale
+TORQUES = ("cur", "load", "pwm")
+#: s: at the start of a run that is left out (where the robot really began is not known well), and of blocks
+SKIP_S, STAND_BLOCK_S, ONE_JOINT_BLOCK_S, FLOOR_BLOCK_S, SCATTER_BLOCK_S = 0.5, 0.1, 0.05, 0.2, 0.4
+#: least size of a scatter, as a share of the signal's noise
+LEAST = 0.3
+SCATTERING = ("vel", "gyro", "acc")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the rows of one run become features.
+
+    Attributes:
+        t: (rows,) s since the run's start. setup: how the robot stood. joints: how many.
+        signals: which, in order.
+        seconds: how long the protocol's run is: a log that goes on longer is cut there.
+    """
+
+    t: Array
+    setup: Setup
+    joints: int
+    signals: tuple[str, ...]
+    seconds: float
+
+    def blocks(self, signal: str) -> Array:
+        """Edges of the blocks of a signal, s."""
+        if self.setup is Setup.FLOOR or signal in COLUMNS:
+            width = FLOOR_BLOCK_S
+        else:
+            width = ONE_JOINT_BLOCK_S if self.joints <= 2 else STAND_BLOCK_S
+        count = max(1, int((self.seconds - SKIP_S) / width + 1e-6))
+        return SKIP_S + width * np.arange(count + 1)
+
+    def groups(self) -> dict[str, list[str]]:
+        """Signal → the names of its features, in the order of `features`."""
+        out: dict[str, list[str]] = {}
+        for signal in self.signals:
+            n = _width(signal, self.joints)
+            count = len(self.blocks(signal)) - 1
+            out[signal] = ["mean"] * (count * n) + ["size"] * n + ["rough"] * n
+        return out
+
+    def features(self, differences: Signals) -> Floats:
+        """(robots, features): block means, and logarithms of sizes, of the differences (robots, rows, columns)."""
+        parts = []
+        for signal in self.signals:
+            x = differences[signal]
+            edges = self.blocks(signal)
+            means = _means(x, self.t, edges)
+            n = x.shape[0]
+            size = np.log10(np.sqrt(np.nanmean(np.square(means), axis=1)) + _least(signal))
+            rough = self._roughness(signal, x)
+            parts += [np.nan_to_num(means).reshape(n, -1), np.nan_to_num(size), np.nan_to_num(rough)]
+        return np.concatenate(parts, axis=1).astype(np.float32)
+
+    def _roughness(self, signal: str, x: Floats) -> Floats:
+        """(robots, columns): logarithm of what scatters faster than blocks."""
+        seen = self.t >= SKIP_S
+        change = np.diff(x[:, seen], axis=1)
+        out: Floats = np.log10(np.sqrt(np.nanmean(np.square(change), axis=1)) + LEAST * _least(signal))
+        return out
+
+
+def logged(run: Run, joints: Sequence[str]) -> dict[str, Floats]:
+    """The signals that a run has, (1, rows, columns) each; torque in whatever unit the servo gives it."""
+    out: dict[str, Floats] = {}
+    for name in ("pos", "vel"):
+        if run.has(name, joints):
+            out[name] = run.signal(name, joints)[None].astype(np.float32)
+    for name in TORQUES:
+        if all(run.has(name, [joint]) for joint in joints):
+            out["torque"] = run.signal(name, joints)[None].astype(np.float32)
+            break
+    if run.has("volt", joints):
+        volts = run.signal("volt", joints)
+        supply = run.facts.supply_v or float(np.nanpercentile(volts, 95))
+        out["volt"] = (volts / supply)[None].astype(np.float32)
+    for name, columns in COLUMNS.items():
+        values = np.stack([run.column(column) for column in columns], axis=1)
+        if np.isfinite(values).any():
+            if name == "yaw":
+                values = _unwrapped(values)
+            out[name] = values[None].astype(np.float32)
+    return out
+
+
+def differences(seen: Signals, simulated: Signals, names: Sequence[str]) -> dict[str, Floats]:
+    """What was seen minus what the model does, (robots, rows, columns) each.
+
+    A torque is scaled first, joint by joint, so that it fits the model's best: its unit is not known. Supplies are shares of
+    the best seen. Base and heading count from where the robot started.
+    """
+    out: dict[str, Floats] = {}
+    for name in names:
+        x, model = seen[name], simulated[name]
+        if name == "torque":
+            known = np.where(np.isfinite(x), model, 0.0)
+            power = np.einsum("rtj,rtj->rj", known, known)
+            slope = np.einsum("rtj,rtj->rj", np.nan_to_num(x), np.broadcast_to(known, x.shape)) / np.maximum(
+                power, 1e-12
+            )
+            usual = np.median(np.abs(slope), axis=1, keepdims=True)
+            slope = np.where(np.abs(slope) > 0.2 * usual, slope, usual)
+            out[name] = (x / np.maximum(np.abs(slope), 1e-12)[:, None] - model).astype(np.float32)
+        elif name == "volt":
+            best = np.nanpercentile(x.reshape(len(x), -1), 95, axis=1)[:, None, None]
+            out[name] = (x / best - 1).astype(np.float32)
+        elif name in ("base", "yaw"):
+            out[name] = (_from_start(x) - _from_start(model)).astype(np.float32)
+        else:
+            out[name] = (x - model).astype(np.float32)
+    return out
+
+
+def with_noise(
+    signals: Signals, robots: Sequence[Robot], resolution: Mapping[str, float], rng: np.random.Generator
+) -> dict[str, Floats]:
+    """What imperfect sensors make of the truth: noise of each robot's own size, and steps."""
+    out: dict[str, Floats] = {}
+    for name, x in signals.items():
+        noise = np.array([robot.noise.get(name, 0.0) for robot in robots], np.float32)[:, None, None]
+        scale = 1.0
+        if name == "torque":
+            # A current sensor's noise is a share of what the servo usually gives.
+            scale = np.maximum(np.nanstd(x, axis=1, keepdims=True), 1e-6)
+        y = x + noise * scale * rng.standard_normal(x.shape, np.float32)
+        if name == "torque":
+            zero = np.array([robot.noise.get("torque_zero", 0.0) for robot in robots], np.float32)[:, None, None]
+            y = y + zero * scale * rng.standard_normal((len(x), 1, x.shape[2]), np.float32)
+        step = resolution.get(name, 0.0)
+        out[name] = (np.round(y / step) * step if step > 0 else y).astype(np.float32)
+    return out
+
+
+def _width(signal: str, joints: int) -> int:
+    return len(COLUMNS[signal]) if signal in COLUMNS else joints
+
+
+def _least(signal: str) -> float:
+    from openant_tools.gap.robot import USUAL_NOISE
+
+    return LEAST * USUAL_NOISE[signal]
+
+
+def _from_start(x: Floats) -> Floats:
+    first = np.nanmean(x[:, :3], axis=1, keepdims=True)
+    out: Floats = x - first
+    return out
+
+
+def _unwrapped(values: Array) -> Array:
+    out = values.copy()
+    seen = np.isfinite(out[:, 0])
+    out[seen, 0] = np.unwrap(out[seen, 0])
+    return out
+
+
+def _means(x: Floats, t: Array, edges: Array) -> Floats:
+    """(robots, blocks, columns) means of the finite samples between edges; NaN where there is none."""
+    at = np.searchsorted(t, edges)
+    inside = slice(at[0], max(at[-1], at[0] + 1))
+    finite = np.isfinite(x[:, inside])
+    values = np.where(finite, x[:, inside], 0.0)
+    starts = np.clip(at[:-1] - at[0], 0, values.shape[1] - 1)
+    total = np.add.reduceat(values, starts, axis=1)
+    count = np.add.reduceat(finite.astype(np.float32), starts, axis=1)
+    empty = at[:-1] >= at[1:]
+    out: Floats = np.where((count > 0) & ~empty[None, :, None], total / np.maximum(count, 1), np.nan)
+    return out

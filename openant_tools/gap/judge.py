@@ -1,0 +1,343 @@
+"""Which causes a log shows: learned from simulated robots, one probability for each cause, because real robots have several.
+
+Differences are measured by what healthy robots of one build show: tolerances, chatter, numerical form and sensors in one
+covariance. In that measure a robot is compared with templates, each the model with one cause at one place: how well the best
+template of a cause fits, over all and signal by signal, is what a forest of trees decides by. Its probabilities are calibrated on
+robots that the deciding trees have not seen.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.ensemble import ExtraTreesClassifier
+from sklearn.linear_model import LogisticRegression
+
+from openant_tools.gap import tolerance
+from openant_tools.gap.cause import catalogue
+from openant_tools.gap.features import Floats
+from openant_tools.gap.population import Case
+from openant_tools.gap.prepare import Prepared
+from openant_tools.gap.robot import Reference
+
+__all__ = ["Judge", "Judgement", "Whitening", "train", "whitening_of"]
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+#: directions kept of what healthy robots do beyond their tolerances
+HEALTHY_DIRECTIONS = 40
+#: deviations beyond which a difference says no more
+CLIP = 40.0
+#: standard deviation of a robot within a tolerance, as a share of it
+SPREAD = 0.6
+#: the forest
+TREES, LEAF, TRIED = 500, 2, 0.15
+#: share of healthy robots whose energy lies above the gate
+GATE = 0.02
+#: causes whose templates show what tolerances do: cause → the tolerance of its coordinate, for a robot's reference
+NUISANCES: dict[str, Callable[[Reference, Ints], float]] = {
+    "stiffness_error": lambda reference, joints: tolerance.FACTORS["stiffness"],
+    "damping_error": lambda reference, joints: tolerance.FACTORS["damping"],
+    "torque_limit": lambda reference, joints: tolerance.FACTORS["torque_limit"],
+    "armature_error": lambda reference, joints: tolerance.FACTORS["armature"],
+    "link_mass": lambda reference, joints: tolerance.FACTORS["link_mass"],
+    "coulomb_friction": lambda reference, joints: tolerance.COULOMB_NM / float(reference.torque[joints].mean()),
+    "zero_offset": lambda reference, joints: tolerance.ZERO_RAD,
+    "action_delay": lambda reference, joints: tolerance.DELAY_S,
+    "floor_friction": lambda reference, joints: tolerance.FLOOR_FRICTION,
+    "contact_softness": lambda reference, joints: tolerance.SOFTNESS,
+    "floor_tilt": lambda reference, joints: tolerance.TILT_RAD,
+    "imu_misalignment": lambda reference, joints: tolerance.IMU_RAD,
+    "payload": lambda reference, joints: tolerance.TORSO_KG / reference.robot_kg,
+}
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What a judge says of one robot.
+
+    Attributes:
+        probability: cause → that it is present beyond tolerance.
+        joints: (joints,) that something sits at this joint and not at all of them.
+        energy: of the whitened differences, as a multiple of the healthy robots' gate: below 1 a robot looks healthy.
+        places: cause → where its best templates sit and their coordinates, best first, each place once.
+    """
+
+    probability: dict[str, float]
+    joints: Array
+    energy: float
+    places: dict[str, list[tuple[tuple[int, ...], dict[str, float]]]]
+
+
+@dataclass(frozen=True)
+class Whitening:
+    """What healthy robots do, taken out of the measure: Σ = M Mᵀ + σ², by its eigenvectors.
+
+    Attributes:
+        centre, scale: (features,) of the differences. basis: (features, directions). gains: (directions,) on top of 1/rest.
+        rest: σ.
+    """
+
+    centre: Array
+    scale: Array
+    basis: Floats
+    gains: Floats
+    rest: float
+
+    def __call__(self, x: Floats) -> Floats:
+        """(robots, features) of differences."""
+        return self.measure(np.clip((x - self.centre) / self.scale, -CLIP, CLIP).astype(np.float32))
+
+    def measure(self, d: Floats) -> Floats:
+        """(robots, features) of differences already scaled."""
+        out: Floats = (d / self.rest + ((d @ self.basis) * self.gains) @ self.basis.T).astype(np.float32)
+        return out
+
+
+@dataclass(frozen=True)
+class Judge:
+    """A trained judge; `say` is what it is for.
+
+    Attributes:
+        causes: by name, in the order of its probabilities. joints: how many.
+        means, logs: which of the features are block means, and which are logarithms of sizes.
+        bank: cause, joints and coordinates of each template. templates: whitened.
+        groups: of each block mean, its run and signal.
+    """
+
+    causes: tuple[str, ...]
+    joints: int
+    means: Bools
+    logs: Bools
+    log_centre: Floats
+    log_scale: Floats
+    whitening: Whitening
+    bank: tuple[tuple[str, tuple[int, ...], dict[str, float]], ...]
+    templates: Floats
+    groups: Ints
+    gates: Array
+    forest: ExtraTreesClassifier | None = None
+    calibration: tuple[tuple[float, float], ...] = ()
+
+    def inputs(self, x: Floats) -> Floats:
+        """(robots, inputs) of the forest, of features (robots, features)."""
+        z = self.whitening(x[:, self.means])
+        fit = self._fits(z)
+        size = np.linalg.norm(z, axis=1, keepdims=True)
+        parts = [
+            np.log10(size + 1e-3),
+            self._by_cause(fit) / size,
+            np.arcsinh(self._by_cause(fit)),
+            self._by_joint(fit) / size,
+        ]
+        for group in np.unique(self.groups):
+            mine = self.groups == group
+            own = np.linalg.norm(z[:, mine], axis=1, keepdims=True)
+            parts += [
+                self._by_cause(self._fits(z, mine)) / np.maximum(own, 1e-6),
+                np.log10(own + 1e-3) - np.log10(size + 1e-3),
+            ]
+        logs = ((x[:, self.logs] - self.log_centre) / self.log_scale).clip(-8, 8)
+        out: Floats = np.concatenate([*parts, logs], axis=1).astype(np.float32)
+        return out
+
+    def energy(self, x: Floats) -> Array:
+        """(robots,) largest energy of any run's signal, as a multiple of its gate."""
+        return np.asarray((_energies(self.whitening(x[:, self.means]), self.groups) / self.gates).max(axis=1))
+
+    def say(self, x: Floats) -> Judgement:
+        """Judge one robot, of features (features,)."""
+        assert self.forest is not None
+        inputs = self.inputs(x[None])
+        raw = np.array([p[0, 1] if p.shape[1] > 1 else 0.0 for p in self.forest.predict_proba(inputs)])
+        chances = [_logistic(a * _logit(p) + b) for p, (a, b) in zip(raw, self.calibration, strict=True)]
+        n = len(self.causes)
+        fit = self._fits(self.whitening(x[None, self.means]))[0]
+        places: dict[str, list[tuple[tuple[int, ...], dict[str, float]]]] = {cause: [] for cause in self.causes}
+        for k in np.argsort(-fit):
+            name, where, x_ = self.bank[int(k)]
+            if where not in [there for there, _ in places[name]]:
+                places[name].append((where, dict(x_)))
+        return Judgement(
+            dict(zip(self.causes, map(float, chances[:n]), strict=True)),
+            np.array(chances[n:]),
+            float(self.energy(x[None])[0]),
+            places,
+        )
+
+    def _fits(self, z: Floats, some: Bools | None = None) -> Floats:
+        """(robots, templates) how far each goes along each template, none backwards."""
+        templates = self.templates if some is None else self.templates[:, some]
+        length = np.linalg.norm(templates, axis=1)
+        out: Floats = np.maximum((z if some is None else z[:, some]) @ templates.T / np.maximum(length, 1e-6), 0.0)
+        return out
+
+    def _by_cause(self, fit: Floats) -> Floats:
+        names = np.array([name for name, _, _ in self.bank])
+        return np.stack([fit[:, names == cause].max(axis=1) for cause in self.causes], axis=1)
+
+    def _by_joint(self, fit: Floats) -> Floats:
+        single = [where[0] if len(where) == 1 else -1 for _, where, _ in self.bank]
+        return np.stack([fit[:, np.array(single) == j].max(axis=1, initial=0.0) for j in range(self.joints)], axis=1)
+
+
+def train(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools], seed: int = 0) -> Judge:
+    """Train a judge on some runs of a prepared protocol.
+
+    Args:
+        which: the runs that the robots at hand have.
+        columns: of each of them, the features that they have.
+    """
+    kept = np.concatenate(list(columns))
+    x = np.concatenate([prepared.features[k] for k in which], axis=1)[:, kept]
+    templates = np.concatenate([prepared.templates[k] for k in which], axis=1)[:, kept]
+    means, groups = _layout(prepared, which)
+    means, groups = means[kept], np.unique(groups[kept], return_inverse=True)[1]
+    healthy = np.flatnonzero(prepared.healthy())
+    np.random.default_rng(seed).shuffle(healthy)
+    # Those that the measure comes from look too healthy to it: they must not teach what healthy looks like.
+    measure, others = np.split(healthy, [max(20, len(healthy) // 2)])
+    whitening = _whiten(x[measure][:, means], templates[:, means], prepared.bank, prepared.protocol.reference)
+    moved = whitening.measure(np.clip(templates[:, means] / whitening.scale, -CLIP, CLIP).astype(np.float32))
+    seen = np.linalg.norm(moved, axis=1) > 1e-3
+    bank = tuple(
+        (name, where, x_)
+        for case, shown in zip(prepared.bank, seen, strict=True)
+        for name, (where, x_) in case.causes.items()
+        if shown
+    )
+    logs = x[measure][:, ~means]
+    names = tuple(sorted({name for name, _, _ in bank}))
+    joints = len(prepared.protocol.joints)
+    energies = _energies(whitening(x[others][:, means]), groups[means])
+    judge = Judge(
+        names, joints, means, ~means, np.median(logs, axis=0), logs.std(axis=0) + 0.05, whitening, bank, moved[seen],
+        groups[means], np.quantile(energies, 1 - GATE, axis=0),
+    )  # fmt: skip
+    labels = _labels(prepared, names, joints)
+    taught = np.concatenate([np.flatnonzero(~prepared.healthy()), others])
+    forest = ExtraTreesClassifier(
+        TREES, min_samples_leaf=LEAF, max_features=TRIED, bootstrap=True, oob_score=True, n_jobs=-1, random_state=seed
+    )
+    inputs = np.concatenate([judge.inputs(x[taught[k : k + 256]]) for k in range(0, len(taught), 256)])
+    forest.fit(inputs, labels[taught])
+    unseen = _unseen(forest, labels.shape[1])
+    calibration = tuple(_calibrated(unseen[:, k], labels[taught, k]) for k in range(labels.shape[1]))
+    forest.oob_decision_function_ = None  # of no use any more, and large
+    return dataclasses.replace(judge, forest=forest, calibration=calibration)
+
+
+def whitening_of(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools]) -> tuple[Whitening, Bools]:
+    """The measure of some runs' block means alone, and which of their features it takes."""
+    means, _ = _layout(prepared, which)
+    chosen = means & np.concatenate(list(columns))
+    x = np.concatenate([prepared.features[k] for k in which], axis=1)[:, chosen]
+    templates = np.concatenate([prepared.templates[k] for k in which], axis=1)[:, chosen]
+    return _whiten(x[prepared.healthy()], templates, prepared.bank, prepared.protocol.reference), chosen
+
+
+def _layout(prepared: Prepared, which: Sequence[int]) -> tuple[Bools, Ints]:
+    """Which features are block means, and to which run and signal each belongs."""
+    means, groups = [], []
+    for n, k in enumerate(which):
+        for m, kinds in enumerate(prepared.protocol.runs[k].layout.groups().values()):
+            means += [kind == "mean" for kind in kinds]
+            groups += [100 * n + m] * len(kinds)
+    return np.array(means), np.array(groups)
+
+
+def _labels(prepared: Prepared, names: Sequence[str], joints: int) -> Ints:
+    labels = np.zeros((len(prepared.cases), len(names) + joints), np.int64)
+    for row, case in enumerate(prepared.cases):
+        for name, (where, _) in case.causes.items():
+            if name not in names:
+                continue
+            labels[row, names.index(name)] = 1
+            if len(where) < joints:
+                labels[row, [len(names) + j for j in where]] = 1
+    return labels
+
+
+def _whiten(x: Floats, templates: Floats, bank: Sequence[Case], reference: Reference) -> Whitening:
+    """Σ of healthy robots: what tolerances do, by the templates' directions, and what else healthy robots show."""
+    centre = np.median(x, axis=0).astype(np.float64)
+    scale = np.std(x, axis=0).astype(np.float64)
+    scale = np.maximum(scale, max(1e-3 * float(np.median(scale)), 1e-9))
+    d = np.clip((x - centre) / scale, -CLIP, CLIP).astype(np.float32)
+    tolerances = _tolerances(templates / scale, bank, reference)
+    inner = np.linalg.solve(tolerances.T @ tolerances + np.eye(tolerances.shape[1]), tolerances.T @ d.T)
+    rest = d - (tolerances @ inner).T
+    # Directions from one half, what lies along them from the other: neither flatters itself.
+    half = len(rest) // 2
+    a, b = rest[:half], rest[half:]
+    count = max(2, min(HEALTHY_DIRECTIONS, half // 3))
+    _, vectors = np.linalg.eigh(a @ a.T)
+    own = np.linalg.qr(a.T @ vectors[:, -count:])[0]
+    along = b @ own
+    variance = float(np.mean((b - along @ own.T) ** 2))
+    more = np.sqrt(np.maximum(np.mean(along**2, axis=0) - variance, 0.0))
+    both = np.hstack([tolerances, own * more])
+    squares, vectors = np.linalg.eigh(both.T @ both)
+    keep = squares > 1e-6 * squares.max()
+    basis = (both @ vectors[:, keep]) / np.sqrt(squares[keep])
+    gains = 1 / np.sqrt(squares[keep] + variance) - 1 / np.sqrt(variance)
+    return Whitening(centre, scale, basis.astype(np.float32), gains.astype(np.float32), float(np.sqrt(variance)))
+
+
+def _tolerances(templates: Array, bank: Sequence[Case], reference: Reference) -> Floats:
+    """(features, nuisances): how a robot moves that is one deviation within each tolerance."""
+    out = [np.zeros(templates.shape[1])]
+    taken = set()
+    for template, case in zip(templates, bank, strict=True):
+        ((name, (joints, x)),) = case.causes.items()
+        if name not in NUISANCES:
+            continue
+        main = max((q for q in catalogue()[name].quantities if not q.shape), key=lambda q: abs(x[q.name]) / q.small)
+        key = (name, joints, main.name)
+        # The smallest template of a place: the nearest to a derivative.
+        if key in taken:
+            continue
+        taken.add(key)
+        out.append(template * (SPREAD * NUISANCES[name](reference, np.array(joints)) / x[main.name]))
+    found: Floats = np.array(out).T.astype(np.float32)
+    return found
+
+
+def _energies(z: Floats, groups: Ints) -> Array:
+    count = np.bincount(groups)
+    sums = np.stack([np.bincount(groups, row) for row in np.square(z, dtype=np.float64)])
+    out: Array = sums / np.maximum(count, 1)
+    return out
+
+
+def _unseen(forest: ExtraTreesClassifier, outputs: int) -> Array:
+    """(robots, outputs) votes of the trees that had not seen each robot."""
+    votes = np.asarray(forest.oob_decision_function_)
+    if votes.ndim == 3 and votes.shape[1] == 2:
+        return np.nan_to_num(votes[:, 1, :outputs])
+    return np.stack([np.nan_to_num(votes[:, k, 1]) for k in range(outputs)], axis=1)
+
+
+def _logit(p: float | Array) -> Array:
+    clipped = np.clip(p, 0.002, 0.998)
+    out: Array = np.log(clipped / (1 - clipped))
+    return out
+
+
+def _logistic(x: float | Array) -> float:
+    return float(1 / (1 + np.exp(-x)))
+
+
+def _calibrated(votes: Array, label: Ints) -> tuple[float, float]:
+    """Platt's scale and offset on the logit of the votes."""
+    if label.sum() < 5:
+        return 1.0, 0.0
+    model = LogisticRegression(C=10.0).fit(_logit(votes)[:, None], label)
+    scale = float(model.coef_[0, 0])
+    return (scale, float(model.intercept_[0])) if scale > 0.1 else (1.0, 0.0)

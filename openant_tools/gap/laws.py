@@ -1,0 +1,199 @@
+"""What acts between the steps of a simulated robot beside the effects of `openant_tools.effects`.
+
+The laws here stand for effects that MuJoCo has features for. A written model uses those; simulations of many robots at once
+cannot, because a hinge or a motor more would be another model, and so have them as laws. Both are compared in the tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.effects.step import Law, Step
+from openant_tools.gap.robot import Robot
+
+__all__ = ["Fields", "first_laws", "last_laws"]
+
+Array = NDArray[np.float64]
+
+#: °C by which a winding that gives all its torque warms up in the end; sizes of derating are per °C of it
+FULL_HEAT_C = 60.0
+#: least share of the torque that heat leaves
+COLDEST = 0.2
+#: share of the stiffest spring that a step can integrate, for what is to be hard
+HARD = 0.15
+#: share of critical damping in a spring
+DAMPED = 0.3
+#: kg·m² that a rotor leaves at the joint once it turns by itself
+BARE = 1e-5
+#: numbers that only must not be zero
+TINY = 1e-9
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Live model fields of the simulations, (n, joints): what a servo's rotor brings to its joint.
+
+    Attributes:
+        armature, damping, friction: kg·m², N·m·s/rad, N·m. link: kg·m², inertia of the joint's links without the rotor.
+    """
+
+    armature: Array
+    damping: Array
+    friction: Array
+    link: Array
+
+
+def first_laws(robots: Sequence[Robot], fields: Fields) -> list[Law]:
+    """The laws on what the servo is asked and may give."""
+    laws: list[Law] = []
+    slew, no_load = _table(robots, "slew"), _table(robots, "no_load")
+    derating = _table(robots, "derating")
+    if np.isfinite(slew).any():
+        laws.append(_slewing(slew))
+    if derating.any():
+        laws.append(_heating(derating, np.array([[robot.derating_s] for robot in robots])))
+    if np.isfinite(no_load).any():
+        laws.append(_fading(no_load))
+    return laws
+
+
+def last_laws(robots: Sequence[Robot], fields: Fields) -> list[Law]:
+    """The laws on what reaches the link."""
+    laws: list[Law] = []
+    electrical = _table(robots, "electrical")
+    if electrical.any():
+        laws.append(_braking(electrical * fields.damping / np.maximum(1 - electrical, TINY)))
+    low, high = _table(robots, "stop_low"), _table(robots, "stop_high")
+    if np.isfinite(low).any() or np.isfinite(high).any():
+        laws.append(_stopping(low, high, fields.armature + fields.link))
+    smooth = np.array([[robot.form.smooth_friction if robot.form else 0.0] for robot in robots])
+    if smooth.any():
+        laws.append(_smoothing(smooth))
+    bristle = np.array([[robot.form.bristle if robot.form else 0.0] for robot in robots])
+    if bristle.any():
+        laws.append(_bending(bristle, fields.armature + fields.link))
+    play, compliance = _table(robots, "play"), _table(robots, "compliance")
+    if play.any() or compliance.any():
+        laws.append(_transmitting(play, compliance, fields))
+    return laws
+
+
+def _table(robots: Sequence[Robot], name: str) -> Array:
+    return np.array([getattr(robot, name) for robot in robots])
+
+
+def _slewing(rate: Array) -> Law:
+    at: list[Array] = []
+
+    def act(step: Step) -> None:
+        if not at:
+            at.append(step.setpoint.copy())
+        at[0] += np.clip(step.setpoint - at[0], -rate * step.dt, rate * step.dt)
+        step.setpoint = at[0].copy()
+
+    return act
+
+
+def _heating(loss: Array, seconds: Array) -> Law:
+    heat = np.zeros(loss.shape)
+
+    def act(step: Step) -> None:
+        share = np.minimum(np.abs(step.motor_torque) / np.maximum(step.limit, TINY), 1.0)
+        heat[:] += step.dt / seconds * (FULL_HEAT_C * share**2 - heat)
+        left = np.maximum(1 - loss * heat, COLDEST)
+        step.stiffness *= left
+        step.velocity_gain *= left
+        step.limit *= left
+
+    return act
+
+
+def _fading(no_load: Array) -> Law:
+    def act(step: Step) -> None:
+        along = step.motor_torque * step.velocity > 0
+        left = np.clip(1 - np.abs(step.velocity) / no_load, TINY, 1.0)
+        step.limit *= np.where(along, left, 1.0)
+
+    return act
+
+
+def _braking(slope: Array) -> Law:
+    def act(step: Step) -> None:
+        step.torque -= np.where(step.on, slope * step.velocity, 0.0)
+
+    return act
+
+
+def _stopping(low: Array, high: Array, inertia: Array) -> Law:
+    def act(step: Step) -> None:
+        spring, damper = HARD * inertia / step.dt**2, HARD * inertia / step.dt
+        beyond = np.maximum(step.position - high, 0.0) + np.minimum(step.position - low, 0.0)
+        step.torque -= np.where(beyond != 0, spring * beyond + damper * step.velocity, 0.0)
+
+    return act
+
+
+def _smoothing(reach: Array) -> Law:
+    def act(step: Step) -> None:
+        smooth = reach > 0
+        step.torque -= np.where(smooth, step.friction * np.tanh(step.velocity / np.maximum(reach, TINY)), 0.0)
+        step.friction = np.where(smooth, 0.0, step.friction)
+
+    return act
+
+
+def _bending(bristle: Array, inertia: Array) -> Law:
+    """LuGre's friction (Canudas de Wit 1995): z' = v − |v| σ₀ z / level, torque σ₀ z + σ₁ z', z taken implicitly."""
+    mine = np.broadcast_to(bristle > 0, inertia.shape)
+    bent = np.zeros(inertia.shape)
+
+    def act(step: Step) -> None:
+        level = np.maximum(step.friction, TINY)
+        stiff = np.minimum(level / np.maximum(bristle, TINY), HARD * inertia / step.dt**2)
+        moved = (bent + step.dt * step.velocity) / (1 + step.dt * stiff * np.abs(step.velocity) / level)
+        damper = 2 * DAMPED * np.sqrt(stiff * inertia) * (moved - bent) / step.dt
+        step.torque -= np.where(mine, stiff * moved + damper, 0.0)
+        bent[:] = moved
+        step.friction = np.where(mine, 0.0, step.friction)
+
+    return act
+
+
+def _transmitting(play: Array, compliance: Array, fields: Fields) -> Law:
+    """A rotor behind play or a spring; the servo's loop closes over both, as the encoder sits on the output.
+
+    The rotor is integrated here, semi-implicitly; the joint keeps its links. Hard teeth are as stiff as a step can take.
+    """
+    mine = (play > 0) | (compliance > 0)
+    rotor, damping = np.where(mine, fields.armature, 1.0), np.where(mine, fields.damping, 0.0)
+    link = np.maximum(fields.link, 10 * BARE)
+    fields.armature[mine] = np.minimum(BARE, fields.armature[mine])
+    fields.damping[mine] = 0.0
+    angle: list[Array] = []
+    speed = np.zeros(play.shape)
+
+    def act(step: Step) -> None:
+        if not angle:
+            angle.append(step.position.copy())
+            speed[:] = step.velocity
+        hard = HARD * np.minimum(link, rotor) / step.dt**2
+        spring = np.where(compliance > 0, np.minimum(1 / np.maximum(compliance, TINY), hard), hard)
+        damper = 2 * DAMPED * np.sqrt(spring * np.minimum(link, rotor))
+        twist = angle[0] - step.position
+        beyond = np.sign(twist) * np.maximum(np.abs(twist) - play / 2, 0.0)
+        passed = np.where(beyond != 0, spring * beyond + damper * (speed - step.velocity), 0.0)
+        motor = step.motor_torque
+        faster = (speed + step.dt / rotor * (motor + step.torque - passed)) / (1 + step.dt * damping / rotor)
+        slowed = np.sign(faster) * np.maximum(np.abs(faster) - step.dt * step.friction / rotor, 0.0)
+        speed[:] = np.where(mine, slowed, step.velocity)
+        angle[0] = np.where(mine, angle[0] + step.dt * speed, step.position)
+        step.torque = np.where(mine, passed, step.torque)
+        step.friction = np.where(mine, 0.0, step.friction)
+        step.stiffness = np.where(mine, TINY, step.stiffness)
+        step.velocity_gain = np.where(mine, TINY, step.velocity_gain)
+
+    return act

@@ -1,0 +1,167 @@
+"""Simulated robots at random: healthy ones, and ones with one cause or several, all of them as different as one build is."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.gap.cause import Cause, Scope, catalogue
+from openant_tools.gap.features import Floats, differences, with_noise
+from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.robot import Robot
+from openant_tools.gap.simulation import simulate
+from openant_tools.gap.tolerance import random_form, scatter
+from openant_tools.model.rollout import Rollouts
+
+__all__ = ["Case", "applicable", "draw", "play", "templates"]
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+#: how many robots have none, one, two … causes
+COUNTS = (0.24, 0.52, 0.18, 0.04, 0.02)
+#: of one joint's model robots have more causes at once: it is cheap, and real servos have many
+COUNTS_ONE_JOINT = (0.15, 0.30, 0.2, 0.15, 0.1, 0.06, 0.04)
+#: what tolerances are drawn wider by
+WIDTH = 1.15
+#: how unequal the joints are that share a cause
+UNEQUAL = 0.1
+#: strengths of templates
+TEMPLATES = (0.2, 0.5, 0.85)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a simulated robot has.
+
+    Attributes:
+        causes: name → (indices of joints, coordinates).
+        seed: of its scatter; below 0 for a template, which has none.
+    """
+
+    causes: dict[str, tuple[tuple[int, ...], dict[str, float]]]
+    seed: int
+
+
+def applicable(protocol: Protocol) -> list[Cause]:
+    """The causes that can show on what this protocol recorded."""
+    one = len(protocol.joints) == 1
+    found = []
+    for cause in catalogue().values():
+        # What is prepared serves robots with any sensors: what shows only to some is left to the judge.
+        everything = dataclasses.replace(
+            protocol.reference, imu=protocol.reference.floor, tracker=protocol.reference.floor
+        )
+        if not cause.shows(everything):
+            continue
+        if one and cause.name in ("weak_joint",):
+            continue  # with one joint it is stiffness and torque limit of all
+        found.append(cause)
+    return found
+
+
+def draw(protocol: Protocol, seed: int, causes: list[Cause] | None = None) -> Case:
+    """A robot at random; the same for the same seed."""
+    rng = np.random.default_rng((813, seed))
+    causes = applicable(protocol) if causes is None else causes
+    counts = COUNTS_ONE_JOINT if len(protocol.joints) <= 2 else COUNTS
+    count = int(rng.choice(len(counts), p=counts))
+    chosen = rng.choice(len(causes), size=min(count, len(causes)), replace=False)
+    out = {}
+    for k in chosen:
+        cause = causes[int(k)]
+        out[cause.name] = (
+            tuple(int(j) for j in place(cause, protocol, rng)),
+            cause.draw(rng, float(rng.uniform(0, 1))),
+        )
+    return Case(out, seed)
+
+
+def place(cause: Cause, protocol: Protocol, rng: np.random.Generator) -> Ints:
+    """Joints that a cause may sit at."""
+    scope = Scope(rng.choice([str(scope) for scope in cause.scopes]))
+    everything = np.arange(len(protocol.joints))
+    if scope is Scope.JOINT:
+        return rng.choice(everything, 1)
+    if scope is Scope.SERVO:
+        groups = protocol.servos()
+        return np.array(groups[int(rng.integers(len(groups)))])
+    return everything
+
+
+def robot_of(protocol: Protocol, case: Case) -> Robot:
+    """The robot that a case describes."""
+    robot = Robot(len(protocol.joints), protocol.reference.low, protocol.reference.high)
+    if case.seed < 0:
+        for name, (joints, x) in case.causes.items():
+            cause, at = catalogue()[name], np.array(joints)
+            cause.enter(robot, at, cause.values(x, protocol.reference, at))
+        return robot
+    rng = np.random.default_rng((977, case.seed))
+    scatter(robot, protocol.reference, rng, WIDTH)
+    for name, (joints, x) in case.causes.items():
+        cause = catalogue()[name]
+        if len(joints) == 1 or cause.scopes == (Scope.BODY,):
+            at = np.array(joints)
+            cause.enter(robot, at, cause.values(x, protocol.reference, at))
+            continue
+        for j in joints:
+            own = {
+                q.name: value if q.shape else value * float(np.exp(UNEQUAL * rng.normal()))
+                for q in cause.quantities
+                for value in (x[q.name],)
+            }
+            at = np.array([j])
+            values = cause.values(
+                own if Scope.JOINT in cause.scopes or Scope.SERVO in cause.scopes else x,
+                protocol.reference,
+                np.array(joints),
+            )
+            cause.enter(
+                robot, at if Scope.JOINT in cause.scopes or Scope.SERVO in cause.scopes else np.array(joints), values
+            )
+            if not (Scope.JOINT in cause.scopes or Scope.SERVO in cause.scopes):
+                break
+    robot.form = random_form(rng)
+    return robot
+
+
+def templates(protocol: Protocol) -> list[Case]:
+    """Every cause at every place it may sit, in two sizes and either sign, on a robot that is else as the model says."""
+    out = []
+    everything = tuple(range(len(protocol.joints)))
+    for cause in applicable(protocol):
+        where: list[tuple[int, ...]] = []
+        if Scope.JOINT in cause.scopes:
+            where += [(j,) for j in everything]
+        if Scope.SERVO in cause.scopes and len(protocol.servos()) > 1:
+            where += [tuple(group) for group in protocol.servos()]
+        if {Scope.ALL, Scope.BODY} & set(cause.scopes) and everything not in where:
+            where.append(everything)
+        for joints in where or [everything]:
+            for strength in TEMPLATES:
+                out += [Case({cause.name: (joints, x)}, -1) for x in cause.starts(strength)]
+    return out
+
+
+def play(protocol: Protocol, cases: Sequence[Case], seed: int) -> list[Floats]:
+    """Features (robots, features) of each run of a protocol, against its own model without any cause.
+
+    A case without a seed is a template: no scatter, no noise.
+    """
+    rng = np.random.default_rng((551, seed))
+    # The first is the model itself, that the others are compared with.
+    robots = [Robot(len(protocol.joints)), *(robot_of(protocol, case) for case in cases)]
+    steps = {} if cases[0].seed < 0 else protocol.resolution()
+    out = []
+    for k, played in enumerate(protocol.runs):
+        rollouts = Rollouts(played.plant, [played.run], nthread=1)
+        signals = simulate(rollouts, robots, seed=seed * 64 + k, signals=played.signals).signals
+        nominal = {name: values[:1] for name, values in signals.items()}
+        noisy = with_noise({name: values[1:] for name, values in signals.items()}, robots[1:], steps, rng)
+        out.append(played.layout.features(differences(noisy, nominal, played.signals)))
+    return out

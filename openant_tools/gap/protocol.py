@@ -1,0 +1,220 @@
+"""What was played: the commands of a set of runs, as every robot that plays them again is simulated and compared."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.gap.features import COLUMNS, Floats, Layout, differences, logged
+from openant_tools.gap.robot import Reference, Robot
+from openant_tools.gap.simulation import simulate
+from openant_tools.model.floor import resolution
+from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
+from openant_tools.model.rollout import Rollouts
+from openant_tools.recording.run import Run
+
+__all__ = ["Played", "Protocol", "same"]
+
+Array = NDArray[np.float64]
+
+#: s: the grid on which commands are compared, so that jitter of time stamps does not make another protocol
+GRID_S = 0.02
+#: rad: commands that differ by less on the whole are the same
+SAME_RAD = 0.01
+#: s, steps of simulated populations, in which they cost the least that does not show beside tolerances
+STAND_STEP_S, FLOOR_STEP_S = 0.0025, 0.004
+
+
+@dataclass(frozen=True)
+class Played:
+    """One run of a protocol.
+
+    Attributes:
+        run: its commands. Where its base was on the floor is left out: it starts from a settled stand at its heading, as
+            every other robot that plays these commands does.
+        plant: how it is simulated. signals: those that a robot on it can have.
+        seen: what its log has of them.
+    """
+
+    run: Run
+    plant: Plant
+    signals: tuple[str, ...]
+    seen: Mapping[str, Floats]
+
+    @classmethod
+    def of(cls, run: Run, plant: Plant) -> Played:
+        """A run on a plant."""
+        free = plant.setup is Setup.FLOOR and plant.free_joint is not None
+        signals = ("pos", "vel", "torque", "volt", *(COLUMNS if free else ()))
+        seen = {name: values for name, values in logged(run, plant.joints).items() if name in signals}
+        columns = {name: values for name, values in run.columns.items() if not name.startswith("base.")}
+        return cls(dataclasses.replace(run, columns=columns), plant, signals, seen)
+
+    @property
+    def layout(self) -> Layout:
+        return Layout(
+            self.run.t - self.run.t[0], self.plant.setup, len(self.plant.joints), self.signals, self.run.duration_s
+        )
+
+    def features(self, nominal: Mapping[str, Floats]) -> tuple[Floats, NDArray[np.bool_]]:
+        """(features,) of the run itself against what the model does, and which of them its log has."""
+        seen = {name: self.seen.get(name, nominal[name]) for name in self.signals}
+        x = self.layout.features(differences(seen, nominal, self.signals))[0]
+        there = [np.full(len(names), name in self.seen) for name, names in self.layout.groups().items()]
+        return x, np.concatenate(there)
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """A set of runs to be diagnosed together.
+
+    Attributes:
+        model: the given MJCF. joints: those played. runs: in order.
+        reference: the model's own numbers.
+    """
+
+    model: Path
+    joints: tuple[str, ...]
+    runs: tuple[Played, ...]
+    reference: Reference
+
+    @classmethod
+    def of(cls, runs: Sequence[Run], model: Path, joints: Sequence[str], models: Sequence[Path | None]) -> Protocol:
+        """The protocol that these runs played.
+
+        Args:
+            models: of each run its own MJCF, None for `model`.
+        """
+        plants: dict[tuple[Path, Setup], Plant] = {}
+        played = []
+        for run, own in zip(runs, models, strict=True):
+            key = (own or model, setup_of(run.facts.setup))
+            if key not in plants:
+                plants[key] = load_plant(key[0], joints, key[1])
+            played.append(Played.of(run, plants[key]))
+        speed, low, high = _reach(runs, joints)
+        seen = {name for one in played for name in one.seen}
+        first = next((one.plant for one in played if one.plant.setup is Setup.FLOOR), played[0].plant)
+        reference = Reference.of(
+            first,
+            floor=any(one.plant.setup is Setup.FLOOR and one.plant.free_joint is not None for one in played),
+            imu=bool({"gyro", "acc"} & seen),
+            tracker="base" in seen,
+            speed=speed,
+            low=low,
+            high=high,
+        )
+        return cls(model, tuple(joints), tuple(played), reference)
+
+    def servos(self) -> list[list[int]]:
+        """Groups of joints with servos of one model: as the runs say, else those that the MJCF makes alike."""
+        motors = next((one.run.facts.motors for one in self.runs if one.run.facts.motors), {})
+        groups: dict[str, list[int]] = {}
+        for j, joint in enumerate(self.joints):
+            alike = f"{self.reference.stiffness[j]:.4g} {self.reference.limit[j]:.4g}"
+            groups.setdefault(str(motors.get(joint, alike)), []).append(j)
+        return list(groups.values())
+
+    def coarse(self) -> Protocol:
+        """The same, simulated in steps as large as populations allow."""
+        plants: dict[int, Plant] = {}
+        for one in self.runs:
+            if id(one.plant) not in plants:
+                largest = FLOOR_STEP_S if one.plant.setup is Setup.FLOOR else STAND_STEP_S
+                model = copy.copy(one.plant.model)
+                model.opt.timestep = (
+                    max(largest, min(one.plant.timestep, largest))
+                    if len(self.joints) > 2
+                    else min(0.002, one.plant.timestep * 2)
+                )
+                model.opt.tolerance = max(model.opt.tolerance, 1e-6)
+                plants[id(one.plant)] = dataclasses.replace(one.plant, model=model)
+        return dataclasses.replace(
+            self, runs=tuple(dataclasses.replace(one, plant=plants[id(one.plant)]) for one in self.runs)
+        )
+
+    def resolution(self) -> dict[str, float]:
+        """Signal → the steps of its sensor, as the runs show them."""
+        out: dict[str, float] = {}
+        for signal in ("pos", "vel"):
+            steps = [resolution(one.run, signal, joint) for one in self.runs for joint in self.joints]
+            out[signal] = float(np.median([step for step in steps if step > 0] or [0.0]))
+        return out
+
+    def nominal(self) -> list[dict[str, Floats]]:
+        """Of each run, what the model does with its commands from its start on, at its own rows."""
+        out: list[dict[str, Floats]] = [{} for _ in self.runs]
+        for plant in {id(one.plant): one.plant for one in self.runs}.values():
+            mine = [k for k, one in enumerate(self.runs) if one.plant is plant]
+            rollouts = Rollouts(plant, [self.runs[k].run for k in mine])
+            found = simulate(rollouts, [Robot(len(self.joints))], signals=self.runs[mine[0]].signals).signals
+            for k, rows in zip(mine, rollouts.rows, strict=True):
+                out[k] = {name: values[:, rows] for name, values in found.items()}
+        return out
+
+    def features(self) -> list[tuple[Floats, NDArray[np.bool_]]]:
+        """Of each run, its features and which of them its log has."""
+        return [one.features(nominal) for one, nominal in zip(self.runs, self.nominal(), strict=True)]
+
+    def commands(self) -> list[Array]:
+        """Of each run (times, joints) rad on a grid."""
+        return [_on_grid(one.run, self.joints) for one in self.runs]
+
+    def fingerprint(self) -> str:
+        """Of what decides the simulations but for the commands themselves: model, joints, setups, sensors."""
+        state = hashlib.sha256()
+        for path in sorted({one.plant.path for one in self.runs}):
+            state.update(path.read_bytes())
+        facts = [[str(one.plant.setup), round(one.run.facts.heading_rad or 0.0, 1)] for one in self.runs]
+        state.update(json.dumps([list(self.joints), facts]).encode())
+        return state.hexdigest()[:16]
+
+
+def same(a: Sequence[Array], b: Sequence[Array]) -> bool:
+    """Whether two sets of commands (as `Protocol.commands`) are the same but for jitter of their times."""
+    if len(a) != len(b):
+        return False
+    for one, other in zip(a, b, strict=True):
+        n = min(len(one), len(other))
+        if abs(len(one) - len(other)) * GRID_S > 0.1 + 0.01 * n * GRID_S:
+            return False
+        # A step that comes a sample early is a large difference for a moment: the median does not see it.
+        if float(np.quantile(np.abs(one[:n] - other[:n]).max(axis=1), 0.75)) > SAME_RAD:
+            return False
+    return True
+
+
+def _on_grid(run: Run, joints: Sequence[str]) -> Array:
+    cmd, times = run.signal("cmd", joints), run.command_times
+    grid = np.arange(run.t[0], run.t[-1], GRID_S) + GRID_S / 2
+    out = np.empty((len(grid), len(joints)))
+    for j in range(len(joints)):
+        given = np.isfinite(cmd[:, j])
+        order = np.argsort(times[given], kind="stable")
+        at = np.maximum(np.searchsorted(times[given][order], grid, side="right") - 1, 0)
+        out[:, j] = cmd[given, j][order][at]
+    return out
+
+
+def _reach(runs: Sequence[Run], joints: Sequence[str]) -> tuple[Array, Array, Array]:
+    """What the commands ask for and where the joints went: rad/s, rad, rad, (joints,) each."""
+    speeds, positions = [], []
+    for run in runs:
+        grid = _on_grid(run, joints)
+        if len(grid) > 5:
+            speeds.append(np.abs(grid[5:] - grid[:-5]).max(axis=0) / (5 * GRID_S))
+        positions.append(run.signal("pos", joints))
+    seen = np.concatenate(positions)
+    low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
+    still = high - low < math.radians(1)
+    low, high = np.where(still, low - math.radians(1), low), np.where(still, high + math.radians(1), high)
+    return np.maximum(np.max(speeds, axis=0), 0.1), low, high

@@ -1,0 +1,252 @@
+"""A robot as simulations of the gap know it: how it differs from the given model, in every way that the catalogue names.
+
+It is plain data. Causes (`gap.causes`) and tolerances change it; `gap.simulation` plays it.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.model.body import floor_contacts, link_bodies, scale_mass, torso_body
+from openant_tools.model.plant import Plant
+from openant_tools.sysid.kinds import KINDS, usual_torque
+
+__all__ = ["Cable", "Form", "Reference", "Robot"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Form:
+    """The numerical form of a simulation, none of which is true of a robot: what holds for one only is no evidence.
+
+    Attributes:
+        integrator: mjtIntegrator. elliptic: cones, else pyramids. impratio: how much stiffer friction is than contact.
+        smooth_friction: dry friction as a steep function of velocity (rad/s where it is reached), 0 as a constraint.
+        bristle: dry friction as bristles that bend by this angle (rad) before they slide (LuGre), 0 as a constraint.
+    """
+
+    integrator: int = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    elliptic: bool = True
+    impratio: float = 10.0
+    smooth_friction: float = 0.0
+    bristle: float = 0.0
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The given model's own numbers, per joint, by which sizes of effects are drawn and bounded.
+
+    Attributes:
+        torque: N·m, what its servo usually gives. stiffness, damping, limit, armature: as the model says; limit may be inf.
+        robot_kg: mass of everything that is not the world.
+        floor: whether some run stands on a floor. imu, tracker: whether some run has them.
+        speed: rad/s, (joints,) that the commands ask for at most; travel: rad, how far they go; low, high: rad, between
+            which the joint was seen.
+    """
+
+    torque: Array
+    stiffness: Array
+    damping: Array
+    limit: Array
+    armature: Array
+    robot_kg: float
+    floor: bool
+    imu: bool
+    tracker: bool
+    speed: Array
+    low: Array
+    high: Array
+
+    @classmethod
+    def of(
+        cls, plant: Plant, *, floor: bool, imu: bool, tracker: bool, speed: Array, low: Array, high: Array
+    ) -> Reference:
+        n, model = range(len(plant.joints)), plant.model
+
+        def read(kind: str) -> Array:
+            return np.array([KINDS[kind].read(model, plant, j) for j in n])
+
+        world = set(np.flatnonzero(model.body_weldid == 0).tolist())
+        mass = float(sum(model.body_mass[k] for k in range(model.nbody) if k not in world))
+        return cls(
+            torque=np.array([usual_torque(model, plant, j) for j in n]),
+            stiffness=read("stiffness"),
+            damping=np.maximum(read("damping") + read("velocity_gain"), 1e-6),
+            limit=read("torque_limit"),
+            armature=read("armature"),
+            robot_kg=max(mass, 1e-3),
+            floor=floor,
+            imu=imu,
+            tracker=tracker,
+            speed=speed,
+            low=low,
+            high=high,
+        )
+
+
+@dataclass
+class Cable:
+    """What a cable does to the torso: force_n (3,) in the world, damping_n_s_m, and a spring to where the robot started."""
+
+    force_n: Array = field(default_factory=lambda: np.zeros(3))
+    damping_n_s_m: float = 0.0
+    stiffness_n_m: float = 0.0
+
+
+@dataclass
+class Robot:
+    """How one robot differs from the model; nothing at all as it is made. Arrays are (joints,).
+
+    Attributes:
+        low, high: rad, between which each joint was seen to move.
+        scale: kind → factor on what the model says ("stiffness", "damping" with the velocity gain, "armature",
+            "torque_limit", "link_mass"). add: kind → what comes on top ("coulomb_friction", N·m; "armature", kg·m²).
+        zero: rad, added to what the encoder reads. delay, lag: s, of commands. slew: rad/s, inf for none.
+        no_load: rad/s at which the torque limit has fallen to nothing, inf for none.
+        electrical: share of the damping that goes with the torque.
+        stop_low, stop_high: rad, where a stop stands that should not be there; ∓inf for none.
+        play: rad. compliance: rad per N·m.
+        derating: share of the torque lost per °C·A² of heat, see `laws`; derating_s: s, how fast it comes.
+        laws: (effect, parameter) → values of the effects that act between steps (`openant_tools.effects`).
+        payload_kg, payload_m: (3,) in the torso's frame. torso_kg: added to it.
+        floor_friction, softness: factors. adhesion_n: force of each foot. tilt: (2,) rad, how far downhill
+            lies along the floor's x and y.
+        jitter_s: deviation of when a command acts. dropout: share of commands lost, (joints,); longest_s: at a stretch.
+        shared_dropout: all joints lose the same commands.
+        late: s by which a signal's log lags: "pos", "vel", "imu", "base".
+        imu_rotation: (3,) rad. gyro_bias (3,) rad/s, acc_bias (3,) m/s². base_scale, base_yaw: of the tracker.
+        noise: signal → deviation of one sample.
+        form: of its simulation.
+    """
+
+    joints: int
+    low: Array = field(default_factory=lambda: np.zeros(0))
+    high: Array = field(default_factory=lambda: np.zeros(0))
+    scale: dict[str, Array] = field(default_factory=dict)
+    add: dict[str, Array] = field(default_factory=dict)
+    zero: Array = field(init=False)
+    delay: Array = field(init=False)
+    lag: Array = field(init=False)
+    slew: Array = field(init=False)
+    no_load: Array = field(init=False)
+    electrical: Array = field(init=False)
+    stop_low: Array = field(init=False)
+    stop_high: Array = field(init=False)
+    play: Array = field(init=False)
+    compliance: Array = field(init=False)
+    derating: Array = field(init=False)
+    derating_s: float = 20.0
+    laws: dict[tuple[str, str], Array] = field(default_factory=dict)
+    payload_kg: float = 0.0
+    payload_m: Array = field(default_factory=lambda: np.zeros(3))
+    torso_kg: float = 0.0
+    floor_friction: float = 1.0
+    softness: float = 1.0
+    adhesion_n: float = 0.0
+    tilt: Array = field(default_factory=lambda: np.zeros(2))
+    cable: Cable = field(default_factory=Cable)
+    jitter_s: float = 0.0
+    dropout: Array = field(init=False)
+    longest_s: float = 0.1
+    shared_dropout: bool = True
+    late: dict[str, float] = field(default_factory=dict)
+    imu_rotation: Array = field(default_factory=lambda: np.zeros(3))
+    gyro_bias: Array = field(default_factory=lambda: np.zeros(3))
+    acc_bias: Array = field(default_factory=lambda: np.zeros(3))
+    base_scale: float = 1.0
+    base_yaw: float = 0.0
+    noise: dict[str, float] = field(default_factory=dict)
+    form: Form | None = None
+
+    def __post_init__(self) -> None:
+        n = self.joints
+        for name in ("zero", "delay", "lag", "electrical", "play", "compliance", "derating", "dropout"):
+            setattr(self, name, np.zeros(n))
+        self.slew, self.no_load = np.full(n, np.inf), np.full(n, np.inf)
+        self.stop_low, self.stop_high = np.full(n, -np.inf), np.full(n, np.inf)
+
+    def copy(self) -> Robot:
+        return copy.deepcopy(self)
+
+    def factor(self, kind: str) -> Array:
+        """The factor of a kind, to be changed in place."""
+        return self.scale.setdefault(kind, np.ones(self.joints))
+
+    def more(self, kind: str) -> Array:
+        """What is added to a kind, to be changed in place."""
+        return self.add.setdefault(kind, np.zeros(self.joints))
+
+    def law(self, effect: str, parameter: str) -> Array:
+        """An effect's parameter, to be changed in place."""
+        return self.laws.setdefault((effect, parameter), np.zeros(self.joints))
+
+    def model(self, plant: Plant) -> mujoco.MjModel:
+        """A variant of the plant's model with all of this that a compiled model can carry."""
+        model = copy.copy(plant.model)
+        for kind, factors in self.scale.items():
+            kinds = ("damping", "velocity_gain") if kind == "damping" else (kind,)
+            for name in kinds:
+                for j in np.flatnonzero(factors != 1.0):
+                    if kind == "link_mass":
+                        scale_mass(model, link_bodies(model, plant, int(j)), float(factors[j]))
+                        continue
+                    value = KINDS[name].read(plant.model, plant, int(j))
+                    if np.isfinite(value) and value != 0:
+                        KINDS[name].write(model, plant, int(j), float(value * factors[j]))
+        for kind, amounts in self.add.items():
+            for j in np.flatnonzero(amounts):
+                value = KINDS[kind].read(model, plant, int(j)) + float(amounts[j])
+                KINDS[kind].write(model, plant, int(j), max(value, 0.0))
+        shared = self.electrical > 0
+        model.dof_damping[plant.dof[shared]] *= 1 - self.electrical[shared]
+        self._body(model, plant)
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        return model
+
+    def _body(self, model: mujoco.MjModel, plant: Plant) -> None:
+        torso = torso_body(model, plant)
+        if self.torso_kg and model.body_mass[torso] > 0:
+            scale_mass(model, np.array([torso]), max(0.1, 1 + self.torso_kg / float(model.body_mass[torso])))
+        if self.payload_kg and torso:
+            add_mass(model, torso, self.payload_kg, self.payload_m)
+        contacts = floor_contacts(model)
+        model.geom_friction[contacts.geoms, 0] *= self.floor_friction
+        model.pair_friction[contacts.pairs, :2] *= self.floor_friction
+        model.geom_solref[contacts.geoms, 0] *= np.where(model.geom_solref[contacts.geoms, 0] > 0, self.softness, 1.0)
+        model.pair_solref[contacts.pairs, 0] *= np.where(model.pair_solref[contacts.pairs, 0] > 0, self.softness, 1.0)
+        if self.tilt.any():
+            model.opt.gravity[:] = tilted(model.opt.gravity, self.tilt)
+
+
+def add_mass(model: mujoco.MjModel, body: int, mass: float, position: Array) -> None:
+    """Fix a point mass (kg) to a body at a position in its frame; the inertia stays physical, its axes stay the body's."""
+    old, com = float(model.body_mass[body]), model.body_ipos[body].copy()
+    total = old + mass
+    centre = (old * com + mass * position) / total
+    reduced = old * mass / total
+    apart = position - com
+    # The point mass adds its moment about the common centre; off-diagonal parts are dropped with the axes kept.
+    model.body_inertia[body] += reduced * (apart @ apart - apart**2)
+    model.body_mass[body], model.body_ipos[body] = total, centre
+
+
+def tilted(gravity: Array, tilt: Array) -> Array:
+    """Gravity as a floor inclined by `tilt` (rad, towards downhill along its x and y) feels it; its norm stays."""
+    angle = float(np.hypot(*tilt))
+    downhill = tilt / max(angle, 1e-12) * np.sin(angle)
+    down = np.array([downhill[0], downhill[1], -np.cos(angle)])
+    out: Array = down * float(np.linalg.norm(gravity))
+    return out
+
+
+#: signal → the sensors' own noise of one sample where nothing is known of them
+USUAL_NOISE: Mapping[str, float] = {
+    "pos": 0.0008, "vel": 0.024, "torque": 0.02, "volt": 0.004, "gyro": 0.01, "acc": 0.08, "base": 0.002, "yaw": 0.007,
+}  # fmt: skip

@@ -1,0 +1,359 @@
+"""Many simulated robots at work on the same commands, and what their sensors would have logged.
+
+The clocks, segments and starts are those of `model.rollout`, whose contract holds here too. Every robot may differ from the
+model in everything that `gap.robot` names, so that one batch holds thousands of different robots, or the variants of a fit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from openant_tools.effects.rollout import laws_of
+from openant_tools.effects.servos import batch_of
+from openant_tools.effects.step import Law, Step
+from openant_tools.gap.laws import Fields, first_laws, last_laws
+from openant_tools.gap.robot import Cable, Form, Robot
+from openant_tools.model.body import torso_body
+from openant_tools.model.plant import Plant, Setup, world_bodies
+from openant_tools.model.rollout import Rollouts, Segment
+
+__all__ = ["BASE", "Log", "simulate"]
+
+Array = NDArray[np.float64]
+
+#: bytes of states kept while a batch runs; more robots at a time gain nothing
+CHUNK_BYTES = 64 * 2**20
+#: s over which velocities become an acceleration
+ACCELERATION_S = 0.01
+#: base signals and how many columns they have
+BASE = {"gyro": 3, "acc": 3, "base": 3, "yaw": 1}
+
+
+@dataclass(frozen=True)
+class Log:
+    """What the robots' sensors would have logged at the rows of all runs, without noise; NaN before a run's first start.
+
+    Attributes:
+        signals: name → (robots, rows, columns): "pos" rad, "vel" rad/s, "torque" (of the motor, N·m) and "volt" (share of the
+            supply) by joint; with a free base "gyro" (rad/s) and "acc" (m/s²) in its frame, "base" (m), "yaw" (rad).
+    """
+
+    signals: dict[str, NDArray[np.float32]]
+
+
+def simulate(rollouts: Rollouts, robots: Sequence[Robot], seed: int = 0, signals: Sequence[str] | None = None) -> Log:
+    """Let robots do what runs command.
+
+    Args:
+        rollouts: the runs, prepared; re-initialised from measurement as they say.
+        robots: any number; those with an integrator or cone of their own are simulated in it.
+        seed: of what is random in time (jitter, lost commands).
+        signals: those wanted; default all that there are.
+    """
+    plant, rows = rollouts.plant, rollouts.rows[-1].stop
+    floor = plant.setup is Setup.FLOOR and plant.free_joint is not None
+    names = [name for name in ("pos", "vel", "torque", "volt") if signals is None or name in signals]
+    names += [name for name in BASE if floor and (signals is None or name in signals)]
+    width = {name: BASE.get(name, len(plant.joints)) for name in names}
+    out = {name: np.full((len(robots), rows, width[name]), np.nan, np.float32) for name in names}
+    longest = max(len(segment.control) for segment in rollouts.segments)
+    state = 8 * (plant.model.nq + 3 * plant.model.nv)
+    at_once = max(1, int(CHUNK_BYTES // (state * longest * len(rollouts.segments))))
+    for first in range(0, len(robots), at_once):
+        some = robots[first : first + at_once]
+        _Batch(rollouts, some, np.random.default_rng((seed, first))).play(
+            {name: values[first : first + len(some)] for name, values in out.items()}
+        )
+    return Log(out)
+
+
+class _Batch:
+    """Robots × segments side by side: simulation s · robots + r."""
+
+    def __init__(self, rollouts: Rollouts, robots: Sequence[Robot], rng: np.random.Generator) -> None:
+        self._rollouts, self._robots, self._rng = rollouts, robots, rng
+        self._plant, self._segments = rollouts.plant, rollouts.segments
+        self._n = len(robots)
+        plant, copies = self._plant, len(self._segments)
+        models = [rollouts.lean(robot.model(plant)) for robot in robots]
+        self._batch, self._servos = batch_of(plant, models, copies, rollouts.nthread)
+        self._zero = np.tile(np.array([robot.zero for robot in robots]), (copies, 1))
+        self._take_forms()
+        state = np.repeat([segment.state for segment in self._segments], self._n, axis=0)
+        state[:, 1 + plant.qpos] -= self._zero
+        self._batch.state[:] = state
+        self._add_adhesion()
+        self._batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
+        self._laws = self._make_laws()
+
+    def _take_forms(self) -> None:
+        forms = [robot.form for robot in self._robots]
+        if not any(forms):
+            return
+        given = self._plant.model.opt
+        for name, value in (
+            ("opt.integrator", lambda form: form.integrator),
+            ("opt.cone", lambda form: int(mujoco.mjtCone.mjCONE_ELLIPTIC if form.elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL)),
+            ("opt.impratio", lambda form: form.impratio),
+        ):  # fmt: skip
+            own = getattr(given, name.partition(".")[2])
+            field = self._batch.expand(name)
+            field[:] = np.tile([own if form is None else value(form) for form in forms], len(self._segments)).reshape(
+                field.shape
+            )
+
+    def _add_adhesion(self) -> None:
+        force = np.array([robot.adhesion_n for robot in self._robots])
+        if not force.any():
+            return
+        model = self._plant.model
+        of_world = np.isin(model.geom_bodyid, list(world_bodies(model)))
+        feet = ~of_world & ((model.geom_contype | model.geom_conaffinity) != 0)
+        self._batch.expand("geom_adhesion")[:, feet] = np.tile(force, len(self._segments))[:, None]
+
+    def _make_laws(self) -> list[Law]:
+        plant, copies = self._plant, len(self._segments)
+        robots = [robot for _ in range(copies) for robot in self._robots]
+        fields = Fields(
+            armature=_column(self._batch, "dof_armature", plant.dof),
+            damping=_column(self._batch, "dof_damping", plant.dof),
+            friction=_column(self._batch, "dof_frictionloss", plant.dof),
+            link=np.maximum(plant.model.dof_M0[plant.dof] - plant.model.dof_armature[plant.dof], 1e-6)[None].repeat(len(robots), 0),
+        )  # fmt: skip
+        first, last = first_laws(robots, fields), last_laws(robots, fields)
+        for name, values in (("dof_armature", fields.armature), ("dof_damping", fields.damping)):
+            self._batch.expand(name)[:, plant.dof] = values
+        return [*first, *laws_of([robot.laws for robot in robots], len(plant.joints)), self._note, *last]
+
+    def _note(self, step: Step) -> None:
+        """What the motors give and get, before laws on what comes of it."""
+        self._given = step.motor_torque, step.supply
+
+    def play(self, out: dict[str, NDArray[np.float32]]) -> None:
+        plant, segments, n = self._plant, self._segments, self._n
+        lengths = np.array([len(segment.control) for segment in segments])
+        longest, sims = int(lengths[0]), n * len(segments)
+        control = self._controls(longest)
+        ctrl, time = self._batch.bind("ctrl"), np.zeros(sims)
+        rest = np.repeat([segment.control[0] for segment in segments], n, axis=0)
+        ctrl[:] = rest
+        flips: dict[int, list[int]] = {}
+        for s, segment in enumerate(segments):
+            for step in segment.torque_off:
+                flips.setdefault(step, []).append(s)
+        floor = "gyro" in out or "base" in out or plant.setup is Setup.FLOOR
+        states = _States(self._batch, plant, sims, longest, floor)
+        cable = self._cable()
+        before = self._servos.state
+        for step in range(longest):
+            active = int((lengths > step).sum()) * n
+            for s in flips.get(step, ()):
+                self._servos.switch(slice(s * n, (s + 1) * n), segments[s].torque_off[step])
+            ctrl[:, plant.ctrl] = control[:, step]
+            self._servos.prepare(self._laws, time, before)
+            states.keep(step, before, self._given)
+            if cable is not None:
+                cable()
+            self._batch.step(ids=np.arange(active, dtype=np.int32))
+            time += plant.timestep
+            before = self._servos.state
+        states.keep(longest, before, None)
+        self._sample(states, out)
+
+    def _controls(self, longest: int) -> NDArray[np.float32]:
+        """(segments · robots, steps, joints) rad, setpoints as they act: late, scattered, lost, filtered."""
+        plant, h = self._plant, self._plant.timestep
+        out = np.zeros((len(self._segments), self._n, longest, len(plant.joints)), np.float32)
+        for s, segment in enumerate(self._segments):
+            steps = len(segment.control)
+            edges = segment.start + h * np.arange(steps + 1)
+            for r, robot in enumerate(self._robots):
+                out[s, r, :steps] = self._control(segment, robot, edges) - robot.zero
+                out[s, r, steps:] = out[s, r, steps - 1]
+        return out.reshape(-1, longest, len(plant.joints))
+
+    def _control(self, segment: Segment, robot: Robot, edges: Array) -> Array:
+        plant, h = self._plant, self._plant.timestep
+        commands = segment.commands
+        random = robot.jitter_s > 0 or robot.dropout.any()
+        if not random and not robot.delay.any():
+            mean = segment.control[:, plant.ctrl]
+        elif not random and (robot.delay == robot.delay[0]).all():
+            mean = commands.mean(edges - robot.delay[0])
+        else:
+            mean = np.empty((len(edges) - 1, len(plant.joints)))
+            times = commands.times
+            jitter = self._rng.normal(0.0, robot.jitter_s, len(times)) if robot.jitter_s > 0 else 0.0
+            late = np.maximum.accumulate(times + jitter)
+            shared = self._lost(robot, times, 0) if robot.shared_dropout else None
+            for j in range(len(plant.joints)):
+                lost = shared if shared is not None else self._lost(robot, times, j)
+                column = dataclasses.replace(commands, times=late, values=_without(commands.values[:, j : j + 1], lost))
+                mean[:, j] = column.mean(edges - robot.delay[j])[:, 0]
+        if robot.lag.any():
+            mean = mean.copy()
+            for j in np.flatnonzero(robot.lag):
+                mean[:, j] = _filtered(mean[:, j], h / robot.lag[j])
+        return mean
+
+    def _lost(self, robot: Robot, times: Array, j: int) -> NDArray[np.bool_]:
+        """Which commands never arrive: stretches of up to `longest_s`, together `dropout` of all."""
+        lost = np.zeros(len(times), bool)
+        share = float(robot.dropout[j] if not robot.shared_dropout else robot.dropout.max())
+        if share <= 0:
+            return lost
+        period = float(np.median(np.diff(times))) if len(times) > 1 else 0.02
+        most = max(1, round(robot.longest_s / max(period, 1e-6)))
+        while lost.mean() < share:
+            start = int(self._rng.integers(1, len(times)))
+            lost[start : start + int(self._rng.integers(1, most + 1))] = True
+        return lost
+
+    def _cable(self) -> _Cable | None:
+        cables = [robot.cable for robot in self._robots]
+        if self._plant.free_joint is None or not any(
+            c.force_n.any() or c.damping_n_s_m or c.stiffness_n_m for c in cables
+        ):
+            return None
+        return _Cable(self._batch, self._plant, [cable for _ in self._segments for cable in cables])
+
+    def _sample(self, states: _States, out: dict[str, NDArray[np.float32]]) -> None:
+        h = self._plant.timestep
+        for s, segment in enumerate(self._segments):
+            steps = len(segment.control)
+            at = segment.step + segment.fraction
+            for r, robot in enumerate(self._robots):
+                k = s * self._n + r
+                for name, values in out.items():
+                    group = "imu" if name in ("gyro", "acc") else "base" if name in ("base", "yaw") else name
+                    when = np.clip(at - robot.late.get(group, 0.0) / h, 0.0, steps)
+                    values[r, segment.row] = states.at(name, k, when, steps, robot)
+
+
+class _States:
+    """All states of a batch, until they are sampled."""
+
+    def __init__(self, batch: Batch, plant: Plant, sims: int, steps: int, base: bool) -> None:
+        n, self._h = len(plant.joints), plant.timestep
+        self.pos, self.vel = np.empty((2, steps + 1, sims, n), np.float32)
+        self.torque, self.share = np.zeros((2, steps + 1, sims, n), np.float32)
+        self._base = base and plant.free_joint is not None
+        if self._base:
+            joint = plant.free_joint
+            adr, dof = int(plant.model.jnt_qposadr[joint]), int(plant.model.jnt_dofadr[joint])
+            self._qpos, self._qvel = batch.bind("qpos")[:, adr : adr + 7], batch.bind("qvel")[:, dof : dof + 6]
+            self.place = np.empty((steps + 1, sims, 7), np.float32)
+            self.twist = np.empty((steps + 1, sims, 6), np.float32)
+            self._gravity = batch.expanded("opt.gravity")
+            self._given = plant.model.opt.gravity.copy()
+
+    def keep(self, step: int, state: tuple[Array, Array], given: tuple[Array, Array] | None) -> None:
+        self.pos[step], self.vel[step] = state
+        if given is not None:
+            self.torque[step], self.share[step] = given
+        elif step:
+            self.torque[step], self.share[step] = self.torque[step - 1], self.share[step - 1]
+        if self._base:
+            self.place[step], self.twist[step] = self._qpos, self._qvel
+
+    def at(self, name: str, sim: int, when: Array, steps: int, robot: Robot) -> Array:
+        """(rows, columns) of a signal at times in steps."""
+        low = np.minimum(np.floor(when).astype(int), steps - 1)
+        share = (when - low)[:, None]
+
+        def mixed(values: NDArray[np.float32]) -> Array:
+            mix: Array = values[low, sim] * (1 - share) + values[low + 1, sim] * share
+            return mix
+
+        if name == "pos":
+            return mixed(self.pos) + robot.zero
+        if name == "vel":
+            return mixed(self.vel)
+        if name == "torque":
+            return mixed(self.torque)
+        if name == "volt":
+            return mixed(self.share)
+        place = mixed(self.place)
+        quat = place[:, 3:] / np.linalg.norm(place[:, 3:], axis=1, keepdims=True)
+        turn = _rotation(robot.imu_rotation)
+        if name == "gyro":
+            return mixed(self.twist)[:, 3:] @ turn + robot.gyro_bias
+        if name == "acc":
+            span = max(1, round(ACCELERATION_S / self._h))
+            ahead, behind = np.minimum(low + span, steps), np.maximum(low - span, 0)
+            change = (self.twist[ahead, sim, :3] - self.twist[behind, sim, :3]) / ((ahead - behind)[:, None] * self._h)
+            gravity = self._given if self._gravity is None else self._gravity[sim]
+            return _to_body(quat, change - gravity) @ turn + robot.acc_bias
+        if name == "yaw":
+            yaw = np.unwrap(2 * np.arctan2(quat[:, 3], quat[:, 0]))
+            return yaw[:, None] + robot.base_yaw
+        c, s = np.cos(robot.base_yaw), np.sin(robot.base_yaw)
+        out = place[:, :3] * robot.base_scale
+        return np.stack([c * out[:, 0] - s * out[:, 1], s * out[:, 0] + c * out[:, 1], out[:, 2]], axis=1)
+
+
+class _Cable:
+    def __init__(self, batch: Batch, plant: Plant, cables: Sequence[Cable]) -> None:
+        torso, joint = torso_body(plant.model, plant), plant.free_joint
+        assert joint is not None
+        adr, dof = int(plant.model.jnt_qposadr[joint]), int(plant.model.jnt_dofadr[joint])
+        self._wrench = batch.bind("xfrc_applied")[:, torso]
+        self._place, self._speed = batch.bind("qpos")[:, adr : adr + 3], batch.bind("qvel")[:, dof : dof + 3]
+        self._force = np.array([cable.force_n for cable in cables])
+        self._damping = np.array([[cable.damping_n_s_m] for cable in cables])
+        self._spring = np.array([[cable.stiffness_n_m] for cable in cables])
+        self._anchor = self._place.copy()
+
+    def __call__(self) -> None:
+        self._wrench[:, :3] = self._force - self._damping * self._speed - self._spring * (self._place - self._anchor)
+
+
+def _column(batch: Batch, name: str, dof: NDArray[np.int64]) -> Array:
+    values: Array = batch.expand(name)[:, dof].copy()
+    return values
+
+
+def _without(values: Array, lost: NDArray[np.bool_]) -> Array:
+    source = np.maximum.accumulate(np.where(lost, 0, np.arange(len(values))))
+    out: Array = values[source]
+    return out
+
+
+def _filtered(values: Array, ratio: float) -> Array:
+    """First-order lag, exact for a piecewise constant input, from rest at the first value."""
+    from scipy.signal import lfilter
+
+    keep = float(np.exp(-ratio))
+    out, _ = lfilter([1 - keep], [1, -keep], values, zi=[keep * values[0]])
+    filtered: Array = out
+    return filtered
+
+
+def _rotation(vector: Array) -> Array:
+    """(3, 3) that turns vectors of the sensor's frame into the body's, for a rotation vector in rad."""
+    quat, matrix = np.zeros(4), np.zeros(9)
+    angle = float(np.linalg.norm(vector))
+    mujoco.mju_axisAngle2Quat(quat, vector / angle if angle else np.array([0.0, 0.0, 1.0]), angle)
+    mujoco.mju_quat2Mat(matrix, quat)
+    return matrix.reshape(3, 3)
+
+
+def _to_body(quat: Array, vectors: Array) -> Array:
+    """World vectors in the frames of quaternions (rows, 4)."""
+    w, u = quat[:, :1], -quat[:, 1:]
+    cross = np.cross(u, vectors)
+    out: Array = vectors + 2 * (w * cross + np.cross(u, cross))
+    return out
+
+
+def own_form(plant: Plant) -> Form:
+    """The form of the plant's own model."""
+    opt = plant.model.opt
+    return Form(int(opt.integrator), int(opt.cone) == int(mujoco.mjtCone.mjCONE_ELLIPTIC), float(opt.impratio))

@@ -1,0 +1,80 @@
+"""How robots of one build differ (effects.md): within this a re-fitted model is calibrated, beyond it lies an effect."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.gap.robot import USUAL_NOISE, Form, Reference, Robot
+
+__all__ = ["FACTORS", "random_form", "scatter"]
+
+Array = NDArray[np.float64]
+
+#: kind → how far the logarithm of a robot's factor may lie from 0
+FACTORS = {"stiffness": 0.15, "torque_limit": 0.15, "damping": 0.25, "armature": 0.30, "link_mass": 0.05}
+COULOMB_NM, ZERO_RAD, DELAY_S = 0.02, math.radians(0.5), 0.002
+TORSO_KG, FLOOR_FRICTION, SOFTNESS, TILT_RAD = 0.03, 0.15, 0.30, math.radians(0.5)
+IMU_RAD, GYRO_RAD_S, ACC_M_S2 = math.radians(1.0), 0.01, 0.1
+#: of the torso mass's tolerance on a robot that is not an Ant: share of its mass
+TORSO_SHARE = 0.03
+#: share by which a current or load sensor's scale is uncertain
+TORQUE_SCALE = 0.03
+#: share of its usual size by which a current sensor may be off at no torque
+TORQUE_ZERO = 0.06
+#: s by which a velocity register is late at most on a healthy servo, and by which a row's stamp is off its samples
+VELOCITY_LATE_S, STAMP_S = 0.012, 0.0015
+#: logarithms between which a sensor's noise lies, as a factor on the usual: nobody says how good a sensor is
+NOISE = (-1.8, 0.5)
+
+
+def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width: float = 1.0) -> None:
+    """Make a robot differ as robots of one build do.
+
+    Args:
+        width: of what is drawn, in tolerances: a judge that has seen a little more is not surprised at the edge.
+    """
+    n = robot.joints
+
+    def spread(size: int = n) -> Array:
+        # Servos of one batch have much in common; how much is not known.
+        common, share = rng.uniform(-1, 1), rng.uniform(0, 1)
+        both: Array = width * (share * common + (1 - share) * rng.uniform(-1, 1, size))
+        return both
+
+    for kind, tolerance in FACTORS.items():
+        robot.factor(kind)[:] *= np.exp(tolerance * spread())
+    # Where the model has almost no friction it has as little to lose.
+    robot.more("coulomb_friction")[:] += COULOMB_NM * np.minimum(1.0, reference.torque / 0.2) * spread()
+    robot.zero += width * ZERO_RAD * rng.uniform(-1, 1, n)
+    robot.delay += DELAY_S * spread()
+    robot.torso_kg += width * rng.uniform(-1, 1) * min(TORSO_KG, TORSO_SHARE * reference.robot_kg)
+    robot.floor_friction *= math.exp(width * FLOOR_FRICTION * rng.uniform(-1, 1))
+    robot.softness *= math.exp(width * SOFTNESS * rng.uniform(-1, 1))
+    robot.tilt += width * TILT_RAD * rng.uniform(-1, 1, 2) / math.sqrt(2)
+    robot.imu_rotation += width * IMU_RAD * rng.uniform(-1, 1, 3)
+    robot.gyro_bias += width * GYRO_RAD_S * rng.uniform(-1, 1, 3)
+    robot.acc_bias += width * ACC_M_S2 * rng.uniform(-1, 1, 3)
+    # A servo's velocity register is a filtered one, and stamps are not exactly those of the samples.
+    robot.late["vel"] = robot.late.get("vel", 0.0) + float(rng.uniform(0, VELOCITY_LATE_S))
+    stamp = float(rng.uniform(-STAMP_S, STAMP_S))
+    for signal in ("pos", "vel", "torque"):
+        robot.late[signal] = robot.late.get(signal, 0.0) + stamp
+    for signal, noise in USUAL_NOISE.items():
+        robot.noise[signal] = noise * float(np.exp(rng.uniform(*NOISE)))
+    robot.noise["torque_zero"] = float(TORQUE_ZERO * rng.uniform(0, 1))
+    robot.noise["torque_scale"] = float(np.exp(TORQUE_SCALE * rng.normal()))
+
+
+def random_form(rng: np.random.Generator) -> Form:
+    """A numerical form at random: what names a cause in one only would name it wrongly on a robot."""
+    pyramidal = rng.random() < 0.2
+    impratio = float(np.exp(rng.uniform(0.0, math.log(30.0)))) if not pyramidal else float(rng.choice([1.0, 3.0, 10.0]))
+    integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST if rng.random() < 0.6 else mujoco.mjtIntegrator.mjINT_IMPLICIT
+    friction = rng.random()
+    smooth = float(np.exp(rng.uniform(math.log(0.02), math.log(0.1)))) if friction < 0.2 else 0.0
+    bristle = float(np.exp(rng.uniform(math.log(1e-4), math.log(3e-3)))) if friction > 0.6 else 0.0
+    return Form(int(integrator), not pyramidal, impratio, smooth, bristle)
