@@ -62,7 +62,8 @@ class Layout:
         else:
             width = ONE_JOINT_BLOCK_S if self.joints <= 2 else STAND_BLOCK_S
         count = max(1, int((self.seconds - SKIP_S) / width + 1e-6))
-        return SKIP_S + width * np.arange(count + 1)
+        edges: Array = SKIP_S + width * np.arange(count + 1, dtype=np.float64)
+        return edges
 
     def groups(self) -> dict[str, list[str]]:
         """Signal → the names of its features, in the order of `features`."""

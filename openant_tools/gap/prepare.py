@@ -6,13 +6,15 @@ where it stopped. It is found again by model and commands, whatever the time sta
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import joblib
 import numpy as np
@@ -21,7 +23,7 @@ from numpy.typing import NDArray
 from openant_tools.files import write_text
 from openant_tools.gap.features import Floats
 from openant_tools.gap.population import Case, applicable, draw, play, templates
-from openant_tools.gap.protocol import Protocol, same
+from openant_tools.gap.protocol import Protocol, reach, same
 from openant_tools.recording.run import Run
 
 __all__ = ["Prepared", "cache_folder", "find", "prepare"]
@@ -163,8 +165,6 @@ def _new(protocol: Protocol) -> Path:
 
 def _reference(folder: Path, protocol: Protocol) -> Protocol:
     """The protocol as it was prepared: its runs' times and commands are those of whoever came first."""
-    import dataclasses
-
     path = folder / "first.npz"
     if not path.is_file():
         columns: dict[str, NDArray[np.float64]] = {}
@@ -181,26 +181,20 @@ def _reference(folder: Path, protocol: Protocol) -> Protocol:
             run = Run(one.run.name, one.run.facts, mine.pop("t"), mine, one.run.path)
             runs.append(dataclasses.replace(one, run=run))
     found = dataclasses.replace(protocol, runs=tuple(runs))
-    speed, low, high = _reach_of(runs, protocol.joints)
+    speed, low, high = reach([one.run for one in runs], protocol.joints)
     return dataclasses.replace(
         found, reference=dataclasses.replace(protocol.reference, speed=speed, low=low, high=high)
     )
-
-
-def _reach_of(played: Sequence[object], joints: Sequence[str]) -> tuple[Array, Array, Array]:
-    from openant_tools.gap.protocol import _reach
-
-    return _reach([one.run for one in played], joints)  # type: ignore[attr-defined]
 
 
 def _part(folder: Path, part: int) -> Path:
     return folder / (f"part-{part:04d}.npz" if part >= 0 else f"bank-{-part:04d}.npz")
 
 
-def _write(path: Path, arrays: dict[str, NDArray[np.generic]]) -> None:
+def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     partial = path.with_suffix(f".{os.getpid()}.tmp")
     with partial.open("wb") as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
+        np.savez(file, **arrays)
         file.flush()
         os.fsync(file.fileno())
     os.replace(partial, path)

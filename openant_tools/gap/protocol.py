@@ -22,7 +22,7 @@ from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 
-__all__ = ["Played", "Protocol", "same"]
+__all__ = ["Played", "Protocol", "reach", "same"]
 
 Array = NDArray[np.float64]
 
@@ -101,7 +101,7 @@ class Protocol:
             if key not in plants:
                 plants[key] = load_plant(key[0], joints, key[1])
             played.append(Played.of(run, plants[key]))
-        speed, low, high = _reach(runs, joints)
+        speed, low, high = reach(runs, joints)
         seen = {name for one in played for name in one.seen}
         first = next((one.plant for one in played if one.plant.setup is Setup.FLOOR), played[0].plant)
         reference = Reference.of(
@@ -205,7 +205,7 @@ def _on_grid(run: Run, joints: Sequence[str]) -> Array:
     return out
 
 
-def _reach(runs: Sequence[Run], joints: Sequence[str]) -> tuple[Array, Array, Array]:
+def reach(runs: Sequence[Run], joints: Sequence[str]) -> tuple[Array, Array, Array]:
     """What the commands ask for and where the joints went: rad/s, rad, rad, (joints,) each."""
     speeds, positions = [], []
     for run in runs:

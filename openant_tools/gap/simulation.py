@@ -173,7 +173,7 @@ class _Batch:
         out = np.zeros((len(self._segments), self._n, longest, len(plant.joints)), np.float32)
         for s, segment in enumerate(self._segments):
             steps = len(segment.control)
-            edges = segment.start + h * np.arange(steps + 1)
+            edges: Array = segment.start + h * np.arange(steps + 1, dtype=np.float64)
             for r, robot in enumerate(self._robots):
                 out[s, r, :steps] = self._control(segment, robot, edges) - robot.zero
                 out[s, r, steps:] = out[s, r, steps - 1]
@@ -212,8 +212,8 @@ class _Batch:
         period = float(np.median(np.diff(times))) if len(times) > 1 else 0.02
         most = max(1, round(robot.longest_s / max(period, 1e-6)))
         while lost.mean() < share:
-            start = int(self._rng.integers(1, len(times)))
-            lost[start : start + int(self._rng.integers(1, most + 1))] = True
+            start, length = int(self._rng.integers(1, len(times))), int(self._rng.integers(1, most + 1))
+            lost[start : start + length] = True
         return lost
 
     def _cable(self) -> _Cable | None:
@@ -292,8 +292,8 @@ class _States:
             gravity = self._given if self._gravity is None else self._gravity[sim]
             return _to_body(quat, change - gravity) @ turn + robot.acc_bias
         if name == "yaw":
-            yaw = np.unwrap(2 * np.arctan2(quat[:, 3], quat[:, 0]))
-            return yaw[:, None] + robot.base_yaw
+            yaw: Array = np.unwrap(2 * np.arctan2(quat[:, 3], quat[:, 0]))[:, None] + robot.base_yaw
+            return yaw
         c, s = np.cos(robot.base_yaw), np.sin(robot.base_yaw)
         out = place[:, :3] * robot.base_scale
         return np.stack([c * out[:, 0] - s * out[:, 1], s * out[:, 0] + c * out[:, 1], out[:, 2]], axis=1)
