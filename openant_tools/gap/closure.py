@@ -131,38 +131,27 @@ class Windows:
         """
         centre = _vector(start)
         scale = np.concatenate([np.maximum(POLISH * np.abs(centre), 1e-3), np.full(len(self.names), SPREAD)])
-        u = np.concatenate([centre, start.nuisance])
+        u: Array = np.concatenate([centre, start.nuisance])
         prior = np.concatenate([centre, np.zeros(len(self.names))])
         blocks: list[tuple[Array, Array]] = []
+        at = u
         for _ in range(ITERATIONS):
+            at = u
             blocks = [
-                self._normal(k, start, u) if k in self.fitted else _nothing(len(u)) for k in range(len(self._quick))
+                self._normal(k, start, at) if k in self.fitted else _nothing(len(u)) for k in range(len(self._quick))
             ]
-            u = self._solve(u, prior, scale, blocks, ())
-        return [_from(start, self._solve(u, prior, scale, blocks, out, again=True)) for out in leave_out]
+            u = self._solve(at, prior, scale, blocks, ())
+        return [_from(start, self._solve(at, prior, scale, blocks, out)) for out in leave_out]
 
     def _solve(
-        self,
-        u: Array,
-        prior: Array,
-        scale: Array,
-        blocks: Sequence[tuple[Array, Array]],
-        out: Sequence[int],
-        again: bool = False,
+        self, u: Array, prior: Array, scale: Array, blocks: Sequence[tuple[Array, Array]], out: Sequence[int]
     ) -> Array:
+        """Where the runs' blocks, made at u, lead without those left out."""
         normal, gradient = np.diag(1 / scale**2), (u - prior) / scale**2
         for k, (more, slope) in enumerate(blocks):
             if k not in out:
                 normal, gradient = normal + more, gradient + slope
-        if again:
-            # The blocks were made before the last step: bring their gradients to where it led.
-            for k, (more, _) in enumerate(blocks):
-                if k not in out:
-                    gradient = gradient + more @ (u - self._at)
-        else:
-            self._at = u.copy()
-        step = -np.linalg.solve(normal, gradient)
-        found = u + step
+        found = u - np.linalg.solve(normal, gradient)
         low, high = np.full(len(u), -END), np.full(len(u), END)
         n = len(u) - len(self.names)
         low[:n] = np.where(prior[:n] >= 0, 0.0, 2.5 * prior[:n])
@@ -203,7 +192,8 @@ class Windows:
             for _ in part.definition.quantities:
                 out.append([(n, everywhere)])
                 n += 1
-        tree, used = one.plant.tree, []
+        tree = one.plant.tree
+        used: list[tuple[set[int], list[tuple[int, NDArray[np.bool_]]]]] = []
         for k, nuisance in enumerate(self.names):
             mine = {int(tree[j]) for j in nuisance.joints} if one.plant.setup is Setup.STAND else set(tree.tolist())
             mask = np.isin(tree, list(mine))

@@ -320,8 +320,9 @@ def _unseen(forest: ExtraTreesClassifier, outputs: int) -> Array:
     """(robots, outputs) votes of the trees that had not seen each robot."""
     votes = np.asarray(forest.oob_decision_function_)
     if votes.ndim == 3 and votes.shape[1] == 2:
-        return np.nan_to_num(votes[:, 1, :outputs])
-    return np.stack([np.nan_to_num(votes[:, k, 1]) for k in range(outputs)], axis=1)
+        votes = votes.transpose(0, 2, 1)
+    out: Array = np.nan_to_num(votes[:, :outputs, 1])
+    return out
 
 
 def _logit(p: float | Array) -> Array:

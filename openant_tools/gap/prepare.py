@@ -194,7 +194,7 @@ def _part(folder: Path, part: int) -> Path:
 def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     partial = path.with_suffix(f".{os.getpid()}.tmp")
     with partial.open("wb") as file:
-        np.savez(file, **arrays)
+        np.savez(file, **arrays)  # type: ignore[arg-type]  # its stub takes the names for options
         file.flush()
         os.fsync(file.fileno())
     os.replace(partial, path)

@@ -199,8 +199,8 @@ class _Batch:
                 mean[:, j] = column.mean(edges - robot.delay[j])[:, 0]
         if robot.lag.any():
             mean = mean.copy()
-            for j in np.flatnonzero(robot.lag):
-                mean[:, j] = _filtered(mean[:, j], h / robot.lag[j])
+            for filtered in np.flatnonzero(robot.lag):
+                mean[:, filtered] = _filtered(mean[:, filtered], h / float(robot.lag[filtered]))
         return mean
 
     def _lost(self, robot: Robot, times: Array, j: int) -> NDArray[np.bool_]:

@@ -1,0 +1,90 @@
+"""Simulated robots of the diagnosis: the same physics as rollouts, and every cause of the catalogue shows."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from openant_tools.gap.cause import Scope, catalogue
+from openant_tools.gap.features import COLUMNS
+from openant_tools.gap.population import Case, draw, play, robot_of, templates
+from openant_tools.gap.protocol import Protocol, same
+from openant_tools.gap.robot import Robot
+from openant_tools.gap.simulation import simulate
+from openant_tools.model.plant import Setup, load_plant
+from openant_tools.model.rollout import Rollouts
+from openant_tools.recording.run import Facts, Run
+from openant_tools.robot.joints import JOINT_NAMES
+from openant_tools.robot.mjcf import nominal_model_path
+
+RATE_HZ = 50
+
+
+def commanded(setup: str, seconds: float = 2.0, seed: int = 0) -> Run:
+    """A run that has commands, and positions only at its start."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    columns = {}
+    for joint in JOINT_NAMES:
+        home = 0.0 if joint.startswith("hip") else 0.5
+        swing = 0.25 if setup == "stand" else 0.08
+        command = home + swing * np.sin(2 * np.pi * rng.uniform(0.4, 1.2) * t + rng.uniform(0, 6))
+        command[t < 0.3] = command[0]
+        columns[f"cmd.{joint}"] = columns[f"pos.{joint}"] = command
+    return Run(setup, Facts(joints=tuple(JOINT_NAMES), setup=setup, heading_rad=0.0), t, columns)
+
+
+@pytest.fixture(scope="module")
+def protocol() -> Protocol:
+    runs = [commanded("stand"), commanded("floor", 1.6)]
+    return Protocol.of(runs, MODEL, JOINT_NAMES, [None, None]).coarse()
+
+
+MODEL = nominal_model_path()
+
+
+@pytest.mark.parametrize("setup", list(Setup))
+def test_a_robot_as_the_model_says_moves_as_its_rollout(setup: Setup) -> None:
+    plant = load_plant(MODEL, JOINT_NAMES, setup)
+    rollouts = Rollouts(plant, [commanded(str(setup), 1.0)])
+    found = simulate(rollouts, [Robot(8)]).signals
+    assert np.allclose(found["pos"][0], rollouts().pos[0], atol=1e-5)
+    assert np.allclose(found["vel"][0], rollouts().vel[0], atol=1e-4)
+    assert set(found) == {"pos", "vel", "torque", "volt", *(COLUMNS if setup is Setup.FLOOR else ())}
+
+
+def test_every_cause_of_the_catalogue_shows(protocol: Protocol) -> None:
+    strongest: dict[str, Case] = {}
+    for case in templates(protocol):
+        ((name, (joints, _)),) = case.causes.items()
+        body = catalogue()[name].scopes == (Scope.BODY,)
+        if body or len(joints) == 8 or name not in strongest:
+            strongest[name] = case
+    assert set(strongest) == set(catalogue())
+    features = play(protocol, list(strongest.values()), 0)
+    moved = {
+        name: max(float(np.abs(x[row] - np.median(x, axis=0)).max()) for x in features)
+        for row, name in enumerate(strongest)
+    }
+    assert all(np.isfinite(x).all() for x in features)
+    silent = [name for name, size in moved.items() if size < 1e-3]
+    # What breaks only under heavy load or in long runs may stay silent in these two seconds.
+    assert set(silent) <= {"thermal_derating", "blocked_joint"}
+
+
+def test_the_same_seed_draws_the_same_robot(protocol: Protocol) -> None:
+    assert draw(protocol, 5) == draw(protocol, 5)
+    one, other = robot_of(protocol, draw(protocol, 5)), robot_of(protocol, draw(protocol, 5))
+    assert np.array_equal(one.factor("stiffness"), other.factor("stiffness"))
+
+
+def test_jitter_of_time_stamps_is_no_other_protocol(protocol: Protocol) -> None:
+    run = commanded("stand")
+    rng = np.random.default_rng(3)
+    jittered = dataclasses.replace(run, t=run.t + rng.uniform(-0.002, 0.002, len(run.t)))
+    other = commanded("stand", seed=9)
+    first, again, different = (Protocol.of([r], MODEL, JOINT_NAMES, [None]).commands() for r in (run, jittered, other))
+    assert same(first, again)
+    assert not same(first, different)
