@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import shutil
 import sys
@@ -244,6 +245,22 @@ def test_two_workers_of_a_dask_cluster_share_the_robots(sealed_set: tuple[Path, 
     finally:
         cloudpickle.unregister_pickle_by_value(sys.modules[__name__])
     assert read(sealed_set[0], sealed_set[2])[1][1].verdict == "action_delay"
+
+
+def test_helpers_that_are_not_there_are_said_so_before_any_work(sealed_set: tuple[Path, Path, bytes]) -> None:
+    asked: list[Path] = []
+
+    def judge(robot: Path, model: Path) -> dict[str, Any]:
+        asked.append(robot)
+        return says(robot, model)
+
+    if importlib.util.find_spec("ray") is None:
+        with pytest.raises(BadInput, match="Ray is not installed"):
+            run_set(sealed_set[0], backend="ray", diagnose=judge)
+    pytest.importorskip("distributed")
+    with pytest.raises(BadInput, match="no Dask scheduler answers"):
+        run_set(sealed_set[0], backend="dask", scheduler="no-scheme://x", diagnose=judge)
+    assert not asked
 
 
 def test_the_score_counts_what_is_right_and_shows_what_is_not(

@@ -77,10 +77,11 @@ def run_set(
     todo = [robot for robot in folders_of(folder) if not _judged(verdict_path(folder, robot.name))]
     if not todo:
         return 0
-    progress(todo[0].name, 0.0)
-    _judge(folder, todo[0], diagnose, True)
-    progress(todo[0].name, 1 / len(todo))
+    # Who is to help is asked for first: the first robot may take half an hour.
     with _fan_out(backend, jobs, scheduler):
+        progress(todo[0].name, 0.0)
+        _judge(folder, todo[0], diagnose, True)
+        progress(todo[0].name, 1 / len(todo))
         work = (delayed(_judge)(folder, robot, diagnose, False) for robot in todo[1:])
         for done, name in enumerate(Parallel(return_as="generator_unordered")(work), 2):
             progress(name, done / len(todo))
