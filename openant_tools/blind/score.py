@@ -259,7 +259,7 @@ def _right_joint(case: Case) -> bool:
 def _closed(case: Case) -> list[float]:
     """1 − excess after / excess before on the held-out runs, where positions show the effect at all."""
     gap = case.said.get("gap", {})
-    if set(case.true) & _OFF_POSITION or not gap:
+    if set(case.true) & _OFF_POSITION or any(gap.get(name) is None for name in ("before", "after", "floor")):
         return []
 
     def beyond(name: str) -> float:
