@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -110,7 +111,9 @@ def openant(context: click.Context, robot: Path | None, virtual_source: str | No
         if robot is not None or virtual_source is not None or port is not None:
             raise click.UsageError("--robot, --virtual and --serve before a command are for none: give them after it")
         return None
-    if port is None and not (sys.stdin.isatty() and sys.stdout.isatty()):
+    # A browser's server runs this program with a driver of its own, and pipes.
+    shown = (sys.stdin.isatty() and sys.stdout.isatty()) or "TEXTUAL_DRIVER" in os.environ
+    if port is None and not shown:
         raise click.exceptions.NoArgsIsHelpError(context)
     from openant_tools.cli import terminal
 

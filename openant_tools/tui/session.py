@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from openant_tools.bringup.virtual_box import virtual_box
 from openant_tools.bringup.walk import standing
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig, Notice, Stopped
@@ -106,6 +105,8 @@ class Session:
             self.virtual = None
             folder = self.folder
             if source is None and folder is not None:
+                from openant_tools.bringup.virtual_box import virtual_box  # it loads MuJoCo
+
                 box = self._virtual_process.enter_context(virtual_box(VIRTUAL_DEFAULT, folder.path, clock))
                 box.hands.resume(standing(folder)["legs"].state == "ok")
                 self.virtual = {"bus": box.bus, "imu": box.imu, "camera": box.camera, "control": box.control}

@@ -15,7 +15,6 @@ from textual.widgets import Input, OptionList, Static
 from textual.widgets.option_list import Option
 
 from openant_tools.errors import OpenAntError
-from openant_tools.recording.tables import read_run
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.feeds import ReplayFeed
 from openant_tools.tui.page import Page
@@ -87,6 +86,8 @@ that has the columns of docs/recordings.md.
 
     @work(thread=True, exclusive=True, group="read")
     def _read(self, path: Path) -> None:
+        from openant_tools.recording.tables import read_run  # it loads pyarrow
+
         try:
             feed = ReplayFeed(read_run(path, need=("pos",)))
         except OpenAntError as error:
