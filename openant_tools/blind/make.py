@@ -106,6 +106,10 @@ def _done(folder: Path, played: Sequence[Motion]) -> bool:
     return all((folder / f"{motion.name}{suffix}").exists() for motion in played for suffix in (".parquet", ".json"))
 
 
+def _missing(out: Path, batch: Sequence[tuple[int, Answer]], motion: Motion) -> list[tuple[int, Answer]]:
+    return [(k, answer) for k, answer in batch if not _done(out / _name(k), [motion])]
+
+
 def _claim(
     out: Path, answers: list[Answer], drawn: dict[str, int], commit: str | None, mix: Mix, key: bytes | None
 ) -> tuple[str, list[Answer]]:
@@ -135,7 +139,8 @@ def _make_batch(out: Path, batch: Sequence[tuple[int, Answer]], played: Sequence
             answer, played, lambda motion, run: write_table(run, out / _name(k) / f"{motion.name}.parquet")
         )
         return
-    robots = [true_robot(answer) for _, answer in batch]
     for number, motion in enumerate(played):
-        for (k, _), robot, trace in zip(batch, robots, simulate(robots, motion, number), strict=True):
+        todo = _missing(out, batch, motion)
+        robots = [true_robot(answer) for _, answer in todo]
+        for (k, _), robot, trace in zip(todo, robots, simulate(robots, motion, number) if todo else (), strict=True):
             write_table(logged(robot, motion, number, trace), out / _name(k) / f"{motion.name}.parquet")
