@@ -1,0 +1,276 @@
+"""From loose motors to a passport, by the commands that a builder types."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from builder import robot
+
+from openant_tools.bringup.passport import write_passport
+from openant_tools.bringup.relay import relayed
+from openant_tools.bringup.virtual_box import virtual_box
+from openant_tools.bringup.walk import WALK, do, standing, step, walk
+from openant_tools.cli.calib import calib
+from openant_tools.comms.clock import VirtualControl
+from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.procedure.finding import Finding, keep
+from openant_tools.procedure.step import Answer, Declined, Event, Intent, Progress, Say
+from openant_tools.robot.folder import RobotFolder, create_robot
+
+TITLES = (
+    "Connect", "Emergency stop", "Motor IDs", "Centring", "Leg by leg", "Inventory", "Zeros and directions", "Observation bounds",
+    "IMU", "Arena", "Comms health", "Thermal soak", "Identification", "Gap check", "Passport",
+)  # fmt: skip
+
+
+def openant(*arguments: str | Path, timeout: float = 900) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "openant_tools.cli", *map(str, arguments)]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=timeout, stdin=subprocess.DEVNULL, check=False
+    )
+
+
+# ---- the walk as data -------------------------------------------------------------------------------------------------
+
+
+def test_the_walk_has_its_steps_in_the_order_in_which_one_builds():
+    assert tuple(step.title for step in WALK.values()) == TITLES
+    names = list(WALK)
+    assert all(names.index(need) < names.index(name) for name, one in WALK.items() for need in one.needs)
+
+
+@pytest.mark.parametrize("name", WALK)
+def test_every_step_is_there_and_says_what_it_does(name):
+    one = WALK[name]
+    module, _, function = one.procedure.partition(":")
+    assert callable(getattr(__import__(module, fromlist=[function]), function))
+    assert one.does.endswith(".")
+
+
+def test_an_unknown_step_is_refused_with_the_known_ones():
+    with pytest.raises(BadInput, match="there is no step 'legz'"):
+        step("legz")
+
+
+def test_every_step_of_building_is_a_command_that_explains_itself():
+    for name in ("connect", "estop", "ids", "centre", "legs", "inventory", "zeros", "bounds", "imu", "arena", "undo"):
+        command = calib.commands[name]
+        assert command.help
+
+
+# ---- standing, resuming -----------------------------------------------------------------------------------------------
+
+
+def found(name: str, ok: bool = True) -> Finding:
+    return Finding(name, ok, f"{name} done", (), "", f"openant calib {name}")
+
+
+def test_a_new_robot_has_everything_to_do(tmp_path):
+    states = standing(create_robot(tmp_path / "ant"))
+    assert {now.state for now in states.values()} == {"todo"}
+    assert states["ids"].waits_for == ("connect", "estop")
+
+
+def test_a_step_whose_need_was_done_again_is_stale(tmp_path):
+    folder = create_robot(tmp_path / "ant")
+    for name in ("connect", "estop"):
+        keep(found(name), folder)
+    path = keep(found("connect"), folder)
+    later = json.loads(path.read_text()) | {"date": "2999-01-01T00:00:00Z"}
+    path.with_name("connect-29990101T000000Z.json").write_text(json.dumps(later))
+    states = standing(folder)
+    assert (states["connect"].state, states["estop"].state) == ("ok", "stale")
+
+
+def test_a_fault_becomes_the_finding_of_its_step_and_the_walk_goes_on(tmp_path):
+    with robot(tmp_path / "ant", robot={"setup": "loose"}) as ant:
+        builder = ant.builder()
+        builder.hands.do = lambda hands: None  # type: ignore[method-assign]
+        finding = do(WALK["estop"], ant.bench, builder)
+        assert not finding.ok
+        assert finding.what == "no servo answers at any baud rate"
+        assert standing(ant.folder)["estop"].state == "failed"
+
+
+def test_a_closed_terminal_resumes_at_the_step_that_was_not_done(tmp_path):
+    class Closing:
+        """Grants, until the step Motor IDs begins."""
+
+        def __init__(self, builder) -> None:
+            self.builder = builder
+
+        def answer(self, event: Event) -> Answer:
+            if isinstance(event, Intent) and "make this" in event.words:
+                raise KeyboardInterrupt
+            return self.builder.answer(event)
+
+    with robot(tmp_path / "ant", robot={"setup": "loose"}) as ant:
+        with pytest.raises(KeyboardInterrupt):
+            walk(ant.bench, Closing(ant.builder()))
+        states = standing(ant.folder)
+        assert [states[name].state for name in ("connect", "estop", "ids")] == ["ok", "ok", "todo"]
+        assert not any(ant.torque())
+        begun = []
+
+        class Stop(Exception):
+            pass
+
+        def notice(one, finding):
+            begun.append(one.name)
+            if len(begun) == 3:
+                raise Stop
+
+        with pytest.raises(Stop):
+            walk(ant.bench, ant.builder(), notice=notice)
+        assert begun == ["ids", "ids", "centre"]
+
+
+def test_steps_that_need_what_said_no_are_left_out_in_words(tmp_path):
+    folder = create_robot(tmp_path / "ant")
+    for name in WALK:
+        keep(found(name, ok=name not in ("identify", "gap")), folder)
+    with robot(tmp_path / "ant") as ant:
+        builder = ant.builder()
+        builder.before = lambda event: (_ for _ in ()).throw(Declined("no")) if isinstance(event, Intent) else None
+        with pytest.raises(Declined):
+            walk(ant.bench, builder)  # it begins with Identification, and asks before anything moves
+    keep(found("zeros", ok=False), folder)
+    with robot(tmp_path / "ant") as ant:
+        builder = ant.builder()
+        builder.before = lambda event: (_ for _ in ()).throw(Declined("no")) if isinstance(event, Progress) else None
+        with pytest.raises(Declined):
+            walk(ant.bench, builder)
+
+
+def test_work_with_callbacks_is_a_procedure_and_ends_when_it_is_closed():
+    seen, ended = [], []
+
+    def work(progress, notice):
+        try:
+            notice("begun")
+            for k in range(1000):
+                progress("working", k / 1000)
+        finally:
+            ended.append(True)
+        return 7
+
+    procedure = relayed(work)
+    seen.append(next(procedure))
+    procedure.close()
+    assert seen == [Say("begun")]
+    assert ended == [True]
+    result = []
+
+    def whole():
+        result.append((yield from relayed(work)))
+
+    assert len(list(whole())) == 1001
+    assert result == [7]
+
+
+def test_what_the_work_raises_is_raised_by_the_procedure():
+    def work(progress, notice):
+        raise HardwareFault("it fell")
+
+    with pytest.raises(HardwareFault, match="it fell"):
+        next(relayed(work))
+
+
+# ---- the passport -----------------------------------------------------------------------------------------------------
+
+
+def test_a_passport_says_what_is_known_and_what_is_not(tmp_path):
+    folder = create_robot(tmp_path / "ant")
+    keep(found("zeros"), folder)
+    keep(Finding("imu", False, "no IMU answers", (), "", "", problems=("IMU: it is silent → unplug it",)), folder)
+    html, markdown = write_passport(folder)
+    page, text = html.read_text(), markdown.read_text()
+    for words in (
+        "Zeros and directions",
+        "zeros done",
+        "IMU: it is silent",
+        "hip_rr",
+        "XM430-W350-T",
+        "openant train sac",
+    ):
+        assert words in page
+        assert words in text
+    assert "not done" in text
+
+
+# ---- the commands -----------------------------------------------------------------------------------------------------
+
+
+def test_without_a_terminal_nothing_is_granted(tmp_path):
+    result = openant("calib", "inventory", "--robot", tmp_path / "ant", "--virtual", scenario(tmp_path))
+    assert result.returncode == 2
+    assert "nobody is there to ask → add --yes if it may" in result.stderr
+
+
+def test_a_step_alone_exits_with_1_where_it_says_no(tmp_path):
+    file = scenario(tmp_path, '[[servo]]\njoint = "knee_rr"\nmodel = "XL430-W250-T"\nid = 11\nbaud = 1000000\n')
+    report = tmp_path / "inventory.json"
+    result = openant("calib", "inventory", "--robot", tmp_path / "ant", "--virtual", file, "--yes", "--json", report)
+    assert result.returncode == 1
+    assert "NOT OK" in result.stdout
+    assert "knee_rr is a XL430-W250-T, the place is for a XM430-W350-T → put the right servo in" in result.stdout
+    assert json.loads(report.read_text())["ok"] is False
+
+
+def test_a_joint_that_is_none_is_refused_in_one_line(tmp_path):
+    result = openant("calib", "ids", "--robot", tmp_path / "ant", "--joint", "hip_xx")
+    assert result.returncode == 2
+    assert result.stderr.startswith("openant: there is no joint 'hip_xx'")
+
+
+def scenario(folder: Path, more: str = "") -> Path:
+    path = folder / "robot.toml.scenario.toml"
+    path.write_text(f'[robot]\nsetup = "stand"\n[clock]\nmode = "stepped"\n[camera]\npresent = false\n{more}')
+    return path
+
+
+def test_the_box_remembers_what_was_written_to_its_servos(tmp_path):
+    given = tmp_path / "given.toml"
+    given.write_text('[robot]\nsetup = "loose"\n[camera]\npresent = false\n')
+    for kept in (1, 77):
+        with virtual_box(str(given), tmp_path) as box:
+            assert box.kit == "standard"
+            state = VirtualControl(box.control).ask("state")
+            assert (state["setup"], state["id"]["hip_rr"]) == ("loose", kept)
+        write_id(tmp_path, 77)
+
+
+def write_id(folder: Path, id: int) -> None:
+    """Let the kept memory of hip_rr say another id, as a step would have left it."""
+    from openant_tools.virtual.eeprom import EepromFile
+    from openant_tools.virtual.scenario import load_scenario
+    from openant_tools.virtual.start import build
+
+    world = build(load_scenario(folder / "virtual.toml"))
+    world.servos[0].set("id", id)
+    EepromFile(folder / "virtual-eeprom.json").write(world)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_from_loose_motors_to_a_passport_and_on_to_learning(tmp_path):
+    ant, report = tmp_path / "ant", tmp_path / "walk.json"
+    result = openant("bringup", "--virtual", "--robot", ant, "--yes", "--json", report)
+    assert result.returncode == 0, result.stdout + result.stderr[-2000:]
+    walked = json.loads(report.read_text())
+    assert walked["ok"]
+    assert {now["state"] for now in walked["steps"].values()} == {"ok"}
+    for name in ("robot.toml", "calibrated.xml", "journal.jsonl", "passport.html", "passport.md"):
+        assert (ant / name).is_file()
+    assert RobotFolder.at(ant).config().model == "calibrated.xml"
+    again = openant("bringup", "--virtual", "--robot", ant, "--yes", timeout=120)
+    assert again.returncode == 0
+    assert "1/15" not in again.stdout  # what stands is not done again
+    pytest.importorskip("torch")
+    trained = openant("train", "sac", "--robot", ant, "--env", "sim", "--steps", "2000", "--out", ant / "runs" / "sac")
+    assert trained.returncode == 0, trained.stderr[-2000:]
+    assert (ant / "runs" / "sac" / "learning_curve.csv").is_file()
