@@ -17,10 +17,12 @@ import pytest
 from rich.text import Text
 from textual.pilot import Pilot
 
+from openant_tools.calib.wires import engine_config
 from openant_tools.comms import messages
 from openant_tools.comms.clock import VirtualControl
+from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.procedure.finding import Evidence, Finding, keep
-from openant_tools.procedure.step import Event, Hands, Intent, Live, RegisterChange, Say
+from openant_tools.procedure.step import Bench, Event, Hands, Intent, Live, Procedure, RegisterChange, Say, Step
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run, write_table
 from openant_tools.robot.folder import RobotFolder, create_robot
@@ -516,6 +518,38 @@ def test_a_robot_is_watched_live_and_the_stop_key_lets_it_go(tmp_path: Path) -> 
         app.session.close()
 
     asyncio.run(watch())
+
+
+def swing(bench: Bench) -> Procedure:
+    """A procedure that moves for longer than anybody waits, and does not look up meanwhile."""
+    yield Intent("swing all legs for a minute", moves=True)
+    with EngineProcess(engine_config(bench)) as engine:
+        start = engine.ask(messages.Torque(True))
+        engine.ask(messages.Play(np.tile(start, (6000, 1)), "swing"))
+    return Finding("swing", True, "it has swung", (), "", "none")
+
+
+def test_the_stop_key_reaches_a_robot_that_moves(tmp_path: Path) -> None:
+    scenario = tmp_path / "blind.toml"
+    scenario.write_text("[camera]\npresent = false\n")
+    step = Step("swing", "Swing", "Swings.", f"{__name__}:swing", moves=True)
+
+    async def stop() -> None:
+        app = OpenAnt(create_robot(tmp_path / "my-ant").path, virtual=str(scenario))
+        async with app.run_test(size=(120, 40)) as pilot:
+            await until(pilot, lambda: app.session.virtual is not None and not app.session.doing)
+            assert app.session.virtual is not None
+            app.push_screen(StepScreen(step))
+            await choose(pilot, "Begin")
+            await choose(pilot, "Yes, do it")
+            await until(pilot, lambda: "torque ON" in screen_text(app))
+            await pilot.press("space")
+            await until(pilot, lambda: not any(torques(app.session.virtual or {})))
+            await until(pilot, lambda: "Begin again" in offered(app))
+            assert "stopped by hand" in screen_text(app)
+        app.session.close()
+
+    asyncio.run(stop())
 
 
 def test_ctrl_c_leaves_with_130_and_nothing_running(robot: RobotFolder, loose: Mapping[str, str | None]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import traceback
 from collections.abc import Callable
 
 from openant_tools.bringup.virtual_hands import VirtualHands
@@ -13,6 +14,8 @@ from openant_tools.procedure.step import Answer, Ask, Bench, Declined, Event, Ha
 
 __all__ = ["BY_VIRTUAL_HANDS", "StepRun"]
 
+#: in the robot's folder: what should never have happened, for a report
+ERRORS = "errors.log"
 #: a reply to `Hands`: the virtual robot's hands are to do it
 BY_VIRTUAL_HANDS = "virtual hands"
 
@@ -106,8 +109,10 @@ class StepRun:
             self._done(None, str(error))
         except ModuleNotFoundError as error:
             self._done(None, f"this step is not part of this version ({error.name} is missing)")
-        except Exception as error:  # whatever it is, the builder sees it and torque is off; the log has the rest
-            self._done(None, f"{type(error).__name__}: {error}")
-            raise
+        except Exception as error:  # a fault of the program: the builder sees it, torque is off, the file has the rest
+            log = self._bench.folder.path / ERRORS
+            with log.open("a", encoding="utf-8") as file:
+                traceback.print_exc(file=file)
+            self._done(None, f"{type(error).__name__}: {error} → this is a fault of the program; please report {log}")
         else:
             self._done(finding, "")
