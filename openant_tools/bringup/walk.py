@@ -125,7 +125,7 @@ WALK: Mapping[str, Step] = {
         Step(
             "comms",
             "Comms health",
-            "Measure losses, delays and jitter of bus, IMU and camera, and the quiet that servos need after a write.",
+            "Measure losses and rate of the bus, and the quiet that servos need after a write.",
             "openant_tools.calib.comms_health:comms_health",
             needs=("inventory",),
             table="the whole robot, cables as they will be",

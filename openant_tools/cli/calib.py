@@ -18,7 +18,14 @@ from openant_tools.procedure.step import Bench, Step
 __all__ = ["bench_of", "calib", "robot_of", "run_step", "step_options"]
 
 
-@click.group()
+class _InOrder(click.Group):
+    """Lists its commands in the order in which one builds."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.commands)
+
+
+@click.group(cls=_InOrder)
 def calib() -> None:
     """Bring a robot up, step by step: what each will do is said before it is done.
 

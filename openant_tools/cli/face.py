@@ -52,13 +52,20 @@ class CommandFace:
                 )
             case Live():
                 return self._show(event)
+            case Intent() | Hands() | Ask():
+                try:
+                    return self._asked(event)
+                except EOFError:  # the terminal was closed, or Ctrl-D: nobody is there any more
+                    raise KeyboardInterrupt from None
+        return None
+
+    def _asked(self, event: Intent | Hands | Ask) -> Answer:
+        match event:
             case Intent():
                 return self._grant(event)
             case Hands():
                 return self._by_hand(event)
-            case Ask():
-                return self._ask(event)
-        return None
+        return self._ask(event)
 
     def _progress(self, share: float | None, words: str) -> None:
         """One line where something new begins, and one a quarter of the way: lines stay, unlike a bar."""
