@@ -188,7 +188,7 @@ def true_robot(answer: Answer) -> TrueRobot:
         tracker_rad=float(chance.uniform(2e-3, 8e-3)),
     )  # fmt: skip
     robot = TrueRobot(
-        servos, mechanics, clocks, senses, float(chance.uniform(20, 26)), float(chance.uniform(6, 14)), answer.seed,
+        servos, mechanics, clocks, senses, float(chance.uniform(20, 26)), float(chance.uniform(14, 24)), answer.seed,
         answer.tracker,
     )  # fmt: skip
     for drawn in answer.effects:

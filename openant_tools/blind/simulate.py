@@ -39,6 +39,8 @@ VELOCITY_FILTER_S = 0.005
 #: heat of one servo: J/K of winding and case, K/W between them and to the air (orders of magnitude)
 WINDING_J_K, CASE_J_K, WINDING_CASE_K_W, CASE_AIR_K_W = 8.0, 40.0, 5.0, 12.0
 COPPER_PER_K = 0.0039
+#: °C of the winding at which a data sheet's figures hold: a servo at work
+WARM_C = 35.0
 #: rad/s at which a horn slips
 SLIP_RAD_S = 1.5
 
@@ -218,7 +220,7 @@ class _Drives:
         flow = (self.winding - self.case) / WINDING_CASE_K_W
         self.winding += dt * (heat - flow) / WINDING_J_K
         self.case += dt * (flow + 0.5 - (self.case - self.ambient) / CASE_AIR_K_W) / CASE_J_K
-        self.resistance = s.resistance * (1 + COPPER_PER_K * (self.winding - 25.0))
+        self.resistance = s.resistance * (1 + COPPER_PER_K * (self.winding - WARM_C))
         self.per_ohm = 1 / self.resistance
         share = np.where(s.derating_s > 0, 1 - np.exp(-dt / np.maximum(s.derating_s, 1e-9)), 1.0)
         self.loss += (s.derating * (self.case - 25.0) - self.loss) * share

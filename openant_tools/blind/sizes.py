@@ -223,14 +223,14 @@ def _kinds() -> dict[str, Kind]:
         "weak_joint": joint("j", _plain("scale", "", (0.72, 0.78), (0.52, 0.62), (0.3, 0.4))),
         "coulomb_friction": joint("jga", _plain("torque_nm", "N·m", (0.09, 0.11), (0.16, 0.22), (0.3, 0.4))),
         "stribeck_friction": joint("ja", (_stribeck, "static_nm 0.12…0.15, 0.22…0.3, 0.4…0.5 N·m")),
-        "load_friction": joint("jga", _plain("coefficient", "", (0.06, 0.09), (0.16, 0.24), (0.32, 0.45))),
+        "load_friction": joint("jga", _plain("coefficient", "", (0.1, 0.14), (0.28, 0.4), (0.5, 0.7))),
         "asymmetric_friction": joint("j", (_asymmetric, "difference 0.06…0.08, 0.13…0.18, 0.25…0.35 N·m")),
         "viscous_nonlinear": joint("jga", _plain("coefficients", "N·m·s²/rad²", (0.06, 0.1), (0.2, 0.3), (0.5, 0.8))),
         "torque_limit": joint("jg", _share("torque_nm", _limit, (0.74, 0.8), (0.52, 0.62), (0.3, 0.4))),
         "speed_limit": joint("g", _share("no_load_rad_s", _speed, (2.4, 3.0), (1.1, 1.5), (0.5, 0.7))),
         "voltage_sag": joint("a", _plain("resistance_ohm", "Ω", (0.2, 0.3), (0.6, 0.9), (1.4, 2.0))),
         "thermal_derating": joint(
-            "jga", _plain("loss_per_c", "1/°C", (0.008, 0.012), (0.022, 0.03), (0.045, 0.06), more=_slow)
+            "jga", _plain("loss_per_c", "1/°C", (0.006, 0.009), (0.016, 0.024), (0.03, 0.04), more=_slow)
         ),
         "backlash": joint("jg", _plain("gap_rad", "rad", (0.006, 0.009), (0.016, 0.024), (0.035, 0.05))),
         "joint_compliance": joint("jg", _plain("stiffness_nm_rad", "N·m/rad", (18.0, 25.0), (6.0, 8.0), (2.5, 3.5))),

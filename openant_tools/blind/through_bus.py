@@ -22,6 +22,7 @@ from openant_tools.blind.commands import RATE_HZ, Motion
 from openant_tools.blind.draw import Answer, Drawn
 from openant_tools.blind.log import facts_of, imu_columns, tracker_columns
 from openant_tools.blind.robot import TrueRobot, true_robot
+from openant_tools.blind.simulate import COPPER_PER_K, WARM_C
 from openant_tools.comms.bus import Bus, Timing
 from openant_tools.comms.servos import Block, Servo, Servos
 from openant_tools.recording.run import Run
@@ -36,6 +37,8 @@ __all__ = ["record_through_bus", "scenario_of"]
 SETTLE_S, RISE_S = 0.6, 1.5
 #: of the world's body, averaged for what the IMU gives: two of its polls, about a low-pass of 50 Hz
 IMU_SAMPLES = 2
+#: °C, of the virtual robot's resistances
+COLD_C = 25.0
 #: What acts where this host samples IMU and tracker, and not in the world.
 _SENSED = frozenset({"imu_misalignment", "imu_bias", "tracker_scale"})
 
@@ -61,12 +64,14 @@ def _servo(robot: TrueRobot, k: int) -> dict[str, Any]:
     joint = list(JOINTS.values())[k]
     nominal = kit("standard").servo(joint.kind)
     gain = float(nominal.register("position_p_gain").default or 0) / nominal.position_p_divisor
+    # The virtual robot states a cold winding's resistance.
+    cold = float(servos.resistance[k]) / (1 + COPPER_PER_K * (WARM_C - COLD_C))
     return {
         "joint": joint.name,
         "pwm_limit": PLATFORM_PWM_LIMIT_COUNTS,
         "mount_rad": np.pi + float(servos.zero[k]),
         "motor": {
-            "kt": float(servos.kt[k]), "ke": float(servos.ke[k]), "viscous": float(servos.viscous[k]),
+            "kt": float(servos.kt[k]), "resistance": cold, "ke": float(servos.ke[k]), "viscous": float(servos.viscous[k]),
             "armature": float(servos.rotor[k] + robot.mechanics.output_armature[k]),
             "stiffness_scale": float(servos.p_gain[k]) / gain, "coulomb_nm": float(servos.coulomb[k]),
             "encoder_noise_rad": robot.senses.encoder_rad, "current_noise_a": robot.senses.current_a,
