@@ -49,12 +49,18 @@ COOL_K = 20.0
 #: IMU: |acc| against gravity, the body's lean on its stand, rad, and the gyro's rate at rest, rad/s.
 GRAVITY_SHARE, LEAN_RAD, STILL_RAD_S = 0.06, math.radians(6), 0.05
 TWITCH_S = 20.0
+#: Share of steps at which an observation may be outside its measured bounds: a bound is the largest of many motions.
+OUTSIDE_SHARE = 0.01
 #: A joint's simulation error that was this much smaller when the model was made.
 GAP_FACTOR, GAP_RAD = 1.8, 0.004
 START_LIST = (
-    "cables run outside the circle and are not twisted",
+    "cables are not twisted, and leave the legs free",
     "the robot stands on its stand, legs free all round",
     "screws of feet and horns are in",
+)
+#: The paper's list for the start of an experiment.
+BEFORE_A_SESSION = (
+    "before it learns: cables outside the circle and untangled; the robot inside the circle, facing its reward",
 )
 
 
@@ -75,11 +81,15 @@ def check(bench: Bench) -> Procedure:
     baseline = {joint: joint_sweep_of(one) for joint, one in bounds.data["sweep"].items()}
     evidence, problems = list[Evidence](), list[str]()
     for line in START_LIST:
-        yield Ask(f"Is it so: {line}?", ("yes", "no"), default="yes")
+        if (yield Ask(f"Is it so: {line}?", ("yes", "no"), default="yes")) != "yes":
+            problems.append(f"start list: it is not so that {line} → see to it first")
+    if problems:
+        return _finding(problems, evidence, {})
     yield Progress(0.0, "bus, supply, temperatures")
     problems += _at_rest(bench, config, evidence)
     if problems:
         return _finding(problems, evidence, {})
+    outside: dict[str, float] = {}
     yield Progress(0.05, "IMU")
     problems += _imu(bench, config, evidence)
     yield Intent("sweep every joint slowly through its range, then twitch for 20 s, on the stand", moves=True)
@@ -107,8 +117,17 @@ def check(bench: Bench) -> Procedure:
     else:
         problems += loose(_lost(twitch), config.bus.chain, problems)
         problems += yield from _against_model(bench, twitch, evidence, problems)
-        yield from _outside(twitch, config)
-    return _finding(problems, evidence, {"sweep": {joint: one.as_dict() for joint, one in now.items()}})
+        outside = _outside(twitch, config)
+        for name, share in outside.items():
+            low, high = config.observation[name]
+            yield Say(
+                f"{name} was outside its bounds {low:.3g} … {high:.3g} for {100 * share:.0f} % of the twitch", "warn"
+            )
+    for line in BEFORE_A_SESSION:
+        yield Say(line)
+    return _finding(
+        problems, evidence, {"sweep": {joint: one.as_dict() for joint, one in now.items()}, "outside": outside}
+    )
 
 
 def changed(before: Mapping[str, JointSweep], now: Mapping[str, JointSweep]) -> list[str]:
@@ -333,15 +352,15 @@ def _against_model(
     ]
 
 
-def _outside(run: Run, config: RobotConfig) -> Generator[Event, Answer, None]:
-    """Say which observations were outside the bounds that agents are normalised by."""
+def _outside(run: Run, config: RobotConfig) -> dict[str, float]:
+    """observation → share of the steps at which it was outside the bounds that agents are normalised by."""
+    shares = {}
     for name, (low, high) in config.observation.items():
         values = run.column(name)
         share = float(np.mean((values < low) | (values > high))) if np.isfinite(values).any() else 0.0
-        if share > 0.01:
-            yield Say(
-                f"{name} was outside its bounds {low:.3g} … {high:.3g} for {100 * share:.0f} % of the twitch", "warn"
-            )
+        if share > OUTSIDE_SHARE:
+            shares[name] = share
+    return shares
 
 
 def _finding(problems: Sequence[str], evidence: Sequence[Evidence], data: Mapping[str, object]) -> Finding:

@@ -141,20 +141,7 @@ def _help(step: Step) -> str:
     return "\n".join([*lines, f"Before it: {needs}." if needs else ""])
 
 
-for _name in (
-    "connect",
-    "estop",
-    "ids",
-    "centre",
-    "legs",
-    "inventory",
-    "zeros",
-    "bounds",
-    "imu",
-    "arena",
-    "comms",
-    "thermal",
-):
+for _name in WALK:
     calib.add_command(_command(WALK[_name]))
 
 
