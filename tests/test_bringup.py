@@ -86,6 +86,17 @@ def test_a_step_whose_need_was_done_again_is_stale(tmp_path):
     assert (states["connect"].state, states["estop"].state) == ("ok", "stale")
 
 
+def test_a_passport_that_is_older_than_any_step_is_stale(tmp_path):
+    folder = create_robot(tmp_path / "ant")
+    for name in WALK:
+        keep(found(name), folder)
+    assert standing(folder)["passport"].state == "ok"
+    path = keep(found("thermal"), folder)
+    later = json.loads(path.read_text()) | {"date": "2999-01-01T00:00:00Z"}
+    path.with_name("thermal-29990101T000000Z.json").write_text(json.dumps(later))
+    assert standing(folder)["passport"].state == "stale"
+
+
 def test_a_fault_becomes_the_finding_of_its_step_and_the_walk_goes_on(tmp_path):
     with robot(tmp_path / "ant", robot={"setup": "loose"}) as ant:
         builder = ant.builder()
@@ -267,6 +278,9 @@ def test_from_loose_motors_to_a_passport_and_on_to_learning(tmp_path):
     for name in ("robot.toml", "calibrated.xml", "journal.jsonl", "passport.html", "passport.md"):
         assert (ant / name).is_file()
     assert RobotFolder.at(ant).config().model == "calibrated.xml"
+    assert "no" not in {
+        cell.strip() for line in (ant / "passport.md").read_text().splitlines() for cell in line.split("|")
+    }
     again = openant("bringup", "--virtual", "--robot", ant, "--yes", timeout=120)
     assert again.returncode == 0
     assert "1/15" not in again.stdout  # what stands is not done again

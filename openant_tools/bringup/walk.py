@@ -205,7 +205,9 @@ def standing(folder: RobotFolder) -> dict[str, Standing]:
         needed = [found[other] for other in step.needs]
         state: State = "todo"
         if finding is not None:
-            newer = any(other is not None and other.date > finding.date for other in needed)
+            # A passport tells of every step.
+            told = found.values() if name == "passport" else needed
+            newer = any(other is not None and other.date > finding.date for other in told)
             state = "failed" if not finding.ok else "stale" if newer else "ok"
         waits = tuple(other for other, seen in zip(step.needs, needed, strict=True) if seen is None or not seen.ok)
         out[name] = Standing(step, finding, state, waits)

@@ -150,7 +150,8 @@ def bounds(bench: Bench) -> Procedure:
         runs.append((yield from _library(bench, "floor")))
         yield Hands("Put it back on its stand.", "place", setup="stand")
         rest(bench)
-    found, quantiles = measured_bounds(runs)
+    # The sweep is the one motion that takes every joint to its ends: neighbouring legs would meet there in the others.
+    found, quantiles = measured_bounds([*runs, swept])
     recording = ", ".join(bench.folder.relative(run.path) for run in runs if run.path)
     bench.folder.update(
         {f"observation.{name}": [round(low, 5), round(high, 5)] for name, (low, high) in found.items()},
