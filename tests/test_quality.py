@@ -12,10 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from openant_tools.cli import main
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run
+from openant_tools.recording.tables import write_table
 from openant_tools.robot.mjcf import nominal_model_path
 from openant_tools.sysid.quality import check_model, check_runs, without_errors
 
@@ -194,3 +196,48 @@ def test_saturation_shows_without_duty_too(plant: Plant) -> None:
 def test_joints_that_are_commanded_alike_are_not_called_swapped(plant: Plant) -> None:
     run = good_run()
     check_runs([with_columns(cmd__hip_fr=run.column("cmd.hip_rr"), pos__hip_fr=run.column("pos.hip_rr"))], plant)
+
+
+def spoiled() -> dict[str, tuple[Run, str]]:
+    """Each way of being bad: the run, and what must be said of it."""
+    good, t = good_run(), good_run().t
+    duty = with_columns(pwm__hip_rr=np.full(len(t), 0.5))
+    columns = good.columns
+    return {
+        "too short": (good_run(0.5), "too short to fit"),
+        "no motion": (with_columns(**{f"pos__{joint}": np.full(len(t), -0.4) for joint in JOINTS}), "nothing moves"),
+        "dead joint": (with_columns(pos__knee_rr=np.full(len(t), -0.8)), "knee_rr is commanded over"),
+        "saturated": (
+            replace(duty, facts=replace(duty.facts, registers={"hip_rr": {"pwm_limit": 442}})),
+            "hip_rr works at its torque limit in 100 %",
+        ),
+        "wrong unit": (with_columns(pos__knee_fr=np.degrees(columns["pos.knee_fr"])), "angles are in rad"),
+        "swapped": (
+            with_columns(pos__hip_rr=columns["pos.hip_fr"], pos__hip_fr=columns["pos.hip_rr"]),
+            "follows cmd.hip_fr",
+        ),
+    }
+
+
+@pytest.mark.parametrize("how", [*spoiled(), "wrong model"])
+def test_the_command_names_bad_data_and_gives_no_number(
+    how: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = nominal_model_path("standard")
+    if how == "wrong model":
+        own = load_plant(plants.write(tmp_path / "pendulum.xml", plants.pendulum()))
+        model = plants.write(tmp_path / "heavy.xml", plants.pendulum().replace('mass="0.3"', 'mass="90"'))
+        t = np.arange(0.0, 3.0, 0.01)
+        columns = plants.drive(own.model, ["joint"], t, plants.sweep(t, 1, reach=1.2))
+        run, words = plants.run_of(columns, t, ["joint"], "bad"), "moves otherwise than in the model altogether"
+    else:
+        run, words = spoiled()[how]
+    write_table(replace(run, name="bad"), tmp_path / "bad.parquet")
+    with pytest.raises(SystemExit) as left:
+        main(["sysid", "fit", str(tmp_path / "bad.parquet"), "--model", str(model), "--out", str(tmp_path / "fit")])
+    printed = capsys.readouterr()
+    assert left.value.code == 2
+    assert printed.out == ""
+    assert words in printed.err.strip().splitlines()[-1]
+    assert "→" in printed.err
+    assert not (tmp_path / "fit").exists()
