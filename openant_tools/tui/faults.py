@@ -29,6 +29,13 @@ class Condition:
 
 def condition(history: History, joint: str) -> Condition:
     """One joint's condition, of the newest rows; it is what its answers say, no more."""
+    found: Condition | None = history.worked_out.get(joint)
+    if found is None:
+        found = history.worked_out[joint] = _condition(history, joint)
+    return found
+
+
+def _condition(history: History, joint: str) -> Condition:
     if not len(history.rows):
         return Condition("todo", "no data")
     answered = history.column(f"ok.{joint}") > 0

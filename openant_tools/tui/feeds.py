@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,6 +124,8 @@ class History:
         self.joints = tuple(joints)
         self._index = {name: k for k, name in enumerate(columns(joints))}
         self.rows: Array = np.empty((0, len(self._index)))
+        #: what others have worked out of these rows, by joint; gone with the next rows
+        self.worked_out: dict[str, Any] = {}
 
     @property
     def t(self) -> Array:
@@ -131,11 +133,13 @@ class History:
 
     def add(self, rows: Array) -> None:
         if len(rows):
+            self.worked_out.clear()
             self.rows = np.concatenate([self.rows, rows])
             self.rows = self.rows[np.searchsorted(self.t, self.t[-1] - WINDOW_S) :]
 
     def clear(self) -> None:
         self.rows = self.rows[:0]
+        self.worked_out.clear()
 
     def column(self, name: str) -> Array:
         """(n,) one column by its name in a run table."""
@@ -148,6 +152,9 @@ class History:
 
     def last_known(self, name: str) -> float:
         """The last value that is a number, of those in the window; NaN where there is none."""
+        newest = self.newest(name)
+        if newest == newest:  # not NaN
+            return newest
         values = self.column(name)
         known = values[np.isfinite(values)]
         return float(known[-1]) if len(known) else float("nan")

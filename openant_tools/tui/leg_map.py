@@ -30,8 +30,8 @@ HIP_M = KNEE_M = SEGMENT * math.sqrt(2)
 SHIN_M = 2 * KNEE_M
 #: m, what the drawing spans ahead and to the side: all of a leg but one that is turned far
 REACH_M = 0.27
-#: rad, less than one sees
-SEEN_RAD = 0.005
+#: rad, about half a dot at a foot: less is not drawn anew
+SEEN_RAD = 0.02
 #: dots drawn for one line of the drawing
 _DOTS_A_LINE = 60
 

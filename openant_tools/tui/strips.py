@@ -56,6 +56,8 @@ SIGNALS: tuple[Signal, ...] = (
 _FACTOR: Mapping[str, float] = {"rtt": 1e3}
 #: columns of text before and after the trace
 _BEFORE, _AFTER = 25, 17
+#: of one joint: each line costs time ten times a second
+MOST_LINES = 2
 
 
 class JointStrips(Widget, can_focus=True):
@@ -129,7 +131,7 @@ All strips of a signal share one scale, which stands in the top line; it grows w
         values = {joint: self._values(joint, chosen) for joint in history.joints}
         low, high = _scale(chosen, values)
         ascii_only = plain()
-        height = max(1, min(3, (self.size.height - 2) // max(1, len(history.joints))))
+        height = max(1, min(MOST_LINES, (self.size.height - 2) // max(1, len(history.joints))))
         stop = float(history.t[-1]) if len(history.rows) else WINDOW_S
         grey = Style(color="#A8A8A8")
         unit = spelled(chosen.unit)

@@ -99,7 +99,10 @@ and can be begun again: what it found or wrote before stays, and every write to 
         if self._live is not self._drawn_live:
             self._drawn_live = self._live
             line = self.query_one("#bars", Static)
-            line.display = self._live is not None
+            if line.display != (self._live is not None):
+                line.display = self._live is not None
+                # What is below the log now takes another share of the screen.
+                self.call_after_refresh(self.query_one("#log", VerticalScroll).scroll_end, animate=False)
             if self._live is not None:
                 line.update(bars(self._live, line.size.width or self.size.width - 4))
 
@@ -304,8 +307,9 @@ and can be begun again: what it found or wrote before stays, and every write to 
         """Answer what the procedure waits for."""
         if self._run is None or self._pending is None:
             return
+        asked = f"{self._pending.question} " if isinstance(self._pending, Ask) else ""
         self._pending = None
-        self.say(Text(f"  {mark('ok')} {words}", style=MARKS["todo"].colour))
+        self.say(Text(f"  {mark('ok')} {asked}{words}", style=MARKS["todo"].colour))
         self.offer("", [])
         self._run.reply(answer)
 
