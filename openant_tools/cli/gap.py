@@ -1,4 +1,4 @@
-"""`openant gap`: how far a simulation is from its robot, and where."""
+"""`openant gap`: how far a simulation is from its robot, where, and why."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from openant_tools.cli.gap_blind import blind
+from openant_tools.cli.gap_diagnose import apply, diagnose, next_experiment, prepare
 from openant_tools.cli.options import json_option, report_option, robot_option
 
 __all__ = ["gap"]
@@ -18,7 +19,8 @@ def gap() -> None:
     """The gap between a robot and its simulation."""
 
 
-gap.add_command(blind)
+for _command in (apply, blind, diagnose, next_experiment, prepare):
+    gap.add_command(_command)
 
 
 @gap.command()

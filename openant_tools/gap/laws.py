@@ -78,7 +78,8 @@ def last_laws(robots: Sequence[Robot], fields: Fields) -> list[Law]:
         laws.append(_bending(bristle, fields.armature + fields.link))
     play, compliance = _table(robots, "play"), _table(robots, "compliance")
     if play.any() or compliance.any():
-        laws.append(_transmitting(play, compliance, fields))
+        before = np.array([[robot.form is not None and not robot.form.loop_behind] for robot in robots])
+        laws.append(_transmitting(play, compliance, fields, before))
     return laws
 
 
@@ -163,8 +164,8 @@ def _bending(bristle: Array, inertia: Array) -> Law:
     return act
 
 
-def _transmitting(play: Array, compliance: Array, fields: Fields) -> Law:
-    """A rotor behind play or a spring; the servo's loop closes over both, as the encoder sits on the output.
+def _transmitting(play: Array, compliance: Array, fields: Fields, before: NDArray[np.bool_]) -> Law:
+    """A rotor behind play or a spring; the servo's loop closes over both, as the encoder sits on the output, or `before` them.
 
     The rotor is integrated here, semi-implicitly; the joint keeps its links. Hard teeth are as stiff as a step can take.
     """
@@ -186,7 +187,10 @@ def _transmitting(play: Array, compliance: Array, fields: Fields) -> Law:
         twist = angle[0] - step.position
         beyond = np.sign(twist) * np.maximum(np.abs(twist) - play / 2, 0.0)
         passed = np.where(beyond != 0, spring * beyond + damper * (speed - step.velocity), 0.0)
+        seen = step.position, step.velocity
+        step.position, step.velocity = np.where(before, angle[0], seen[0]), np.where(before, speed, seen[1])
         motor = step.motor_torque
+        step.position, step.velocity = seen
         faster = (speed + step.dt / rotor * (motor + step.torque - passed)) / (1 + step.dt * damping / rotor)
         slowed = np.sign(faster) * np.maximum(np.abs(faster) - step.dt * step.friction / rotor, 0.0)
         speed[:] = np.where(mine, slowed, step.velocity)

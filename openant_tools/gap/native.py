@@ -16,7 +16,7 @@ import numpy as np
 from lxml import etree
 from numpy.typing import NDArray
 
-from openant_tools.gap.laws import DAMPED
+from openant_tools.gap.laws import DAMPED, HARD
 from openant_tools.gap.robot import Robot, tilted
 from openant_tools.model.body import torso_body
 from openant_tools.model.mjcf import actuator_element, in_degrees, joint_element, number, numbers
@@ -29,17 +29,15 @@ Element = etree._Element
 
 #: what stands in for none where MuJoCo wants a positive motor constant: its back-EMF is the square
 NO_MOTOR = 1e-5
-#: rad that teeth bend before they slide (LuGre), the least that a step of 2 ms can follow with a light link
-BRISTLE_RAD = 1e-3
-#: share of the critical damping of bristles
-BRISTLE_DAMPING = 0.5
-#: s, how fast stops push back; at least two steps, or MuJoCo softens them
-STOP_S = 0.004
+#: rad that teeth bend before they slide (LuGre), the share of the stiffest spring that a step can follow, and the share of
+#: its critical damping: more of it is carried into the sliding
+BRISTLE_RAD, BRISTLE_STEP, BRISTLE_DAMPING = 3e-4, 0.2, 0.05
+#: share of the friction at rest that is left at speed at least: with none, bristles have nothing to slide on
+LEAST_SLIDING = 0.05
+#: of stops: how little of their spring gives way
+STOP_IMPEDANCE = "0.99 0.9999 0.0001"
 #: m from the torso to where the cable's tendons end: their direction and length change by a per cent while it walks a metre
 FAR_M = 100.0
-#: share of the spring's stiffness up to which a servo that closes its loop over the spring can be had by a stiffer one that
-#: does not
-SERIES = 0.8
 
 
 @dataclass
@@ -85,12 +83,6 @@ def _servo(root: Element, plant: Plant, robot: Robot, j: int, done: Edit) -> Non
     share = float(robot.electrical[j])
     slope = share / (1 - share) * float(model.dof_damping[dof])
     stiffness, velocity, limit = _loop(model, i)
-    spring = float(robot.compliance[j])
-    if spring and stiffness * spring < SERIES:
-        # The servo measures behind the spring, MuJoCo's before it: the same torque for the same angle behind it.
-        stiffness, velocity = (gain / (1 - stiffness * spring) for gain in (stiffness, velocity))
-    elif spring:
-        done.notes.append(f"{joint}: its spring is softer than its servo; the model measures before the spring")
     motor = (slope > 0 or math.isfinite(no_load)) and math.isfinite(limit)
     if lag > 0 and (motor or math.isfinite(slew)):
         done.notes.append(f"{joint}: MuJoCo filters no setpoint of such a servo; its lag acts as a delay as long")
@@ -98,10 +90,12 @@ def _servo(root: Element, plant: Plant, robot: Robot, j: int, done: Edit) -> Non
         _as_motor(root, element, model, i, stiffness, velocity, limit, slope, no_load, slew, joint)
     elif math.isfinite(slew):
         _as_pid(element, model, i, stiffness, velocity + slope, limit, slew)
-    elif slope > 0 or spring:
+    elif slope > 0:
         _set_gains(element, stiffness, velocity + slope)
     filtered = element.tag in ("position", "general")
     if robot.lag[j] > 0 and filtered:
+        # MuJoCo shows what its filter says a step later, which belongs to the lag.
+        lag = max(lag - plant.timestep, 0.1 * lag)
         if element.tag == "general":
             element.set("dyntype", "filterexact")
             element.set("dynprm", number(lag))
@@ -225,7 +219,14 @@ def _stops(root: Element, plant: Plant, robot: Robot, j: int) -> None:
     ends = np.array([max(given[0], low + reading), min(given[1], high + reading)])
     element.set("range", numbers(np.degrees(ends) if _turns(model, joint) and in_degrees(root) else ends))
     element.set("limited", "true")
-    element.set("solreflimit", f"{number(max(STOP_S, 2 * plant.timestep))} 1")
+    _hard(element, plant, math.sqrt(HARD) / 2)
+
+
+def _hard(joint: Element, plant: Plant, damping: float) -> None:
+    """Stops of screws and teeth, which throw back as those of `laws` do: a spring as stiff as there, and its damping ratio."""
+    seconds = plant.timestep / (math.sqrt(HARD) * damping)
+    joint.set("solreflimit", numbers([seconds, damping]))
+    joint.set("solimplimit", STOP_IMPEDANCE)
 
 
 def _turns(model: mujoco.MjModel, joint: int) -> bool:
@@ -246,12 +247,15 @@ def _gears(root: Element, plant: Plant, robot: Robot, j: int) -> None:
         element.set("damping", numbers([plant.model.dof_damping[plant.dof[j]], quadratic]))
     static = law("stribeck_friction", "static_nm")
     if static:
-        coulomb = law("stribeck_friction", "coulomb_nm")
-        stiffness = static / BRISTLE_RAD
+        # The joint's own dry friction slides on the same bristles.
+        own = float(plant.model.dof_frictionloss[plant.dof[j]])
+        joint_element(root, joint, plant.path).set("frictionloss", "0")
         inertia = max(float(plant.model.dof_M0[plant.dof[j]]), 1e-6)
+        rest = own + static
+        stiffness = min(rest / BRISTLE_RAD, BRISTLE_STEP * inertia / plant.timestep**2)
         bristles = [stiffness, 2 * BRISTLE_DAMPING * math.sqrt(stiffness * inertia)]
-        law_of = [max(coulomb, 1e-4 * static), static, law("stribeck_friction", "velocity_rad_s")]
-        _gear(root, joint, "friction", "lugre", [*bristles, *law_of])
+        sliding = max(own + law("stribeck_friction", "coulomb_nm"), LEAST_SLIDING * rest)
+        _gear(root, joint, "friction", "lugre", [*bristles, sliding, rest, law("stribeck_friction", "velocity_rad_s")])
     amplitude = law("cogging", "amplitude_nm")
     if amplitude:
         periods = law("cogging", "periods")
@@ -302,7 +306,7 @@ def _series(root: Element, plant: Plant, robot: Robot, j: int, done: Edit) -> No
         if name == "play":
             hinge.set("range", numbers([-play / 2 * turn, play / 2 * turn]))
             hinge.set("limited", "true")
-            hinge.set("solreflimit", f"{number(max(STOP_S, 2 * plant.timestep))} 1")
+            _hard(hinge, plant, DAMPED)
         else:
             stiffness = 1 / compliance
             rotor = float(model.dof_armature[dof])
@@ -322,10 +326,10 @@ def _series(root: Element, plant: Plant, robot: Robot, j: int, done: Edit) -> No
     fixed.tail = "\n  "
     for name in (joint, *names):
         etree.SubElement(fixed, "joint", joint=name, coef="1")
-    if play:
-        done.notes.append(
-            f"{joint}: MuJoCo's servo measures before its play, the robot's behind it; pos.{joint} reads behind it"
-        )
+    what = "play" if play else "spring"
+    done.notes.append(
+        f"{joint}: MuJoCo's servo measures before its {what}; pos.{joint} reads behind it, as an encoder does"
+    )
 
 
 def _encoder(root: Element, plant: Plant, robot: Robot, joint: str, hinges: Sequence[str]) -> None:

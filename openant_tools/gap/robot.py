@@ -30,6 +30,8 @@ class Form:
         integrator: mjtIntegrator. elliptic: cones, else pyramids. impratio: how much stiffer friction is than contact.
         smooth_friction: dry friction as a steep function of velocity (rad/s where it is reached), 0 as a constraint.
         bristle: dry friction as bristles that bend by this angle (rad) before they slide (LuGre), 0 as a constraint.
+        loop_behind: a servo measures behind its play or spring, as encoders on output shafts do; a written MJCF, whose
+            servos measure their own joint, cannot.
     """
 
     integrator: int = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
@@ -37,6 +39,7 @@ class Form:
     impratio: float = 10.0
     smooth_friction: float = 0.0
     bristle: float = 0.0
+    loop_behind: bool = True
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from openant_tools.model.plant import (
     samples_for,
 )
 
-__all__ = ["write_model"]
+__all__ = ["actuator_element", "document_text", "in_degrees", "joint_element", "number", "numbers", "write_model"]
 
 #: attribute of <compiler> that names the folder, relative to the model's file, of what these elements read;
 #: `assetdir` stands for both
@@ -56,7 +56,7 @@ def write_model(
         source: the MJCF to start from.
         variant: a model compiled from it as it is (with its free joint), in which some of these differ: stiffness and
             velocity gain of actuators, their force range, delay and lag; damping, armature, friction and zero of joints;
-            mass and inertia of bodies, together; friction and softness of geoms.
+            mass and inertia of bodies, together; friction, softness and adhesion of geoms.
         out: the file to write, atomically.
         joints: the servo joints; default all.
         note: a line for the comment at the top.
@@ -76,7 +76,7 @@ def write_model(
     try:
         if stated:
             _write_stated(root, stated, source)
-            write_text(trial, _text(tree))
+            write_text(trial, document_text(tree))
             plant = replace(load_plant(trial, joints, Setup.FLOOR), path=source)
         spec = mujoco.MjSpec.from_file(str(trial if stated else source))
         ratios = _write_servos(root, plant, variant)
@@ -86,26 +86,24 @@ def write_model(
         if note:
             root.insert(0, etree.Comment(f" {note.replace('--', '−−')} "))
             root[0].tail = root.text or "\n  "
-        write_text(trial, _text(tree))
+        write_text(trial, document_text(tree))
         if ratios:
             _set_damping_ratios(ratios, trial, plant, variant)
-            write_text(trial, _text(tree))
+            write_text(trial, document_text(tree))
         _check(trial, plant, variant)
     finally:
         trial.unlink(missing_ok=True)
-    write_text(out, _text(tree))
+    write_text(out, document_text(tree))
     return out
 
 
 def _write_servos(root: etree._Element, plant: Plant, variant: mujoco.MjModel) -> dict[int, etree._Element]:
     """Set what differs in joints and actuators; returns those whose velocity gain must yet be given as a damping ratio."""
-    degrees = _in_degrees(root)
+    degrees = in_degrees(root)
     ratios = {}
     for j, name in enumerate(plant.joints):
-        joint = next((e for e in root.iter("joint") if e.get("name") == name and _in_world(e)), None)
-        if joint is None:
-            raise _not_written_out(f"the joint {name!r}", plant.path)
-        actuator = _actuator_element(root, plant, j)
+        joint = joint_element(root, name, plant.path)
+        actuator = actuator_element(root, plant, j)
         _write_joint(joint, plant, variant, j, degrees)
         if is_motor(variant, int(plant.actuator[j])) and not is_motor(plant.model, int(plant.actuator[j])):
             _write_motor(actuator, variant, int(plant.actuator[j]))
@@ -131,13 +129,13 @@ _SECTIONS: dict[str, tuple[str, tuple[str, ...] | None]] = {
 
 def _write_stated(root: etree._Element, values: Stated, source: Path) -> None:
     """Set attributes as they stand in the file, with as many numbers as it gives, or as are needed."""
-    for attribute, numbers in values.items():
+    for attribute, wanted in values.items():
         element = _stated_element(root, attribute)
         if element is None:
             raise _not_written_out(f"the {attribute}", source)
         given = len(str(element.get(attribute.attribute, "")).split())
-        needed = len(np.trim_zeros(np.array(numbers), "b"))
-        element.set(attribute.attribute, _numbers(numbers[: max(given, needed, 1)]))
+        needed = len(np.trim_zeros(np.array(wanted), "b"))
+        element.set(attribute.attribute, numbers(wanted[: max(given, needed, 1)]))
 
 
 def _stated_element(root: etree._Element, attribute: Attribute) -> etree._Element | None:
@@ -165,7 +163,7 @@ def _not_written_out(what: str, source: Path) -> BadInput:
     )
 
 
-def _text(tree: etree._ElementTree) -> str:
+def document_text(tree: etree._ElementTree) -> str:
     """The document with a line for each comment around its root, whose line ends a parser does not keep."""
     root = tree.getroot()
     before = [etree.tostring(e, encoding="unicode", with_tail=False) for e in root.itersiblings(preceding=True)]
@@ -220,11 +218,15 @@ def _files(element: etree._Element) -> list[tuple[str, str]]:
     return [(str(name), str(value)) for name, value in element.attrib.items() if str(name).startswith("file")]
 
 
-def _in_world(element: etree._Element) -> bool:
-    return any(ancestor.tag == "worldbody" for ancestor in element.iterancestors())
+def joint_element(root: etree._Element, name: str, source: Path) -> etree._Element:
+    """The element of a joint of that name."""
+    for element in root.iter("joint"):
+        if element.get("name") == name and any(ancestor.tag == "worldbody" for ancestor in element.iterancestors()):
+            return element
+    raise _not_written_out(f"the joint {name!r}", source)
 
 
-def _in_degrees(root: etree._Element) -> bool:
+def in_degrees(root: etree._Element) -> bool:
     given = [str(e.get("angle")) for e in root.iter("compiler") if e.get("angle")]
     return not given or given[-1] == "degree"
 
@@ -251,7 +253,7 @@ def _repoint_assets(root: etree._Element, source: Path, out: Path) -> None:
             element.set(name, str(here / value))
 
 
-def _actuator_element(root: etree._Element, plant: Plant, j: int) -> etree._Element:
+def actuator_element(root: etree._Element, plant: Plant, j: int) -> etree._Element:
     """The element that became the actuator of joint j, by the joint that it names and its own name."""
     name = plant.model.actuator(int(plant.actuator[j])).name
     elements = [e for section in root.iter("actuator") for e in section if isinstance(e.tag, str)]
@@ -261,12 +263,12 @@ def _actuator_element(root: etree._Element, plant: Plant, j: int) -> etree._Elem
     return named[0]
 
 
-def _number(value: float) -> str:
+def number(value: float) -> str:
     return f"{value:.10g}"
 
 
-def _numbers(values: Sequence[float] | NDArray[np.float64]) -> str:
-    return " ".join(_number(float(value)) for value in values)
+def numbers(values: Sequence[float] | NDArray[np.float64]) -> str:
+    return " ".join(number(float(value)) for value in values)
 
 
 def _differ(a: float, b: float) -> bool:
@@ -279,17 +281,17 @@ def _write_joint(element: etree._Element, plant: Plant, variant: mujoco.MjModel,
     scale = math.degrees(1.0) if degrees and given.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE else 1.0
     if _differ(given.dof_damping[dof], variant.dof_damping[dof]):
         higher = np.trim_zeros(given.dof_dampingpoly[dof], "b")
-        element.set("damping", _numbers([variant.dof_damping[dof], *higher]))
+        element.set("damping", numbers([variant.dof_damping[dof], *higher]))
     if _differ(given.dof_armature[dof], variant.dof_armature[dof]):
-        element.set("armature", _number(variant.dof_armature[dof]))
+        element.set("armature", number(variant.dof_armature[dof]))
     if _differ(given.dof_frictionloss[dof], variant.dof_frictionloss[dof]):
-        element.set("frictionloss", _number(variant.dof_frictionloss[dof]))
+        element.set("frictionloss", number(variant.dof_frictionloss[dof]))
     if _differ(given.qpos0[adr], variant.qpos0[adr]):
-        element.set("ref", _number(variant.qpos0[adr] * scale))
+        element.set("ref", number(variant.qpos0[adr] * scale))
         if given.jnt_limited[joint]:
-            element.set("range", _numbers(variant.jnt_range[joint] * scale))
+            element.set("range", numbers(variant.jnt_range[joint] * scale))
         if given.jnt_stiffness[joint]:
-            element.set("springref", _number(variant.qpos_spring[adr] * scale))
+            element.set("springref", number(variant.qpos_spring[adr] * scale))
 
 
 def _write_actuator(element: etree._Element, plant: Plant, variant: mujoco.MjModel, j: int) -> bool:
@@ -300,24 +302,24 @@ def _write_actuator(element: etree._Element, plant: Plant, variant: mujoco.MjMod
     as_ratio = False
     if element.tag == "general":
         if stiffness or velocity:
-            element.set("biasprm", _numbers(after[:3]))
-            element.set("gainprm", _numbers(variant.actuator_gainprm[i][:3]))
+            element.set("biasprm", numbers(after[:3]))
+            element.set("gainprm", numbers(variant.actuator_gainprm[i][:3]))
     else:
         if stiffness:
-            element.set("kp", _number(-after[1]))
+            element.set("kp", number(-after[1]))
         # A damping ratio would follow the new stiffness and inertia; what was identified is the gain itself.
         own = element.attrib.pop("dampratio", "") != ""
         as_ratio = element.get("kv") is None and _ratio_by_default(element)
         if (velocity or own) and not as_ratio:
-            element.set("kv", _number(-after[2]))
+            element.set("kv", number(-after[2]))
     if is_filtered(variant, int(i)) and _differ(_lag(given, int(i)), _lag(variant, int(i))):
         if element.tag == "general":
             element.set("dyntype", "filterexact")
-            element.set("dynprm", _number(_lag(variant, int(i))))
+            element.set("dynprm", number(_lag(variant, int(i))))
         else:
-            element.set("timeconst", _number(_lag(variant, int(i))))
+            element.set("timeconst", number(_lag(variant, int(i))))
     if any(_differ(a, b) for a, b in zip(given.actuator_forcerange[i], variant.actuator_forcerange[i], strict=True)):
-        element.set("forcerange", _numbers(variant.actuator_forcerange[i]))
+        element.set("forcerange", numbers(variant.actuator_forcerange[i]))
     return as_ratio
 
 
@@ -342,10 +344,10 @@ def _set_damping_ratios(
         if not math.isclose(now, wanted, rel_tol=1e-9):
             # Its class's ratio counts where it has none of its own; which that is, a ratio of 1 tells.
             element.set("dampratio", "1")
-            write_text(trial, _text(element.getroottree()))
+            write_text(trial, document_text(element.getroottree()))
             again = load_plant(trial, plant.joints, Setup.FLOOR)
             of_one = -float(again.model.actuator_biasprm[again.actuator[j], 2])
-            element.set("dampratio", _number(wanted / of_one))
+            element.set("dampratio", number(wanted / of_one))
 
 
 def _write_motor(element: etree._Element, variant: mujoco.MjModel, i: int) -> None:
@@ -357,20 +359,20 @@ def _write_motor(element: etree._Element, variant: mujoco.MjModel, i: int) -> No
     for name, value in kept.items():
         element.set(name, value)
     element.set("input", "pos")
-    element.set("motorconst", _numbers([motor[MOTOR_CONSTANT]] * 2))
-    element.set("resistance", _number(motor[RESISTANCE]))
-    element.set("controller", _numbers([motor[KP], 0, motor[KD], 0, 0, motor[VMAX]]))
+    element.set("motorconst", numbers([motor[MOTOR_CONSTANT]] * 2))
+    element.set("resistance", number(motor[RESISTANCE]))
+    element.set("controller", numbers([motor[KP], 0, motor[KD], 0, 0, motor[VMAX]]))
     # It leaves its class, which was made for the servo, and takes along what else stood there.
     if variant.actuator_ctrllimited[i]:
-        element.set("ctrlrange", _numbers(variant.actuator_ctrlrange[i]))
+        element.set("ctrlrange", numbers(variant.actuator_ctrlrange[i]))
     samples, interpolation = (int(value) for value in variant.actuator_history[i])
     if samples:
         element.set("nsample", str(samples))
         element.set("interp", ("zoh", "linear", "cubic")[interpolation])
-        element.set("delay", _number(variant.actuator_delay[i]))
+        element.set("delay", number(variant.actuator_delay[i]))
     for name, value in (("armature", variant.actuator_armature[i]), ("damping", variant.actuator_damping[i])):
         if value:
-            element.set(name, _number(value))
+            element.set(name, number(value))
     if variant.actuator_group[i]:
         element.set("group", str(variant.actuator_group[i]))
     main = element.getroottree().getroot().find("default")
@@ -396,7 +398,7 @@ def _write_delay(element: etree._Element, plant: Plant, variant: mujoco.MjModel,
     delay = float(variant.actuator_delay[i])
     if not _differ(plant.model.actuator_delay[i], delay):
         return
-    element.set("delay", _number(delay))
+    element.set("delay", number(delay))
     element.set("nsample", str(max(int(plant.model.actuator_history[i, 0]), samples_for(delay, plant.timestep))))
     element.set("interp", "linear")
 
@@ -411,38 +413,39 @@ def _write_bodies(root: etree._Element, plant: Plant, variant: mujoco.MjModel, s
     for body in heavier:
         factor = float(variant.body_mass[body] / given.body_mass[body])
         for inertial in bodies[body].findall("inertial"):
-            inertial.set("mass", _number(float(inertial.get("mass", "0")) * factor))
+            inertial.set("mass", number(float(inertial.get("mass", "0")) * factor))
             for name in ("diaginertia", "fullinertia"):
                 if inertial.get(name):
-                    inertial.set(name, _numbers([float(x) * factor for x in str(inertial.get(name)).split()]))
+                    inertial.set(name, numbers([float(x) * factor for x in str(inertial.get(name)).split()]))
         for k in np.flatnonzero(given.geom_bodyid == body):
             # What a default class says of it is what the spec says; a mass stands before a density.
             mass, density = float(spec.geoms[k].mass), float(spec.geoms[k].density)
             if math.isnan(mass):
-                geoms[k].set("density", _number(density * factor))
+                geoms[k].set("density", number(density * factor))
             elif mass:
-                geoms[k].set("mass", _number(mass * factor))
+                geoms[k].set("mass", number(mass * factor))
 
 
 def _write_contacts(root: etree._Element, plant: Plant, variant: mujoco.MjModel) -> None:
     given = plant.model
-    for attribute in ("friction", "solref", "solimp"):
+    for attribute in ("friction", "solref", "solimp", "adhesion"):
         differing = _differing(given, variant, f"geom_{attribute}")
         if len(differing):
             _, geoms = _in_order(root, plant)
             for k in differing:
-                geoms[k].set(attribute, _numbers(getattr(variant, f"geom_{attribute}")[k]))
-        for k in _differing(given, variant, f"pair_{attribute}"):
+                geoms[k].set(attribute, numbers(np.atleast_1d(getattr(variant, f"geom_{attribute}")[k])))
+        for k in _differing(given, variant, f"pair_{attribute}") if attribute != "adhesion" else ():
             names = {given.geom(int(given.pair_geom1[k])).name, given.geom(int(given.pair_geom2[k])).name}
             found = [e for e in root.iter("pair") if {e.get("geom1"), e.get("geom2")} == names]
             if len(found) != 1:
                 raise _not_written_out(f"the contact pair of {' and '.join(sorted(names))}", plant.path)
-            found[0].set(attribute, _numbers(getattr(variant, f"pair_{attribute}")[k]))
+            found[0].set(attribute, numbers(getattr(variant, f"pair_{attribute}")[k]))
 
 
 def _differing(given: mujoco.MjModel, variant: mujoco.MjModel, field: str) -> NDArray[np.int64]:
     before, after = getattr(given, field), getattr(variant, field)
-    return np.flatnonzero(~np.isclose(before, after, rtol=1e-12, atol=1e-15).all(axis=1)).astype(np.int64)
+    differs = ~np.isclose(before, after, rtol=1e-12, atol=1e-15)
+    return np.flatnonzero(differs if differs.ndim == 1 else differs.any(axis=1)).astype(np.int64)
 
 
 def _in_order(root: etree._Element, plant: Plant) -> tuple[list[etree._Element], list[etree._Element]]:
@@ -541,6 +544,7 @@ _OF_BODIES = (
     ("the friction of a geom", "geom_friction"),
     ("the softness of a geom (solref)", "geom_solref"),
     ("the softness of a geom (solimp)", "geom_solimp"),
+    ("the adhesion of a geom", "geom_adhesion"),
     ("the friction of a pair", "pair_friction"),
     ("the softness of a pair (solref)", "pair_solref"),
     ("the softness of a pair (solimp)", "pair_solimp"),

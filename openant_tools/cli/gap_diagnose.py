@@ -1,0 +1,220 @@
+"""`openant gap diagnose | apply | prepare | next`: what a gap comes from, the model without it, and what to record next."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from openant_tools.cli.options import json_option, report_option, robot_option
+
+if TYPE_CHECKING:
+    from openant_tools.gap.diagnosis import Diagnosis
+
+__all__ = ["apply", "diagnose", "next_experiment", "prepare"]
+
+#: effects shown in the terminal; the JSON has all
+SHOWN = 6
+
+runs_argument = click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN…")
+model_option = click.option(
+    "--model",
+    type=click.Path(path_type=Path),
+    metavar="M.xml",
+    help="Default: the model that every run names, else that of the robot's folder.",
+)
+joint_option = click.option("--joint", "joints", multiple=True, metavar="NAME", help="Only this joint. Repeatable.")
+robots_option = click.option(
+    "--robots",
+    type=click.IntRange(min=64),
+    metavar="N",
+    help="How many robots to simulate for a protocol never seen. Default: by the number of joints.",
+)
+
+
+@click.command()
+@runs_argument
+@model_option
+@click.option(
+    "--hold-out",
+    "hold_out",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="RUN",
+    help="Judge on this run. Repeatable. Default: each run is left out in turn.",
+)
+@joint_option
+@robots_option
+@robot_option
+@json_option
+@report_option
+def diagnose(
+    runs: tuple[Path, ...],
+    model: Path | None,
+    hold_out: tuple[Path, ...],
+    joints: tuple[str, ...],
+    robots: int | None,
+    robot: Path | None,
+    json_file: Path | None,
+    report: Path | None,
+) -> None:
+    """Say where the gap between RUNs and a model lies, which unmodelled effect causes it, and how far it closes.
+
+    \b
+      openant gap diagnose stand.mcap walk.mcap --robot my-ant --json gap.json --report gap
+      openant gap diagnose a.parquet b.parquet --hold-out c.parquet --model pendulum.xml
+
+    Where the protocol was never seen, robots are simulated first (`openant gap prepare` does that ahead of time). Exit code
+    0 whatever the verdict.
+    """
+    from openant_tools.files import write_text
+    from openant_tools.gap.diagnose import diagnose as diagnosed
+    from openant_tools.gap.report import diagnosis_report
+    from openant_tools.recording.tables import read_run
+
+    recordings, held_out = [read_run(path) for path in runs], [read_run(path) for path in hold_out]
+    model = _model(model, robot, (*runs, *hold_out))
+    with progress() as tell:
+        found = diagnosed(recordings, model, hold_out=held_out, joints=joints or None, robots=robots, progress=tell)
+        if json_file:
+            write_text(json_file, json.dumps(found.as_json(), indent=1, ensure_ascii=False) + "\n")
+        written = None
+        if report:
+            tell(1.0, "writing the report")
+            written = diagnosis_report(found, recordings, held_out, model).write_folder(report)
+    _print(found)
+    if written:
+        click.echo(f"wrote {written}", err=True)
+
+
+@click.command()
+@runs_argument
+@model_option
+@joint_option
+@robots_option
+@robot_option
+def prepare(
+    runs: tuple[Path, ...], model: Path | None, joints: tuple[str, ...], robots: int | None, robot: Path | None
+) -> None:
+    """Simulate the robots that diagnoses of what RUNs played will be judged by, so that each takes a minute.
+
+    What is done is kept: interrupt it and start it again as you like. The same commands count as the same protocol
+    whatever their time stamps.
+    """
+    from openant_tools.gap.prepare import prepare as prepared
+    from openant_tools.gap.protocol import Protocol
+    from openant_tools.recording.tables import read_run
+    from openant_tools.sysid.identify import joints_in_common, own_model
+
+    recordings = [read_run(path) for path in runs]
+    model = _model(model, robot, runs)
+    wanted = joints_in_common(recordings, model, joints or None)
+    protocol = Protocol.of(recordings, model, wanted, [own_model(run) for run in recordings])
+    with progress() as tell:
+        made = prepared(protocol, robots, tell)
+    click.echo(f"ready: {len(made.cases)} simulated robots of {len(wanted)} joints in {made.folder}")
+
+
+@click.command()
+@click.argument("diagnosis", type=click.Path(path_type=Path), metavar="OUT.json")
+@model_option
+@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="IMPROVED.xml", help="What to make.")
+@robot_option
+def apply(diagnosis: Path, model: Path | None, out: Path, robot: Path | None) -> None:
+    """Write the model with the effects that a diagnosis selected.
+
+    What MuJoCo has features for stands in IMPROVED.xml, which plain MuJoCo loads; the rest beside it in
+    IMPROVED.effects.toml, or with --robot in its robot.toml.
+    """
+    from openant_tools.gap.apply import apply as applied
+    from openant_tools.gap.diagnosis import read_diagnosis
+
+    found = read_diagnosis(diagnosis)
+    source = model or (_model(None, robot, ()) if robot is not None else Path(found.model))
+    done = applied(found, source, out, robot=robot)
+    for line in done.carried:
+        click.echo(line)
+    for line in done.notes:
+        click.echo(line, err=True)
+    for path in done.written:
+        click.echo(f"wrote {path}", err=True)
+
+
+@click.command("next")
+@click.argument("diagnosis", type=click.Path(path_type=Path), metavar="OUT.json")
+@model_option
+@json_option
+def next_experiment(diagnosis: Path, model: Path | None, json_file: Path | None) -> None:
+    """Say which experiment best separates what a diagnosis left open, and how far it would.
+
+    Simulates what is still possible on every protocol of `openant sysid record --list`.
+    """
+    from openant_tools.files import write_text
+    from openant_tools.gap.diagnosis import read_diagnosis
+    from openant_tools.gap.next import experiments
+
+    found = read_diagnosis(diagnosis)
+    with progress() as tell:
+        answer = experiments(found, model or Path(found.model), progress=tell)
+    click.echo(answer.sentence)
+    for one in answer.experiments:
+        click.echo(f"  {one.name:22}  {one.words}")
+    if json_file:
+        write_text(json_file, json.dumps(answer.as_json(), indent=1, ensure_ascii=False) + "\n")
+
+
+@contextlib.contextmanager
+def progress() -> Iterator[Callable[[float, str], None]]:
+    """A bar on stderr, told a share and words."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("reading", total=1.0)
+        yield lambda share, words: bar.update(task, description=words, completed=share)
+
+
+def _model(model: Path | None, robot: Path | None, runs: tuple[Path, ...]) -> Path:
+    """The MJCF that was named, or that all runs name, or that the robot's folder has."""
+    from openant_tools.cli.options import robot_folder
+    from openant_tools.recording.tables import read_run
+    from openant_tools.robot.folder import RobotFolder
+    from openant_tools.sysid.identify import own_model
+
+    if model is not None:
+        return model
+    if robot is None and runs:
+        own = [own_model(read_run(path)) for path in runs]
+        if own[0] is not None and None not in own:
+            return own[0]
+    return RobotFolder.at(robot_folder(robot)).model_path()
+
+
+def _print(found: Diagnosis) -> None:
+    from openant_tools.gap.report import sentence, where_words
+
+    click.echo(sentence(found))
+    click.echo("effect               where               present  closes  parameters")
+    for one in found.effects[:SHOWN]:
+        values = ", ".join(
+            f"{name} {span.value:.3g} [{span.low:.3g}, {span.high:.3g}]" for name, span in one.parameters.items()
+        )
+        closed = "–" if one.gap_closed is None else f"{100 * one.gap_closed:.0f} %"
+        mark = "*" if one.effect in found.selected else " "
+        click.echo(
+            f"{mark}{one.effect:19}  {where_words(one.joints):18}  {100 * one.probability:5.0f} %  {closed:>6}  {values}"
+        )
+    gap = found.gap
+    click.echo(
+        f"gap of position on held-out runs: {1e3 * gap['before']:.2f} → {1e3 * gap['after']:.2f} mrad, "
+        f"floor {1e3 * gap['floor']:.2f} mrad"
+    )
+    for note in found.notes:
+        click.echo(note)
+    if found.next_experiment:
+        click.echo(f"next: {found.next_experiment}")
