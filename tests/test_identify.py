@@ -356,7 +356,14 @@ def test_progress_runs_from_start_to_end(model: Path) -> None:
     seen: list[float] = []
     robot = Robot(7.3)
     runs = [robot.record("a", 1.5), robot.record("b", 1.5, seed=1)]
-    identify(runs, model, kinds=["stiffness"], progress=lambda what, done: seen.append(done))
+    said: list[str] = []
+
+    def tell(what: str, done: float) -> None:
+        said.append(what)
+        seen.append(done)
+
+    identify(runs, model, kinds=["stiffness"], progress=tell)
+    assert said.count("judging on held-out runs") >= 2
     assert seen
     assert all(a <= b + 1e-9 for a, b in itertools.pairwise(seen))
     assert 0 <= seen[0] <= seen[-1] <= 1
