@@ -1,0 +1,286 @@
+"""The experiment that best separates what a diagnosis left open.
+
+What is still possible is simulated on every protocol of the library; the protocol on which the two that are most alike differ
+most, against how robots of one build differ, is the one to record. Where physics forbids commands and positions to tell two
+effects apart, a table knows what to do with one's hands.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.errors import BadInput
+from openant_tools.gap.apply import robot_of
+from openant_tools.gap.diagnosis import NONE, Diagnosis, Found
+from openant_tools.gap.protocol import FLOOR_STEP_S, STAND_STEP_S
+from openant_tools.gap.robot import USUAL_NOISE, Reference, Robot
+from openant_tools.gap.simulation import simulate
+from openant_tools.gap.tolerance import scatter
+from openant_tools.model.plant import Plant, Setup, load_plant
+from openant_tools.model.rollout import Rollouts
+from openant_tools.recording.run import Facts, Run
+from openant_tools.robot.joints import JOINTS
+from openant_tools.sysid.protocols import FULL, PROTOCOLS, CommandSpace, Protocol, protocols
+
+__all__ = ["Answer", "Experiment", "experiments"]
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, str], None]
+
+#: effects that count as still possible: probability at least, how many at most
+POSSIBLE, MOST = 0.1, 4
+#: simulated robots without any effect, by which is told what robots of one build differ by
+BUILD = 12
+#: s and Hz of a candidate's recording here: how motions compare does not need all of a recording
+SECONDS, RATE_HZ = 8.0, 50.0
+#: s over which signals are averaged before they are compared
+BLOCK_S = 0.1
+#: experiments shown
+SHOWN = 5
+#: rad, of joints without a range
+REACH_RAD = 0.6
+
+#: what commands and positions alone cannot tell apart, or hardly (effects.md), and what can
+ACTIONS: Mapping[frozenset[str], tuple[str, str]] = {
+    frozenset(pair.split()): action
+    for pair, action in {
+        "action_delay sensor_delay": (
+            "tap the robot", "hold it still, tap a leg sharply and log current or the IMU beside positions: what comes late "
+            "without any command is the sensor",
+        ),
+        "payload torque_limit": ("hang a known mass", "weigh the robot, or record once more with 100 g on the torso"),
+        "payload stiffness_error": ("hang a known mass", "weigh the robot, or record once more with 100 g on the torso"),
+        "payload link_mass": ("stand and floor", "weigh one leg; legs show on the stand, the torso's load on the floor only"),
+        "link_mass stiffness_error": ("weigh one leg", "a scale of mass, gains and friction in common shows in no position"),
+        "floor_tilt cable_drag": (
+            "turn the robot", "record `shifts`, which plays in two headings, and unplug the cable or hold it up for one of them",
+        ),
+        "cable_drag floor_friction": ("hold the cable up", "record `gait` with the cable held up, and once more without"),
+        "imu_misalignment floor_tilt": ("turn the robot", "at rest, in two headings: a tilt turns in the body's frame, an IMU does not"),
+        "imu_bias floor_tilt": ("turn the robot", "at rest, in two headings: a tilt turns in the body's frame, a bias does not"),
+        "imu_bias imu_misalignment": ("turn it over", "at rest on each side: a bias stays, a turned sensor follows"),
+        "voltage_sag load_friction": (
+            "one joint alone, then all", "record `one-by-one` with the supply's voltage logged: sag is shared, friction is not",
+        ),
+        "voltage_sag torque_limit": ("one joint alone, then all", "record `one-by-one`: a limit does not care what others do"),
+        "thermal_derating voltage_sag": ("warm it up", "record the same motion cold and after five minutes of work"),
+        "thermal_derating torque_limit": ("warm it up", "record the same motion cold and after five minutes of work"),
+        "thermal_derating weak_joint": ("warm it up", "record the same motion cold and after five minutes of work"),
+        "weak_joint torque_limit": ("swap two servos", "what moves with the servo is the servo's, what stays is the leg's"),
+        "weak_joint stiffness_error": ("swap two servos", "what moves with the servo is the servo's, what stays is the leg's"),
+        "damping_error electrical_damping": ("let it fall", "record `drops` and `releases`: without torque back-EMF is gone"),
+        "tracker_scale floor_friction": ("move it by hand", "push it a metre along a ruler with torque off: a scale shows at once"),
+    }.items()
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One thing to do.
+
+    Attributes:
+        name: of the protocol, or what to do by hand. words: for people.
+        apart: whitened distance of the two possibilities that it leaves most alike, in standard deviations of robots of one
+            build; None for what is not simulated. pair: those two.
+    """
+
+    name: str
+    words: str
+    apart: float | None
+    pair: tuple[str, str]
+
+    def as_json(self) -> dict[str, Any]:
+        return {"name": self.name, "words": self.words, "apart": self.apart, "pair": list(self.pair)}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What to do next: a sentence, what was still open, and experiments, best first."""
+
+    sentence: str
+    open: tuple[str, ...]
+    experiments: tuple[Experiment, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "sentence": self.sentence,
+            "open": list(self.open),
+            "experiments": [one.as_json() for one in self.experiments],
+        }
+
+
+def experiments(
+    found: Diagnosis, model: Path, *, names: Sequence[str] | None = None, progress: Progress | None = None
+) -> Answer:
+    """The experiments that would settle what is open.
+
+    Args:
+        model: the MJCF that was diagnosed.
+        names: the protocols to consider; default all of the library that this robot can play.
+
+    Raises:
+        BadInput: the model lacks a joint of the diagnosis.
+    """
+    possible = _possible(found)
+    if len(possible) < 2:
+        return Answer(_nothing_open(found), tuple(one.effect for one in possible), ())
+    tell = progress or (lambda share, words: None)
+    by_hand = _by_hand(possible)
+    simulated = _simulated(possible, found, model, names, tell)
+    listed = sorted(simulated, key=lambda one: -(one.apart or 0.0))[:SHOWN]
+    open_ = tuple(one.effect for one in possible)
+    if listed and (listed[0].apart or 0.0) >= 1.0:
+        best = listed[0]
+        said = (
+            f"Record `{best.name}`: even {best.pair[0]} and {best.pair[1]} differ there by {best.apart:.1f} standard "
+            "deviations of robots of one build."
+        )
+    elif by_hand:
+        said = f"No motion tells {' from '.join(by_hand[0].pair)} well; {by_hand[0].name}: {by_hand[0].words}."
+    else:
+        said = "No protocol of the library tells these apart well; log more signals (current, voltage, IMU), or repeat the runs."
+    return Answer(said, open_, (*listed, *by_hand))
+
+
+def _possible(found: Diagnosis) -> list[Found]:
+    """What was not settled: the sets that were not told apart, else what may still be true beside what leads."""
+    if found.verdict == NONE:
+        return []
+    named = {name for group in found.ambiguous_with for name in group}
+    fitted = [one for one in found.effects if one.parameters]
+    if named:
+        return [one for one in fitted if one.effect in named][:MOST]
+    return [one for one in fitted if one.probability >= POSSIBLE][:MOST]
+
+
+def _nothing_open(found: Diagnosis) -> str:
+    if found.verdict == NONE:
+        return "Nothing is open: these runs show no gap to explain."
+    return (
+        "Nothing is open between known effects: apply the diagnosis, and record another motion to hold out against it."
+        if found.selected
+        else "No known effect is left to tell apart: repeat the runs, and look at the robot where the gap is largest."
+    )
+
+
+def _by_hand(possible: Sequence[Found]) -> list[Experiment]:
+    out = []
+    for a, b in itertools.combinations([one.effect for one in possible], 2):
+        action = ACTIONS.get(frozenset((a, b)))
+        if action is not None:
+            out.append(Experiment(action[0], action[1], None, (a, b)))
+    return out
+
+
+def _simulated(
+    possible: Sequence[Found], found: Diagnosis, model: Path, names: Sequence[str] | None, tell: Progress
+) -> list[Experiment]:
+    plants = {setup: _coarse(load_plant(model, None, setup)) for setup in Setup}
+    joints = plants[Setup.STAND].joints
+    walks = set(joints) <= set(JOINTS) and plants[Setup.FLOOR].free_joint is not None
+    out = []
+    wanted = [name for name in PROTOCOLS if name != FULL] if names is None else list(names)
+    for k, name in enumerate(wanted):
+        tell(k / len(wanted), f"simulating {name}")
+        parts = _parts(name)
+        if any(part.setup == "floor" for part in parts) and not walks:
+            continue
+        squares: dict[tuple[str, str], float] = {}
+        for part in parts:
+            plant = plants[Setup(part.setup)]
+            for pair, distance in _distances(plant, part, possible, found).items():
+                squares[pair] = squares.get(pair, 0.0) + distance**2
+        pair = min(squares, key=lambda pair: squares[pair])
+        out.append(Experiment(name, PROTOCOLS[name][0], math.sqrt(squares[pair]), pair))
+    return out
+
+
+def _parts(name: str) -> tuple[Protocol, ...]:
+    try:
+        return protocols(name, SECONDS)
+    except BadInput:
+        return protocols(name)  # too short for all of its recordings
+
+
+def _coarse(plant: Plant) -> Plant:
+    """The plant in steps that are fine enough to compare by."""
+    model = copy.copy(plant.model)
+    most = FLOOR_STEP_S if plant.setup is Setup.FLOOR else STAND_STEP_S
+    model.opt.timestep = max(model.opt.timestep, most if len(plant.joints) > 2 else STAND_STEP_S / 2)
+    return dataclasses.replace(plant, model=model)
+
+
+def _distances(
+    plant: Plant, part: Protocol, possible: Sequence[Found], found: Diagnosis
+) -> dict[tuple[str, str], float]:
+    """Whitened distances of each pair of possibilities on one recording."""
+    run = _run(plant, part)
+    n = len(plant.joints)
+    cmd = run.signal("cmd", plant.joints)
+    low, high = cmd.min(axis=0), cmd.max(axis=0)
+    reference = Reference.of(
+        plant, floor=plant.setup is Setup.FLOOR, imu=True, tracker=True, speed=np.ones(n), low=low, high=high
+    )
+    robots = [robot_of(plant, [one], found.calibration) for one in possible]
+    chance = np.random.default_rng(0)  # the same robots for every protocol: what differs is the motion
+    for _ in range(BUILD):
+        robots.append(Robot(n, low, high))
+        scatter(robots[-1], reference, chance)
+    names = ("pos", "gyro", "acc", "base", "yaw") if plant.setup is Setup.FLOOR else ("pos",)
+    signals = simulate(Rollouts(plant, [run]), robots, signals=names).signals
+    width = max(1, round(BLOCK_S * RATE_HZ))
+    parts = []
+    for name, values in signals.items():
+        rows = values.shape[1] // width * width
+        blocks = np.nan_to_num(values[:, :rows]).reshape(len(robots), -1, width, values.shape[2]).mean(axis=2)
+        parts.append(blocks.reshape(len(robots), -1) / USUAL_NOISE[name])
+    x = np.concatenate(parts, axis=1, dtype=np.float64)
+    apart, build = x[: len(possible)], x[len(possible) :]
+    build = (build - build.mean(axis=0)) / math.sqrt(len(build) - 1)
+    out = {}
+    for (a, one), (b, other) in itertools.combinations(enumerate(possible), 2):
+        # Woodbury: what robots of one build share counts little, and all else by the sensors' noise.
+        d = apart[a] - apart[b]
+        along = build @ d
+        squared = float(d @ d - along @ np.linalg.solve(np.eye(len(build)) + build @ build.T, along))
+        out[one.effect, other.effect] = math.sqrt(max(squared, 0.0) / x.shape[1])
+    return out
+
+
+def _run(plant: Plant, part: Protocol) -> Run:
+    space = _space(plant)
+    commands = part.commands(space, RATE_HZ)
+    limp = part.limp(space, RATE_HZ)
+    t = np.arange(len(commands)) / RATE_HZ
+    columns: dict[str, Array] = {}
+    for j, joint in enumerate(plant.joints):
+        columns[f"cmd.{joint}"] = commands[:, j]
+        columns[f"pos.{joint}"] = commands[:, j]
+        columns[f"torque.{joint}"] = 1.0 - limp[:, j]
+    facts = Facts(joints=plant.joints, setup=part.setup, heading_rad=part.heading_rad)
+    return Run(part.name, facts, t, columns)
+
+
+def _space(plant: Plant) -> CommandSpace:
+    """Where the library may move this robot: an Ant as the library does, another about the middle of its ranges."""
+    if set(plant.joints) <= set(JOINTS):
+        return CommandSpace.around_home(joints=plant.joints)
+    low, high = [], []
+    for dof in plant.dof:
+        joint = int(plant.model.dof_jntid[dof])
+        ends = plant.model.jnt_range[joint] if plant.model.jnt_limited[joint] else np.array([-REACH_RAD, REACH_RAD])
+        middle = float(np.clip(0.0, ends[0], ends[1]))
+        low.append(max(float(ends[0]), middle - REACH_RAD))
+        high.append(min(float(ends[1]), middle + REACH_RAD))
+    a, b = np.array(low), np.array(high)
+    return CommandSpace(plant.joints, np.clip(0.0, a, b), a, b)

@@ -1,0 +1,299 @@
+"""The report of a diagnosis: one page that is read in a minute, then the details."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.gap.apply import robot_of
+from openant_tools.gap.cause import catalogue
+from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
+from openant_tools.gap.robot import Robot
+from openant_tools.gap.simulation import simulate
+from openant_tools.model.gap import HORIZON_S
+from openant_tools.model.plant import load_plant, setup_of
+from openant_tools.model.rollout import Rollouts
+from openant_tools.recording.run import Run
+from openant_tools.report import KeyFigure, Report, Table, plots
+from openant_tools.robot.joints import JOINTS
+from openant_tools.sysid.identify import joints_in_common, own_model
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as MatplotlibFigure
+
+__all__ = ["diagnosis_report", "sentence", "where_words"]
+
+Array = NDArray[np.float64]
+
+#: s shown around the worst moment
+WINDOW_S = 3.0
+#: candidates and places on the first page
+CANDIDATES, PLACES = 6, 8
+#: probability below which an effect is refuted rather than a runner-up
+REFUTED = 0.2
+
+
+def sentence(found: Diagnosis) -> str:
+    """The verdict, with its confidence."""
+    sure = f"confidence {100 * found.confidence:.0f} %"
+    if found.verdict == NONE:
+        return f"Nothing beyond the floor and the tolerance of robots of one build ({sure})."
+    by_name = {one.effect: one for one in reversed(found.effects)}
+    if found.verdict == AMBIGUOUS:
+        sets = "; ".join(" or ".join(group) for group in found.ambiguous_with)
+        candidates = sets or " or ".join(one.effect for one in found.effects[:2])
+        return f"The gap is real, but these runs cannot tell its causes apart: {candidates} ({sure})."
+    if found.verdict == UNEXPLAINED:
+        best = found.effects[0] if found.effects else None
+        closest = "" if best is None else f"; closest is {best.effect}" + (
+            "" if best.gap_closed is None else f", which closes {100 * best.gap_closed:.0f} % of it"
+        )  # fmt: skip
+        return f"The gap is real, and nothing known here explains it{closest} ({sure})."
+    one = by_name[found.verdict]
+    words = f"{one.effect} ({where_words(one.joints)}): {catalogue()[one.effect].words}"
+    closed = _closed(found)
+    beside = [name for name in found.selected if name != found.verdict]
+    more = f", with {' and '.join(beside)} beside it" if beside else ""
+    return f"{words}{more}; the improved model closes {100 * closed:.0f} % of the gap on held-out runs ({sure})."
+
+
+def where_words(joints: tuple[str, ...] | str) -> str:
+    """`all`, `body` or the joints."""
+    return joints if isinstance(joints, str) else ", ".join(joints)
+
+
+def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[Run], model: Path) -> Report:
+    """Everything about a diagnosis.
+
+    Args:
+        runs, held_out: those that were diagnosed. model: the MJCF.
+    """
+    report = Report(
+        "Diagnosis of the gap", f"{model.name} · {', '.join(run.name for run in (*runs, *held_out))}",
+        made_by="openant gap diagnose",
+    )  # fmt: skip
+    report.text(f"**{sentence(found)}**")
+    gap, closed = found.gap, _closed(found)
+    healthy = found.verdict == NONE
+    report.key_figures(
+        KeyFigure("verdict", found.verdict, f"confidence {100 * found.confidence:.0f} %", "good" if healthy else ""),
+        KeyFigure("gap before", f"{1e3 * gap['before']:.2f} mrad", "the model as given"),
+        KeyFigure("gap after", f"{1e3 * gap['after']:.2f} mrad", "the improved model"),
+        KeyFigure("floor", f"{1e3 * gap['floor']:.2f} mrad", "what no model could beat"),
+        KeyFigure("closed", f"{100 * closed:.0f} %", "of the excess, on held-out runs", "good" if closed > 0.7 else ""),
+    )
+    report.section("Where")
+    if found.where:
+        report.figure(
+            places(found), "Share of the excess gap, largest first; on a walking robot also by joint from above."
+        )
+    report.section("Which")
+    report.figure(
+        candidates(found), "How likely each effect is present beyond tolerance, and what it closes by itself."
+    )
+    report.table(
+        ["effect", "where", "present", "closes alone", "parameters", "stands"],
+        [
+            [one.effect, where_words(one.joints), f"{100 * one.probability:.0f} %", _percent(one.gap_closed),
+             _parameters(one), _standing(found, one)]
+            for one in found.effects[:CANDIDATES]
+        ],
+    )  # fmt: skip
+    report.section("How far")
+    report.figure(
+        worst(found, held_out or runs, model),
+        f"Measured and simulated around the moment at which the given model is farthest off, re-initialised every "
+        f"{HORIZON_S:g} s; of {'the held-out runs' if held_out else 'all runs'}.",
+    )
+    report.section("What next").text(found.next_experiment or _what_next(found))
+    _details(report, found)
+    return report
+
+
+def _what_next(found: Diagnosis) -> str:
+    if found.verdict == NONE:
+        return "Nothing: the model is as good as these runs can tell."
+    if found.verdict == UNEXPLAINED:
+        return "Look at the robot where the gap is largest; repeat the runs, so that what changes from run to run is told from what does not."
+    if found.verdict == AMBIGUOUS:
+        return "Run `openant gap next` on the JSON of this diagnosis: it simulates what is left on every protocol."
+    return "Write the improved model with `openant gap apply`, and record another motion to hold out against it."
+
+
+def _details(report: Report, found: Diagnosis) -> None:
+    report.section("Details")
+    parts = [Table(["held out", "closure lost without it"], [[name, value] for name, value in found.removal.items()])]
+    if found.removal:
+        report.details("What each selected effect is worth", *parts)
+    report.details(
+        "All effects considered",
+        Table(
+            ["effect", "where", "present", "closes alone", "interval", "MuJoCo carries it"],
+            [
+                [one.effect, where_words(one.joints), f"{100 * one.probability:.1f} %", _percent(one.gap_closed),
+                 f"{_percent(one.gap_closed_low)} … {_percent(one.gap_closed_high)}", one.native]
+                for one in found.effects
+            ],
+        ),
+    )  # fmt: skip
+    if found.where:
+        names = list(dict.fromkeys(name for place in found.where for name in place))
+        report.details(
+            "Where the gap lies, all of it",
+            Table(names, [[place.get(name) for name in names] for place in found.where]),
+        )
+    if found.calibration:
+        rows = [[kind, joint, value] for kind, values in found.calibration.items() for joint, value in values.items()]
+        report.details("What moved within tolerance", Table(["kind", "joint", "factor or amount"], rows))
+    if found.notes:
+        report.text("\n".join(f"- {note}" for note in found.notes))
+
+
+def places(found: Diagnosis) -> MatplotlibFigure:
+    """A bar of shares, and the robot from above where it has legs."""
+    figure: MatplotlibFigure
+    largest = list(found.where[:PLACES])
+    of_ant = {str(place["joint"]) for place in found.where} & set(JOINTS)
+    if of_ant:
+        figure, (axes, legs) = plots.figure(1, 2, height=3.0, width_ratios=[3, 2])
+        _leg_map(legs, found)
+    else:
+        figure, axes = plots.figure(height=0.7 + 0.28 * len(largest))
+    labels = [f"{place['signal']} · {place['joint']} · {place['regime']}" for place in largest]
+    axes.barh(range(len(largest)), [100 * float(place["share"]) for place in largest], color=plots.BLUE)
+    axes.set_yticks(range(len(largest)), labels)
+    axes.invert_yaxis()
+    axes.grid(axis="y", visible=False)
+    axes.set_xlabel("share of the excess of its signal (%)")
+    return figure
+
+
+def _leg_map(axes: Axes, found: Diagnosis) -> None:
+    """The Ant from above, each joint as large as its share of the position gap; chosen ones ringed."""
+    share = dict.fromkeys(JOINTS, 0.0)
+    for place in found.where:
+        if place["signal"] == "pos" and place["joint"] in share:
+            share[str(place["joint"])] += float(place["share"])
+    named = {
+        joint
+        for one in found.effects
+        if one.effect in found.selected and not isinstance(one.joints, str)
+        for joint in one.joints
+    }
+    for leg, (along, left) in {"fr": (1, -1), "fl": (1, 1), "rr": (-1, -1), "rl": (-1, 1)}.items():
+        # To the left of the robot is to the left of the picture, so its y points the other way.
+        axes.plot(
+            [0, -2.6 * left], [0, 2.6 * along], color=plots.INK, alpha=0.35, lw=3, solid_capstyle="round", zorder=1
+        )
+        for name, far in ((f"hip_{leg}", 1.0), (f"knee_{leg}", 2.0)):
+            x, y = -far * left, far * along
+            edge = plots.VERMILLION if name in named else plots.INK
+            axes.scatter(
+                [x], [y], s=25 + 900 * share[name], color=plots.ORANGE, edgecolor=edge,
+                linewidth=2.0 if name in named else 0.6, zorder=2,
+            )  # fmt: skip
+            axes.annotate(
+                f"{name}\n{100 * share[name]:.0f} %", (x, y), xytext=(-14 * left, 0), textcoords="offset points",
+                ha="right" if left > 0 else "left", va="center", fontsize=7,
+            )  # fmt: skip
+    axes.scatter([0], [0], s=500, color=plots.INK, alpha=0.25, zorder=1)
+    axes.set_xlim(-4.6, 4.6)
+    axes.set_ylim(-3.0, 3.0)
+    axes.set_aspect("equal")
+    axes.axis("off")
+    axes.set_title("position, by joint (front is up)")
+
+
+def candidates(found: Diagnosis) -> MatplotlibFigure:
+    """Probability and closure of the first effects."""
+    figure: MatplotlibFigure
+    shown = found.effects[:CANDIDATES]
+    figure, axes = plots.figure(height=0.8 + 0.34 * len(shown))
+    at = np.arange(len(shown))
+    axes.barh(at - 0.19, [100 * one.probability for one in shown], 0.36, color=plots.BLUE, label="present")
+    alone = [math.nan if one.gap_closed is None else 100 * max(one.gap_closed, 0.0) for one in shown]
+    axes.barh(at + 0.19, alone, 0.36, color=plots.GREEN, label="closes alone")
+    for k, one in enumerate(shown):
+        if one.gap_closed_low is not None and one.gap_closed_high is not None:
+            ends = [100 * max(one.gap_closed_low, 0.0), 100 * max(one.gap_closed_high, 0.0)]
+            axes.plot(ends, [k + 0.19] * 2, color=plots.INK, lw=1.2)
+    marked = [f"{one.effect}{' *' if one.effect in found.selected else ''}" for one in shown]
+    axes.set_yticks(at, marked)
+    axes.invert_yaxis()
+    axes.set_xlim(0, 100)
+    axes.grid(axis="y", visible=False)
+    axes.set_xlabel("probability, and share of the excess gap closed on held-out runs (%)")
+    plots.legend(axes)
+    return figure
+
+
+def worst(found: Diagnosis, runs: Sequence[Run], model: Path) -> MatplotlibFigure:
+    """Around the largest error of the given model: measured, given, improved."""
+    figure: MatplotlibFigure
+    joints = joints_in_common(runs, model, None)
+    selected = [one for one in found.effects if one.effect in found.selected and (one.parameters or one.coordinates)]
+    best: tuple[float, Run, int, int, Array] | None = None
+    for run in runs:
+        plant = load_plant(own_model(run) or model, joints, setup_of(run.facts.setup))
+        robots = [Robot(len(joints)), robot_of(plant, selected, found.calibration)]
+        both = simulate(Rollouts(plant, [run], HORIZON_S), robots, signals=["pos"]).signals["pos"].astype(np.float64)
+        error = np.abs(np.nan_to_num(run.signal("pos", joints) - both[0]))
+        row, j = divmod(int(error.argmax()), len(joints))
+        if best is None or error[row, j] > best[0]:
+            best = float(error[row, j]), run, row, j, both
+    assert best is not None
+    _, run, row, j, both = best
+    t = run.t
+    near = np.abs(t - t[row]) <= WINDOW_S / 2
+    figure, axes = plots.figure(height=2.8)
+    since = t[near] - t[0]
+    axes.step(
+        since, run.signal("cmd", joints)[near, j], where="post", color=plots.INK, lw=0.8, alpha=0.6, label="command"
+    )
+    axes.plot(since, run.signal("pos", joints)[near, j], color=plots.BLUE, label="measured")
+    axes.plot(since, both[0][near, j], color=plots.VERMILLION, ls="--", label="given model")
+    if selected or found.calibration:
+        axes.plot(since, both[1][near, j], color=plots.GREEN, ls="-.", label="improved model")
+    axes.set_xlabel(plots.signal_label("t"))
+    axes.set_ylabel(plots.signal_label("pos"))
+    axes.set_title(f"{joints[j]}, {run.name}", loc="left", fontsize=10, fontweight="bold")
+    plots.legend(axes)
+    return figure
+
+
+def _closed(found: Diagnosis) -> float:
+    """1 − excess after / excess before (formats, section 3)."""
+    before, after, floor = (float(found.gap[name]) for name in ("before", "after", "floor"))
+    excess = math.sqrt(max(before**2 - floor**2, 0.0))
+    return 1 - math.sqrt(max(after**2 - floor**2, 0.0)) / excess if excess > 0 else 0.0
+
+
+def _percent(value: float | None) -> str | None:
+    return None if value is None else f"{100 * value:.0f} %".replace("-", "−")
+
+
+def _parameters(one: Found) -> str:
+    return ", ".join(
+        f"{name} {span.value:.3g} [{span.low:.3g}, {span.high:.3g}]".replace("-", "−")
+        for name, span in one.parameters.items()
+    )
+
+
+def _standing(found: Diagnosis, one: Found) -> str:
+    """Why it is in the answer, or not."""
+    if one.effect in found.selected:
+        lost = found.removal.get(one.effect)
+        return "selected" + (f"; without it {100 * lost:.0f} % less closes" if lost is not None else "")
+    if any(one.effect in group for group in found.ambiguous_with):
+        return "these runs cannot tell"
+    if one.probability < REFUTED:
+        return "unlike what simulated robots with it show"
+    if one.gap_closed is not None and one.gap_closed < 0.1:
+        return "closes nothing by itself on held-out runs"
+    return "not needed beside what was selected"
