@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from openant_tools.errors import BadInput, OpenAntError
 from openant_tools.procedure.finding import Finding, keep, latest
 from openant_tools.procedure.step import Bench, Declined, Face, Say, Step, drive
-from openant_tools.robot.folder import RobotFolder
+
+if TYPE_CHECKING:
+    from openant_tools.robot.folder import RobotFolder
 
 __all__ = ["WALK", "Standing", "State", "do", "standing", "step", "walk"]
 

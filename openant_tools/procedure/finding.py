@@ -7,11 +7,13 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from openant_tools.files import write_text
-from openant_tools.robot.config import Provenance
-from openant_tools.robot.folder import RobotFolder
+
+if TYPE_CHECKING:  # a manual that lists the steps opens without NumPy
+    from openant_tools.robot.config import Provenance
+    from openant_tools.robot.folder import RobotFolder
 
 __all__ = ["SCHEMA", "Evidence", "Finding", "keep", "latest"]
 
@@ -148,6 +150,8 @@ def keep(finding: Finding, folder: RobotFolder, recording: str | None = None) ->
     They stand apart from what `openant sysid fit` puts below `identified`: the calibrated model holds the latter, and two
     estimators that disagree are to be seen side by side.
     """
+    from openant_tools.robot.config import Provenance
+
     stamp = finding.date.strftime("%Y%m%dT%H%M%SZ")
     path = folder.findings / f"{finding.step}-{stamp}.json"
     write_text(path, json.dumps(finding.as_json(), indent=1, ensure_ascii=False) + "\n")

@@ -15,11 +15,13 @@ import importlib
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 from openant_tools.errors import OpenAntError
 from openant_tools.procedure.finding import Finding
-from openant_tools.robot.folder import RobotFolder
+
+if TYPE_CHECKING:  # a manual that lists the steps opens without NumPy
+    from openant_tools.robot.folder import RobotFolder
 
 __all__ = [
     "Answer", "Ask", "Bench", "Declined", "Event", "Face", "Hands", "Intent", "Live", "Look", "Procedure", "Progress",
