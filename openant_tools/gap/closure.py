@@ -22,7 +22,7 @@ from openant_tools.model.gap import HORIZON_S, excess
 from openant_tools.model.plant import Setup
 from openant_tools.model.rollout import Rollouts
 
-__all__ = ["Closure", "Refit", "Windows", "closures"]
+__all__ = ["Closure", "Refit", "Windows", "calibration_of", "closures", "nothing"]
 
 Array = NDArray[np.float64]
 
@@ -281,6 +281,16 @@ def _nuisances(protocol: Protocol) -> list[_Nuisance]:
         out.append(_Nuisance("armature", tuple(group), FACTORS["armature"]))
         out.append(_Nuisance("link_mass", tuple(group), FACTORS["link_mass"]))
     out.append(_Nuisance("delay", tuple(joints), DELAY_S))
+    return out
+
+
+def calibration_of(windows: Windows, refit: Refit) -> dict[str, dict[str, float]]:
+    """What moved within tolerance: kind → joint → factor, or amount where the kind is one that is added (N·m, rad, s)."""
+    out: dict[str, dict[str, float]] = {}
+    for one, u in zip(windows.names, refit.nuisance, strict=True):
+        value = float(np.exp(u * one.tolerance)) if one.name in FACTORS else float(u * one.tolerance)
+        for j in one.joints:
+            out.setdefault(one.name, {})[windows.protocol.joints[j]] = float(f"{value:.6g}")
     return out
 
 

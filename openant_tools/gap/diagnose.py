@@ -6,7 +6,6 @@ large it would be; held-out closure decides between them, and says when none wil
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import math
 from collections.abc import Callable, Sequence
@@ -19,14 +18,19 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.gap.cause import Scope, catalogue
-from openant_tools.gap.closure import Closure, Refit, Windows, closures, nothing
+from openant_tools.gap.closure import Closure, Refit, Windows, calibration_of, closures, nothing
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found, Span
 from openant_tools.gap.explain import Explained, Part, Scene, fit
+from openant_tools.gap.features import Floats, differences
 from openant_tools.gap.judge import Judge, Judgement, train, whitening_of
-from openant_tools.gap.measure import measure
+from openant_tools.gap.measure import Measurement, measure
 from openant_tools.gap.prepare import Prepared, prepare
 from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.robot import Robot
+from openant_tools.gap.simulation import simulate
+from openant_tools.model.gap import excess
 from openant_tools.model.plant import Setup
+from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.sysid.identify import joints_in_common, own_model
 
@@ -34,14 +38,23 @@ __all__ = ["diagnose"]
 
 Progress = Callable[[float, str], None]
 
-#: probabilities below which a cause is not looked at, how many are, and above which the best one is a finding
-SUSPECT, SUSPECTS, FINDING = 0.05, 5, 0.5
+#: probabilities: below which of the best nothing is fitted, below which a cause is not looked at, above which it is a finding
+DOUBT, SUSPECT, FINDING = 0.12, 0.07, 0.5
+#: how many causes are looked at
+SUSPECTS = 5
+#: probability of a second cause, once the first is taken into account
+SECOND = 0.35
 #: places at which each of them is tried
 PLACES = 2
-#: held-out closure that an addition must bring, and below which a set explains nothing
-ADDS, EXPLAINS = 0.02, 0.3
+#: held-out closure that an addition must bring; that one cause must bring beyond what tolerances do, where the judge doubts;
+#: and below which a set explains nothing
+ADDS, ADDS_ALONE, EXPLAINS = 0.02, 0.2, 0.35
+#: gaps that are so many floors, of robots whose energy is so many gates, ask for an explanation
+LARGE, STRANGE = 3.0, 5.0
 #: sets whose closures differ by less are not told apart
-APART = 0.02
+APART = 0.01
+#: how what is left of the gap counts beside the judge's probability
+LEFT_COUNTS = 3.0
 
 
 def diagnose(
@@ -79,27 +92,43 @@ def diagnose(
     x = np.concatenate([found[k][0][found[k][1]] for k in training])
     judgement = judge.say(x)
     tell(0.7, "causes")
-    ranked = sorted(judgement.probability.items(), key=lambda item: -item[1])
-    shown = [(name, chance) for name, chance in ranked if catalogue()[name].shows(protocol.reference)]
-    suspects = [name for name, chance in shown if chance > SUSPECT][:SUSPECTS] or [shown[0][0]]
+    case = _Case(protocol, prepared, measured, judge, found, training, len(runs), model, runs, hold_out)
+    first = _shown(judgement, protocol)
+    if first[0][1] < DOUBT:
+        tell(1.0, "done")
+        return _healthy(case, judgement, first)
     scenes = _scenes(prepared, protocol, found, training)
+    suspects = [name for name, chance in first if chance > SUSPECT][:SUSPECTS]
     explained = _explain(scenes, suspects, judgement)
     tell(0.85, "held-out runs")
-    return _decide(_Case(protocol, measured, judgement, shown, explained, training, len(runs), model, runs, hold_out))
+    return _decide(case, judgement, first, explained, scenes)
+
+
+def _shown(judgement: Judgement, protocol: Protocol) -> list[tuple[str, float]]:
+    """Causes that can show on these runs and signals, with their probabilities, most probable first."""
+    ranked = sorted(judgement.probability.items(), key=lambda item: -item[1])
+    return [(name, chance) for name, chance in ranked if catalogue()[name].shows(protocol.reference)]
 
 
 @dataclass(frozen=True)
 class _Case:
+    """What is known of the robot at hand."""
+
     protocol: Protocol
-    measured: object
-    judgement: Judgement
-    ranked: list[tuple[str, float]]
-    explained: dict[str, Explained]
+    prepared: Prepared
+    measured: Measurement
+    judge: Judge
+    found: Sequence[tuple[Floats, NDArray[np.bool_]]]
     training: list[int]
     count: int
     model: Path
     runs: Sequence[Run]
     hold_out: Sequence[Run]
+
+    @property
+    def features(self) -> Floats:
+        """(features,) of the runs that are diagnosed."""
+        return np.concatenate([self.found[k][0][self.found[k][1]] for k in self.training])
 
 
 def _check(runs: Sequence[Run], hold_out: Sequence[Run]) -> None:
@@ -204,36 +233,128 @@ def _explain(scenes: dict[Setup, Scene], suspects: Sequence[str], judgement: Jud
     return out
 
 
-def _decide(case: _Case) -> Diagnosis:
-    protocol, judgement = case.protocol, case.judgement
-    windows = Windows(protocol)
-    held_out = list(range(case.count, len(protocol.runs)))
-    names = [name for name, _ in case.ranked if name in case.explained]
-    probability = dict(case.ranked)
-    chosen = [name for name in names if probability[name] > FINDING] or names[:1]
-    chosen = chosen[:3]
-    sets: list[list[str]] = [chosen, *([name] for name in names[:3] if [name] != chosen)]
-    if len(chosen) > 1:
-        sets += [[other for other in chosen if other != name] for name in chosen if len(chosen) > 2]
-    starts = [nothing(windows), *(_start(windows, [case.explained[name] for name in some]) for some in sets)]
-    before, floor, results = closures(windows, starts, held_out, case.training)
-    refit, results = results[0], results[1:]
-    alone = {some[0]: result for some, result in zip(sets, results, strict=True) if len(some) == 1}
-    whole = results[0]
-    removal = _removal(chosen, sets, results, refit)
-    chosen = sorted(chosen, key=lambda name: -removal.get(name, 0.0))
-    healthy = judgement.energy < 1.0 and probability[names[0]] < FINDING
-    best = probability[chosen[0]] if chosen else 0.0
-    verdict, selected = chosen[0], list(chosen)
-    if healthy or (judgement.energy < 1.5 and best < SUSPECT * 4):
-        verdict, selected = NONE, []
-    elif best < FINDING:
-        verdict, selected = (NONE, []) if judgement.energy < 2.0 else (AMBIGUOUS, [])
-    effects = tuple(
-        _found(case, name, probability[name], alone.get(name))
-        for name in [*chosen, *(n for n in names if n not in chosen)]
-    )
-    rest = tuple(
+def _without(case: _Case, explained: Explained) -> Judgement:
+    """What the judge says of what is left once a cause is taken into account.
+
+    The features that the cause makes on the model are taken off; logarithms of sizes do not subtract, and stay as healthy.
+    """
+    coarse = case.protocol.coarse()
+    scene = Scene.robot_of(case.protocol, explained.hypothesis, explained.x)
+    parts = []
+    for plant in {id(one.plant): one.plant for one in coarse.runs}.values():
+        mine = [k for k in case.training if coarse.runs[k].plant is plant]
+        if not mine:
+            continue
+        rollouts = Rollouts(plant, [coarse.runs[k].run for k in mine])
+        both = simulate(
+            rollouts, [Robot(len(case.protocol.joints)), scene], signals=coarse.runs[mine[0]].signals
+        ).signals
+        for k, rows in zip(mine, rollouts.rows, strict=True):
+            one = coarse.runs[k]
+            apart = differences(
+                {name: values[1:, rows] for name, values in both.items()},
+                {name: values[:1, rows] for name, values in both.items()},
+                one.signals,
+            )
+            parts.append((k, one.layout.features(apart)[0][case.found[k][1]]))
+    made = np.concatenate([part for _, part in sorted(parts, key=lambda item: case.training.index(item[0]))])
+    x = case.features.copy()
+    judge = case.judge
+    x[judge.means] -= made[judge.means]
+    x[judge.logs] = judge.log_centre
+    return judge.say(x)
+
+
+def _healthy(case: _Case, judgement: Judgement, ranked: Sequence[tuple[str, float]]) -> Diagnosis:
+    """No cause is likely: the gap is one of tolerances and noise."""
+    gap = {
+        "before": case.measured.gaps["pos"],
+        "after": case.measured.gaps["pos"],
+        "floor": case.measured.floors["pos"],
+    }
+    return _diagnosis(case, NONE, 1 - ranked[0][1], _rest(ranked, ()), (), (), gap, {}, judgement, None)
+
+
+def _decide(
+    case: _Case,
+    judgement: Judgement,
+    ranked: Sequence[tuple[str, float]],
+    explained: dict[str, Explained],
+    scenes: dict[Setup, Scene],
+) -> Diagnosis:
+    windows = Windows(case.protocol)
+    held_out = list(range(case.count, len(case.protocol.runs)))
+    probability = dict(ranked)
+    names = list(explained)
+    starts = [nothing(windows), *(_start(windows, [explained[name]]) for name in names)]
+    before, floor, (refit, *singles) = closures(windows, starts, held_out, case.training)
+    alone = dict(zip(names, singles, strict=True))
+    names.sort(key=lambda name: -_score(probability[name], alone[name]))
+    best = names[0]
+    chosen, whole = [best], alone[best]
+    beyond = {best: whole.closed - refit.closed}
+    if probability[best] > FINDING or beyond[best] > ADDS_ALONE:
+        left = _without(case, explained[best])
+        for name, chance in _shown(left, case.protocol)[:2]:
+            if (
+                name in chosen
+                or max(chance, probability[name] if name in explained else 0.0) < SECOND
+                or chance < SUSPECT
+            ):
+                continue
+            more = explained.get(name) or _explain(scenes, [name], left).get(name)
+            if more is None:
+                continue
+            explained[name] = more
+            _, _, (both,) = closures(
+                windows, [_start(windows, [explained[one] for one in [*chosen, name]])], held_out, case.training
+            )
+            body = catalogue()[name].scopes == (Scope.BODY,) or catalogue()[name].signal is not None
+            if both.closed > whole.closed + ADDS or (body and chance > FINDING and both.closed > whole.closed - ADDS):
+                beyond[name] = both.closed - whole.closed
+                beyond[best] = both.closed - (alone[name].closed if name in alone else refit.closed)
+                chosen.append(name)
+                whole = both
+                probability[name] = max(probability[name], chance)
+                break
+    body = catalogue()[best].scopes == (Scope.BODY,) or catalogue()[best].signal is not None
+    sure = probability[best] > FINDING or (probability[best] > SUSPECT and beyond[best] > ADDS_ALONE)
+    verdict, selected = best, tuple(sorted(chosen, key=lambda name: -beyond[name]))
+    ambiguous: tuple[tuple[str, ...], ...] = ()
+    rivals = [
+        name
+        for name in names[1:3]
+        if not body
+        and abs(alone[name].closed - alone[best].closed) < APART
+        and probability[name] > probability[best] / 2
+    ]
+    if not sure:
+        verdict, selected = NONE, ()
+    elif not body and excess(before, floor) > LARGE * floor and whole.closed < EXPLAINS and judgement.energy > STRANGE:
+        verdict, selected = UNEXPLAINED, ()
+    elif rivals:
+        verdict, ambiguous = AMBIGUOUS, ((best, *rivals),)
+    elif len(selected) > 1:
+        verdict = selected[0]
+    order = [*selected, *(name for name in names if name not in selected)]
+    effects = tuple(_found(case, explained[name], probability[name], alone.get(name)) for name in order)
+    gap = {"before": before, "after": before if verdict == NONE else whole.after, "floor": floor, "refit": refit.after}
+    removal = {name: beyond[name] for name in selected}
+    confidence = 1 - probability[best] if verdict == NONE else probability[best]
+    return _diagnosis(
+        case, verdict, confidence, (*effects, *_rest(ranked, order)), selected, ambiguous, gap, removal, judgement,
+        None if verdict == NONE else calibration_of(windows, whole.refit),
+    )  # fmt: skip
+
+
+def _score(probability: float, closure: Closure) -> float:
+    """How a cause ranks: by the judge, and by what it leaves of the gap on held-out runs."""
+    return math.log(max(probability, 1e-3)) - LEFT_COUNTS * math.log(max(1 - closure.closed, 0.0) + 0.05)
+
+
+def _rest(ranked: Sequence[tuple[str, float]], done: Sequence[str]) -> tuple[Found, ...]:
+    """The causes that were not fitted."""
+    return tuple(
         Found(
             name,
             "body" if catalogue()[name].scopes == (Scope.BODY,) else "all",
@@ -244,41 +365,51 @@ def _decide(case: _Case) -> Diagnosis:
             None,
             catalogue()[name].native,
         )
-        for name, chance in case.ranked
-        if name not in names
+        for name, chance in ranked
+        if name not in done
     )
-    after = before if verdict == NONE else whole.after
-    measured = case.measured
+
+
+def _diagnosis(
+    case: _Case, verdict: str, confidence: float, effects: tuple[Found, ...], selected: tuple[str, ...],
+    ambiguous: tuple[tuple[str, ...], ...], gap: dict[str, float], removal: dict[str, float], judgement: Judgement,
+    calibration: dict[str, dict[str, float]] | None,
+) -> Diagnosis:  # fmt: skip
+    signals = case.measured.as_json()["signals"]
     return Diagnosis(
         model=str(case.model),
         runs=tuple(run.name for run in case.runs),
         held_out=tuple(run.name for run in case.hold_out),
         verdict=verdict,
-        confidence=1 - best if verdict == NONE else best,
-        effects=effects + rest,
-        selected=tuple(selected),
-        ambiguous_with=(tuple(names[:2]),) if verdict == AMBIGUOUS else (),
+        confidence=confidence,
+        effects=effects,
+        selected=selected,
+        ambiguous_with=ambiguous,
         next_experiment=None,
-        gap={"before": before, "after": after, "floor": floor, "energy": judgement.energy, "refit": refit.after},
-        where=measured.as_json()["where"],  # type: ignore[attr-defined]
+        gap={**gap, "energy": judgement.energy, "signals": signals},
+        where=case.measured.as_json()["where"],
+        calibration=calibration or {},
         removal=removal,
+        notes=_notes(case),
     )
 
 
-def _removal(
-    chosen: Sequence[str], sets: Sequence[Sequence[str]], results: Sequence[Closure], refit: Closure
-) -> dict[str, float]:
-    """Effect → held-out closure that is lost without it."""
-    out = {}
-    whole = results[0].closed
-    for name in chosen:
-        others = [other for other in chosen if other != name]
-        without = refit.closed
-        for some, result in zip(sets, results, strict=True):
-            if others and sorted(some) == sorted(others):
-                without = result.closed
-        out[name] = whole - without
-    return out
+def _notes(case: _Case) -> tuple[str, ...]:
+    """What it rests on, and what more signals would add."""
+    seen = {name for one in case.protocol.runs for name in one.seen}
+    notes = [
+        f"judged by {len(case.prepared.cases)} simulated robots that played these commands",
+        "held-out runs as given" if case.hold_out else "each run left out of the fits in turn",
+    ]
+    if not case.protocol.reference.floor:
+        notes.append("no run on the floor: body, contact and environment cannot show")
+    elif not case.protocol.reference.imu:
+        notes.append("no IMU: tilt, cable and payload are hard to tell apart")
+    if "torque" not in seen:
+        notes.append("no current or load: stiffness and torque scale are known only together")
+    if "volt" not in seen:
+        notes.append("no voltage: a sagging supply looks like weak motors")
+    return tuple(notes)
 
 
 def _start(windows: Windows, explained: Sequence[Explained]) -> Refit:
@@ -287,8 +418,9 @@ def _start(windows: Windows, explained: Sequence[Explained]) -> Refit:
     return Refit(parts, x, np.zeros(len(windows.names)))
 
 
-def _found(case: _Case, name: str, probability: float, closure: Closure | None) -> Found:
-    one, cause = case.explained[name], catalogue()[name]
+def _found(case: _Case, one: Explained, probability: float, closure: Closure | None) -> Found:
+    name = one.hypothesis[0].cause
+    cause = catalogue()[name]
     part, x, std = one.hypothesis[0], dict(one.x[0]), one.std[0]
     if closure is not None and len(closure.refit.x) == 1:
         x = dict(closure.refit.x[0])
@@ -319,6 +451,3 @@ def _found(case: _Case, name: str, probability: float, closure: Closure | None) 
         None if closure is None else closure.closed, None if closure is None else closure.low,
         None if closure is None else closure.high, cause.native, x,
     )  # fmt: skip
-
-
-_ = (UNEXPLAINED, dataclasses, ADDS, EXPLAINS, APART)

@@ -30,7 +30,7 @@ Tell = Callable[[float, str], None]
 #: strengths from which a size is sought, and how a shape that is not fitted stands
 STARTS = (0.1, 0.45, 0.85)
 #: iterations of Gauss and Newton, and the least improvement (share) that goes on
-ITERATIONS, ENOUGH = 4, 2e-3
+ITERATIONS, ENOUGH = 3, 5e-3
 #: share of a size by which it is varied, and the least variation in units of `small`
 STEP, LEAST_STEP = 0.08, 0.25
 #: how far beyond `large` a size may go
@@ -98,8 +98,14 @@ class Scene:
         )
 
     def robot(self, hypothesis: Hypothesis, x: Sequence[Mapping[str, float]]) -> Robot:
-        reference = self.protocol.reference
-        robot = Robot(len(self.protocol.joints), reference.low, reference.high)
+        """The model with causes of these sizes."""
+        return self.robot_of(self.protocol, hypothesis, x)
+
+    @staticmethod
+    def robot_of(protocol: Protocol, hypothesis: Hypothesis, x: Sequence[Mapping[str, float]]) -> Robot:
+        """The same, for a protocol."""
+        reference = protocol.reference
+        robot = Robot(len(protocol.joints), reference.low, reference.high)
         for part, coordinates in zip(hypothesis, x, strict=True):
             joints = np.array(part.joints)
             cause = part.definition
