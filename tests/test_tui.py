@@ -30,6 +30,7 @@ from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.app import SCENARIOS, SCREENS, OpenAnt
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.feeds import ReplayFeed
+from openant_tools.tui.leg_map import REST_S
 from openant_tools.tui.marks import plain
 from openant_tools.tui.page import Page
 from openant_tools.tui.screens import settings
@@ -188,6 +189,7 @@ def test_every_screen_looks_as_it_did(
         if name == "live":
             app.session.selected = "knee_fl"
             frozen(app, run, 10.0)
+            await pilot.pause(2 * REST_S)
         await pilot.pause()
 
     assert snap_compare(app, terminal_size=size, run_before=before)

@@ -12,6 +12,7 @@ from rich.text import Text
 from textual.binding import Binding, BindingType
 from textual.message import Message
 from textual.reactive import reactive
+from textual.timer import Timer
 from textual.widget import Widget
 
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS, LEGS
@@ -32,6 +33,8 @@ SHIN_M = 2 * KNEE_M
 REACH_M = 0.27
 #: rad, about half a dot at a foot: less is not drawn anew
 SEEN_RAD = 0.02
+#: s between two drawings: one costs half as much as all strips
+REST_S = 0.25
 #: dots drawn for one line of the drawing
 _DOTS_A_LINE = 60
 
@@ -68,14 +71,24 @@ Arrow keys choose a joint, here and among the strips.
         super().__init__(id=id)
         self._history = history
         self._looks: tuple[tuple[int, Condition], ...] = ()
+        self._shown: tuple[tuple[int, Condition], ...] = ()
+        self._resting: Timer | None = None
 
     def draw(self, history: History) -> None:
         """Draw these rows, where they look any different."""
         self._history = history
         looks = tuple((round(self._angle(joint) / SEEN_RAD), self._condition(joint)) for joint in JOINT_NAMES)
-        if looks != self._looks:
-            self._looks = looks
+        self._looks = looks
+        if self._resting is None:
+            self._catch_up()
+
+    def _catch_up(self) -> None:
+        """Show what changed since the last time, and rest for a while where something did."""
+        self._resting = None
+        if self._looks != self._shown:
+            self._shown = self._looks
             self.refresh()
+            self._resting = self.set_timer(REST_S, self._catch_up)
 
     def action_choose(self, by: int) -> None:
         names = JOINT_NAMES
