@@ -25,6 +25,7 @@ from openant_tools.robot.folder import create_robot
 from openant_tools.tui.app import OpenAnt
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.feeds import ReplayFeed
+from openant_tools.tui.leg_map import REST_S
 from openant_tools.tui.screens.step import StepScreen
 
 __all__ = ["PAGES", "make"]
@@ -193,7 +194,7 @@ async def _replay(take: Callable[[OpenAnt, str], None], recording: Path) -> None
         feed.seek(10.0)
         app.session.selected = "knee_fl"
         app.tick()
-        await pilot.pause(0.2)
+        await pilot.pause(2 * REST_S)
         take(app, "live")
 
 
