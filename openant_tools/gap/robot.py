@@ -17,7 +17,7 @@ from openant_tools.model.body import floor_contacts, link_bodies, scale_mass, to
 from openant_tools.model.plant import Plant
 from openant_tools.sysid.kinds import KINDS, usual_torque
 
-__all__ = ["Cable", "Form", "Reference", "Robot"]
+__all__ = ["Cable", "Form", "Reference", "Robot", "tilted"]
 
 Array = NDArray[np.float64]
 
@@ -224,8 +224,12 @@ class Robot:
         model.pair_friction[contacts.pairs, :2] *= self.floor_friction
         model.geom_solref[contacts.geoms, 0] *= np.where(model.geom_solref[contacts.geoms, 0] > 0, self.softness, 1.0)
         model.pair_solref[contacts.pairs, 0] *= np.where(model.pair_solref[contacts.pairs, 0] > 0, self.softness, 1.0)
+        if self.adhesion_n:
+            # Where the floor has priority, it alone decides what its contacts are like.
+            model.flg_adhesion = True
+            model.geom_adhesion[contacts.geoms] = self.adhesion_n
         if self.tilt.any():
-            model.opt.gravity[:] = tilted(model.opt.gravity, self.tilt)
+            model.opt.gravity[:] = tilted(plant.model.opt.gravity, self.tilt)
 
 
 def add_mass(model: mujoco.MjModel, body: int, mass: float, position: Array) -> None:

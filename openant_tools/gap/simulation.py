@@ -19,9 +19,9 @@ from openant_tools.effects.rollout import laws_of
 from openant_tools.effects.servos import batch_of
 from openant_tools.effects.step import Law, Step
 from openant_tools.gap.laws import Fields, first_laws, last_laws
-from openant_tools.gap.robot import Cable, Form, Robot
+from openant_tools.gap.robot import Cable, Robot, tilted
 from openant_tools.model.body import torso_body
-from openant_tools.model.plant import Plant, Setup, world_bodies
+from openant_tools.model.plant import Plant, Setup
 from openant_tools.model.rollout import Rollouts, Segment
 
 __all__ = ["BASE", "Log", "simulate"]
@@ -83,17 +83,23 @@ class _Batch:
         self._n = len(robots)
         plant, copies = self._plant, len(self._segments)
         models = [rollouts.lean(robot.model(plant)) for robot in robots]
+        # A batch takes arrays from its models, flags from the first.
+        models[0].flg_adhesion = any(robot.adhesion_n > 0 for robot in robots)
         self._batch, self._servos = batch_of(plant, models, copies, rollouts.nthread)
         self._zero = np.tile(np.array([robot.zero for robot in robots]), (copies, 1))
         self._take_forms()
         state = np.repeat([segment.state for segment in self._segments], self._n, axis=0)
         state[:, 1 + plant.qpos] -= self._zero
         self._batch.state[:] = state
-        self._add_adhesion()
         self._batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
         self._laws = self._make_laws()
 
     def _take_forms(self) -> None:
+        if any(robot.tilt.any() for robot in self._robots):
+            # What a batch takes from its models are their arrays; gravity is an option.
+            given = self._plant.model.opt.gravity
+            down = np.array([tilted(given, robot.tilt) if robot.tilt.any() else given for robot in self._robots])
+            self._batch.expand("opt.gravity")[:] = np.tile(down, (len(self._segments), 1))
         forms = [robot.form for robot in self._robots]
         if not any(forms):
             return
@@ -108,15 +114,6 @@ class _Batch:
             field[:] = np.tile([own if form is None else value(form) for form in forms], len(self._segments)).reshape(
                 field.shape
             )
-
-    def _add_adhesion(self) -> None:
-        force = np.array([robot.adhesion_n for robot in self._robots])
-        if not force.any():
-            return
-        model = self._plant.model
-        of_world = np.isin(model.geom_bodyid, list(world_bodies(model)))
-        feet = ~of_world & ((model.geom_contype | model.geom_conaffinity) != 0)
-        self._batch.expand("geom_adhesion")[:, feet] = np.tile(force, len(self._segments))[:, None]
 
     def _make_laws(self) -> list[Law]:
         plant, copies = self._plant, len(self._segments)
@@ -351,9 +348,3 @@ def _to_body(quat: Array, vectors: Array) -> Array:
     cross = np.cross(u, vectors)
     out: Array = vectors + 2 * (w * cross + np.cross(u, cross))
     return out
-
-
-def own_form(plant: Plant) -> Form:
-    """The form of the plant's own model."""
-    opt = plant.model.opt
-    return Form(int(opt.integrator), int(opt.cone) == int(mujoco.mjtCone.mjCONE_ELLIPTIC), float(opt.impratio))
