@@ -66,7 +66,9 @@ def name_it(servo: Servo) -> Procedure:
 def test_a_granted_procedure_runs_to_its_finding():
     servo, face = Servo(), Scripted(20.0, True)
     finding = drive(name_it(servo), face)
-    assert finding.ok and servo.written == [20] and not servo.torque
+    assert finding.ok
+    assert servo.written == [20]
+    assert not servo.torque
     assert [type(event).__name__ for event in face.seen] == ["Say", "Ask", "Intent"]
 
 
@@ -74,7 +76,8 @@ def test_what_is_not_granted_is_not_written_and_torque_is_off():
     servo = Servo()
     with pytest.raises(Declined, match="write the id"):
         drive(name_it(servo), Scripted(20.0, False))
-    assert servo.written == [] and not servo.torque
+    assert servo.written == []
+    assert not servo.torque
 
 
 def test_ctrl_c_at_a_question_lets_the_procedure_put_the_robot_into_order():
@@ -87,7 +90,8 @@ def test_ctrl_c_at_a_question_lets_the_procedure_put_the_robot_into_order():
     servo = Servo()
     with pytest.raises(KeyboardInterrupt):
         drive(name_it(servo), Interrupting())
-    assert not servo.torque and servo.written == []
+    assert not servo.torque
+    assert servo.written == []
 
 
 def test_a_fault_of_the_procedure_reaches_the_one_who_runs_it():
@@ -122,7 +126,8 @@ def test_the_newest_finding_of_a_step_is_found_and_a_torn_one_passed_over(tmp_pa
     (folder.findings / "zeros-29991231T000000Z.json").write_text('{"step": "zer')
     (folder.findings / "zeros-29991230T000000Z.json").write_text("[]")
     seen = latest(folder, "zeros")
-    assert seen is not None and seen.what == "all straight"
+    assert seen is not None
+    assert seen.what == "all straight"
     assert "# zeros: ✓ ok" in path.with_suffix(".md").read_text()
 
 
@@ -184,4 +189,5 @@ def test_the_journal_survives_kill_9_between_a_line_and_its_write(tmp_path):
 
 def test_a_bench_needs_no_more_than_a_folder(tmp_path: Path):
     bench = Bench(create_robot(tmp_path / "ant"))
-    assert bench.bus is None and bench.joints == ()
+    assert bench.bus is None
+    assert bench.joints == ()
