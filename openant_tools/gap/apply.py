@@ -20,8 +20,9 @@ from openant_tools.gap.cause import catalogue
 from openant_tools.gap.diagnosis import Diagnosis, Found
 from openant_tools.gap.native import Edit, edit
 from openant_tools.gap.robot import Reference, Robot
+from openant_tools.model.body import floor_contacts
 from openant_tools.model.mjcf import document_text, write_model
-from openant_tools.model.plant import Plant, Setup, load_plant, world_bodies
+from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.robot.config import Effect, Provenance
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.sysid.kinds import KINDS
@@ -179,9 +180,7 @@ def _variant(plant: Plant, robot: Robot) -> mujoco.MjModel:
     for j in np.flatnonzero(robot.zero):
         zero.write(variant, plant, int(j), zero.read(variant, plant, int(j)) + float(robot.zero[j]))
     if robot.adhesion_n:
-        of_world = np.isin(variant.geom_bodyid, list(world_bodies(variant)))
-        feet = ~of_world & ((variant.geom_contype | variant.geom_conaffinity) != 0)
-        variant.geom_adhesion[feet] = robot.adhesion_n
+        variant.geom_adhesion[floor_contacts(plant.model).geoms] = robot.adhesion_n
     return variant
 
 

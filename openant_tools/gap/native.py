@@ -22,7 +22,7 @@ from openant_tools.model.body import torso_body
 from openant_tools.model.mjcf import actuator_element, in_degrees, joint_element, number, numbers
 from openant_tools.model.plant import Plant, is_filtered, is_motor, samples_for
 
-__all__ = ["Edit", "edit"]
+__all__ = ["BRISTLE_RAD", "Edit", "edit"]
 
 Array = NDArray[np.float64]
 Element = etree._Element

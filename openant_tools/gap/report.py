@@ -35,6 +35,8 @@ Array = NDArray[np.float64]
 WINDOW_S = 3.0
 #: candidates and places on the first page
 CANDIDATES, PLACES = 6, 8
+#: of the excess, below which a place is not worth a line
+LEAST_SHARE = 0.005
 #: probability below which an effect is refuted rather than a runner-up
 REFUTED = 0.2
 
@@ -158,7 +160,7 @@ def _details(report: Report, found: Diagnosis) -> None:
 def places(found: Diagnosis) -> MatplotlibFigure:
     """A bar of shares, and the robot from above where it has legs."""
     figure: MatplotlibFigure
-    largest = list(found.where[:PLACES])
+    largest = [place for place in found.where if float(place["share"]) >= LEAST_SHARE][:PLACES] or list(found.where[:1])
     of_ant = {str(place["joint"]) for place in found.where} & set(JOINTS)
     if of_ant:
         figure, (axes, legs) = plots.figure(1, 2, height=3.0, width_ratios=[3, 2])
@@ -195,11 +197,11 @@ def _leg_map(axes: Axes, found: Diagnosis) -> None:
             x, y = -far * left, far * along
             edge = plots.VERMILLION if name in named else plots.INK
             axes.scatter(
-                [x], [y], s=25 + 900 * share[name], color=plots.ORANGE, edgecolor=edge,
+                [x], [y], s=25 + 400 * share[name], color=plots.ORANGE, edgecolor=edge,
                 linewidth=2.0 if name in named else 0.6, zorder=2,
             )  # fmt: skip
             axes.annotate(
-                f"{name}\n{100 * share[name]:.0f} %", (x, y), xytext=(-14 * left, 0), textcoords="offset points",
+                f"{name}\n{100 * share[name]:.0f} %", (x, y), xytext=(-left * (6 + 10 * math.sqrt(share[name])), 0), textcoords="offset points",
                 ha="right" if left > 0 else "left", va="center", fontsize=7,
             )  # fmt: skip
     axes.scatter([0], [0], s=500, color=plots.INK, alpha=0.25, zorder=1)
@@ -207,7 +209,7 @@ def _leg_map(axes: Axes, found: Diagnosis) -> None:
     axes.set_ylim(-3.0, 3.0)
     axes.set_aspect("equal")
     axes.axis("off")
-    axes.set_title("position, by joint (front is up)")
+    axes.set_title("position, by joint (front is up)", loc="left", fontsize=10, fontweight="bold")
 
 
 def candidates(found: Diagnosis) -> MatplotlibFigure:

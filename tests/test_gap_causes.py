@@ -1,0 +1,96 @@
+"""The catalogue as causes: complete, consistent with effects.md, and extensible by one file."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plants import pendulum, write
+from test_gap_apply import diagnosis, found
+
+from openant_tools.effects.catalogue import catalogue as acting
+from openant_tools.gap.cause import Cause, catalogue
+from openant_tools.gap.next import ACTIONS, experiments
+from openant_tools.gap.robot import Reference, Robot
+from openant_tools.model.plant import load_plant
+
+CATALOGUE = Path(__file__).parents[2] / "shared" / "effects.md"
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("model") / "pendulum.xml", pendulum())
+
+
+def reference(model: Path) -> Reference:
+    one = np.ones(1)
+    return Reference.of(load_plant(model), floor=True, imu=True, tracker=True, speed=4 * one, low=-one, high=one)
+
+
+@pytest.mark.skipif(not CATALOGUE.is_file(), reason="shared/ is not here")
+def test_every_effect_of_the_catalogue_is_a_cause_with_its_family_and_scope() -> None:
+    rows = re.findall(
+        r"^\| ([a-z ]+) \| `(\w+)` \|.*\| ([jgab ]+) \|.*\|$", CATALOGUE.read_text(encoding="utf-8"), re.M
+    )
+    assert {name for _, name, _ in rows} == set(catalogue())
+    for family, name, scopes in rows:
+        cause = catalogue()[name]
+        assert cause.family == family
+        assert {str(scope) for scope in cause.scopes} <= set(scopes.split())
+
+
+@pytest.mark.parametrize("cause", list(catalogue().values()), ids=list(catalogue()))
+def test_a_cause_changes_a_robot_and_only_where_it_sits(cause: Cause, model: Path) -> None:
+    known = reference(model)
+    for x in cause.starts(0.5):
+        robot, healthy = Robot(1, known.low, known.high), Robot(1, known.low, known.high)
+        cause.enter(robot, np.array([0]), cause.values(x, known, np.array([0])))
+        assert repr(robot) != repr(healthy)
+
+
+@pytest.mark.parametrize("cause", list(catalogue().values()), ids=list(catalogue()))
+def test_a_coordinate_is_the_value_and_back(cause: Cause, model: Path) -> None:
+    known, joints = reference(model), np.array([0])
+    for quantity in cause.quantities:
+        scale = quantity.scale(known, joints)
+        for x in (quantity.small, quantity.large):
+            assert quantity.back(quantity.value(x, scale), scale) == pytest.approx(x)
+
+
+def test_what_mujoco_does_not_carry_acts_between_steps_or_on_the_log() -> None:
+    log_or_bus = {"clock_jitter", "command_dropout", "imu_bias", "tracker_scale", "thermal_derating"}
+    assert {name for name, cause in catalogue().items() if not cause.native} <= set(acting()) | log_or_bus
+
+
+def test_actions_name_effects_of_the_catalogue() -> None:
+    for pair in ACTIONS:
+        assert len(pair) == 2
+        assert pair <= set(catalogue())
+
+
+def test_delay_in_the_log_or_in_the_command_is_no_matter_of_motion(model: Path) -> None:
+    open_ = diagnosis(
+        model, found("action_delay", "all", delay_s=0.02), found("sensor_delay", "all", **{"pos.delay_s": 0.02}),
+        selected=False, verdict="ambiguous",
+    )  # fmt: skip
+    answer = experiments(open_, model, names=["steps"])
+    assert "tap the robot" in answer.sentence
+    assert answer.experiments[0].apart is not None
+    assert answer.experiments[0].apart < 0.1
+
+
+def test_a_large_motion_tells_a_limit_from_stiffness(model: Path) -> None:
+    open_ = diagnosis(
+        model, found("stiffness_error", "all", scale=0.6), found("torque_limit", "all", limit=0.3),
+        selected=False, verdict="ambiguous",
+    )  # fmt: skip
+    answer = experiments(open_, model, names=["holds", "saturating-steps"])
+    assert answer.experiments[0].name == "saturating-steps"
+    assert "Record `saturating-steps`" in answer.sentence
+
+
+def test_nothing_is_open_where_nothing_was_found(model: Path) -> None:
+    healthy = diagnosis(model, found("stiffness_error", "all", scale=0.9), selected=False, verdict="none")
+    assert experiments(healthy, model).experiments == ()
