@@ -106,6 +106,7 @@ class Judge:
 
     Attributes:
         causes: by name, in the order of its probabilities. joints: how many.
+        known: which causes, then joints, the forest tells.
         means, logs: which of the features are block means, and which are logarithms of sizes.
         bank: cause, joints and coordinates of each template. templates: whitened.
         groups: of each block mean, its run and signal.
@@ -123,6 +124,7 @@ class Judge:
     groups: Ints
     gates: Array
     forest: ExtraTreesClassifier | None = None
+    known: Bools | None = None
     calibration: tuple[tuple[float, float], ...] = ()
 
     def inputs(self, x: Floats) -> Floats:
@@ -156,8 +158,9 @@ class Judge:
         assert self.forest is not None
         inputs = self.inputs(x[None])
         raw = np.array([p[0, 1] if p.shape[1] > 1 else 0.0 for p in self.forest.predict_proba(inputs)])
-        chances = [_logistic(a * _logit(p) + b) for p, (a, b) in zip(raw, self.calibration, strict=True)]
         n = len(self.causes)
+        chances = np.zeros(n + self.joints)
+        chances[self.known] = [_logistic(a * _logit(p) + b) for p, (a, b) in zip(raw, self.calibration, strict=True)]
         fit = self._fits(self.whitening(x[None, self.means]))[0]
         places: dict[str, list[tuple[tuple[int, ...], dict[str, float]]]] = {cause: [] for cause in self.causes}
         for k in np.argsort(-fit):
@@ -166,7 +169,7 @@ class Judge:
                 places[name].append((where, dict(x_)))
         return Judgement(
             dict(zip(self.causes, map(float, chances[:n]), strict=True)),
-            np.array(chances[n:]),
+            chances[n:],
             float(self.energy(x[None])[0]),
             places,
         )
@@ -222,15 +225,16 @@ def train(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools], se
     )  # fmt: skip
     labels = _labels(prepared, names, joints)
     taught = np.concatenate([np.flatnonzero(~prepared.healthy()), others])
+    known = labels[taught].any(axis=0)  # a robot of one joint has no other joints
     forest = ExtraTreesClassifier(
         TREES, min_samples_leaf=LEAF, max_features=TRIED, bootstrap=True, oob_score=True, n_jobs=-1, random_state=seed
     )
     inputs = np.concatenate([judge.inputs(x[taught[k : k + 256]]) for k in range(0, len(taught), 256)])
-    forest.fit(inputs, labels[taught])
-    unseen = _unseen(forest, labels.shape[1])
-    calibration = tuple(_calibrated(unseen[:, k], labels[taught, k]) for k in range(labels.shape[1]))
+    forest.fit(inputs, labels[np.ix_(taught, known)])
+    unseen = _unseen(forest, int(known.sum()))
+    calibration = tuple(_calibrated(unseen[:, n], labels[taught, k]) for n, k in enumerate(np.flatnonzero(known)))
     forest.oob_decision_function_ = None  # of no use any more, and large
-    return dataclasses.replace(judge, forest=forest, calibration=calibration)
+    return dataclasses.replace(judge, forest=forest, known=known, calibration=calibration)
 
 
 def whitening_of(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools]) -> tuple[Whitening, Bools]:

@@ -69,7 +69,9 @@ def last_laws(robots: Sequence[Robot], fields: Fields) -> list[Law]:
         laws.append(_braking(electrical * fields.damping / np.maximum(1 - electrical, TINY)))
     low, high = _table(robots, "stop_low"), _table(robots, "stop_high")
     if np.isfinite(low).any() or np.isfinite(high).any():
-        laws.append(_stopping(low, high, fields.armature + fields.link))
+        # What stops behind play or a spring is the link alone.
+        behind = (_table(robots, "play") > 0) | (_table(robots, "compliance") > 0)
+        laws.append(_stopping(low, high, np.where(behind, fields.link, fields.armature + fields.link)))
     smooth = np.array([[robot.form.smooth_friction if robot.form else 0.0] for robot in robots])
     if smooth.any():
         laws.append(_smoothing(smooth))

@@ -32,6 +32,8 @@ WIDTH = 1.15
 UNEQUAL = 0.1
 #: strengths of templates
 TEMPLATES = (0.2, 0.5, 0.85)
+#: beyond which a feature says only that it is large
+LARGEST = 1e4
 
 
 @dataclass(frozen=True)
@@ -163,5 +165,7 @@ def play(protocol: Protocol, cases: Sequence[Case], seed: int) -> list[Floats]:
         signals = simulate(rollouts, robots, seed=seed * 64 + k, signals=played.signals).signals
         nominal = {name: values[:1] for name, values in signals.items()}
         noisy = with_noise({name: values[1:] for name, values in signals.items()}, robots[1:], steps, rng)
-        out.append(played.layout.features(differences(noisy, nominal, played.signals)))
+        # A robot that no step can hold together shows as very ill, not as infinite.
+        found = played.layout.features(differences(noisy, nominal, played.signals))
+        out.append(np.clip(np.nan_to_num(found, nan=0.0, posinf=LARGEST, neginf=-LARGEST), -LARGEST, LARGEST))
     return out

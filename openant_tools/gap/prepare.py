@@ -82,8 +82,9 @@ def prepare(protocol: Protocol, robots: int | None = None, progress: Progress | 
         progress: told a share and words.
     """
     robots = robots or robots_of(protocol)
-    folder = find(protocol) or _new(protocol)
-    known = _reference(folder, protocol)
+    folder, order = find(protocol) or (_new(protocol), list(range(len(protocol.runs))))
+    # From here on in the order of whoever prepared it first.
+    known = _reference(folder, dataclasses.replace(protocol, runs=tuple(protocol.runs[k] for k in order)))
     coarse = known.coarse()
     causes = applicable(coarse)
     size = PART if len(protocol.joints) > 2 else 8 * PART
@@ -106,15 +107,16 @@ def prepare(protocol: Protocol, robots: int | None = None, progress: Progress | 
             for k in range(len(coarse.runs)):
                 features[k].append(stored[f"run{k}"].astype(np.float32))
     cases = [draw(coarse, k, causes) for k in range(parts * size)]
-    whole_features = [np.concatenate(x) for x in features]
     n = len(cases)
+    back = [order.index(k) for k in range(len(order))]
+    mine = [np.concatenate(features[k]) for k in back]
     return Prepared(
-        known,
+        dataclasses.replace(known, runs=tuple(known.runs[k] for k in back)),
         folder,
         tuple(cases),
-        tuple(x[:n] for x in whole_features),
+        tuple(x[:n] for x in mine),
         tuple(bank),
-        tuple(x[n:] for x in whole_features),
+        tuple(x[n:] for x in mine),
     )
 
 
@@ -129,8 +131,8 @@ def _make(protocol: Protocol, part: int, size: int, path: Path) -> None:
     _write(path, {f"run{k}": x.astype(np.float16) for k, x in enumerate(found)})
 
 
-def find(protocol: Protocol) -> Path | None:
-    """The folder of the same model and commands, if it was ever begun."""
+def find(protocol: Protocol) -> tuple[Path, list[int]] | None:
+    """The folder of the same model and commands, if it was ever begun, and which of the runs are its first, second …"""
     commands = protocol.commands()
     for folder in sorted(cache_folder().glob(f"v{VERSION}-{protocol.fingerprint()}-*")):
         try:
@@ -138,8 +140,11 @@ def find(protocol: Protocol) -> Path | None:
                 known = [stored[f"cmd{k}"] for k in range(len(stored.files) // 2)]
         except (OSError, KeyError, ValueError):
             continue
-        if same(known, commands):
-            return folder
+        order: list[int] = []
+        for one in known:
+            order += [k for k, mine in enumerate(commands) if k not in order and same([one], [mine])][:1]
+        if len(order) == len(known) == len(commands):
+            return folder, order
     return None
 
 

@@ -174,7 +174,7 @@ class Protocol:
         state = hashlib.sha256()
         for path in sorted({one.plant.path for one in self.runs}):
             state.update(path.read_bytes())
-        facts = [[str(one.plant.setup), round(one.run.facts.heading_rad or 0.0, 1)] for one in self.runs]
+        facts = sorted([str(one.plant.setup), round(one.run.facts.heading_rad or 0.0, 1)] for one in self.runs)
         state.update(json.dumps([list(self.joints), facts]).encode())
         return state.hexdigest()[:16]
 

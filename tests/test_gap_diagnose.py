@@ -1,0 +1,102 @@
+"""The diagnosis, end to end, on a robot of one joint that MuJoCo itself plays."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from plants import ENCODER_RAD, drive, pendulum, run_of, sweep, write
+
+from openant_tools.errors import BadInput
+from openant_tools.gap.diagnose import diagnose
+from openant_tools.gap.diagnosis import NONE, Diagnosis, Found, Span, read_diagnosis
+from openant_tools.recording.run import Run
+
+ROBOTS = 768
+
+
+@pytest.fixture(autouse=True, scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> None:
+    patch = pytest.MonkeyPatch()
+    patch.setenv("OPENANT_CACHE", str(tmp_path_factory.mktemp("cache")))
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("model") / "pendulum.xml", pendulum())
+
+
+def recorded(text: str, late_s: float = 0.0) -> list[Run]:
+    """Three motions of a robot of this MJCF whose commands come late."""
+    # On a stand nothing of the robot touches the world (formats, section 1).
+    robot = mujoco.MjModel.from_xml_string(
+        text.replace('<geom name="bench" type="plane" size="1 1 0.1" pos="0 0 -0.12"/>', "")
+    )
+    robot.opt.timestep = 0.0005
+    runs = []
+    for k, (reach, fast) in enumerate([(0.6, 2.5), (0.9, 1.5), (0.35, 3.5)]):
+        t = 3.0 + np.arange(200) / 50
+        command = sweep(t, 1, reach=reach, high_hz=fast)
+        shifted = sweep(t - late_s, 1, reach=reach, high_hz=fast)
+        shifted[t - t[0] < late_s] = command[0]
+        # Commands late by whole rows: what acts is an older one than what is logged.
+        columns = drive(robot, ["joint"], t, shifted, noise=5e-4, quantum=ENCODER_RAD, seed=k)
+        columns["cmd.joint"] = command[:, 0]
+        runs.append(run_of(columns, t, ["joint"], f"motion-{k}"))
+    return runs
+
+
+def test_a_robot_within_tolerance_is_healthy(model: Path) -> None:
+    found = diagnose(
+        recorded(pendulum(joint='damping="0.128" armature="0.0063" frictionloss="0.035"')), model, robots=ROBOTS
+    )
+    assert found.verdict == NONE
+    assert found.selected == ()
+
+
+def test_late_commands_are_named_and_close_the_gap(model: Path) -> None:
+    found = diagnose(recorded(pendulum(), late_s=0.04), model, robots=ROBOTS)
+    # On positions alone a late command is a late sensor (effects.md).
+    names = {found.effects[0].effect, found.effects[1].effect}
+    assert names & {"action_delay", "sensor_delay"}
+    assert found.verdict != NONE
+    assert found.gap["before"] > 3 * found.gap["floor"]
+    assert found.gap["after"] < 0.5 * found.gap["before"]
+    assert sum(place["share"] for place in found.where if place["signal"] == "pos") == pytest.approx(1, abs=0.01)
+
+
+def test_bad_input_is_one_line(model: Path) -> None:
+    runs = recorded(pendulum())
+    with pytest.raises(BadInput, match="one run is not enough"):
+        diagnose(runs[:1], model)
+    with pytest.raises(BadInput, match="the same as motion-0"):
+        diagnose(runs, model, hold_out=[runs[0]])
+    still = [dataclasses.replace(r, columns={n: np.zeros_like(v) for n, v in r.columns.items()}) for r in runs]
+    with pytest.raises(BadInput, match="nothing moves"):
+        diagnose(still, model)
+    other = [
+        run_of({"cmd.elbow": r.columns["cmd.joint"], "pos.elbow": r.columns["pos.joint"]}, r.t, ["elbow"]) for r in runs
+    ]
+    with pytest.raises(BadInput, match=r"joint"):
+        diagnose(other, model)
+
+
+def test_a_diagnosis_survives_its_json(tmp_path: Path) -> None:
+    import json
+
+    span = Span(0.02, 0.018, 0.022)
+    found = Diagnosis(
+        "m.xml", ("a", "b"), (), "action_delay", 0.9,
+        (Found("action_delay", "all", {"delay_s": span}, 0.9, 0.8, 0.7, 0.9, True, {"delay_s": 0.02}),),
+        ("action_delay",), (), None, {"before": 0.01, "after": 0.002, "floor": 0.001}, (),
+    )  # fmt: skip
+    path = tmp_path / "out.json"
+    path.write_text(json.dumps(found.as_json()))
+    again = read_diagnosis(path)
+    assert again.as_json() == found.as_json()
+    path.write_text("{}")
+    with pytest.raises(BadInput, match="no diagnosis"):
+        read_diagnosis(path)
