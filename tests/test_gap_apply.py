@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import mujoco
@@ -51,11 +52,11 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("model") / "pendulum.xml", pendulum())
 
 
-def commanded(plant: Plant, commands: Array, setup: str = "stand", **more: Array) -> Run:
+def commanded(plant: Plant, commands: Array, setup: str = "stand", more: Mapping[str, Array] | None = None) -> Run:
     columns = {f"cmd.{joint}": commands[:, j] for j, joint in enumerate(plant.joints)}
     columns |= {f"pos.{joint}": np.full(len(commands), commands[0, j]) for j, joint in enumerate(plant.joints)}
-    t = 0.01 * np.arange(len(commands))
-    return Run("run", Facts(joints=plant.joints, setup=setup), t, {**columns, **more})
+    t = 0.01 * np.arange(len(commands), dtype=np.float64)
+    return Run("run", Facts(joints=plant.joints, setup=setup), t, {**columns, **(more or {})})
 
 
 def reference(plant: Plant) -> Reference:
@@ -101,7 +102,7 @@ def test_plain_mujoco_does_what_the_diagnosis_simulated(name: str, model: Path, 
 def test_electrical_damping_goes_with_the_torque(model: Path, tmp_path: Path) -> None:
     plant = load_plant(model)
     torque = np.where((T > 0.8) & (T < 1.4), 0.0, 1.0)
-    run = commanded(plant, sweep(T, 1), **{"torque.joint": torque})
+    run = commanded(plant, sweep(T, 1), more={"torque.joint": torque})
     robot = with_cause(plant, catalogue()["electrical_damping"], 1.0)
     given, simulated = simulate(
         Rollouts(plant, [run]), [Robot(1), robot], signals=["pos"]
@@ -127,9 +128,9 @@ def walk() -> tuple[Plant, Run]:
     commands = home + sway * np.sin(2 * np.pi * 1.2 * t)[:, None] * np.sign(np.arange(8) % 3 - 0.5)
     base = dict(zip(("x", "y", "z", "qw", "qx", "qy", "qz"), data.qpos[:7], strict=True))
     more = {f"base.{axis}": np.full(len(t), value) for axis, value in base.items()}
-    run = commanded(plant, commands, "floor", **more)
+    run = commanded(plant, commands, "floor", more)
     for j, joint in enumerate(plant.joints):
-        run.columns[f"pos.{joint}"][:] = data.qpos[plant.qpos[j]]  # type: ignore[index]
+        run.columns[f"pos.{joint}"][:] = data.qpos[plant.qpos[j]]
     return plant, run
 
 

@@ -123,7 +123,7 @@ def _set_gains(element: Element, stiffness: float, velocity: float) -> None:
         element.set("biasprm", numbers([0.0, -stiffness, -velocity]))
     else:
         element.set("kp", number(stiffness))
-        element.attrib.pop("dampratio", None)
+        element.attrib.pop("dampratio", "")
         element.set("kv", number(velocity))
 
 
@@ -409,11 +409,11 @@ def _imu(root: Element, plant: Plant, robot: Robot, done: Edit) -> None:
     for sensor in sensors:
         _late(sensor, late, plant.timestep)
     for name in dict.fromkeys(str(sensor.get("site")) for sensor in sensors) if turned.any() else ():
-        site = next(e for e in root.iter("site") if e.get("name") == name and e.getparent().tag != "spatial")
+        site = next(e for e in root.iter("site") if e.get("name") == name)
         quat, turn = np.zeros(4), np.zeros(4)
         angle = float(np.linalg.norm(turned))
         mujoco.mju_axisAngle2Quat(turn, turned / angle, angle)
         mujoco.mju_mulQuat(quat, turn, plant.model.site(name).quat)
         for other in ("euler", "axisangle", "xyaxes", "zaxis"):
-            site.attrib.pop(other, None)
+            site.attrib.pop(other, "")
         site.set("quat", numbers(quat))

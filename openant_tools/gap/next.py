@@ -261,12 +261,12 @@ def _run(plant: Plant, part: Protocol) -> Run:
     space = _space(plant)
     commands = part.commands(space, RATE_HZ)
     limp = part.limp(space, RATE_HZ)
-    t = np.arange(len(commands)) / RATE_HZ
+    t = np.arange(len(commands), dtype=np.float64) / RATE_HZ
     columns: dict[str, Array] = {}
     for j, joint in enumerate(plant.joints):
         columns[f"cmd.{joint}"] = commands[:, j]
         columns[f"pos.{joint}"] = commands[:, j]
-        columns[f"torque.{joint}"] = 1.0 - limp[:, j]
+        columns[f"torque.{joint}"] = (~limp[:, j]).astype(np.float64)
     facts = Facts(joints=plant.joints, setup=part.setup, heading_rad=part.heading_rad)
     return Run(part.name, facts, t, columns)
 
