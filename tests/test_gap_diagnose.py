@@ -15,7 +15,7 @@ from openant_tools.gap.diagnose import diagnose
 from openant_tools.gap.diagnosis import NONE, Diagnosis, Found, Span, read_diagnosis
 from openant_tools.recording.run import Run
 
-ROBOTS = 768
+ROBOTS, RATE_HZ = 768, 50
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -38,11 +38,11 @@ def recorded(text: str, late_s: float = 0.0) -> list[Run]:
     robot.opt.timestep = 0.0005
     runs = []
     for k, (reach, fast) in enumerate([(0.6, 2.5), (0.9, 1.5), (0.35, 3.5)]):
-        t = 3.0 + np.arange(200) / 50
+        t = 3.0 + np.arange(4 * RATE_HZ) / RATE_HZ
         command = sweep(t, 1, reach=reach, high_hz=fast)
-        shifted = sweep(t - late_s, 1, reach=reach, high_hz=fast)
-        shifted[t - t[0] < late_s] = command[0]
-        # Commands late by whole rows: what acts is an older one than what is logged.
+        # Late by whole rows: what acts is an older command than what is logged.
+        rows = round(late_s * RATE_HZ)
+        shifted = np.concatenate([np.repeat(command[:1], rows, axis=0), command[: len(t) - rows]])
         columns = drive(robot, ["joint"], t, shifted, noise=5e-4, quantum=ENCODER_RAD, seed=k)
         columns["cmd.joint"] = command[:, 0]
         runs.append(run_of(columns, t, ["joint"], f"motion-{k}"))

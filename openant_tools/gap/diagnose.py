@@ -40,8 +40,8 @@ Progress = Callable[[float, str], None]
 
 #: probabilities: below which of the best nothing is fitted, below which a cause is not looked at, above which it is a finding
 DOUBT, SUSPECT, FINDING = 0.12, 0.07, 0.5
-#: how many causes are looked at
-SUSPECTS = 5
+#: how many causes are looked at, at most and at least
+SUSPECTS, LIKELIEST = 5, 3
 #: probability of a second cause, once the first is taken into account
 SECOND = 0.35
 #: places at which each of them is tried
@@ -49,8 +49,9 @@ PLACES = 2
 #: held-out closure that an addition must bring; that one cause must bring beyond what tolerances do, where the judge doubts;
 #: and below which a set explains nothing
 ADDS, ADDS_ALONE, EXPLAINS = 0.02, 0.2, 0.35
-#: gaps that are so many floors, of robots whose energy is so many gates, ask for an explanation
-LARGE, STRANGE = 3.0, 5.0
+#: gaps that are so many floors, of robots whose energy is so many gates, ask for an explanation; beyond ODD gates no robot of
+#: the build is healthy, whatever the judge says
+LARGE, STRANGE, ODD = 3.0, 5.0, 20.0
 #: sets whose closures differ by less are not told apart
 APART = 0.01
 #: how what is left of the gap counts beside the judge's probability
@@ -94,11 +95,12 @@ def diagnose(
     tell(0.7, "causes")
     case = _Case(protocol, prepared, measured, judge, found, training, len(runs), model, runs, hold_out)
     first = _shown(judgement, protocol)
-    if first[0][1] < DOUBT:
+    if first[0][1] < DOUBT and judgement.energy < STRANGE:
         tell(1.0, "done")
         return _healthy(case, judgement, first)
     scenes = _scenes(prepared, protocol, found, training)
-    suspects = [name for name, chance in first if chance > SUSPECT][:SUSPECTS]
+    # Where nothing is likely and yet the log is strange, the likeliest few have to answer.
+    suspects = [name for n, (name, chance) in enumerate(first) if chance > SUSPECT or n < LIKELIEST][:SUSPECTS]
     explained = _explain(scenes, suspects, judgement)
     tell(0.85, "held-out runs")
     return _decide(case, judgement, first, explained, scenes)
@@ -318,7 +320,9 @@ def _decide(
                 probability[name] = max(probability[name], chance)
                 break
     body = catalogue()[best].scopes == (Scope.BODY,) or catalogue()[best].signal is not None
-    sure = probability[best] > FINDING or (probability[best] > SUSPECT and beyond[best] > ADDS_ALONE)
+    sure = probability[best] > FINDING or (
+        judgement.energy > 1 and beyond[best] > ADDS_ALONE and alone[best].closed > EXPLAINS
+    )
     verdict, selected = best, tuple(sorted(chosen, key=lambda name: -beyond[name]))
     ambiguous: tuple[tuple[str, ...], ...] = ()
     rivals = [
@@ -329,7 +333,7 @@ def _decide(
         and probability[name] > probability[best] / 2
     ]
     if not sure:
-        verdict, selected = NONE, ()
+        verdict, selected = (NONE if judgement.energy < ODD else UNEXPLAINED), ()
     elif not body and excess(before, floor) > LARGE * floor and whole.closed < EXPLAINS and judgement.energy > STRANGE:
         verdict, selected = UNEXPLAINED, ()
     elif rivals:
