@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import re
@@ -203,7 +204,9 @@ def test_the_truth_of_a_healthy_robot_is_its_nominal_model(tmp_path: Path) -> No
 def test_ctrl_c_ends_the_running_command_in_order_and_the_demo_goes_on_from_there(tmp_path: Path) -> None:
     folder = tmp_path / "ant"
     command = [sys.executable, "-m", "openant_tools.cli", "demo", "--robot", str(folder)]
-    process = subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    # Whoever runs the tests in the background may have told their processes to ignore Ctrl-C.
+    heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=heed)
     recording = folder / "recordings" / "stand.mcap"
     give_up = time.monotonic() + PATIENCE_S
     while not recording.exists():
