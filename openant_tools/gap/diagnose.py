@@ -40,6 +40,8 @@ Progress = Callable[[float, str], None]
 
 #: probabilities: below which of the best nothing is fitted, below which a cause is not looked at, above which it is a finding
 DOUBT, SUSPECT, FINDING = 0.12, 0.07, 0.5
+#: probability of a cause that little closure on the held-out runs does not overrule: a stop, say, shows in few of them
+CERTAIN = 0.8
 #: how many causes are looked at, at most and at least
 SUSPECTS, LIKELIEST = 5, 3
 #: probability of a second cause, once the first is taken into account
@@ -334,7 +336,13 @@ def _decide(
     ]
     if not sure:
         verdict, selected = (NONE if judgement.energy < ODD else UNEXPLAINED), ()
-    elif not body and excess(before, floor) > LARGE * floor and whole.closed < EXPLAINS and judgement.energy > STRANGE:
+    elif (
+        not body
+        and probability[best] < CERTAIN
+        and excess(before, floor) > LARGE * floor
+        and whole.closed < EXPLAINS
+        and judgement.energy > STRANGE
+    ):
         verdict, selected = UNEXPLAINED, ()
     elif rivals:
         verdict, ambiguous = AMBIGUOUS, ((best, *rivals),)
