@@ -244,13 +244,20 @@ class Server:
         sleep_s, until = self._pause()
         ready: Sequence[tuple[selectors.SelectorKey, int]]
         if sleep_s > 0:
-            self._lateness.start()
             before = time.monotonic()
-            ready = self._selector.select(sleep_s)
+            ready = self._selector.select(0)
             after = time.monotonic()
-            self._late_s = after - self._empty_at
             if ready:
-                self._late_s = self._lateness.seconds(after - before, self._late_s)
+                # They lay there: no wait could tell how long.
+                self._late_s = after - self._empty_at
+            else:
+                self._empty_at = before
+                self._lateness.start()
+                ready = self._selector.select(sleep_s)
+                slept_s, after = time.monotonic() - after, time.monotonic()
+                self._late_s = after - self._empty_at
+                if ready:
+                    self._late_s = self._lateness.seconds(slept_s, self._late_s)
         else:
             after = self._spin(until)
             ready = self._selector.select(0)
