@@ -110,6 +110,11 @@ class BodyCamera:
             self._pose = out[-1] if isinstance(out[-1], BodyPose) else None
         return out
 
+    @property
+    def taken_at(self) -> float:
+        """s, when the picture of the last pose was taken; NaN where the robot was lost."""
+        return float("nan") if self._pose is None else self._pose.t
+
     def newest(self, t: float) -> tuple[float, float, float, float]:
         """x, y, z (m) and yaw (rad) of the last pose taken by `poses`, as of `t`; NaN where it is old or was lost."""
         pose = self._pose

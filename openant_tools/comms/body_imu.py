@@ -60,6 +60,11 @@ class BodyImu:
         return line
 
     @property
+    def taken_at(self) -> float:
+        """s, when the last sample was taken; NaN before the first."""
+        return self._t if self._sample is not None else float("nan")
+
+    @property
     def lean(self) -> tuple[float, float, float] | None:
         """(t, roll, pitch) of the body by the flight controller's own estimate, rad; None where it has none."""
         sample = self._sample

@@ -99,12 +99,16 @@ class Engine:
         self._angles = np.zeros(len(config.servos))
         self._counts: list[int] | None = None
         self._waiting: list[tuple[int, Motion]] = []
+        #: (number, until when) of commands that only let time pass
+        self._looks: list[tuple[int, float]] = []
         self._recorder: RecordingWriter | None = None
         self._overruns = 0
         self._worst_wake = 0.0
         #: when the servos were last asked, s
         self._asked_at = 0.0
         self._cycles = 0
+        #: number of the goal that this cycle's command belongs to, 0 for none
+        self._playing = 0
         self._guardian: subprocess.Popen[bytes] | None = None
         self._lost = False
         self._imu: BodyImu | None = None
@@ -331,10 +335,11 @@ class Engine:
     def _loop(self) -> None:
         due, cycles = self.clock.now(), 1
         while not self._ending:
-            if self.clock.stepped and not self._motions:
-                # A virtual robot's time stands still while there is nothing to do.
+            if self.clock.stepped and not self._motions and not self._looks:
+                # A virtual robot's time stands still while there is nothing to do. What is asked for within the cycle
+                # begins with the next one, as it would in real time.
                 self._take_commands(block=True)
-                due = self.clock.now()
+                due = max(due, self.clock.now())
                 continue
             self._pass_time(due)
             wake = self.clock.now() - due
@@ -347,11 +352,18 @@ class Engine:
             except HardwareFault as error:
                 # A servo that had to answer did not, or refused: what its motion waits for will not come.
                 self._stopped(Trip(error.what, error.remedy or ""))
+            self._end_looks()
             self._flush()
             late = int((self.clock.now() - due) / self._period)
             self._overruns += late > 0
             cycles = 1 + late
             due += cycles * self._period
+
+    def _end_looks(self) -> None:
+        now = self.clock.now()
+        for look in [look for look in self._looks if look[1] <= now]:
+            self._looks.remove(look)
+            self._say(messages.Reply(look[0]))
 
     def _pass_time(self, due: float) -> None:
         """Wait for the next cycle; the IMU's samples and the camera's poses come meanwhile."""
@@ -388,8 +400,10 @@ class Engine:
             return
         cmd_t: float | None = None
         ended: Motion | None = None
+        self._playing = 0
         if self._torque and self._motions:
             motion = self._motions[0]
+            self._playing = motion.number
             self._goal = motion.step(cycles)
             if (motion.limp_now != self._limp).any():
                 self._goal = self._release_and_catch(motion)
@@ -468,7 +482,7 @@ class Engine:
 
     def _motion_ended(self, motion: Motion) -> None:
         waiting = [entry for entry in self._waiting if entry[1] is motion]
-        here = self._measure() if waiting else None
+        here = self._measure() if waiting and motion.measured else None
         for entry in waiting:
             self._waiting.remove(entry)
             self._say(messages.Reply(entry[0], value=here))
@@ -589,7 +603,10 @@ class Engine:
         nan = float("nan")
         body = (nan,) * 6 if self._imu is None else self._imu.newest(t)
         base = (nan,) * 4 if self._camera is None else self._camera.newest(t)
-        row = [t, nan if cmd_t is None else cmd_t, wake, float(self._torque), *body, *base]
+        taken = nan if self._imu is None else self._imu.taken_at, nan if self._camera is None else self._camera.taken_at
+        row = [
+            t, nan if cmd_t is None else cmd_t, wake, float(self._torque), *body, *base, *taken, float(self._playing)
+        ]  # fmt: skip
         for k, (answer, block) in enumerate(answers):
             servo = self._servos.servos[k]
             command = nan if self._goal is None else float(self._goal[k])
@@ -645,6 +662,9 @@ class Engine:
         if isinstance(command, messages.Stop):
             self._stopped(Trip("stopped by hand", ""))
             return messages.Reply(number)
+        if isinstance(command, messages.Look):
+            self._looks.append((number, self.clock.now() + command.seconds))
+            return None
         if self._lost:
             raise HardwareFault("the port is gone", where=self.config.port, remedy="look at the USB cable")
         handlers: dict[type, Callable[[int, Any], messages.Reply | None]] = {
@@ -717,7 +737,8 @@ class Engine:
             raise BadInput("torque is off", remedy="switch it on first")
         low, high = self._limit_arrays()
         cycles = max(1, round(command.seconds * self.config.rate_hz))
-        motion = Motion("goal", np.repeat(np.clip(command.target, low, high)[None, :], cycles, axis=0))
+        row = np.clip(command.target, low, high)
+        motion = Motion("goal", np.repeat(row[None, :], cycles, axis=0), number=number, measured=command.measured)
         self._motions.clear()
         self._motions.append(motion)
         self._waiting.append((number, motion))

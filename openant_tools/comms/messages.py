@@ -24,6 +24,7 @@ __all__ = [
     "Goal",
     "Hold",
     "ImuConfig",
+    "Look",
     "Notice",
     "Play",
     "Ramp",
@@ -126,10 +127,25 @@ class Hold:
 class Goal:
     """A new goal (joints,) rad, clipped to the limits, for `seconds`; the reply comes when they have passed.
 
-    It is sent as it is: ramp to where such steps begin.
+    It is sent as it is: ramp to where such steps begin. The telemetry's `goal` holds the number of this command in the rows
+    in which it is in force.
+
+    Attributes:
+        measured: whether the reply is where the joints are, which is read after the last cycle; else telemetry tells.
     """
 
     target: NDArray[np.float64]
+    seconds: float
+    measured: bool = True
+
+
+@dataclass(frozen=True)
+class Look:
+    """Let cycles pass for `seconds` and command nothing new; the reply comes when they have.
+
+    It is answered while the port is gone, too, so that a face can wait for it to come back.
+    """
+
     seconds: float
 
 
@@ -174,7 +190,20 @@ class Statistics:
     """The reply is `BusStatistics.as_dict`, with the loop's own figures."""
 
 
-Command = Torque | Ramp | Play | Hold | Goal | Record | StopRecording | Stop | ReadRegister | WriteRegister | Statistics
+Command = (
+    Torque
+    | Ramp
+    | Play
+    | Hold
+    | Goal
+    | Look
+    | Record
+    | StopRecording
+    | Stop
+    | ReadRegister
+    | WriteRegister
+    | Statistics
+)
 
 
 # ---- from the engine ---------------------------------------------------------------------------------------------

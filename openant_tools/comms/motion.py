@@ -27,12 +27,16 @@ class Motion:
         commands: (n, joints) rad.
         done: rows played so far.
         limp: (n, joints), where torque is off; None where it is on throughout.
+        number: of the command that it came with, for those that telemetry is to tell apart.
+        measured: whether where the joints are is to be read once more when it has ended.
     """
 
     name: str
     commands: Array
     done: int = 0
     limp: NDArray[np.bool_] | None = None
+    number: int = 0
+    measured: bool = True
 
     @property
     def ended(self) -> bool:

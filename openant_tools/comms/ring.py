@@ -18,10 +18,11 @@ __all__ = ["ERR_CODES", "SIGNALS", "Ring", "columns"]
 
 #: per joint, in this order
 SIGNALS = ("cmd", "pos", "vel", "cur", "load", "pwm", "volt", "temp", "tick", "ok", "err", "rtt")
-#: of the loop and the body, before the joints
+#: of the loop and the body, before the joints; `imu_t` and `base_t` say when the sensors measured, `goal` which command's
+#: goal is in force
 COMMON = (
     "t", "cmd_t", "wake", "torque", "gyro.x", "gyro.y", "gyro.z", "acc.x", "acc.y", "acc.z",
-    "base.x", "base.y", "base.z", "base.yaw",
+    "base.x", "base.y", "base.z", "base.yaw", "imu_t", "base_t", "goal",
 )  # fmt: skip
 #: numbers for the words of `err.J`
 ERR_CODES = ("", "timeout", "crc", "short", "late", "port", "alert")
