@@ -47,6 +47,8 @@ SPRING_STEP = 0.5
 #: rad/s, below which a joint stands; encoder noise alone shakes it by less
 REST_RAD_S = 5e-3
 _NOISE_BLOCK = 4096
+#: K over the room at which `case_air_k_w` holds, where the exchange with air is not linear
+AIR_RISE_K = 30.0
 
 
 class Drives:
@@ -105,6 +107,11 @@ class Drives:
         self.ambient = 25.0
         self.winding, self.case = np.full(n, 25.0), np.full(n, 25.0)
         self._derating = np.zeros(n)
+        #: W/K between cases, (n, n) symmetric, diagonal 0; None where none touch
+        self.touching: Array | None = None
+        #: servo → share of its answers in which the temperature is garbled
+        self.garbled: dict[int, float] = {}
+        self._garbling = np.random.default_rng(seed + 4211)
         self.configure()
 
     # ---- settings ----
@@ -141,6 +148,13 @@ class Drives:
         self._copper, self._magnet = column("copper_per_k"), column("magnet_per_k")
         self._winding_j_k, self._case_j_k = column("winding_j_k"), column("case_j_k")
         self._winding_case, self._case_air = column("winding_case_k_w"), column("case_air_k_w")
+        sink, housing = column("heat_sink_k_w"), np.minimum(column("housing_k_w"), self._case_air)
+        outside = self._case_air - housing
+        with_sink = housing + outside * sink / np.maximum(outside + sink, 1e-9)
+        self._case_air = np.where(sink > 0, with_sink, self._case_air)
+        self._case_j_k = self._case_j_k + np.where(sink > 0, column("heat_sink_j_k"), 0.0)
+        self._air_exponent = column("air_exponent")
+        self._free_air = bool(self._air_exponent.any())
         self._derating_per_k, self._derating_s = column("derating_per_k"), column("derating_s")
         self._p_divisor, self._i_divisor, self._d_divisor = (
             column("p_divisor"), column("i_divisor"), column("d_divisor"),
@@ -234,14 +248,16 @@ class Drives:
         self, k: int, arrival: float, pulses: float, velocity: float, acceleration: float, time_based: bool
     ) -> None:
         """A goal that arrived at `arrival` (s); the loop's next turn after it and the motor's delay takes it up, unless
-        it is lost."""
-        self.touched += 1
+        it is lost. One that is in force already changes nothing."""
         motor = self.motors[k]
         if motor.dropout_fraction > 0 and self._lost(k, motor):
             return
         late = motor.action_delay_s
         if motor.jitter_s > 0:
             late = max(0.0, late + motor.jitter_s * float(self._random.standard_normal()))
+        if pulses == self.goal[k] and k not in self._moves and all(entry[2] != k for entry in self._queue):
+            return
+        self.touched += 1
         self._count += 1
         heapq.heappush(self._queue, (arrival + late, self._count, k, (pulses, velocity, acceleration, time_based)))
 
@@ -435,7 +451,14 @@ class Drives:
         idle = self._standby * self.voltage * self.powered
         flow = (self.winding - self.case) / self._winding_case
         self.winding += dt * (loss - flow) / self._winding_j_k
-        self.case += dt * (flow + idle - (self.case - self.ambient) / self._case_air) / self._case_j_k
+        rise = self.case - self.ambient
+        to_air = rise / self._case_air
+        if self._free_air:
+            to_air *= (np.abs(rise) / AIR_RISE_K) ** self._air_exponent
+        gain = flow + idle - to_air
+        if self.touching is not None:
+            gain += self.touching @ self.case - self.touching.sum(axis=1) * self.case
+        self.case += dt * gain / self._case_j_k
         self._warm(dt)
 
     def _warm(self, dt: float) -> None:
@@ -484,12 +507,18 @@ class Drives:
             current=current,
             duty=float(self.duty[k]),
             voltage=self.voltage_at(k),
-            temperature=float(self.case[k]),
+            temperature=self._reported_temperature(k),
             trajectory=float(self.goal[k]),
             trajectory_velocity=move.velocity if move else 0.0,
             profile_active=move is not None,
             profile_shape=move.shape if move else 0,
         )
+
+    def _reported_temperature(self, k: int) -> float:
+        """°C; a garbled answer has anything that fits into its byte."""
+        if k in self.garbled and self._garbling.random() < self.garbled[k]:
+            return float(self._garbling.integers(0, 256))
+        return float(self.case[k])
 
 
 class Drive:

@@ -40,6 +40,8 @@ CAUSES: Mapping[str, Mapping[str, Any]] = {
     "write_read_gap": {"gap_s": 0.001},
     # not causes of lost communication, but what else befalls a robot
     "overheated": {"temperature_c": 85.0},
+    # single answers in which the temperature is anything
+    "temperature_glitch": {"fraction": 0.01},
     "encoder_error": {},
     "imu_silent": {},
     "imu_frozen": {},
@@ -172,6 +174,7 @@ class Faults:
         silent = frozen = False
         camera: str | None = None
         registers: dict[tuple[int, str], int] = {}
+        garbled: dict[int, float] = {}
         for fault in self.faults:
             if not fault.from_s <= now < fault.to_s:
                 continue
@@ -214,6 +217,8 @@ class Faults:
                 case "overheated":
                     for k in self._at(fault.where):
                         world.drives.case[k] = max(world.drives.case[k], p["temperature_c"])
+                case "temperature_glitch":
+                    garbled |= dict.fromkeys(self._at(fault.where) or range(len(path)), p["fraction"])
                 case "encoder_error":
                     for k in self._at(fault.where):
                         world.servos[k].raise_hardware_error(ENCODER_ERROR)
@@ -227,6 +232,7 @@ class Faults:
                     camera = "stalled"
         world.set_supply(volts, ohm)
         world.drives.set_path(path)
+        world.drives.garbled = garbled
         self._set_registers(registers)
         self._set_devices(unplugged)
         if self.imu is not None:

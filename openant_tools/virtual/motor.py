@@ -37,7 +37,12 @@ class MotorSettings:
         sensor_delay_s: by how much position and velocity answers are old.
         velocity_filter_s: time constant of the reported velocity. encoder_noise_rad: standard deviation.
         current_noise_a: standard deviation of the reported current.
-        winding_j_k, case_j_k, winding_case_k_w, case_air_k_w: two-node heat model.
+        winding_j_k, case_j_k, winding_case_k_w, case_air_k_w: two-node heat model; the sensor sits in the case.
+        housing_k_w: the part of `case_air_k_w` that lies inside the housing, where no heat sink helps.
+        heat_sink_k_w, heat_sink_j_k: from the housing's outside through a heat sink to the air, 0 for no sink; its mass.
+        air_exponent: with what power of the rise over the room the exchange with air grows beyond the linear, as free
+            convection and radiation do; `case_air_k_w` holds at 30 K.
+        leg_w_k: heat that goes over to the other servo of the leg, W/K; the smaller of the two counts.
         copper_per_k: rise of resistance, magnet_per_k: loss of kt, per K of the winding over 25 °C.
         derating_per_k, derating_s: loss of torque per K of the case over 25 °C, and how slowly it follows.
         reset_v: supply below which the electronics restart; reset_s: for how long it must stay below.
@@ -84,6 +89,11 @@ class MotorSettings:
     case_j_k: float = 40.0
     winding_case_k_w: float = 5.0
     case_air_k_w: float = 12.0
+    housing_k_w: float = 3.0
+    heat_sink_k_w: float = 0.0
+    heat_sink_j_k: float = 0.0
+    air_exponent: float = 0.0
+    leg_w_k: float = 0.0
     copper_per_k: float = 0.0039
     magnet_per_k: float = 0.001
     derating_per_k: float = 0.0

@@ -42,7 +42,7 @@ _SECTIONS: Mapping[str, Mapping[str, str]] = {
         "chain": "lists of joints",
     },
     "supply": {"volts": _NUMBER, "resistance_ohm": _NUMBER},
-    "room": {"ambient_c": _NUMBER},
+    "room": {"ambient_c": _NUMBER, "swing_k": _NUMBER, "period_s": _NUMBER},
     "clock": {"mode": "real or stepped", "doze": "true or false"},
 }  # fmt: skip
 _FREE_SECTIONS = ("imu", "camera", "motor")
@@ -157,7 +157,11 @@ def parse_scenario(table: Mapping[str, Any], name: str = "scenario") -> Scenario
     supply = sections["supply"]
     world.supply.volts = float(supply.get("volts", KITS[kit].supply_v))
     world.supply.resistance_ohm = float(supply.get("resistance_ohm", 0.0))
-    world.ambient_c = float(sections["room"].get("ambient_c", 25.0))
+    room = sections["room"]
+    world.ambient_c = float(room.get("ambient_c", 25.0))
+    world.ambient_swing_k, world.ambient_period_s = float(room.get("swing_k", 0.0)), float(room.get("period_s", 3600.0))
+    if not world.ambient_period_s > 0:
+        raise BadInput("period_s = 0", where=f"{name}, [room]", remedy="the time of one swing, in s")
     world.doze = bool(sections["clock"].get("doze", False))
     world.imu = _fields(table.get("imu", {}), FlightControllerSettings, f"{name}, [imu]")
     camera = _read_camera(table.get("camera", {}), world, f"{name}, [camera]")

@@ -6,6 +6,7 @@ test step by step) says until when; the world never looks at a clock.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -30,6 +31,8 @@ POLL_S = 5e-3
 HEAT_S = 2e-2
 #: s of standstill before mechanics are left out, and for how long at most.
 REST_S, DOZE_S = 0.1, 2.0
+#: s from one look to the next meanwhile, where nothing hangs on the polls, and the fewest steps worth leaving out.
+NAP_S, SHORTEST_NAP = 0.1, 4
 #: Eighths of a turn from the servo's zero to the joint's: horns go on in steps of 45°, and half a turn keeps the whole
 #: range of every joint away from the encoder's seam.
 MOUNT_EIGHTHS = 4
@@ -79,6 +82,9 @@ class WorldSettings:
     bus: BusSettings = field(default_factory=BusSettings)
     supply: SupplySettings = field(default_factory=SupplySettings)
     ambient_c: float = 25.0
+    #: the room swings about `ambient_c` by so many K, once in so many s, rising at first
+    ambient_swing_k: float = 0.0
+    ambient_period_s: float = 3600.0
     doze: bool = False
     seed: int = 0
     #: what differs from the defaults of `FlightControllerSettings`
@@ -119,7 +125,7 @@ class World:
             settings.bus.chains = _chains_by_leg(joints)
         self.events: list[Callable[[float], None]] = []
         self._tilting: Tilting | None = None
-        self._steps = 0
+        self._steps = self._heated = 0
         self._poll_every = max(1, round(POLL_S / settings.body.timestep_s))
         self._heat_every = max(1, round(HEAT_S / settings.body.timestep_s))
         self._overloaded_s = np.zeros(len(joints))
@@ -144,9 +150,27 @@ class World:
         )
         self.drives = Drives(self.body, motors, signs, mount, seed=settings.seed)
         self.drives.ambient = settings.ambient_c
+        self.drives.touching = self._touching(motors)
         self.drives.winding[:] = self.drives.case[:] = settings.ambient_c
         self.set_supply(settings.supply.volts, settings.supply.resistance_ohm)
         self._stall_current = settings.supply.volts / self.drives.resistance
+
+    def _touching(self, motors: Sequence[MotorSettings]) -> np.ndarray[Any, Any] | None:
+        """W/K between the cases of servos that are screwed to each other: hip and knee of one leg."""
+        conductance = np.zeros((len(motors), len(motors)))
+        for chain in _chains_by_leg(self.joints) if self.settings.body.setup != "loose" else ():
+            for one, other in itertools.pairwise(chain):
+                conductance[one, other] = conductance[other, one] = min(motors[one].leg_w_k, motors[other].leg_w_k)
+        return conductance if conductance.any() else None
+
+    def _warm(self) -> None:
+        """Let heat flow over the time since the last call."""
+        seconds, self._heated = (self._steps - self._heated) * self.settings.body.timestep_s, self._steps
+        settings = self.settings
+        if settings.ambient_swing_k:
+            phase = 2 * math.pi * self._steps * settings.body.timestep_s / settings.ambient_period_s
+            self.drives.ambient = settings.ambient_c + settings.ambient_swing_k * math.sin(phase)
+        self.drives.heat(seconds)
 
     def assemble(self, setup: str) -> None:
         """Take the motors out of the box and build the robot, or put it elsewhere; every servo starts anew.
@@ -196,15 +220,15 @@ class World:
             drives.step(self._steps)
             self._steps += 1
             if self._steps % self._poll_every == 0:
-                self._poll()
+                self._poll(POLL_S, protect=self._steps % self._heat_every == 0)
             if self._steps % self._heat_every == 0:
-                drives.heat(self._heat_every * dt)
+                self._warm()
         self.now = max(self.now, t)
         for view in self._views:
             view.now = self.now
 
     def _asleep(self, target: int) -> bool:
-        """While all stands still, let only heat go on: one bound of HEAT_S without mechanics. True where it did so.
+        """While all stands still, let only heat go on: one bound of NAP_S without mechanics. True where it did so.
 
         It wakes on whatever the drives are told, and by itself once in DOZE_S, so that what creeps or warms is seen.
         """
@@ -218,15 +242,18 @@ class World:
         if resting > REST_S + DOZE_S:
             self._rest_since = self._steps
             return False
-        if self._steps % self._heat_every or self._steps + self._heat_every > target:
+        longest = self._heat_every if self.events else round(NAP_S / dt)
+        nap = min(longest, target - self._steps)
+        if nap < SHORTEST_NAP:
             return False
-        self._steps += self._heat_every
-        drives.time += self._heat_every * dt
-        self._poll()
-        drives.heat(self._heat_every * dt)
+        self._steps += nap
+        drives.time += nap * dt
+        self._poll(nap * dt, protect=True)
+        self._warm()
         return True
 
-    def _poll(self) -> None:
+    def _poll(self, elapsed: float, *, protect: bool) -> None:
+        """Let faults, hands, firmware and supply look at what `elapsed` (s) brought."""
         now = self._steps * self.settings.body.timestep_s
         self.now = max(self.now, now)
         for view in self._views:
@@ -238,7 +265,7 @@ class World:
             if self._tilting.ended(now):
                 self._tilting = None
         drives = self.drives
-        drives.watch_supply(POLL_S)
+        drives.watch_supply(elapsed)
         for k, servo in enumerate(self.servos):
             if drives.starved_s[k] > drives.motors[k].reset_s:
                 if servo.powered:
@@ -249,10 +276,10 @@ class World:
                 servo.power_on(now)
             elif servo.powered:
                 servo.watch_bus(now)
-                if self._steps % self._heat_every == 0:
+                if protect:
                     servo.protect(drives.voltage_at(k), float(drives.case[k]))
         heavy = np.abs(drives.current) > OVERLOAD_SHARE * self._stall_current
-        self._overloaded_s = np.where(heavy, self._overloaded_s + POLL_S, 0.0)
+        self._overloaded_s = np.where(heavy, self._overloaded_s + elapsed, 0.0)
         if heavy.any():
             for k in map(int, np.flatnonzero(self._overloaded_s > OVERLOAD_S)):
                 self.servos[k].raise_hardware_error(OVERLOAD_ERROR)
