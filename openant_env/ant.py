@@ -12,19 +12,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import gymnasium
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_env.actions import action_map
-from openant_env.metrics import AverageReward
-from openant_env.observations import ORDERS, layout
+from openant_env.base import AntBase, Observation, OnFall, unit
 from openant_env.rendering import Painter
-from openant_env.robots import DT_S, SimulatedRobot, simulated_robot
-from openant_env.tasks import BackAndForth, make_task
+from openant_env.robots import DT_S, simulated_robot
+from openant_env.tasks import BackAndForth
 from openant_tools.effects.acting import Acting
 from openant_tools.errors import BadInput
 from openant_tools.model.rollout import fill_setpoints
@@ -38,12 +35,10 @@ RESTLESS = 0.5
 #: m, from which the robot is let down onto the floor before it settles (the published simulation's start).
 START_HEIGHT_M = 0.2
 
-Observation = NDArray[np.float32]
-OnFall = Literal["truncate", "terminate", "ignore"]
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
-class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
+class Ant(AntBase):
     """A walking Open Ant on a floor, without episodes.
 
     Actions: (8,) in −1…1, one a joint, mapped onto `action_range` and kept within the calibrated limits.
@@ -99,78 +94,25 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
             "on_fall": on_fall, "time_limit_s": time_limit_s, "render_mode": render_mode, "width": width,
             "height": height,
         }  # fmt: skip
-        if on_fall not in ("truncate", "terminate", "ignore"):
-            raise BadInput(f"on_fall is {on_fall!r}", remedy="use 'truncate', 'terminate' or 'ignore'")
         if render_mode not in (None, "rgb_array"):
             raise BadInput(f"render mode {render_mode!r} does not exist", remedy="use 'rgb_array' or None")
-        if observation_order not in ORDERS:
-            raise BadInput(
-                f"no such order of observations: {observation_order!r}", remedy=f"choose one of {', '.join(ORDERS)}"
-            )
-        if time_limit_s is not None and not time_limit_s > 0.0:
-            raise BadInput(f"the time limit is {time_limit_s} s", remedy="give a time above 0, or None for no limit")
-        self.robot: SimulatedRobot = simulated_robot(robot, kit=kit, effects=effects)
+        super().__init__(
+            simulated_robot(robot, kit=kit, effects=effects),
+            task=task, task_options=task_options, dt=dt, action_range=action_range, observation_order=observation_order,
+            on_fall=on_fall, time_limit_s=time_limit_s,
+        )  # fmt: skip
         self._plant = self.robot.load()
         self.model: mujoco.MjModel = self._plant.model
         # MuJoCo would start a simulation that has come apart afresh without a word.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.data = mujoco.MjData(self.model)
         self._acting = Acting(self._plant, self.data, self.robot.effects) if self.robot.effects else None
-        self.dt = self.robot.dt_s if dt is None else float(dt)
         self._substeps = _whole_steps(self.dt, self.model.opt.timestep, self.robot.model_path)
-        self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self.dt))}
         self.render_mode = render_mode
         self._size = (width, height)
         self._painter: Painter | None = None
-
-        joints = self.robot.joints
-        self.actions = action_map(
-            self.robot.action_range if action_range is None else action_range, joints, self.robot.low, self.robot.high
-        )
-        self.layout = layout(joints, observation_order)
-        self.task = make_task(task, task_options)
-        self.average_reward = AverageReward()
-        self._on_fall = on_fall
-        self._time_limit_s = math.inf if time_limit_s is None else float(time_limit_s)
-
-        size = len(self.layout)
-        low, high = np.full(size, -np.inf, np.float32), np.full(size, np.inf, np.float32)
-        direction = self.layout.slices["direction"]
-        # A unit vector computed in single precision may stick out by its rounding error.
-        low[direction], high[direction] = -1.0 - 1e-6, 1.0 + 1e-6
-        self.observation_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(joints),), np.float32)
-
         self._bind()
         self._settled = self._settle()
-        self._seconds = 0.0
-
-    # ------------------------------------------------------------------------------------------------ what it is
-
-    @property
-    def observation_names(self) -> tuple[str, ...]:
-        """What each number of an observation is, such as `pos.hip_rr`."""
-        return self.layout.names
-
-    @property
-    def observation_bounds(self) -> tuple[Observation, Observation]:
-        """Low and high, each (24,), that observations keep to in practice: the robot's measured bounds where its
-        folder has them, else nominal ones. Not a promise: use them to normalise, never to clip what you learn from."""
-        return self.robot.bounds(self.layout)
-
-    def describe(self) -> dict[str, Any]:
-        """What a policy trained here depends on, as plain values: to be kept beside it and compared before it plays."""
-        return {
-            "observation_names": list(self.layout.names),
-            "action_names": list(self.robot.joints),
-            "action_range": {
-                "centre_rad": self.actions.centre.round(6).tolist(),
-                "half_rad": self.actions.half.round(6).tolist(),
-            },
-            "dt": self.dt,
-            "task": self.task.name,
-            "model_sha256": self.robot.model_sha256(),
-        }
 
     def _bind(self) -> None:
         """Look every name up once, and keep views into the simulation's memory, which never moves."""
@@ -182,8 +124,6 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         self._sensordata = data.sensordata
         self._torso_position = data.xpos[torso]
         self._torso_rotation = data.xmat[torso]
-        self._command = np.empty(len(joints))
-        self._least, self._most = np.full(len(joints), -1.0), np.full(len(joints), 1.0)  # quicker than plain −1 and 1
 
         index = np.zeros(len(self.layout), np.intp)
         index[self.layout.slices["pos"]] = [_sensor(model, f"pos.{joint}", 1, where) for joint in joints]
@@ -255,8 +195,9 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         self.task.reset(torso_x, torso_y, self.np_random, chosen.get("direction_rad"))
         self.average_reward.clear()
         self._seconds = 0.0
-        hx, hy = _unit(self._torso_rotation[0], self._torso_rotation[3])
-        return self._observe(hx, hy), self._info(torso_x, torso_y, hx, hy)
+        hx, hy = unit(self._torso_rotation[0], self._torso_rotation[3])
+        observation = self._observe(hx, hy)
+        return observation, self._info(torso_x, torso_y, hx, hy, self._observation)
 
     def _advance(self, steps: int) -> None:
         if self._acting is None:
@@ -273,23 +214,14 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         Returns:
             Observation (24,), reward (m), terminated, truncated, and info: `position` (m), `heading` and
             `reward_direction` (unit vectors in the world), `average_reward_m_s` (over 120 s, since reset), `time_s`
-            (since reset), `dt` (s, of this step), and `reason` where it ended. Everything is the caller's to keep.
+            (since reset), `dt` (s, of this step), `reason` where it ended, and `out_of_bounds` (names) where an
+            observation lies beyond what was measured on the robot. Everything is the caller's to keep.
 
         Raises:
             BadInput: the action has another shape, or is not finite.
         """
-        command, actions = self._command, self.actions
-        action = np.asarray(action)
-        if action.shape != command.shape:
-            raise BadInput(f"an action has shape {action.shape}", remedy=f"give {len(command)} numbers")
-        np.minimum(np.maximum(action, self._least, out=command), self._most, out=command)
-        command *= actions.half
-        command += actions.centre
-        if actions.clipped:
-            np.minimum(np.maximum(command, actions.low, out=command), actions.high, out=command)
-        if not math.isfinite(command.dot(command)):
-            raise BadInput(f"an action is not finite: {action}", remedy="look for NaN in the agent's networks")
-        self._ctrl[self._setpoints] = command
+        self._set_command(action)
+        self._ctrl[self._setpoints] = self._command
         self._advance(self._substeps)
         self._seconds += self.dt
 
@@ -297,14 +229,15 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         readings = self._sensordata
         if not math.isfinite(readings.dot(readings) + x + y + z):
             # The last sound observation stands in for what can no longer be measured; a learner must not see NaN.
-            info = self._info(math.nan, math.nan, math.nan, math.nan)
+            info = self._info(math.nan, math.nan, math.nan, math.nan, self._observation)
             info["reason"] = "the physics has come apart"
             return self._observation.astype(np.float32), 0.0, False, True, info
         forward_x, _, _, forward_y, _, _, _, _, up_z = self._torso_rotation.tolist()
-        hx, hy = _unit(forward_x, forward_y)
+        hx, hy = unit(forward_x, forward_y)
         reward = self.task.reward(x, y)
         self.average_reward.add(reward, self.dt)
-        info = self._info(x, y, hx, hy)
+        observation = self._observe(hx, hy)
+        info = self._info(x, y, hx, hy, self._observation)
         terminated = truncated = False
         if up_z < 0.0 and self._on_fall != "ignore":
             terminated, truncated = self._on_fall == "terminate", self._on_fall == "truncate"
@@ -312,7 +245,7 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         elif self._seconds >= self._time_limit_s - 0.5 * self.dt:
             truncated = True
             info["reason"] = "time limit"
-        return self._observe(hx, hy), reward, terminated, truncated, info
+        return observation, reward, terminated, truncated, info
 
     def _observe(self, hx: float, hy: float) -> Observation:
         observation = self._observation
@@ -321,17 +254,6 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         at = self._direction_at
         observation[at], observation[at + 1] = self.task.observed_direction(hx, hy)
         return observation.astype(np.float32)
-
-    def _info(self, x: float, y: float, hx: float, hy: float) -> dict[str, Any]:
-        task = self.task
-        return {
-            "position": np.array((x, y)),
-            "heading": np.array((hx, hy)),
-            "reward_direction": np.array((task.ux, task.uy)),
-            "average_reward_m_s": self.average_reward.value,
-            "time_s": self._seconds,
-            "dt": self.dt,
-        }
 
     # --------------------------------------------------------------------------------------------------- pictures
 
@@ -401,12 +323,6 @@ class Ant(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         self.__init__(**pickled["arguments"])  # type: ignore[misc]
         self.spec = pickled["spec"]
         self.set_state(pickled["state"])
-
-
-def _unit(x: float, y: float) -> tuple[float, float]:
-    """The vector made 1 long; east where it has no length, as the heading of a robot that points straight up."""
-    length = math.hypot(x, y)
-    return (x / length, y / length) if length > 1e-9 else (1.0, 0.0)
 
 
 def _whole_steps(dt: float, timestep: float, where: Path) -> int:
