@@ -35,6 +35,7 @@ Array = NDArray[np.float64]
 
 STANDARD_GRAVITY = 9.80665
 I16 = 32767
+IDLE_S = 0.01
 #: Silence after a lone byte outside every frame, until it is taken for a command (facts/imu.md D1).
 LONE_BYTE_SILENCE_S = 0.1
 #: From power to the first answer over USB.
@@ -148,6 +149,8 @@ class FlightController:
         self.frozen = False
         self.refused: set[int] = set()
         self.mode = "msp"
+        #: s between two looks at the sensors while nobody asks
+        self.idle_s = IDLE_S
         self._truth = truth
         self._rng = rng
         self._plugged = True
@@ -230,7 +233,7 @@ class FlightController:
 
     def next_event(self, t: float) -> float:
         """The next time after `t` at which bytes may leave or the mode may change."""
-        times = [self._grid(t) if self._requests or self._attitude is None else t + 0.01]
+        times = [self._grid(t) if self._requests or self._attitude is None else t + self.idle_s]
         if self._out:
             times.append(max(t, self._out[0][0]))
         if self._lone is not None:
@@ -260,7 +263,7 @@ class FlightController:
                 self._out.append((run + USB_LATENCY_S, reply))
         if self._tick_at <= t:
             self._tick_at = self._grid(t)  # the runs since had nothing to do
-        if t - self._tick >= 0.01 or self._attitude is None:
+        if t - self._tick >= self.idle_s or self._attitude is None:
             self._sense(t)
 
     def _sense(self, t: float) -> None:

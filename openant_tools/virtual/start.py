@@ -16,7 +16,7 @@ from openant_tools.virtual.flight_controller import FlightController, FlightCont
 from openant_tools.virtual.overhead_camera import OverheadCameraSettings
 from openant_tools.virtual.scenario import Scenario, load_scenario
 from openant_tools.virtual.server import Server
-from openant_tools.virtual.world import World
+from openant_tools.virtual.world import NAP_S, World
 
 __all__ = ["BodyTruth", "assemble", "build", "serve"]
 
@@ -72,6 +72,8 @@ def assemble(script: Scenario, *, clock: str | None = None, tcp: bool = False, c
         world = build(script)
         settings = FlightControllerSettings(**script.world.imu)
         imu = FlightController(settings, lambda: BodyTruth(world.body), np.random.default_rng(seed + 2))
+        if world.doze:
+            imu.idle_s = NAP_S
         server = Server(world, stepped=stepped, imu=imu, camera=eye, tcp=tcp)
     except BaseException:
         if eye is not None:
