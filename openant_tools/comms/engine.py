@@ -39,6 +39,7 @@ from openant_tools.comms.ring import ERR_CODES, Ring
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Block, Servo, Servos
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
 from openant_tools.procedure.journal import EepromWrite, Journal
+from openant_tools.recording.resume import continuation
 from openant_tools.recording.telemetry import Answer as RecordedAnswer
 from openant_tools.recording.telemetry import Cycle, ServoChannel
 from openant_tools.recording.writer import RecordingStopped, RecordingWriter
@@ -773,6 +774,9 @@ class Engine:
             extra["chain"] = [list(cable) for cable in self.config.chain]
         facts = replace(command.facts, joints=self._servos.joints, extra={**extra, **command.facts.extra})
         self._registers = self._read_registers()
+        continued = None
+        if command.resume:
+            continued = continuation(command.path, channels, self.clock.now(), wall_counts=not self.clock.stepped)
         self._recorder = RecordingWriter(
             command.path,
             facts=facts,
@@ -781,7 +785,10 @@ class Engine:
             config=command.config,
             clock=self.clock.now,
             overwrite=command.overwrite,
+            continued=continued,
         )
+        if continued is not None:
+            self._recorder.event("resumed", pause_s=self.clock.now() + continued.shift_s - continued.last_s)
         return messages.Reply(number, value=str(self._recorder.path))
 
     def _channel(self, servo: Servo) -> ServoChannel:

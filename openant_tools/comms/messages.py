@@ -151,12 +151,17 @@ class Look:
 
 @dataclass(frozen=True)
 class Record:
-    """Begin a recording; the engine adds servos, registers and resolution to the facts."""
+    """Begin a recording; the engine adds servos, registers and resolution to the facts.
+
+    Attributes:
+        resume: go on with the recording that stands there, be it torn; its facts and config stay.
+    """
 
     path: str
     facts: Facts
     config: str | None = None
     overwrite: bool = False
+    resume: bool = False
 
 
 @dataclass(frozen=True)

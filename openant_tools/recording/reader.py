@@ -27,7 +27,7 @@ from openant_tools.recording.run import Array, Facts, Run
 from openant_tools.recording.telemetry import IMU_FIELDS, POSE_FIELDS, ServoChannel, message_classes
 from openant_tools.recording.writer import METADATA, SCHEMA
 
-__all__ = ["RecordScan", "Recording", "Samples", "read_recording"]
+__all__ = ["RecordScan", "Recording", "Samples", "read_recording", "recording_content"]
 
 _log = logging.getLogger(__name__)
 
@@ -166,7 +166,7 @@ def read_recording(path: str | Path) -> Recording:
     events: list[Mapping[str, Any]] = []
     for record in scan:
         if isinstance(record, Metadata) and record.name == METADATA:
-            content = _content(record, path)
+            content = recording_content(record, path)
         elif isinstance(record, Schema):
             schemas[record.id] = record
             if record.encoding == "protobuf" and not classes:
@@ -249,7 +249,8 @@ def merge_nearest(samples: Samples, t: Array) -> dict[str, Array]:
     return merged
 
 
-def _content(record: Metadata, path: Path) -> dict[str, Any] | None:
+def recording_content(record: Metadata, path: Path) -> dict[str, Any] | None:
+    """What the metadata of a recording says; None where it is torn. BadInput: a format of another version."""
     text = record.metadata.get("content", "")
     if f"{zlib.crc32(text.encode()):08x}" != record.metadata.get("crc32"):
         return None

@@ -17,7 +17,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -30,7 +30,7 @@ from openant_tools.recording.facts import facts_to_json
 from openant_tools.recording.run import Facts
 from openant_tools.recording.telemetry import Cycle, ServoChannel, Telemetry
 
-__all__ = ["METADATA", "PROFILE", "SCHEMA", "RecordingStopped", "RecordingWriter", "recording_path"]
+__all__ = ["METADATA", "PROFILE", "SCHEMA", "Continued", "RecordingStopped", "RecordingWriter", "recording_path"]
 
 SCHEMA = "openant.recording/1"
 PROFILE = "openant"
@@ -60,6 +60,22 @@ def recording_path(path: str | Path) -> Path:
     return path if path.suffix == ".mcap" else path.with_name(path.name + ".mcap")
 
 
+@dataclass(frozen=True)
+class Continued:
+    """A recording that is gone on with; see `resume.continuation`.
+
+    Attributes:
+        metadata: its metadata record, as it stands. messages: (topic, ns, bytes) of all that is whole.
+        shift_s: added to every time to come, so that the recording has one time axis.
+        last_s: time of its last row.
+    """
+
+    metadata: Mapping[str, str]
+    messages: Sequence[tuple[str, int, bytes]]
+    shift_s: float
+    last_s: float
+
+
 class RecordingWriter:
     """Records one run; a context manager. The file appears at once and only ever grows.
 
@@ -72,6 +88,7 @@ class RecordingWriter:
         clock: the clock of `t`, for events that bring no time of their own.
         overwrite: whether a file that stands there may be replaced.
         telemetry: the schema, where it is not the plain one of `channels`.
+        continued: the recording at `path` so far: it is gone on with, and `facts`, `registers` and `config` are its own.
 
     Raises:
         BadInput: there is such a file already.
@@ -89,6 +106,7 @@ class RecordingWriter:
         clock: Callable[[], float] = time.monotonic,
         overwrite: bool = False,
         telemetry: Telemetry | None = None,
+        continued: Continued | None = None,
     ) -> None:
         joints = tuple(channel.joint for channel in channels)
         if facts.joints != joints:
@@ -102,11 +120,18 @@ class RecordingWriter:
         self._reported = False
         self._closed = False
         self._kept_t: float | None = None
-        self._stream = _AppendOnly(self.path, overwrite)
+        self._shift = 0.0 if continued is None else continued.shift_s
+        # What is gone on with is copied beside itself, and replaced when all of it is on the disk.
+        place = self.path if continued is None else self.path.with_name(f".{self.path.name}.resumed")
+        self._stream = _AppendOnly(place, overwrite or continued is not None)
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         facts = _completed(facts, self._telemetry, registers or {})
         try:
-            self._begin(facts, registers or {}, config)
+            self._begin(facts, registers or {}, config, continued)
+            if continued is not None:
+                self._take_over(continued)
+                os.replace(place, self.path)
+                _sync_folder(self.path.parent)
         except BaseException as error:
             self._stream.discard()
             if isinstance(error, OSError):
@@ -117,11 +142,15 @@ class RecordingWriter:
 
     def cycle(self, cycle: Cycle) -> None:
         """Record one turn of the bus loop. Costs a microsecond: encoding and disk are another thread's."""
+        if self._shift:
+            cmd_t = None if cycle.cmd_t is None else cycle.cmd_t + self._shift
+            cycle = replace(cycle, t=cycle.t + self._shift, cmd_t=cmd_t)
         self._put((_CYCLE, cycle.t, cycle))
         self.cycles += 1
 
     def imu(self, t: float, gyro: Sequence[float], acc: Sequence[float]) -> None:
         """Record one sample of the IMU at its own time: gyro (3,) rad/s, specific force (3,) m/s², body frame."""
+        t += self._shift
         self._put((_IMU, t, (tuple(gyro), tuple(acc))))
 
     def pose(
@@ -144,11 +173,11 @@ class RecordingWriter:
 
     def pose_fields(self, t: float, values: Mapping[str, float]) -> None:
         """Record where the body is by the names of formats: x, y, z, yaw, qw, qx, qy, qz; NaN is missing."""
-        self._put((_POSE, t, values))
+        self._put((_POSE, t + self._shift, values))
 
     def event(self, kind: str, **payload: Any) -> None:
         """Record that something happened now, such as a question answered or a write to a register; kept as JSON."""
-        now = self._clock()
+        now = self._clock() + self._shift
         self._put((_EVENT, now, json.dumps({"t": now, "kind": kind} | payload, default=str).encode()))
 
     def row(self, t: float, message: bytes) -> None:
@@ -197,7 +226,13 @@ class RecordingWriter:
             self._reported = True
             raise self._stopped
 
-    def _begin(self, facts: Facts, registers: Mapping[str, Mapping[str, int]], config: str | None) -> None:
+    def _begin(
+        self,
+        facts: Facts,
+        registers: Mapping[str, Mapping[str, int]],
+        config: str | None,
+        continued: Continued | None = None,
+    ) -> None:
         self._writer.start(profile=PROFILE, library=f"openant-tools {importlib.metadata.version('openant-tools')}")
         content = json.dumps(
             self._telemetry.as_json()
@@ -211,13 +246,22 @@ class RecordingWriter:
             ensure_ascii=False,
         )
         # Metadata records carry no checksum of their own, and a zeroed tail may begin in the middle of this one.
-        self._writer.add_metadata(METADATA, {"content": content, "crc32": f"{zlib.crc32(content.encode()):08x}"})
+        metadata = {"content": content, "crc32": f"{zlib.crc32(content.encode()):08x}"}
+        self._writer.add_metadata(METADATA, metadata if continued is None else dict(continued.metadata))
         self._channel_ids = {}
         for kind, topic, message in ((_CYCLE, "/cycle", "Cycle"), (_IMU, "/imu", "Imu"), (_POSE, "/pose", "Pose")):
             schema = self._writer.register_schema(f"openant.{message}", "protobuf", self._telemetry.descriptor_set)
             self._channel_ids[kind] = self._writer.register_channel(topic, "protobuf", schema)
         schema = self._writer.register_schema("openant.Event", "jsonschema", _EVENT_SCHEMA)
         self._channel_ids[_EVENT] = self._writer.register_channel("/event", "json", schema)
+        self._stream.sync()
+
+    def _take_over(self, continued: Continued) -> None:
+        topics = {"/cycle": _CYCLE, "/imu": _IMU, "/pose": _POSE, "/event": _EVENT}
+        for topic, stamp, data in continued.messages:
+            self._writer.add_message(self._channel_ids[topics[topic]], stamp, data, stamp)
+            self.cycles += topic == "/cycle"
+        self._writer.flush()
         self._stream.sync()
 
     def _run(self) -> None:
@@ -284,6 +328,15 @@ _EVENT_SCHEMA = json.dumps(
 ).encode()
 
 
+def _sync_folder(path: Path) -> None:
+    """So that a file's name survives a power cut, too."""
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
 class _AppendOnly:
     """The file under the MCAP writer: unbuffered; a write that fails half way is taken back."""
 
@@ -296,11 +349,7 @@ class _AppendOnly:
             raise BadInput(
                 "there is a recording already", where=path, remedy="record under another name, or move that file away"
             ) from None
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # so that the file's name survives a power cut too
-        finally:
-            os.close(folder)
+        _sync_folder(path.parent)
         self._path = path
         self._end = 0
         self._open = True
