@@ -68,7 +68,7 @@ class EngineProcess:
         self._connection = Connection(ours.detach())
         try:
             self._connection.send((config, len(self.columns)))
-            self.description: dict[str, Any] = self._await(0, CONNECT_TIMEOUT_S)
+            self.description: dict[str, Any] = self.wait(0, CONNECT_TIMEOUT_S)
         except BaseException:
             self.close()
             raise
@@ -118,7 +118,7 @@ class EngineProcess:
         Raises:
             HardwareFault: the engine says no, was stopped meanwhile, or has died.
         """
-        return self._await(self.start(command), timeout_s)
+        return self.wait(self.start(command), timeout_s)
 
     def stop(self) -> None:
         """The stop key: torque off now."""
@@ -146,7 +146,8 @@ class EngineProcess:
         """The telemetry for another reader, with a place of its own in it, from any thread; to be closed by it."""
         return Ring(len(self.columns), os.dup(self._ring.fd))
 
-    def _await(self, number: int, timeout_s: float | None) -> Any:
+    def wait(self, number: int, timeout_s: float | None = None) -> Any:
+        """The answer to a command that was sent with `start`; as `ask`."""
         give_up = None if timeout_s is None else time.monotonic() + timeout_s
         while number not in self._replies:
             if give_up is not None and time.monotonic() > give_up:

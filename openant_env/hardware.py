@@ -1,0 +1,510 @@
+"""The robot itself as a Gymnasium environment: `gymnasium.make("openant/AntHardware-v0", robot="my-ant")`.
+
+Timing contract: an action's commands leave with the next cycle of the engine and hold for `dt`, a whole number of
+cycles; the observation returned is what the last of them measured. Who answers within a cycle (10 ms) has the next
+action leave exactly `dt` after the last one. Who takes longer makes the period longer: that is measured from command to
+command (`info["period_s"]`), counted (`info["overruns"]`) and told, and `info["dt"]` is the time that really passed.
+
+What a robot cannot do is a truncation with a reason; `reset` then waits until it can, and says what for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_env.base import AntBase, Observation, OnFall
+from openant_env.link import RobotLink, engine_config, engine_rate
+from openant_env.robots import simulated_robot
+from openant_env.tasks import BackAndForth
+from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.recording.run import Facts
+from openant_tools.robot.folder import RobotFolder
+
+__all__ = ["AntHardware"]
+
+Array = NDArray[np.float64]
+
+#: s for the legs to come to rest after the ramp to the start
+SETTLE_S = 0.5
+#: s without a pose after which the robot counts as lost (the published software's patience)
+TAG_PATIENCE_S = 2.0
+#: s without a sample of the IMU
+IMU_PATIENCE_S = 0.5
+#: s upside down: a robot that tumbles for a moment has not fallen
+FALLEN_S = 1.0
+#: m/s² along the body's z axis that a robot on its feet reads at least
+UPRIGHT_M_S2 = 5.0
+#: turns of the torso either way that a cable from above takes
+CABLE_TURNS = 2.0
+#: share of an engine's cycle by which a period may be too long before it counts as an overrun
+LATE_SHARE = 0.5
+#: K below the limit that stops a motion, to which a servo cools before it goes on
+COOLED_K = 15.0
+#: s of one look at a robot that is waited for, and between two words about the same trouble
+LOOK_S, REPEAT_S = 0.25, 30.0
+#: servos that shut down so often within so many seconds are not started again without someone looking
+REBOOTS, REBOOTS_S = 3, 600.0
+
+_log = logging.getLogger("openant_env")
+
+
+class AntHardware(AntBase):
+    """A walking Open Ant on a floor under a camera, real or virtual, without episodes.
+
+    Spaces, reward and info are those of `openant/Ant-v0` (`openant_env.ant`). In addition info holds `period_s` (s, from
+    the last command to this one), `overruns` (steps so far that began late), `observation_age_s` (s, of joints, IMU and
+    position, as of the step's end), `missed` (answers of servos that did not come in this step), `joint_temperatures`
+    (°C), `joint_loads` (A or share of full load, as the servos measure) and `supply_v`.
+
+    Args:
+        robot: a robot's folder (or its robot.toml). None only with `virtual`: an Ant as the guide says.
+        virtual: a virtual robot in place of the ports of robot.toml: a scenario, the ready file of a running one, or
+            "default". One that is started here stands on the floor where its scenario allows.
+        clock: "real" or "stepped", of a virtual robot started here; None for stepped unless its scenario says otherwise.
+        task, task_options, dt, action_range, observation_order, on_fall, time_limit_s: as in `openant_env.ant`. The
+            circle's centre is where the robot stands first, unless `task_options` say otherwise.
+        bus, imu, camera: in place of what robot.toml names.
+        recordings: folder for the recording of every connection; None: `recordings/` of the robot's folder.
+        patience_s: s that `reset` waits for a robot that needs help before it gives up; None: for ever.
+        notice: called with what the user should know; default: the log.
+
+    Raises:
+        BadInput, HardwareFault: in one line, what is missing.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(
+        self,
+        *,
+        robot: str | Path | None = None,
+        virtual: str | None = None,
+        clock: str | None = None,
+        task: str = BackAndForth.name,
+        task_options: Mapping[str, Any] | None = None,
+        dt: float | None = None,
+        action_range: str | None = None,
+        observation_order: str = "platform",
+        on_fall: OnFall = "truncate",
+        time_limit_s: float | None = None,
+        bus: str | None = None,
+        imu: str | None = None,
+        camera: str | int | None = None,
+        recordings: str | Path | None = None,
+        patience_s: float | None = None,
+        notice: Callable[[str], None] | None = None,
+        render_mode: None = None,
+    ) -> None:
+        if robot is None and virtual is None:
+            raise BadInput("no robot is named", remedy="give robot=DIR, or virtual='default' for a virtual one")
+        if render_mode is not None:
+            raise BadInput(
+                f"render mode {render_mode!r} does not exist", remedy="look at the robot; its runs are recorded"
+            )
+        super().__init__(
+            simulated_robot(robot, effects=False),
+            task=task, task_options=task_options, dt=dt, action_range=action_range, observation_order=observation_order,
+            on_fall=on_fall, time_limit_s=time_limit_s,
+        )  # fmt: skip
+        self.render_mode = None
+        self._chosen_origin = "origin" in (task_options or {})
+        self._patience_s = math.inf if patience_s is None else float(patience_s)
+        self._notice = notice or _log.warning
+        self._paused = threading.Event()
+        self._why_paused = ""
+        self._held = contextlib.ExitStack()
+        folder = None if robot is None else RobotFolder.at(robot)
+        described = None if folder is None else folder.config()
+        rate_hz = engine_rate(self.dt)
+        self._cycle_s = 1.0 / rate_hz
+        try:
+            found: Mapping[str, str | None] = {}
+            if virtual is not None:
+                found = self._held.enter_context(_virtual(virtual, clock))
+            config = engine_config(
+                described,
+                rate_hz=rate_hz,
+                bus=bus or found.get("bus"),
+                imu=imu or found.get("imu"),
+                camera=found.get("camera") if camera is None else camera,
+                control=found.get("control"),
+                journal=None if folder is None else folder.journal,
+            )
+            kept = recordings if recordings is not None else None if folder is None else folder.recordings
+            facts = Facts(
+                joints=self.robot.joints,
+                setup="floor",
+                protocol="walk",
+                model=str(self.robot.model_path.resolve()),
+                extra={"dt_s": self.dt, "rate_hz": rate_hz, "task": self.task.name},
+            )
+            self.link = RobotLink(
+                config,
+                recordings=None if kept is None else Path(kept),
+                facts=facts,
+                robot_toml=None if folder is None else folder.config_file.read_text(encoding="utf-8"),
+                notice=self._notice,
+            )
+            self._held.callback(self.link.close)
+            self.link.connect()
+        except BaseException:
+            self._held.close()
+            raise
+        self._bind()
+
+    def _bind(self) -> None:
+        """Look every name up once, and forget what was."""
+        at, joints = self.link.columns, self.robot.joints
+        index = np.zeros(len(self.layout), np.intp)
+        for block in ("pos", "vel"):
+            index[self.layout.slices[block]] = [at[f"{block}.{joint}"] for joint in joints]
+        for block in ("acc", "gyro"):
+            index[self.layout.slices[block]] = [at[f"{block}.{axis}"] for axis in "xyz"]
+        direction = self.layout.slices["direction"]
+        self._direction_at = direction.start
+        index[direction] = at["t"]  # anything that is always there; the task fills it in
+        self._index = index
+        self._pose_at = [at["base.x"], at["base.y"], at["base.yaw"]]
+        self._temp_at = [at[f"temp.{joint}"] for joint in joints]
+        self._ok_at = [at[f"ok.{joint}"] for joint in joints]
+        self._effort_at = [
+            at[f"{'cur' if servo.model.has_current_sensor else 'load'}.{servo.joint}"]
+            for servo in self.link.config.servos
+        ]
+        self._volt_at = [at[f"volt.{joint}"] for joint in joints]
+        self._observation = np.full(len(index), np.nan)
+        self._pose = np.full(3, np.nan)
+        self._temps, self._efforts = np.full(len(joints), np.nan), np.full(len(joints), np.nan)
+        self._volts = math.nan
+        #: s, the robot's clock: of the last row, of its command, of the last pose and sample
+        self._t = self._cmd_t = self._pose_t = self._imu_t = math.nan
+        self._fallen_s = self._wound_rad = 0.0
+        self._overruns = 0
+        self._told_late = -math.inf
+        self._reboots: deque[float] = deque(maxlen=REBOOTS)
+        #: joint → whether it is left to cool down
+        self._cooling: dict[str, bool] = {}
+        self._reason = ""
+        self._ready = False
+
+    # ---------------------------------------------------------------------------------------------- pause and resume
+
+    def pause(self, why: str = "paused by hand") -> None:
+        """End the step in progress with a truncation; `reset` then waits for `resume`. From any thread."""
+        self._why_paused = why
+        self._paused.set()
+
+    def resume(self) -> None:
+        """Go on after a pause; whoever does that has looked at the robot, so its cable counts as unwound."""
+        self._wound_rad = 0.0
+        self._reboots.clear()
+        self._paused.clear()
+
+    @property
+    def paused(self) -> bool:
+        return self._paused.is_set()
+
+    @property
+    def overruns(self) -> int:
+        """Steps so far that began later than a whole period after the one before."""
+        return self._overruns
+
+    # ---------------------------------------------------------------------------------------------- reset and step
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Have the robot stand where it is, after waiting for whatever it needs.
+
+        Args:
+            seed: of the reward direction.
+            options: `direction_rad`, the first reward direction.
+
+        Raises:
+            HardwareFault: it still needs help after `patience_s`.
+        """
+        super().reset(seed=seed)
+        chosen = options or {}
+        unknown = set(chosen) - {"direction_rad"}
+        if unknown:
+            raise BadInput(
+                f"no such reset option on a robot: {sorted(unknown)[0]}",
+                remedy="direction_rad; a robot stands where it is",
+            )
+        self._stand_up()
+        x, y, yaw = self._pose.tolist()
+        if not self._chosen_origin and isinstance(self.task, BackAndForth):
+            self.task.ox, self.task.oy, self._chosen_origin = x, y, True
+        self.task.reset(x, y, self.np_random, chosen.get("direction_rad"))
+        self.average_reward.clear()
+        self._seconds, self._cmd_t, self._reason = 0.0, math.nan, ""
+        self._ready = True
+        hx, hy = math.cos(yaw), math.sin(yaw)
+        return self._observe(hx, hy), self._info(x, y, hx, hy, self._observation) | self._more(0.0, 0)
+
+    def step(self, action: NDArray[Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Command the joints for `dt` seconds; see the class.
+
+        Raises:
+            BadInput: the action has another shape or is not finite, or the environment was not reset.
+        """
+        if not self._ready:
+            raise BadInput("the robot does not stand yet", remedy="reset the environment first")
+        self._set_command(action)
+        before = self._t
+        try:
+            rows, number = self.link.go(self._command, self.dt)
+        except HardwareFault as fault:
+            return self._stopped(str(fault))
+        mine = rows[rows[:, self.link.columns["goal"]] == number]
+        if not len(mine):
+            return self._stopped("the engine played nothing of this step")
+        self._take(rows)
+        period = self._timed(float(mine[0, self.link.columns["cmd_t"]]))
+        elapsed = self._t - before
+        self._seconds += elapsed
+        x, y, yaw = self._pose.tolist()
+        reward = self.task.reward(x, y)
+        self.average_reward.add(reward, elapsed)
+        hx, hy = math.cos(yaw), math.sin(yaw)
+        observation = self._observe(hx, hy)
+        missed = int((rows[:, self._ok_at] == 0.0).sum())
+        info = self._info(x, y, hx, hy, self._observation) | {"dt": elapsed} | self._more(period, missed)
+        terminated, truncated = self._judge(elapsed, info)
+        if terminated or truncated:
+            self._reason, self._ready = info["reason"], False
+        return observation, reward, terminated, truncated, info
+
+    def _stopped(self, why: str) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """A step that torque off ended: what was seen last stands in, and no reward is given for it."""
+        self._reason, self._ready = why, False
+        self._seconds += self.dt
+        x, y, yaw = self._pose.tolist()
+        hx, hy = math.cos(yaw), math.sin(yaw)
+        info = self._info(x, y, hx, hy, self._observation) | self._more(math.nan, 0) | {"reason": why}
+        return self._observation.astype(np.float32), 0.0, False, True, info
+
+    def _take(self, rows: Array) -> None:
+        """The newest sound reading of everything; what did not come keeps its last."""
+        at = self.link.columns
+        for out, index in (
+            (self._observation, self._index), (self._temps, self._temp_at), (self._efforts, self._effort_at)
+        ):  # fmt: skip
+            values = rows[:, index]
+            newest = values[-1]
+            if not np.isfinite(newest).all():
+                newest = _last_sound(values)
+            np.copyto(out, newest, where=np.isfinite(newest))
+        pose = rows[:, self._pose_at]
+        seen = np.flatnonzero(np.isfinite(pose).all(axis=1))
+        if len(seen):
+            turned = pose[seen[-1], 2] - self._pose[2]
+            if math.isfinite(turned):
+                self._wound_rad += math.remainder(turned, 2.0 * math.pi)
+            self._pose = pose[seen[-1]].copy()
+            self._pose_t = float(rows[seen[-1], at["base_t"]])
+        sampled = rows[np.isfinite(rows[:, at["acc.x"]])]
+        if len(sampled):
+            self._imu_t = float(sampled[-1, at["imu_t"]])
+        volts = rows[-1, self._volt_at]
+        if np.isfinite(volts).any():
+            self._volts = float(np.nanmean(volts))
+        self._t = float(rows[-1, at["t"]])
+
+    def _timed(self, cmd_t: float) -> float:
+        """s from the last step's command to this one's; what is too long is counted and told."""
+        period, self._cmd_t = cmd_t - self._cmd_t, cmd_t
+        if not math.isfinite(period):
+            return self.dt  # the first step since a reset follows no command
+        if period > self.dt + LATE_SHARE * self._cycle_s:
+            self._overruns += 1
+            if cmd_t - self._told_late > REPEAT_S:
+                self._told_late = cmd_t
+                self._notice(
+                    f"a step took {1e3 * period:.0f} ms instead of {1e3 * self.dt:.0f}, the {self._overruns}. late one: "
+                    "this computer is busy"
+                )
+        return period
+
+    def _judge(self, elapsed: float, info: dict[str, Any]) -> tuple[bool, bool]:
+        """Whether the step ended it, terminated and truncated; the reason goes into info."""
+        up = self._observation[self.layout.slices["acc"]][2]
+        self._fallen_s = self._fallen_s + elapsed if up < 0.0 else 0.0
+        lost, silent = self._t - self._pose_t, self._t - self._imu_t
+        turns = self._wound_rad / (2.0 * math.pi)
+        if self._fallen_s >= FALLEN_S and self._on_fall != "ignore":
+            info["reason"] = "the robot lies on its back"
+            return self._on_fall == "terminate", self._on_fall == "truncate"
+        if lost > TAG_PATIENCE_S:
+            info["reason"] = f"the camera has not seen the robot for {lost:.1f} s"
+        elif silent > IMU_PATIENCE_S:
+            info["reason"] = f"the IMU has sent nothing for {silent:.1f} s"
+        elif abs(turns) > CABLE_TURNS:
+            info["reason"] = (
+                f"the cable is wound up by {abs(turns):.1f} turns to the {'left' if turns > 0 else 'right'}"
+            )
+        elif self._paused.is_set():
+            info["reason"] = self._why_paused
+        elif self._seconds >= self._time_limit_s - 0.5 * self.dt:
+            info["reason"] = "time limit"
+        return False, "reason" in info
+
+    def _observe(self, hx: float, hy: float) -> Observation:
+        at = self._direction_at
+        self._observation[at], self._observation[at + 1] = self.task.observed_direction(hx, hy)
+        return self._observation.astype(np.float32)
+
+    def _more(self, period: float, missed: int) -> dict[str, Any]:
+        """What only a robot has to say."""
+        waited = 0.0 if self.link.stepped else max(0.0, time.monotonic() - self._t)
+        return {
+            "period_s": period,
+            "overruns": self._overruns,
+            "observation_age_s": {
+                "joints": waited,
+                "imu": self._t - self._imu_t + waited,
+                "position": self._t - self._pose_t + waited,
+            },
+            "missed": missed,
+            "joint_temperatures": self._temps.copy(),
+            "joint_loads": self._efforts.copy(),
+            "supply_v": self._volts,
+        }
+
+    # ------------------------------------------------------------------------------------------------- getting it back
+
+    def _stand_up(self) -> None:
+        """Wait until nothing is in the way, saying what it is, and stand."""
+        said, said_at, waited = "", -math.inf, 0.0
+        while True:
+            why = self._in_the_way()
+            if why is None:
+                try:
+                    rows = self.link.stand(self.actions.rest, SETTLE_S)
+                    self._take(rows)
+                    why = self._unseen()
+                    if why is None:
+                        break
+                except HardwareFault as fault:
+                    why = str(fault)
+                    self.link.drop()
+            if waited > self._patience_s:
+                raise HardwareFault(f"the robot cannot go on: {why}", remedy="help it, and start again")
+            kind = why[:24]
+            if kind != said or waited - said_at > REPEAT_S:
+                self._notice(f"waiting: {why}")
+                said, said_at = kind, waited
+            began = time.monotonic()
+            self.link.look(LOOK_S)
+            waited += LOOK_S if self.link.stepped else time.monotonic() - began
+        if said:
+            self._notice(f"going on after {waited:.0f} s")
+        self._fallen_s = 0.0
+
+    def _in_the_way(self) -> str | None:
+        """Why the robot cannot stand up yet; what software can do about it has been done."""
+        if self._paused.is_set():
+            self.link.let_down()
+            return self._why_paused
+        try:
+            if not self.link.connected or (self._reason and not self.link.standing):
+                # After a stop everything is looked at anew: ids, registers, turns that a power cut has forgotten.
+                self.link.connect()
+                self._reason = ""
+            if self.link.standing and not self._reason:
+                return None
+            rows = self.link.look(LOOK_S)
+            if rows is None or not len(rows):
+                return "the robot does not answer"
+            self._take(rows)
+            return self._trouble()
+        except HardwareFault as fault:
+            self.link.drop()
+            return str(fault)
+
+    def _trouble(self) -> str | None:
+        """What the servos and sensors of a robot have to say against its standing up."""
+        hot = self._hot()
+        if hot is not None:
+            self.link.let_down()
+            return hot
+        errors = self.link.errors()
+        if errors:
+            if len(self._reboots) == REBOOTS and time.monotonic() - self._reboots[0] < REBOOTS_S:
+                self.pause(f"{', '.join(errors)} shut down again and again: look at them, then go on")
+                return self._why_paused
+            self._reboots.append(time.monotonic())
+            self.link.reboot(list(errors))
+            return f"{', '.join(errors)} had shut down, and are started again"
+        turns = self._wound_rad / (2.0 * math.pi)
+        if abs(turns) > CABLE_TURNS:
+            self.link.let_down()
+            return f"the cable is wound up by {abs(turns):.1f} turns: turn the robot back by hand, in the camera's view"
+        if self._observation[self.layout.slices["acc"]][2] < UPRIGHT_M_S2 and self._on_fall != "ignore":
+            self.link.let_down()
+            return "the robot lies on its back or side: put it on its feet"
+        why = self._unseen()
+        if why is not None:
+            self.link.let_down()
+        return why
+
+    def _hot(self) -> str | None:
+        guards = self.link.config.guards
+        if guards.temperature_margin_k is None:
+            return None
+        for servo, temperature in zip(self.link.config.servos, self._temps.tolist(), strict=True):
+            limit = servo.model.temperature_limit_c - guards.temperature_margin_k
+            cooled = limit - COOLED_K
+            tripped = self._cooling.get(servo.joint, False)
+            self._cooling[servo.joint] = temperature >= (cooled if tripped else limit - 1.0)
+            if self._cooling[servo.joint]:
+                return f"{servo.joint} is at {temperature:.0f} °C, and cools down to {cooled:.0f} °C"
+        return None
+
+    def _unseen(self) -> str | None:
+        """Which reading is missing, so that there is nothing to learn from."""
+        if not self._t - self._pose_t < TAG_PATIENCE_S:
+            return "the camera does not see the robot: look at light, focus, and both tags in view"
+        if not self._t - self._imu_t < IMU_PATIENCE_S:
+            return "the IMU sends nothing: look at its cable"
+        if not np.isfinite(self._observation).all():
+            missing = self.layout.names[int(np.flatnonzero(~np.isfinite(self._observation))[0])]
+            return f"there is no reading of {missing}"
+        return None
+
+    def close(self) -> None:
+        """Lay the robot down, torque off, recording closed; a virtual robot that was started here ends."""
+        self._ready = False
+        self._held.close()
+
+
+def _last_sound(values: Array) -> Array:
+    """The last finite value of every column, NaN where there is none."""
+    sound = np.isfinite(values)
+    last = len(values) - 1 - np.argmax(sound[::-1], axis=0)
+    out: Array = np.where(sound.any(axis=0), values[last, np.arange(values.shape[1])], np.nan)
+    return out
+
+
+@contextlib.contextmanager
+def _virtual(source: str, clock: str | None) -> Any:
+    """What the ready file of the virtual robot says; one started here is put on the floor where that is possible."""
+    from openant_tools.virtual.process import clock_of_its_own, placeable, placed, virtual_robot
+
+    with contextlib.ExitStack() as stack:
+        if placeable(source):
+            given = clock_of_its_own(source) if clock is None else clock
+            source = stack.enter_context(placed(source, "floor", 0.0))
+            clock = given
+        yield stack.enter_context(virtual_robot(source, clock=clock))
