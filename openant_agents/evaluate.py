@@ -59,6 +59,7 @@ def evaluate(
     frames: int = 0,
     frames_from_s: float = 0.0,
     frame_every: int = 1,
+    begin: Callable[[], None] | None = None,
 ) -> tuple[Evaluation, list[Frame]]:
     """Play a policy for some time.
 
@@ -70,6 +71,7 @@ def evaluate(
         report: called after each step with the robot time so far (s) and the average reward so far (m/s).
         frames: how many pictures to take (the environment must render).
         frames_from_s, frame_every: from when on, and at every how many steps.
+        begin: called after each reset, for a policy that remembers.
 
     Returns:
         The figures, and the pictures.
@@ -85,6 +87,8 @@ def evaluate(
     progress = path = 0.0
     steps = turns = since_picture = 0
     observation, info = env.reset(seed=seed)
+    if begin is not None:
+        begin()
     while average.seconds < seconds - 1e-9:
         before = info
         observation, reward, terminated, truncated, info = env.step(policy(observation))
@@ -102,4 +106,6 @@ def evaluate(
         if terminated or truncated:
             helped[str(info.get("reason", "the episode ended"))] += 1
             observation, info = env.reset()
+            if begin is not None:
+                begin()
     return Evaluation(average.value, average.seconds, steps, progress, path, turns, dict(helped), seed), pictures

@@ -19,15 +19,12 @@ entropy, and transitions kept as rows of one array, so that a batch is one gathe
 from __future__ import annotations
 
 import math
-import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import gymnasium
@@ -38,6 +35,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from openant_agents.runs import CurvePoint, Run, load_checkpoint, read_facts
+from openant_agents.training import CHECKPOINT_EVERY_S, REPORT_EVERY_S, Progress, event_writer, stop_on_signal
 from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput
 
@@ -335,32 +333,8 @@ class Sac:
 
 # ---------------------------------------------------------------------------------------------------------- training
 
-#: s of wall-clock time between checkpoints: a crash loses at most this much.
-CHECKPOINT_EVERY_S = 30.0
 #: steps between points of the learning curve
 CURVE_EVERY = 100
-#: s of wall-clock time between calls of the progress report
-REPORT_EVERY_S = 0.25
-
-
-@dataclass(frozen=True)
-class Progress:
-    """How far a training run is.
-
-    Attributes:
-        step, steps: environment steps done, and wanted.
-        robot_seconds: s, the time that the robot has walked.
-        average_reward_m_s: m/s, over the last 120 s of it.
-        learning: whether updates have begun.
-        helped: why and how often the robot had to be set up again.
-    """
-
-    step: int
-    steps: int
-    robot_seconds: float
-    average_reward_m_s: float
-    learning: bool
-    helped: Mapping[str, int]
 
 
 def train(
@@ -406,11 +380,11 @@ def train(
             "versions": {"torch": torch.__version__, "numpy": np.__version__, "gymnasium": gymnasium.__version__},
         },
     )  # fmt: skip
-    events = _event_writer(folder) if tensorboard else None
+    events = event_writer(folder) if tensorboard else None
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with _stop_on_signal() as stop:
+        with stop_on_signal() as stop:
             return _train(env, run, agent, steps, seed, events, report, stop)
     finally:
         torch.set_num_threads(threads)
@@ -542,16 +516,6 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
     return agent, int(checkpoint["step"])
 
 
-def _event_writer(folder: Path) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise BadInput(
-            "TensorBoard is not installed", remedy="pip install 'openant-tools[agents]', or train without --tensorboard"
-        ) from error
-    return SummaryWriter(str(folder / "tensorboard"))
-
-
 def _device(name: str) -> torch.device:
     try:
         device = torch.device(name)
@@ -572,24 +536,3 @@ def _sizes(env: gymnasium.Env[Any, Any]) -> tuple[int, int]:
     ):
         raise BadInput(f"actions are {action}, not a vector in −1…1", remedy="wrap it in RescaleAction")
     return observation.shape[0], action.shape[0]
-
-
-@contextmanager
-def _stop_on_signal() -> Iterator[threading.Event]:
-    """Turn the first SIGINT or SIGTERM into a wish, so that no update is cut in half; the second interrupts at once."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-
-    def handle(signum: int, frame: FrameType | None) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

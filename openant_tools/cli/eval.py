@@ -11,8 +11,9 @@ import click
 from openant_tools.cli.options import json_option
 from openant_tools.errors import BadInput
 
-#: pictures in a strip, one a step, and s of walking before the first
+#: pictures in a strip, s between them at least, and s of walking before the first
 STRIP_FRAMES = 8
+STRIP_EVERY_S = 0.12
 STRIP_FROM_S = 6.0
 
 
@@ -39,7 +40,7 @@ def eval_(
     Example:
       openant eval my-ant/runs/sac-1 --seconds 120 --json eval.json --strip walk.png
     """
-    from openant_tools.cli.train import need_torch
+    from openant_tools.cli.learning import need_torch
 
     need_torch()
     import gymnasium
@@ -48,8 +49,8 @@ def eval_(
 
     import openant_env  # noqa: F401  (registers the environment)
     from openant_agents.evaluate import evaluate
+    from openant_agents.policies import load_policy
     from openant_agents.runs import read_facts
-    from openant_agents.sac import load_policy
     from openant_env.rendering import NoOpenGL, write_strip
     from openant_tools.files import write_text
 
@@ -64,7 +65,8 @@ def eval_(
         )
     env = gymnasium.make(facts["env"]["id"], render_mode="rgb_array", **options)
     try:
-        agent, step = load_policy(run, env)
+        policy = load_policy(run, env, explore=explore)
+        apart = max(1, round(STRIP_EVERY_S / env.unwrapped.dt))
         if strip is not None:
             try:
                 env.reset(seed=seed)
@@ -76,23 +78,25 @@ def eval_(
             task = bar.add_task("walking", total=seconds)
             result, pictures = evaluate(
                 env,
-                lambda observation: agent.act(observation, explore=explore),
+                policy.act,
                 seconds=seconds,
                 seed=seed,
                 report=lambda done, average: bar.update(task, completed=done, description=f"{100 * average:+.1f} cm/s"),
                 frames=0 if strip is None else STRIP_FRAMES,
                 frames_from_s=min(STRIP_FROM_S, 0.5 * seconds),
+                frame_every=apart,
+                begin=policy.begin,
             )
     finally:
         env.close()
     if strip is not None:
-        write_strip(pictures, strip, seconds_apart=result.seconds / result.steps)
+        write_strip(pictures, strip, seconds_apart=apart * result.seconds / result.steps)
         click.echo(f"strip: {strip}")
     helped = "".join(f", set up again {count}× ({reason})" for reason, count in result.helped.items())
     speed = 100 * result.average_reward_m_s
     click.echo(
         f"{speed:+.1f} cm/s over {result.seconds:.0f} s: {result.progress_m:+.2f} m of progress,"
-        f" {result.path_m:.2f} m walked, {result.turns} turns{helped} (policy of step {step})"
+        f" {result.path_m:.2f} m walked, {result.turns} turns{helped} (policy of step {policy.step})"
     )
     if json_file is not None:
-        write_text(json_file, json.dumps({**result.as_dict(), "run": str(run), "step": step}, indent=2) + "\n")
+        write_text(json_file, json.dumps({**result.as_dict(), "run": str(run), "step": policy.step}, indent=2) + "\n")

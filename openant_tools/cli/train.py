@@ -3,34 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from openant_tools.cli.options import json_option, robot_folder, robot_option
-from openant_tools.errors import BadInput
-
-if TYPE_CHECKING:
-    from openant_agents.sac import Progress
-
-
-def need_torch() -> None:
-    """Refuse in one line where the agents' extra is not installed."""
-    import importlib.util
-
-    if importlib.util.find_spec("torch") is None:
-        raise BadInput("agents need torch, which is not installed", remedy="pip install 'openant-tools[agents]'")
-
-
-def robot_argument(robot: Path | None, kit: str | None) -> dict[str, str]:
-    """How the environment is told which robot: the folder named or lying here, else the nominal robot by its kit."""
-    if kit is not None:
-        if robot is not None:
-            raise BadInput("--robot and --kit name two robots", remedy="give one of them")
-        return {"kit": kit}
-    return {"robot": os.path.abspath(robot_folder(robot))}
+from openant_tools.cli.learning import LearningBar, need_torch, robot_argument
+from openant_tools.cli.options import json_option, robot_option
+from openant_tools.cli.train_sarsa import sarsa
 
 
 @click.group()
@@ -114,7 +94,7 @@ def sac(
     env = gymnasium.make(name, **options)
     settings = Settings(learning_start=learning_start, entropy_start=entropy_start)
     try:
-        with _Bar(steps) as bar:
+        with LearningBar(steps) as bar:
             result = train_sac(
                 env,
                 folder=out,
@@ -153,44 +133,4 @@ def sac(
         write_text(json_file, json.dumps(answer, indent=2) + "\n")
 
 
-class _Bar:
-    """Progress on stderr: steps, robot time, average reward, steps a second, time left."""
-
-    def __init__(self, steps: int) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-        from rich.progress import Progress as RichProgress
-
-        self._bar = RichProgress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=16),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[words]}"),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-        )
-        self._task = self._bar.add_task("learning", total=steps, words="")
-        self._begun = False
-
-    def __enter__(self) -> _Bar:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._bar.stop()
-
-    def show(self, progress: Progress) -> None:
-        if not self._begun:
-            # A run that goes on did not get this far in no time.
-            self._bar.reset(self._task, completed=progress.step)
-            self._begun = True
-        speed = self._bar.tasks[self._task].speed
-        words = [f"{100 * progress.average_reward_m_s:+5.1f} cm/s", f"{progress.robot_seconds / 60:5.1f} min walked"]
-        if speed:
-            words.append(f"{speed:4.0f} steps/s")
-        self._bar.update(
-            self._task,
-            completed=progress.step,
-            description="learning" if progress.learning else "exploring",
-            words="  ".join(words),
-        )
+train.add_command(sarsa)

@@ -1,0 +1,569 @@
+"""SARSA(λ) with tile coding and motion primitives as the Open Ant paper uses it, to be read from top to bottom.
+
+Every half second the agent looks at the robot once and chooses one of eight motion primitives, which then runs blindly.
+The value of primitive a where the robot's state falls into tiles φ is linear in them, with weights of its own,
+
+    Q(s, a) = Σ_{k ∈ φ(s)} w_a[k],    w ← w + α δ z,    z ← (γλ)^(Δ/h) z + φ(s, a),
+    δ = c Σ_i γ^(i) r_{i+1} + γ^(Δ/h) Q(s', a') − Q(s, a)
+
+(Sutton and Barto 2018, section 12.7). γ and λ are those of a robot step of h = 0.05 s, so that a primitive of Δ = 0.5 s
+discounts by their tenth power, as in the platform's software; c scales rewards, which are metres.
+
+The task has no episodes and the traces z are never cleared: where someone had to help the robot, the last transition
+bootstraps from what was seen last, and the next begins from where the robot was set down. A trace needs no table:
+the tiles of the last few decisions and how far each has faded are all there is to it.
+
+What a run leaves behind is the log of its decisions: what was seen, chosen and rewarded. The weights are computed from it
+again, a few seconds for an hour of robot time, so that nothing large is ever written while the robot moves, and what is
+written is written by another thread.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_agents.primitives import Gait
+from openant_agents.runs import CurvePoint, Run, load_checkpoint, read_facts
+from openant_agents.tile_coding import Rows, TileCoder
+from openant_agents.training import CHECKPOINT_EVERY_S, REPORT_EVERY_S, Progress, event_writer, stop_on_signal
+from openant_env.metrics import AverageReward
+from openant_tools.errors import BadInput
+
+__all__ = ["Sarsa", "SarsaPolicy", "Settings", "load_policy", "train"]
+
+Array = NDArray[np.float32]
+
+#: s, the robot step that γ and λ belong to (the paper's).
+STEP_S = 0.05
+#: share of its first strength below which a decision's trace is forgotten
+FADED = 1e-4
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The paper's parameters of SARSA(λ).
+
+    Attributes:
+        gamma: discount of a robot step of 0.05 s.
+        trace: λ, of a robot step of 0.05 s.
+        epsilon: share of decisions that are drawn evenly from all primitives.
+        step_size: α, of each weight; with n tilings a value moves by n α of its error.
+        tiles: boxes of a tiling along each observation's range.
+        tilings: how many.
+        table: rows of weights; boxes beyond share rows, which is counted.
+        reward_scale: factor on rewards, which are metres. The paper searches 1 to 10 and does not say what it chose;
+            5 is what the platform's software uses.
+        bounds_from_s: s of robot time with primitives drawn evenly at the start of a run, from which the bounds of
+            observations are taken that were not measured on the robot before.
+    """
+
+    gamma: float = 0.998
+    trace: float = 0.964
+    epsilon: float = 0.255
+    step_size: float = 1e-4
+    tiles: int = 4
+    tilings: int = 192
+    table: int = 2**25
+    reward_scale: float = 5.0
+    bounds_from_s: float = 60.0
+
+    def as_dict(self) -> dict[str, float | int]:
+        return asdict(self)
+
+
+# ------------------------------------------------------------------------------------------------------------ agent
+
+
+class Sarsa:
+    """Weights, traces and the update; primitives are numbers from 0.
+
+    Args:
+        coder: from observations to rows of weights.
+        actions: how many primitives there are.
+        settings: parameters of the algorithm.
+        seed: of exploration.
+    """
+
+    def __init__(self, coder: TileCoder, actions: int, settings: Settings, *, seed: int) -> None:
+        self.coder, self.actions, self.settings = coder, actions, settings
+        self.random = np.random.default_rng(seed)
+        # Rows by tile, so that all actions of a tile lie together; the system gives memory only as rows are written.
+        self.weights = np.zeros((coder.rows, actions), np.float32)
+        self._flat = self.weights.reshape(-1)
+        self._traces: deque[Rows] = deque()  # places in the flat weights, newest first
+        self._strengths = np.empty(0, np.float32)
+        self._fading = 0.0  # γλ over the transition that the newest trace began
+        self.decisions = 0
+        self.moved = 0.0  # sum of how far the weights were ever moved
+
+    def values(self, rows: Rows) -> Array:
+        """(actions,): Q of each primitive where the tiles have these rows."""
+        values: Array = self.weights[rows].sum(axis=0)
+        return values
+
+    def choose(self, rows: Rows) -> int:
+        """A primitive, ε-greedily; ties are broken by chance."""
+        if self.random.random() < self.settings.epsilon:
+            return int(self.random.integers(self.actions))
+        return self.best(rows)
+
+    def best(self, rows: Rows) -> int:
+        """The primitive of the highest value; one of them by chance where several are."""
+        values = self.values(rows)
+        best = np.flatnonzero(values == values.max())
+        return int(best[0] if len(best) == 1 else self.random.choice(best))
+
+    def learn(
+        self,
+        rows: Rows,
+        action: int,
+        reward: float,
+        seconds: float,
+        next_rows: Rows,
+        next_action: int,
+        *,
+        terminated: bool = False,
+    ) -> float:
+        """One update of all weights with a trace.
+
+        Args:
+            rows, action: where the robot was, and the primitive chosen there.
+            reward: m, the discounted sum of rewards since.
+            seconds: s, how long it took.
+            next_rows, next_action: where it then was, and the primitive chosen there.
+            terminated: whether nothing follows.
+
+        Returns:
+            The error δ.
+        """
+        settings = self.settings
+        steps = seconds / STEP_S
+        discount = math.exp(steps * math.log(settings.gamma)) if settings.gamma > 0.0 else 0.0
+        at = rows * self.actions + action
+        value = float(self._flat[at].sum())
+        following = 0.0 if terminated else float(self._flat[next_rows * self.actions + next_action].sum())
+        error = settings.reward_scale * reward + discount * following - value
+
+        strengths = np.concatenate((np.ones(1, np.float32), self._strengths * np.float32(self._fading)))
+        self._traces.appendleft(at)
+        while strengths[-1] < FADED:
+            strengths = strengths[:-1]
+            self._traces.pop()
+        self._strengths = strengths
+        self._fading = discount * settings.trace**steps
+        steps_by_trace = np.float32(settings.step_size * error) * strengths
+        # add.at, because a box that the robot stayed in is there several times.
+        np.add.at(self._flat, np.concatenate(self._traces), np.repeat(steps_by_trace, [len(t) for t in self._traces]))
+        self.moved += abs(float(steps_by_trace.sum())) * len(at)
+        self.decisions += 1
+        return error
+
+
+# ------------------------------------------------------------------------------------------------ a run's decisions
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """Where each part of a decision stands in a row of the log: what was seen, the primitive, its discounted reward (m),
+    its time (s), whether the task ended, what was seen then, the primitive chosen there."""
+
+    observations: int
+
+    @property
+    def width(self) -> int:
+        return 2 * self.observations + 5
+
+    def row(
+        self,
+        observation: Array,
+        action: int,
+        reward: float,
+        seconds: float,
+        terminated: bool,
+        next_observation: Array,
+        next_action: int,
+    ) -> Array:
+        o, row = self.observations, np.empty(self.width, np.float32)
+        row[:o] = observation
+        row[o : o + 4] = action, reward, seconds, terminated
+        row[o + 4 : -1] = next_observation
+        row[-1] = next_action
+        return row
+
+    def learn(self, agent: Sarsa, row: Array) -> float:
+        """Learn from a row; the same row gives the same update, now and when the log is read again."""
+        o = self.observations
+        action, reward, seconds, terminated = row[o : o + 4].tolist()
+        rows, next_rows = agent.coder.rows_of(row[:o]), agent.coder.rows_of(row[o + 4 : -1])
+        return agent.learn(
+            rows, int(action), reward, seconds, next_rows, int(row[-1]), terminated=bool(terminated)
+        )  # fmt: skip
+
+
+@dataclass
+class _Bounds:
+    """The range of each observation: known before where the robot was measured, else what the first minute showed."""
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    known: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, env: gymnasium.Env[Any, Any]) -> _Bounds:
+        space = env.observation_space
+        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+        names = getattr(env.unwrapped, "observation_names", ())
+        measured = getattr(env.unwrapped, "measured_bounds", {})
+        for at, name in enumerate(names):
+            if name in measured:
+                low[at], high[at] = measured[name]
+        known = np.isfinite(low) & np.isfinite(high)
+        return cls(np.where(known, low, np.inf), np.where(known, high, -np.inf), known)
+
+    @property
+    def complete(self) -> bool:
+        return bool(self.known.all())
+
+    def see(self, observation: Array) -> None:
+        """Widen those that are still open."""
+        self.low = np.where(self.known, self.low, np.minimum(self.low, observation))
+        self.high = np.where(self.known, self.high, np.maximum(self.high, observation))
+
+
+def _agent(bounds: _Bounds, actions: int, settings: Settings, seed: int) -> Sarsa:
+    coder = TileCoder(
+        bounds.low, bounds.high, tiles=settings.tiles, tilings=settings.tilings, rows=settings.table
+    )  # fmt: skip
+    return Sarsa(coder, actions, settings, seed=seed)
+
+
+# ---------------------------------------------------------------------------------------------------------- training
+
+#: environment steps between points of the learning curve: 10 s of 0.05 s
+CURVE_EVERY = 200
+
+
+class _Scribe:
+    """Writes to the disk on a thread of its own, in order, so that a slow disk never holds up a decision."""
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1, "scribe")
+        self._last: Future[None] | None = None
+
+    def write(self, what: Callable[..., None], *arguments: Any) -> None:
+        """Have it written soon.
+
+        Raises:
+            OSError: an earlier write failed.
+        """
+        if self._last is not None and self._last.done():
+            self._last.result()
+        before = self._last
+
+        def next_write() -> None:
+            if before is not None:
+                before.result()  # has ended: one thread; its failure is this one's, too
+            what(*arguments)
+
+        self._last = self._thread.submit(next_write)
+
+    def finish(self) -> None:
+        """Wait until everything is written."""
+        if self._last is not None:
+            self._last.result()
+
+    def close(self) -> None:
+        self._thread.shutdown()
+
+
+def train(
+    env: gymnasium.Env[Any, Any],
+    *,
+    folder: Path,
+    steps: int,
+    seed: int,
+    settings: Settings | None = None,
+    env_facts: Mapping[str, Any] | None = None,
+    tensorboard: bool = False,
+    report: Callable[[Progress], None] | None = None,
+) -> Progress:
+    """Train on one environment, or go on with the run that the folder holds.
+
+    Args:
+        env: an Open Ant whose step divides half a second. Where it has `get_state` and `set_state`, a resumed run is
+            equal to one that was never stopped, bit for bit; else a resumed run begins with a reset.
+        folder: for everything the run leaves behind (`openant_agents.runs`); `transitions.f32` is the log of decisions.
+        steps: environment steps until the run is long enough, those of earlier calls included; a primitive that has
+            begun is finished.
+        seed: of the agent and of the first reset.
+        settings: the paper's by default.
+        env_facts: how to make the environment again, for `run.json`.
+        tensorboard: also write the learning curve and the errors as TensorBoard events into the folder.
+        report: called a few times a second.
+
+    Raises:
+        BadInput: the folder holds another run, the environment does not suit, or a number that is none came up.
+        KeyboardInterrupt: asked for by SIGINT or SIGTERM; the run is saved and goes on with the same call.
+    """
+    settings = settings or Settings()
+    describe = getattr(env.unwrapped, "describe", None)
+    described = dict(describe()) if describe is not None else {}
+    gait = _gait(env, described)
+    bounds = _Bounds.of(env)
+    run = Run(
+        folder,
+        {
+            "agent": "sarsa", "seed": seed, "settings": settings.as_dict(), "env": dict(env_facts or {}),
+            "trained_on": described, "observations": len(bounds.low), "actions": len(gait),
+            "versions": {"numpy": np.__version__, "gymnasium": gymnasium.__version__},
+        },
+    )  # fmt: skip
+    events = event_writer(folder) if tensorboard else None
+    scribe = _Scribe()
+    try:
+        with stop_on_signal() as stop:
+            return _train(env, gait, bounds, run, scribe, settings, steps, seed, events, report, stop)
+    finally:
+        scribe.close()
+        run.close()
+        if events is not None:
+            events.close()
+
+
+def _train(
+    env: gymnasium.Env[Any, Any],
+    gait: Gait,
+    bounds: _Bounds,
+    run: Run,
+    scribe: _Scribe,
+    settings: Settings,
+    steps: int,
+    seed: int,
+    events: Any,
+    report: Callable[[Progress], None] | None,
+    stop: Any,
+) -> Progress:
+    columns = _Columns(len(bounds.low))
+    average = AverageReward()
+    helped: Counter[str] = Counter()
+    step, seconds = 0, 0.0
+    random = np.random.default_rng(seed)
+    agent = _agent(bounds, len(gait), settings, seed) if bounds.complete else None
+    observation, _ = env.reset(seed=seed)
+    action: int | None = None
+    checkpoint = run.resume()
+    log: list[Array] = []  # decisions not yet handed to the scribe
+    if checkpoint is not None:
+        step, seconds = int(checkpoint["step"]), float(checkpoint["seconds"])
+        average.set_state(checkpoint["average"])
+        helped.update(checkpoint["helped"])
+        random.bit_generator.state = checkpoint["random"]
+        bounds, agent = _learned(run.folder, checkpoint, len(gait), settings, seed)
+        if checkpoint["env"] is not None:
+            env.unwrapped.set_state(checkpoint["env"])
+            observation, action = checkpoint["observation"].numpy(), int(checkpoint["action"])
+            gait.sent(checkpoint["last"].numpy())
+    last_save = last_report = time.monotonic()
+
+    def choose(observed: Array) -> int:
+        if agent is None:
+            return int(random.integers(len(gait)))
+        return agent.choose(agent.coder.rows_of(observed))
+
+    def save() -> None:
+        nonlocal last_save
+        get_state = getattr(env.unwrapped, "get_state", None)
+        state = {
+            "step": step, "seconds": seconds, "average": average.get_state(), "helped": dict(helped),
+            "random": random.bit_generator.state, "bounds": [bounds.low, bounds.high, bounds.known],
+            "agent": None if agent is None else _summary(agent),
+            "observation": observation, "action": action, "last": gait.last,
+            "env": None if get_state is None else get_state(),
+        }  # fmt: skip
+        rows = np.stack(log) if log else np.empty((0, columns.width), np.float32)
+        log.clear()
+        last_save = time.monotonic()
+        scribe.write(run.save, state, rows)
+
+    def progress() -> Progress:
+        return Progress(step, steps, seconds, average.value, agent is not None, dict(helped))
+
+    if action is None:
+        action = choose(observation)
+    while step < steps and not stop.is_set():
+        reward = took = 0.0
+        terminated = truncated = False
+        for command in gait.actions(action):
+            seen, r, terminated, truncated, info = env.step(command.astype(np.float32))
+            r = float(r)
+            if not math.isfinite(r + float(seen.sum())):
+                raise BadInput(
+                    f"step {step} gave a reward or an observation that is no number",
+                    where=run.folder,
+                    remedy="look at the environment; what was saved until then is sound",
+                )
+            dt = float(info["dt"])
+            gait.sent(command)
+            reward += settings.gamma ** (took / STEP_S) * r
+            took += dt
+            average.add(r, dt)
+            step += 1
+            if agent is None:
+                bounds.see(seen)
+            if step % CURVE_EVERY == 0:
+                scribe.write(run.add_curve_point, CurvePoint(step, seconds + took, average.value))
+            if terminated or truncated:
+                break
+        seconds += took
+        next_action = choose(seen)
+        if agent is None:
+            if seconds >= settings.bounds_from_s:
+                agent = _agent(bounds, len(gait), settings, seed)
+        else:
+            log.append(columns.row(observation, action, reward, took, terminated, seen, next_action))
+            error = columns.learn(agent, log[-1])
+            if not math.isfinite(error):
+                raise BadInput(
+                    f"the values grew without bound after {agent.decisions} decisions",
+                    where=run.folder,
+                    remedy="use a smaller step size",
+                )
+            if events is not None and agent.decisions % 20 == 0:
+                scribe.write(events.add_scalar, "average_reward_m_s", average.value, step)
+                scribe.write(events.add_scalar, "error", error, step)
+        observation, action = seen, next_action
+        if terminated or truncated:
+            helped[str(info.get("reason", "the episode ended"))] += 1
+            observation, _ = env.reset()
+            gait.rest()
+            action = choose(observation)
+        now = time.monotonic()
+        if now - last_save > CHECKPOINT_EVERY_S:
+            save()
+        if report is not None and now - last_report > REPORT_EVERY_S:
+            last_report = now
+            report(progress())
+    save()
+    scribe.finish()
+    if report is not None:
+        report(progress())
+    if stop.is_set() and step < steps:
+        raise KeyboardInterrupt
+    return progress()
+
+
+def _summary(agent: Sarsa) -> dict[str, Any]:
+    """What the log does not hold, and what the weights computed from it must agree with."""
+    return {
+        "random": agent.random.bit_generator.state, "decisions": agent.decisions, "moved": agent.moved,
+        "tiles": agent.coder.used, "shared": agent.coder.shared,
+    }  # fmt: skip
+
+
+def _learned(
+    folder: Path, checkpoint: Mapping[str, Any], actions: int, settings: Settings, seed: int
+) -> tuple[_Bounds, Sarsa | None]:
+    """Bounds and agent as they were at a checkpoint: its decisions learned again, one after the other.
+
+    Raises:
+        BadInput: the log has fewer decisions than it should, or they lead elsewhere than they did.
+    """
+    low, high, known = (part.numpy() for part in checkpoint["bounds"])
+    bounds = _Bounds(low, high, known)
+    summary = checkpoint["agent"]
+    if summary is None:
+        return bounds, None
+    agent = _agent(bounds, actions, settings, seed)
+    columns = _Columns(len(low))
+    rows = np.fromfile(folder / "transitions.f32", np.float32) if summary["decisions"] else np.empty(0, np.float32)
+    rows = rows[: summary["decisions"] * columns.width].reshape(-1, columns.width)
+    if len(rows) < summary["decisions"]:
+        raise BadInput(
+            f"its log has {len(rows)} of {summary['decisions']} decisions",
+            where=folder,
+            remedy="train into another folder; this one has lost data",
+        )
+    for row in rows:
+        columns.learn(agent, row)
+    agent.random.bit_generator.state = summary["random"]
+    # Other processors and versions round sums otherwise; other rules of learning lead elsewhere altogether.
+    if not math.isclose(agent.moved, summary["moved"], rel_tol=1e-2, abs_tol=1e-6):
+        raise BadInput(
+            "its decisions, learned again, lead to other weights than they did",
+            where=folder,
+            remedy="use the version of the software that trained it, or train again",
+        )
+    return bounds, agent
+
+
+# --------------------------------------------------------------------------------------------------------- playing
+
+
+class SarsaPolicy:
+    """An agent that acts and no longer learns: the action of every environment step."""
+
+    def __init__(self, agent: Sarsa, gait: Gait, *, explore: bool) -> None:
+        self._agent, self._gait, self._explore = agent, gait, explore
+        self._commands: deque[Array] = deque()
+
+    def begin(self) -> None:
+        """The robot was set up anew."""
+        self._gait.rest()
+        self._commands.clear()
+
+    def __call__(self, observation: Array) -> Array:
+        if not self._commands:
+            agent = self._agent
+            rows = agent.coder.rows_of(observation, learn=False)
+            primitive = agent.choose(rows) if self._explore else agent.best(rows)
+            self._commands.extend(self._gait.actions(primitive).astype(np.float32))
+        command = self._commands.popleft()
+        self._gait.sent(command)
+        return command
+
+
+def load_policy(folder: Path, env: gymnasium.Env[Any, Any], *, explore: bool = False) -> tuple[SarsaPolicy, int]:
+    """The agent of a run, ready to act in an environment, and the step it was saved at.
+
+    Raises:
+        BadInput: no such run, or one whose observations or actions are not the environment's.
+    """
+    facts = read_facts(folder)
+    describe = getattr(env.unwrapped, "describe", None)
+    here = dict(describe()) if describe is not None else {}
+    gait = _gait(env, here)
+    for what in ("observation_names", "action_names", "action_range", "dt"):
+        if what in here and facts["trained_on"].get(what) != here[what]:
+            raise BadInput(
+                f"its policy was trained with other {what.replace('_', ' ')} than this environment has",
+                where=folder,
+                remedy="make the environment as run.json says",
+            )
+    checkpoint = load_checkpoint(folder)
+    settings, seed = Settings(**facts["settings"]), int(facts["seed"])
+    _, agent = _learned(folder, checkpoint, len(gait), settings, seed)
+    if agent is None:
+        raise BadInput(
+            "it had not begun to learn when it was saved: its first minute measures the bounds of observations",
+            where=folder,
+            remedy="train a little longer",
+        )
+    return SarsaPolicy(agent, gait, explore=explore), int(checkpoint["step"])
+
+
+def _gait(env: gymnasium.Env[Any, Any], described: Mapping[str, Any]) -> Gait:
+    space = env.observation_space
+    if not (isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1):
+        raise BadInput(f"observations are {space}, not a vector", remedy="wrap it in FlattenObservation")
+    return Gait(described.get("action_names", ()), float(described.get("dt", 0.0)))

@@ -1,0 +1,77 @@
+"""What training loops share: how far they are, how they stop, where their events go."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from openant_tools.errors import BadInput
+
+__all__ = ["CHECKPOINT_EVERY_S", "REPORT_EVERY_S", "Progress", "event_writer", "stop_on_signal"]
+
+#: s of wall-clock time between checkpoints: a crash loses at most this much.
+CHECKPOINT_EVERY_S = 30.0
+#: s of wall-clock time between calls of the progress report
+REPORT_EVERY_S = 0.25
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a training run is.
+
+    Attributes:
+        step, steps: environment steps done, and wanted.
+        robot_seconds: s, the time that the robot has walked.
+        average_reward_m_s: m/s, over the last 120 s of it.
+        learning: whether updates have begun.
+        helped: why and how often the robot had to be set up again.
+    """
+
+    step: int
+    steps: int
+    robot_seconds: float
+    average_reward_m_s: float
+    learning: bool
+    helped: Mapping[str, int]
+
+
+def event_writer(folder: Path) -> Any:
+    """TensorBoard events in a run's folder.
+
+    Raises:
+        BadInput: TensorBoard is not installed.
+    """
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise BadInput(
+            "TensorBoard is not installed", remedy="pip install 'openant-tools[agents]', or train without --tensorboard"
+        ) from error
+    return SummaryWriter(str(folder / "tensorboard"))
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[threading.Event]:
+    """Turn the first SIGINT or SIGTERM into a wish, so that no update is cut in half; the second interrupts at once."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+
+    def handle(signum: int, frame: FrameType | None) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
