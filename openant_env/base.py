@@ -93,6 +93,11 @@ class AntBase(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         folder has them, else nominal ones. Not a promise: use them to normalise, never to clip what you learn from."""
         return self.robot.bounds(self.layout)
 
+    @property
+    def measured_bounds(self) -> Mapping[str, tuple[float, float]]:
+        """Name of an observation → (low, high), of those alone whose bounds were measured on the robot."""
+        return self.robot.measured_bounds
+
     def describe(self) -> dict[str, Any]:
         """What a policy trained here depends on, as plain values: to be kept beside it and compared before it plays."""
         return {
