@@ -28,6 +28,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "passport": ("passport", "Robot", "One page with everything known about a robot."),
     "config": ("config", "Robot", "Check, show, import and export the robot's configuration."),
     "comms": ("comms", "Robot", "The bus: scan, watch, measure."),
+    "thermal": ("thermal", "Robot", "Heat: soak the robot, fit its heat, forecast shutdowns, compare."),
     "rec": ("rec", "Data", "Recordings: info, repair, export, import."),
     "sysid": ("sysid", "Data", "Record excitations and fit a calibrated model to them."),
     "gap": ("gap", "Data", "How far a simulation is from its robot, and where."),

@@ -78,12 +78,16 @@ def placeable(source: str) -> bool:
 
 
 @contextlib.contextmanager
-def placed(source: str, setup: str, heading_rad: float) -> Iterator[str]:
-    """The source of a virtual robot like that of `source`, which is placeable, but standing elsewhere."""
+def placed(source: str, setup: str, heading_rad: float = 0.0, *, doze: bool = False) -> Iterator[str]:
+    """The source of a virtual robot like that of `source`, which is placeable, but standing elsewhere.
+
+    Args:
+        doze: for hours in which it mostly stands: nothing looks at it, and its mechanics are left out while it does.
+    """
     document = tomlkit.document() if source == VIRTUAL_DEFAULT else _scenario(source)
     robot = document.setdefault("robot", tomlkit.table())
     there = robot.get("setup", "stand")
-    if there == setup and (setup == "stand" or robot.get("heading_rad", 0.0) == heading_rad):
+    if not doze and there == setup and (setup == "stand" or robot.get("heading_rad", 0.0) == heading_rad):
         yield source
         return
     robot["setup"], robot["heading_rad"] = setup, heading_rad
@@ -91,6 +95,9 @@ def placed(source: str, setup: str, heading_rad: float) -> Iterator[str]:
         robot["eeprom"] = str(Path(source).resolve().parent / str(robot["eeprom"]))
     if source == VIRTUAL_DEFAULT:
         document["clock"] = {"mode": "stepped"}
+    if doze:
+        document.setdefault("clock", tomlkit.table()).setdefault("doze", True)
+        document.setdefault("camera", tomlkit.table()).setdefault("present", False)
     with tempfile.TemporaryDirectory(prefix="openant-placed-") as folder:
         path = Path(folder) / (Path(source).name if source != VIRTUAL_DEFAULT else f"{setup}.toml")
         path.write_text(tomlkit.dumps(document), encoding="utf-8")

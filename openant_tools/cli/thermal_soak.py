@@ -1,0 +1,330 @@
+"""`openant thermal soak`: load the robot and keep its temperatures, with live curves."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from openant_tools.cli.options import finite, json_option, robot_option
+from openant_tools.cli.sysid_record import robot_of
+from openant_tools.cli.virtual_for_command import clock_of_its_own, placeable, placed, virtual_option, virtual_robot
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from openant_tools.comms.messages import EngineConfig
+    from openant_tools.robot.folder import RobotFolder
+    from openant_tools.thermal.soak import Plan, Sample, Soaked
+
+__all__ = ["soak"]
+
+_BARS = "▁▂▃▄▅▆▇█"
+_PLAIN_BARS = "_.,-=+*#"
+#: points of a live curve
+CURVE = 32
+#: s between two drawings of the live table, and between two lines where no terminal is attached
+DRAW_S, LINE_S = 0.25, 20.0
+
+
+@click.command()
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), required=True, metavar="RUN.mcap")
+@click.option(
+    "--load", type=click.Choice(["stand", "hang", "stall"]), default="stand", show_default=True,
+    help="Stand on its feet; hang on its stand, legs free; or lie under a weight that stalls the pressing knees.",
+)  # fmt: skip
+@click.option(
+    "--play", "commands", type=click.Path(path_type=Path), metavar="RUN", help="Play a recording's commands instead."
+)
+@click.option(
+    "--pose", "poses", multiple=True, metavar="POSE",
+    help="home, low, tall, straight, or knee=-0.32,hip=0; repeat it to hold several in turn.  [default: home]",
+)  # fmt: skip
+@click.option(
+    "--effort", type=click.FloatRange(0.02, 1.0), callback=finite, default=0.5, show_default=True, metavar="SHARE",
+    help="Of full duty, with which stalled knees press.",
+)  # fmt: skip
+@click.option(
+    "--minutes", type=click.FloatRange(0.05, 24 * 60), callback=finite, default=60.0, show_default=True, metavar="MIN",
+    help="Under load.",
+)  # fmt: skip
+@click.option(
+    "--cool-down", type=click.FloatRange(0, 24 * 60), callback=finite, default=20.0, show_default=True, metavar="MIN",
+    help="Recorded afterwards, torque off.",
+)  # fmt: skip
+@click.option(
+    "--margin", type=click.FloatRange(0, 60), callback=finite, default=3.0, show_default=True, metavar="K",
+    help="The load ends so far below a servo's own limit.",
+)  # fmt: skip
+@click.option("--to-shutdown", is_flag=True, help="Let the servos shut down by themselves, as the paper's test did.")
+@click.option(
+    "--heat-sink", "heat_sinks", multiple=True, metavar="JOINT", help="Has one: a joint, knee, hip or all; repeatable."
+)
+@click.option(
+    "--ambient",
+    "ambient_c",
+    type=click.FloatRange(-20, 60),
+    callback=finite,
+    metavar="°C",
+    help="Of the room, if known.",
+)
+@click.option("--note", metavar="TEXT", help="What is special, kept with the recording.")
+@click.option("--resume", is_flag=True, help="Go on with a soak that was cut short; its plan stands in its recording.")
+@click.option(
+    "--rate", "rate_hz", type=click.FloatRange(2, 100), callback=finite, metavar="HZ",
+    help="Reads a second.  [default: 5, or 50 where motions are played]",
+)  # fmt: skip
+@virtual_option
+@click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one U2D2 that is plugged in.")
+@robot_option
+@click.option("--yes", is_flag=True, help="The robot may move: do not ask. Needed where no terminal is attached.")
+@json_option
+def soak(
+    out: Path,
+    load: str,
+    commands: Path | None,
+    poses: tuple[str, ...],
+    effort: float,
+    minutes: float,
+    cool_down: float,
+    margin: float,
+    to_shutdown: bool,
+    heat_sinks: tuple[str, ...],
+    ambient_c: float | None,
+    note: str | None,
+    resume: bool,
+    rate_hz: float | None,
+    virtual_source: str | None,
+    port: str | None,
+    robot: Path | None,
+    yes: bool,
+    json_file: Path | None,
+) -> int:
+    """Load the robot for minutes to hours and record how warm every servo gets.
+
+    Each servo's own limit is read from it; the load ends a margin below, torque goes off, and the cooling is recorded too.
+    Ctrl-C, a crash or a power cut leave a recording that --resume goes on with. --load stall is the stress test of the Open
+    Ant paper: the robot lies under a weight that it cannot lift while its knees press down.
+
+    \b
+      openant thermal soak --robot my-ant --minutes 30 --out soak.mcap
+      openant thermal soak --robot my-ant --load stall --to-shutdown --heat-sink knee --out stress.mcap
+      openant thermal soak --robot my-ant --play walk.mcap --minutes 20 --out walking.mcap
+      openant thermal soak --virtual --minutes 30 --out soak.mcap --yes
+
+    Exit code 1: a servo came so near its limit that the load ended early.
+    """
+    from rich.console import Console
+
+    from openant_tools.errors import BadInput
+    from openant_tools.recording.writer import recording_path
+    from openant_tools.robot.joints import JOINT_NAMES
+    from openant_tools.thermal.soak import Plan, pose_angles, resume_plan
+
+    out = recording_path(out)
+    if resume:
+        if not out.is_file():
+            raise BadInput("there is no soak to go on with", where=out, remedy="leave out --resume to begin one")
+        plan = resume_plan(out)
+    else:
+        if out.exists():
+            raise BadInput(
+                "there is a recording already", where=out, remedy="record under another name, or --resume it"
+            )
+        plan = Plan(
+            load="play" if commands else load,  # type: ignore[arg-type]
+            seconds=minutes * 60,
+            cool_down_s=cool_down * 60,
+            poses=poses or ("home",),
+            effort=effort,
+            margin_k=-1.0 if to_shutdown else margin,
+            commands=None if commands is None else str(commands),
+            notes=note,
+            heat_sinks=_joints(heat_sinks),
+            ambient_c=ambient_c,
+        )
+        for pose in plan.poses:
+            pose_angles(pose, JOINT_NAMES)
+    console = Console(stderr=True, highlight=False)
+    folder = robot_of(robot, needed=virtual_source is None)
+    with contextlib.ExitStack() as stack:
+        config = _connected(
+            stack, plan, virtual_source, port, folder, rate_hz or (50.0 if plan.load == "play" else 5.0)
+        )
+        console.print(
+            f"{'going on with ' if resume else ''}{_words(plan)}, {plan.seconds / 60:g} min, then {plan.cool_down_s / 60:g} "
+            f"min of cooling. {'The knees press' if plan.load == 'stall' else 'All joints move'} on {config.port}."
+        )
+        _ask(yes)
+        made = _run(console, config, plan, out, folder, resume)
+    for joint, peak in made.peak_c.items():
+        click.echo(
+            f"{joint:9} {peak:4.0f} °C at most"
+            + (f", {made.glitches[joint]} telemetry errors" if made.glitches[joint] else "")
+        )
+    click.echo(f"{made.path}  {made.cycles} cycles, {made.loaded_s / 60:.1f} min under load: {made.words}")
+    if json_file is not None:
+        from openant_tools.files import write_text
+
+        write_text(json_file, json.dumps({**vars(made), "path": str(made.path)}, indent=1, ensure_ascii=False) + "\n")
+    return 0 if made.why == "time" else 1
+
+
+def _connected(
+    stack: contextlib.ExitStack,
+    plan: Plan,
+    virtual_source: str | None,
+    port: str | None,
+    folder: RobotFolder | None,
+    rate_hz: float,
+) -> EngineConfig:
+    from openant_tools.comms.setup import config_of_robot, config_of_unknown_robot
+    from openant_tools.thermal.soak import soak_config
+
+    control = None
+    if virtual_source is not None:
+        source = virtual_source
+        if placeable(source):
+            source = stack.enter_context(placed(source, plan.setup, doze=True))
+        found = stack.enter_context(virtual_robot(source, clock=clock_of_its_own(source)))
+        port, control = port or found["bus"], found["control"]
+    if folder is not None:
+        config = config_of_robot(folder.config(), port, control=control)
+    else:
+        assert port is not None
+        config = config_of_unknown_robot(port, control)
+    return soak_config(config, rate_hz)
+
+
+def _run(
+    console: Console, config: EngineConfig, plan: Plan, out: Path, folder: RobotFolder | None, resume: bool
+) -> Soaked:
+    """Drive the soak and draw it; Ctrl-C says how to go on."""
+    from rich.live import Live
+
+    from openant_tools.thermal.soak import soak as soaking
+
+    steps = soaking(
+        config, plan, out, robot_toml=None if folder is None else folder.config_file.read_text(), resume=resume
+    )
+    curves = _Curves(console)
+    live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
+    drawn = said = -math.inf
+    try:
+        with live or contextlib.nullcontext():
+            while True:
+                sample = next(steps)
+                curves.take(sample)
+                now = time.monotonic()
+                if sample.words:
+                    console.print(sample.words, markup=False)
+                if live is not None and now - drawn > DRAW_S:
+                    drawn = now
+                    live.update(curves.table(sample), refresh=True)
+                elif live is None and now - said > LINE_S:
+                    said = now
+                    console.print(curves.line(sample), markup=False)
+    except StopIteration as end:
+        made: Soaked = end.value
+        return made
+    except BaseException:
+        steps.close()
+        if out.exists():
+            console.print(
+                f"kept what was recorded: go on with `openant thermal soak --resume --out {out}`", markup=False
+            )
+        raise
+
+
+class _Curves:
+    """What the live table shows: newest values, and each servo's temperature so far as a strip."""
+
+    def __init__(self, console: Console) -> None:
+        self._bars = _BARS if (console.encoding or "").lower().startswith("utf") else _PLAIN_BARS
+        self._past: list[list[float]] = []
+
+    def take(self, sample: Sample) -> None:
+        self._past.append(sample.temperature_c.tolist())
+
+    def table(self, sample: Sample) -> Table:
+        from rich.table import Table
+
+        minutes = sample.seconds / 60
+        table = Table(title=f"{sample.phase}, {minutes:.1f} min, {sample.share:.0%}", title_justify="left", box=None)
+        for name, justify in (
+            ("servo", "left"),
+            ("°C", "right"),
+            ("limit", "right"),
+            ("K/min", "right"),
+            ("effort", "right"),
+        ):
+            table.add_column(name, justify=justify)  # type: ignore[arg-type]
+        table.add_column("V", justify="right")
+        table.add_column("so far")
+        for k, joint in enumerate(sample.joints):
+            now, limit = sample.temperature_c[k], sample.limit_c[k]
+            colour = "red" if now >= limit - 5 else "yellow" if now >= limit - 15 else "default"
+            effort = sample.current_a[k] if math.isfinite(sample.current_a[k]) else sample.load[k]
+            unit = " A" if math.isfinite(sample.current_a[k]) else ""
+            table.add_row(
+                joint, f"[{colour}]{now:.0f}[/{colour}]", f"{limit:.0f}",
+                "–" if math.isnan(sample.rate_k_min[k]) else f"{sample.rate_k_min[k]:+.1f}",
+                "–" if math.isnan(effort) else f"{effort:+.2f}{unit}", f"{sample.volts[k]:.1f}", self._strip(k, limit),
+            )  # fmt: skip
+        return table
+
+    def line(self, sample: Sample) -> str:
+        warmest = max(range(len(sample.joints)), key=lambda k: sample.temperature_c[k] - sample.limit_c[k])
+        return (
+            f"{sample.phase} {sample.seconds / 60:5.1f} min ({sample.share:.0%}): {sample.joints[warmest]} "
+            f"{sample.temperature_c[warmest]:.0f} °C of {sample.limit_c[warmest]:.0f}"
+        )
+
+    def _strip(self, k: int, limit: float) -> str:
+        """From the coldest reading to the limit."""
+        every = max(1, len(self._past) // CURVE)
+        values = [row[k] for row in self._past[::every] if math.isfinite(row[k])]
+        if not values:
+            return ""
+        low = min(values)
+        steps = len(self._bars) - 1
+        return "".join(self._bars[min(steps, max(0, round((v - low) / max(limit - low, 1.0) * steps)))] for v in values)
+
+
+def _joints(names: tuple[str, ...]) -> tuple[str, ...]:
+    from openant_tools.errors import BadInput
+    from openant_tools.robot.joints import JOINT_NAMES, JOINTS
+
+    chosen: list[str] = []
+    for name in names:
+        found = [joint for joint in JOINT_NAMES if name in (joint, JOINTS[joint].kind, "all")]
+        if not found:
+            raise BadInput(f"no joint {name!r}", remedy=f"one of {', '.join(JOINT_NAMES)}, knee, hip or all")
+        chosen += found
+    return tuple(joint for joint in JOINT_NAMES if joint in chosen)
+
+
+def _words(plan: Plan) -> str:
+    if plan.load == "stall":
+        return f"the knees press with {plan.effort:.0%} of full duty against a weight that stalls them"
+    if plan.load == "play":
+        return f"the commands of {plan.commands} over and over"
+    where = "standing on its feet" if plan.load == "stand" else "hanging on its stand"
+    return f"{where}, {' then '.join(plan.poses)}"
+
+
+def _ask(yes: bool) -> None:
+    from openant_tools.errors import BadInput
+
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise BadInput("the robot would move and nobody is there to ask", remedy="add --yes if it may")
+    click.confirm("May it move?", abort=True, err=True)

@@ -1,0 +1,1 @@
+"""Heat: soak runs, a two-node model of every servo, forecasts, derating, comparisons."""

@@ -1,0 +1,549 @@
+"""A soak: load the robot, keep every servo's temperature for minutes to hours, stop before its limit, and keep the cooling.
+
+The steps of a soak are samples that any face can show: `soak` is a generator of `Sample`, and its value what came of it.
+The recording knows the plan, so that after a crash `resume_plan` and `soak(…, resume=True)` make one recording of both parts.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.comms import messages
+from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.guards import Guards
+from openant_tools.comms.messages import EngineConfig
+from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.recording.reader import read_recording
+from openant_tools.recording.run import Facts, Run
+from openant_tools.recording.tables import read_run
+from openant_tools.robot.joints import JOINTS
+from openant_tools.robot.kit import HOME_RAD
+from openant_tools.robot.registers import PULSES_PER_TURN, PWM_FULL
+from openant_tools.thermal.thermometer import Thermometer
+
+__all__ = [
+    "COOL_DOWN_S", "POSES", "Load", "Phase", "Plan", "Sample", "Soaked", "pose_angles", "resume_plan", "soak", "soak_config",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
+Load = Literal["stand", "hang", "stall", "play"]
+Phase = Literal["load", "cool-down"]
+
+#: The maker's advice after an overheating shutdown (facts/dynamixel C3), s.
+COOL_DOWN_S = 1200.0
+#: s between two looks at the robot: real time is watched closely, a virtual robot's may run on.
+LOOK_S, STEPPED_LOOK_S = 1.0, 10.0
+#: s after the joints were loaded until they must be stalled, and the share of the wanted duty that proves it.
+STALL_S, STALLED = 3.0, 0.7
+#: K below a limit from which no soak begins: what is hot already is to cool first.
+BEGIN_K = 10.0
+#: A soak must outlive a noisy bus: s without an answer until a servo is given up.
+SILENT_S = 3.0
+
+#: name → angles by kind of joint, rad
+POSES: Mapping[str, Mapping[str, float]] = {
+    "home": {"hip": HOME_RAD["hip"], "knee": HOME_RAD["knee"]},
+    "low": {"hip": 0.0, "knee": math.radians(-30)},
+    "tall": {"hip": 0.0, "knee": math.radians(-65)},
+    "straight": {"hip": 0.0, "knee": 0.0},
+}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a soak is to do.
+
+    Attributes:
+        load: `stand` on its feet in held poses, `hang` on its stand in held poses, `stall`ed knees that press a weight
+            they cannot lift (the paper's stress test), or `play` a recording's commands over and over.
+        seconds: of load. cool_down_s: recorded afterwards, torque off.
+        poses: names of `POSES` or `knee=-0.32,hip=0`, held one after the other, equally long.
+        effort: share of full duty with which stalled knees press.
+        margin_k: below each servo's own limit, where the load ends; negative to let the servos shut down by themselves.
+        commands: the file whose commands are played.
+        notes: of the builder, such as "heat sinks on all knees".
+        heat_sinks: joints whose servo has one.
+        ambient_c: of the room, where a thermometer hangs there.
+    """
+
+    load: Load = "stand"
+    seconds: float = 3600.0
+    cool_down_s: float = COOL_DOWN_S
+    poses: tuple[str, ...] = ("home",)
+    effort: float = 0.5
+    margin_k: float = 3.0
+    commands: str | None = None
+    notes: str | None = None
+    heat_sinks: tuple[str, ...] = ()
+    ambient_c: float | None = None
+
+    @property
+    def setup(self) -> str:
+        return "stand" if self.load == "hang" else "floor"
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Where a soak is.
+
+    Attributes:
+        phase: what goes on. seconds: since the load began, pauses of a resumed soak included.
+        share: of the whole that is done.
+        joints: names, in the order of the arrays.
+        temperature_c: (joints,) without telemetry errors. limit_c: (joints,) as the servos have it.
+        rate_k_min: (joints,) over the last minutes, NaN while too early.
+        current_a, load, duty, volts: (joints,) newest, NaN where there is none.
+        words: what just happened, "" mostly.
+    """
+
+    phase: Phase
+    seconds: float
+    share: float
+    joints: tuple[str, ...]
+    temperature_c: Array
+    limit_c: Array
+    rate_k_min: Array
+    current_a: Array
+    load: Array
+    duty: Array
+    volts: Array
+    words: str = ""
+
+
+@dataclass(frozen=True)
+class Soaked:
+    """What came of a soak.
+
+    Attributes:
+        path: the recording. cycles: in it.
+        why: how the load ended: `time`, `margin`, `shutdown`, or `guard`.
+        joint: who ended it. words: the same for people.
+        loaded_s: how long the robot was under load, in all.
+        peak_c: joint → highest temperature. glitches: joint → readings that were telemetry errors.
+    """
+
+    path: Path
+    cycles: int
+    why: Literal["time", "margin", "shutdown", "guard"]
+    joint: str | None
+    words: str
+    loaded_s: float
+    peak_c: Mapping[str, float]
+    glitches: Mapping[str, int]
+
+
+Soaking = Generator[Sample, None, Soaked]
+
+
+def pose_angles(pose: str, joints: Sequence[str]) -> Array:
+    """(joints,) rad of a pose by name, or by `knee=-0.32,hip_rr=0.1` (the rest at home).
+
+    Raises:
+        BadInput: no such pose, joint or number.
+    """
+    if pose in POSES:
+        return np.array([POSES[pose][JOINTS[joint].kind] for joint in joints])
+    angles = np.array([HOME_RAD[JOINTS[joint].kind] for joint in joints])
+    for part in pose.split(","):
+        name, _, text = part.partition("=")
+        name = name.strip()
+        chosen = [k for k, joint in enumerate(joints) if name in (joint, JOINTS[joint].kind)]
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not chosen or not math.isfinite(value):
+            remedy = f"name one of {', '.join(POSES)}, or angles in rad such as knee=-0.32,hip=0"
+            raise BadInput(f"{pose!r} is no pose", remedy=remedy)
+        angles[chosen] = value
+    return angles
+
+
+def soak_config(config: EngineConfig, rate_hz: float) -> EngineConfig:
+    """The engine's config for hours at a few cycles a second: heat is watched here, silence is borne longer."""
+    guards = replace(
+        config.guards or Guards(),
+        temperature_margin_k=None,
+        silent_s=max(0.25, SILENT_S),
+        silent_cycles=5,
+        lost_s=max(0.4, 2 * SILENT_S),
+    )
+    # Servos stop by themselves where three cycles in a row are lost.
+    watchdog = min(2.54, max(config.watchdog_s, 3.0 / rate_hz))
+    return replace(config, rate_hz=rate_hz, guards=guards, watchdog_s=watchdog, imu=None, camera=None)
+
+
+def resume_plan(path: Path) -> Plan:
+    """The plan of a soak that was cut short, as its recording has it.
+
+    Raises:
+        BadInput: there is no such recording, or it is none of a soak.
+    """
+    recording = read_recording(path)
+    table = recording.run.facts.extra.get("soak")
+    if not isinstance(table, dict):
+        raise BadInput("this is no recording of a soak", where=path, remedy="record under another name")
+    known = {name: table[name] for name in Plan.__dataclass_fields__ if name in table}
+    return Plan(**{**known, "poses": tuple(known["poses"]), "heat_sinks": tuple(known["heat_sinks"])})
+
+
+@dataclass
+class _Log:
+    """What was seen so far: thermometers, and a few minutes of the past for rates."""
+
+    joints: tuple[str, ...]
+    columns: Mapping[str, int]
+    thermometers: list[Thermometer]
+    past: list[tuple[float, Array]] = field(default_factory=list)
+    last: Array | None = None
+    first_t: float | None = None
+    t: float = 0.0
+    peak: Array = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def of(cls, engine: EngineProcess, joints: tuple[str, ...]) -> _Log:
+        columns = {name: k for k, name in enumerate(engine.columns)}
+        return cls(joints, columns, [Thermometer() for _ in joints], peak=np.full(len(joints), np.nan))
+
+    def take(self, rows: Array) -> None:
+        if not len(rows):
+            return
+        places = [self.columns[f"temp.{joint}"] for joint in self.joints]
+        times = rows[:, self.columns["t"]]
+        for t, readings in zip(times.tolist(), rows[:, places].tolist(), strict=True):
+            for thermometer, reading in zip(self.thermometers, readings, strict=True):
+                thermometer.read(t, reading)
+        self.t = float(times[-1])
+        self.first_t = float(times[0]) if self.first_t is None else self.first_t
+        self.last = rows[-1]
+        now = self.temperature
+        self.peak = np.fmax(self.peak, now)
+        self.past.append((self.t, now))
+        while len(self.past) > 2 and self.past[0][0] < self.t - RATE_S:
+            self.past.pop(0)
+
+    @property
+    def temperature(self) -> Array:
+        return np.array([thermometer.value for thermometer in self.thermometers])
+
+    @property
+    def rate(self) -> Array:
+        """(joints,) K/min over the last minutes."""
+        then, was = self.past[0] if self.past else (self.t, self.temperature)
+        minutes = (self.t - then) / 60
+        return (self.temperature - was) / minutes if minutes >= 0.5 else np.full(len(self.joints), np.nan)
+
+    def newest(self, signal: str) -> Array:
+        if self.last is None:
+            return np.full(len(self.joints), np.nan)
+        return self.last[[self.columns[f"{signal}.{joint}"] for joint in self.joints]]
+
+
+#: s over which the rate of warming is taken: whole °C need minutes
+RATE_S = 180.0
+
+
+def soak(
+    config: EngineConfig,
+    plan: Plan,
+    out: Path,
+    *,
+    robot_toml: str | None = None,
+    resume: bool = False,
+) -> Soaking:
+    """Do it. Closed at any yield (Ctrl-C, a stop key) it leaves torque off and a recording that can be resumed.
+
+    Args:
+        config: the robot, best by `soak_config`.
+        out: the recording to make, or to go on with.
+        robot_toml: the robot's configuration as text, kept inside the recording.
+
+    Raises:
+        BadInput: the plan cannot be; knees that were to be stalled move.
+        HardwareFault: the robot does not answer, or is too hot to begin.
+    """
+    joints = tuple(servo.joint for servo in config.servos)
+    before = _so_far(out) if resume else _SoFar()
+    played = _commands(plan, joints, config)
+    with EngineProcess(config) as engine:
+        stepped = bool(engine.description["stepped"])
+        limit = engine.ask(messages.ReadRegister("temperature_limit"))
+        limits = np.array([float(limit[joint]) for joint in joints])
+        log = _Log.of(engine, joints)
+        yield from _look_around(engine, log, limits, plan, before, resume)
+        if before.phase == "load" and before.loaded_s < plan.seconds:
+            engine.ask(messages.Torque(True))
+            found = np.asarray(engine.description["position"], float)
+            start = played[0] if played is not None else _first_pose(plan, joints, found)
+            if start is not None:
+                engine.ask(messages.Ramp(_within(start, config)))
+        facts = Facts(
+            joints=joints,
+            setup=plan.setup,
+            protocol="soak",
+            ambient_c=plan.ambient_c,
+            notes=plan.notes,
+            extra={"soak": asdict(plan), "rate_hz": config.rate_hz, "temperature_limit_c": limit},
+        )
+        path, _ = str(out), engine.telemetry()
+        engine.ask(messages.Record(path, facts, robot_toml, resume=resume))
+        loaded, why, joint, words = before.loaded_s, "time", None, "the time is over"
+        try:
+            if before.phase == "load" and loaded < plan.seconds:
+                loaded, why, joint, words = yield from _under_load(
+                    engine, config, plan, log, limits, loaded, played, stepped
+                )
+            if plan.setup == "floor" and plan.load != "stall" and why != "shutdown":
+                _lie_down(engine, config)
+            engine.ask(messages.Torque(False))
+            yield from _cooling(engine, plan, log, limits, loaded, before.cooled_s, words, stepped)
+        finally:
+            if not engine.ended:
+                made, cycles = engine.ask(messages.StopRecording())
+                engine.ask(messages.Torque(False))
+    peaks = {name: float(value) for name, value in zip(joints, log.peak, strict=True)}
+    peaks = {name: float(np.nanmax([value, before.peak_c.get(name, np.nan)])) for name, value in peaks.items()}
+    glitches = {name: thermometer.glitches for name, thermometer in zip(joints, log.thermometers, strict=True)}
+    return Soaked(Path(made), cycles, why, joint, words, loaded, peaks, glitches)  # type: ignore[arg-type]
+
+
+def _look_around(
+    engine: EngineProcess, log: _Log, limits: Array, plan: Plan, before: _SoFar, resume: bool
+) -> Generator[Sample, None, None]:
+    """Read temperatures before anything moves; a soak that begins hot says nothing and risks a servo."""
+    engine.ask(messages.Look(1.0))
+    log.take(engine.telemetry())
+    temperature = log.temperature
+    hot = [k for k in range(len(log.joints)) if temperature[k] >= limits[k] - BEGIN_K]
+    if hot and before.phase == "load":
+        k = max(hot, key=lambda k: temperature[k] - limits[k])
+        raise HardwareFault(
+            f"{log.joints[k]} is at {temperature[k]:.0f} °C, {limits[k]:.0f} °C is its limit: a soak does not begin there",
+            where=engine.config.port,
+            remedy=f"let it cool below {limits[k] - BEGIN_K:.0f} °C" + (" and --resume again" if resume else ""),
+        )
+    for event in engine.events():
+        if isinstance(event, messages.Notice):
+            yield _sample(log, limits, before.phase, 0.0, 0.0, event.text)
+
+
+def _under_load(
+    engine: EngineProcess,
+    config: EngineConfig,
+    plan: Plan,
+    log: _Log,
+    limits: Array,
+    loaded: float,
+    played: Array | None,
+    stepped: bool,
+) -> Generator[Sample, None, tuple[float, str, str | None, str]]:
+    """Until the time is over, a servo is too warm, or something stops it: seconds under load, why, who, words."""
+    look = STEPPED_LOOK_S if stepped else LOOK_S
+    total = plan.seconds + plan.cool_down_s
+    pose = -1
+    number: int | None = None
+    if plan.load == "stall":
+        yield from _press(engine, config, plan, log, limits)
+    begun, at = log.t, loaded
+    while True:
+        if plan.load in ("stand", "hang"):
+            wanted = min(int(loaded / plan.seconds * len(plan.poses)), len(plan.poses) - 1)
+            if wanted != pose:
+                pose = wanted
+                engine.ask(messages.Ramp(_within(pose_angles(plan.poses[pose], log.joints), config)))
+        try:
+            if played is None:
+                engine.ask(messages.Hold(min(look, max(1.0 / config.rate_hz, plan.seconds - loaded))))
+            else:
+                number = (
+                    engine.start(messages.Play(played, "play")) if number is None or engine.done(number) else number
+                )
+                if stepped:
+                    engine.wait(number)
+                    number = None
+                else:
+                    time.sleep(look)
+        except HardwareFault as stopped:
+            log.take(engine.telemetry())
+            return _why_stopped(engine, log, limits, at + log.t - begun, stopped)
+        log.take(engine.telemetry())
+        loaded = at + log.t - begun
+        yield _sample(log, limits, "load", loaded, loaded / total, _notices(engine))
+        near = limits - log.temperature
+        k = int(np.nanargmin(near)) if np.isfinite(near).any() else 0
+        if plan.margin_k >= 0 and near[k] <= plan.margin_k:
+            words = f"{log.joints[k]} is at {log.temperature[k]:.0f} °C, {near[k]:.0f} K below its limit"
+            return loaded, "margin", log.joints[k], words
+        if loaded >= plan.seconds - 0.5 / config.rate_hz:
+            return loaded, "time", None, "the time is over"
+
+
+def _why_stopped(
+    engine: EngineProcess, log: _Log, limits: Array, loaded: float, fault: HardwareFault
+) -> tuple[float, str, str | None, str]:
+    """A servo's own shutdown is what the test was for; anything else is not."""
+    joint = next((e.joint for e in engine.events() if isinstance(e, messages.Stopped) and e.joint), None)
+    if engine.ended or joint is None:
+        raise fault
+    k = log.joints.index(joint)
+    if "overheating" in fault.what:
+        words = f"{joint} shut itself down at {log.temperature[k]:.0f} °C, its limit is {limits[k]:.0f} °C"
+        return loaded, "shutdown", joint, words
+    return loaded, "guard", joint, fault.what
+
+
+def _press(
+    engine: EngineProcess, config: EngineConfig, plan: Plan, log: _Log, limits: Array
+) -> Generator[Sample, None, None]:
+    """Let the knees press down with the wanted duty; the position loop makes it of the error that it sees.
+
+    Raises:
+        BadInput: the legs move instead of being stalled, or cannot press so hard.
+    """
+    joints = log.joints
+    servos = {servo.joint: servo for servo in config.servos}
+    registers = engine.description["registers"]
+    here = np.asarray(engine.ask(messages.Hold(0.5)), float)
+    goal = here.copy()
+    for k, joint in enumerate(joints):
+        if JOINTS[joint].kind != "knee":
+            continue
+        allowed = registers[joint]["pwm_limit"] / PWM_FULL
+        if plan.effort > allowed + 1e-9:
+            raise BadInput(
+                f"{joint} may use {allowed:.0%} of full duty, not {plan.effort:.0%}",
+                where=config.port,
+                remedy="give --effort less, or raise bus.pwm_limit in robot.toml",
+            )
+        gain = registers[joint]["position_p_gain"] / servos[joint].model.position_p_divisor
+        pulses = plan.effort * PWM_FULL / max(gain, 1e-9)
+        # Where all that the limit allows is wanted, a bit more error keeps it there whatever the leg gives way.
+        pulses *= 1.3 if plan.effort > 0.95 * allowed else 1.0
+        goal[k] -= pulses * 2 * math.pi / PULSES_PER_TURN
+    engine.ask(messages.Ramp(_within(goal, config)))
+    engine.ask(messages.Hold(STALL_S))
+    log.take(engine.telemetry())
+    duty = np.abs(log.newest("pwm"))
+    for k, joint in enumerate(joints):
+        if JOINTS[joint].kind == "knee" and duty[k] < STALLED * plan.effort:
+            raise BadInput(
+                f"{joint} is not stalled: it presses with {duty[k]:.0%} of full duty, not {plan.effort:.0%}",
+                where=config.port,
+                remedy="let the robot lie on its belly, feet on the floor, and put more weight on it: 8 kg for the "
+                "standard robot, 5 kg for the Lite",
+            )
+    yield _sample(log, limits, "load", 0.0, 0.0, f"the knees are stalled at {plan.effort:.0%} of full duty")
+
+
+def _cooling(
+    engine: EngineProcess,
+    plan: Plan,
+    log: _Log,
+    limits: Array,
+    loaded: float,
+    cooled: float,
+    words: str,
+    stepped: bool,
+) -> Generator[Sample, None, None]:
+    """Torque off; the recording goes on."""
+    look = STEPPED_LOOK_S if stepped else LOOK_S
+    total = plan.seconds + plan.cool_down_s
+    begun, at = log.t, cooled
+    while cooled < plan.cool_down_s:
+        engine.ask(messages.Look(min(look, plan.cool_down_s - cooled)))
+        log.take(engine.telemetry())
+        cooled = at + max(log.t - begun, 1e-6)
+        yield _sample(log, limits, "cool-down", loaded + cooled, min(1.0, (plan.seconds + cooled) / total), words)
+        words = _notices(engine)
+
+
+def _sample(log: _Log, limits: Array, phase: Phase, seconds: float, share: float, words: str) -> Sample:
+    return Sample(
+        phase, seconds, share, log.joints, log.temperature, limits, log.rate,
+        log.newest("cur"), log.newest("load"), log.newest("pwm"), log.newest("volt"), words,
+    )  # fmt: skip
+
+
+def _notices(engine: EngineProcess) -> str:
+    return "; ".join(event.text for event in engine.events() if isinstance(event, messages.Notice))
+
+
+def _lie_down(engine: EngineProcess, config: EngineConfig) -> None:
+    """Standing, it would fall when it is let go: back to how it lay."""
+    found = np.asarray(engine.description["position"], float)
+    engine.ask(messages.Ramp(_within(found, config)))
+
+
+def _within(angles: Array, config: EngineConfig) -> Array:
+    limits = [config.limits_rad.get(servo.joint, (-np.inf, np.inf)) for servo in config.servos]
+    return np.clip(angles, [low for low, _ in limits], [high for _, high in limits])
+
+
+def _first_pose(plan: Plan, joints: Sequence[str], found: Array) -> Array | None:
+    """Where the load begins; stalled joints press from where they lie."""
+    return None if plan.load == "stall" else pose_angles(plan.poses[0], joints)
+
+
+def _commands(plan: Plan, joints: Sequence[str], config: EngineConfig) -> Array | None:
+    """(n, joints) rad at the engine's rate, of the recording that is to be played; None for held poses."""
+    if plan.load != "play":
+        for pose in plan.poses:
+            pose_angles(pose, joints)
+        return None
+    if plan.commands is None:
+        raise BadInput("nothing to play", remedy="name a recording with --play RUN")
+    run = read_run(plan.commands, need=("cmd",))
+    missing = [joint for joint in joints if f"cmd.{joint}" not in run.columns]
+    if missing:
+        raise BadInput(f"it has no commands for {', '.join(missing)}", where=plan.commands)
+    return _resampled(run, joints, config)
+
+
+def _resampled(run: Run, joints: Sequence[str], config: EngineConfig) -> Array:
+    command = run.signal("cmd", joints)
+    good = np.isfinite(command).all(axis=1)
+    times, command = run.command_times[good], command[good]
+    if len(times) < 2:
+        raise BadInput("it has no commands to play", where=run.path)
+    grid = np.arange(times[0], times[-1], 1.0 / config.rate_hz)
+    # A command holds until the next.
+    rows = np.clip(np.searchsorted(times, grid, side="right") - 1, 0, len(times) - 1)
+    return np.asarray(_within(command[rows], config))
+
+
+@dataclass(frozen=True)
+class _SoFar:
+    """How far a soak got before it was cut short."""
+
+    phase: Phase = "load"
+    loaded_s: float = 0.0
+    cooled_s: float = 0.0
+    peak_c: Mapping[str, float] = field(default_factory=dict)
+
+
+#: s between two rows beyond which the time between them was a pause
+PAUSE_S = 10.0
+
+
+def _so_far(path: Path) -> _SoFar:
+    run = read_recording(path).run
+    step = np.diff(run.t, append=run.t[-1])
+    step[step > PAUSE_S] = 0.0
+    on = run.signal("torque", default=1.0).max(axis=1) > 0
+    loaded, cooled = float(step[on].sum()), float(step[~on].sum())
+    plan = resume_plan(path)
+    # A shutdown or a margin ends the load for good; Ctrl-C and crashes leave rows under torque at the end.
+    phase: Phase = "load" if not len(on) or on[-1] or loaded == 0.0 else "cool-down"
+    if loaded >= plan.seconds - 1.0:
+        phase = "cool-down"
+    temperature = run.signal("temp")
+    peak = {joint: float(np.nanmax(temperature[:, k])) for k, joint in enumerate(run.joints)}
+    return _SoFar(phase, loaded, cooled if phase == "cool-down" else 0.0, peak)
