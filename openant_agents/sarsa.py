@@ -428,7 +428,7 @@ def _train(
         seconds += took
         next_action = choose(seen)
         if agent is None:
-            if seconds >= settings.bounds_from_s:
+            if seconds > settings.bounds_from_s - 0.5 * STEP_S:
                 agent = _agent(bounds, len(gait), settings, seed)
         else:
             log.append(columns.row(observation, action, reward, took, terminated, seen, next_action))
