@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from openant_tools.cli.comms_diagnose import diagnose, timing
 from openant_tools.cli.options import json_option, robot_option
 from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_option, virtual_robot
 
@@ -33,7 +34,12 @@ def comms() -> None:
       openant comms ports                     adapters that are plugged in, and their latency timers
       openant comms scan --port /dev/ttyUSB0  every servo at every baud rate, in two seconds
       openant comms watch                     live: angles, losses by cause, round trips
+      openant comms diagnose soak.mcap        what loses the communication, and what to do about it
     """
+
+
+for _command in (diagnose, timing):
+    comms.add_command(_command)
 
 
 @comms.command()

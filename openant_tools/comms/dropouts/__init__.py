@@ -1,0 +1,1 @@
+"""Which cause lost the communication: from recordings and run tables to causes with probability, evidence and remedy."""
