@@ -23,7 +23,7 @@ from openant_tools.gap.cause import Cause, Scope, catalogue
 from openant_tools.gap.diagnosis import Diagnosis, Found, Span, read_diagnosis
 from openant_tools.gap.native import BRISTLE_RAD
 from openant_tools.gap.report import diagnosis_report, sentence
-from openant_tools.gap.robot import Form, Reference, Robot
+from openant_tools.gap.robot import Form, Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.model.rollout import Rollouts
@@ -62,7 +62,7 @@ def commanded(plant: Plant, commands: Array, setup: str = "stand", more: Mapping
 def reference(plant: Plant) -> Reference:
     n = len(plant.joints)
     return Reference.of(
-        plant, floor=True, imu=True, tracker=True, speed=np.full(n, 4.0), low=np.full(n, -0.6), high=np.full(n, 0.6)
+        plant, floor=True, imu=True, tracker=True, seen=Seen(np.full(n, 4.0), np.full(n, -0.6), np.full(n, 0.6), 0.0)
     )
 
 

@@ -13,7 +13,7 @@ from test_gap_apply import diagnosis, found
 from openant_tools.effects.catalogue import catalogue as acting
 from openant_tools.gap.cause import Cause, catalogue
 from openant_tools.gap.next import ACTIONS, experiments
-from openant_tools.gap.robot import Reference, Robot
+from openant_tools.gap.robot import Reference, Robot, Seen
 from openant_tools.model.plant import load_plant
 
 CATALOGUE = Path(__file__).parents[2] / "shared" / "effects.md"
@@ -26,7 +26,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def reference(model: Path) -> Reference:
     one = np.ones(1)
-    return Reference.of(load_plant(model), floor=True, imu=True, tracker=True, speed=4 * one, low=-one, high=one)
+    return Reference.of(load_plant(model), floor=True, imu=True, tracker=True, seen=Seen(4 * one, -one, one, 0.0))
 
 
 @pytest.mark.skipif(not CATALOGUE.is_file(), reason="shared/ is not here")

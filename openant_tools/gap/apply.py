@@ -19,7 +19,7 @@ from openant_tools.files import write_text
 from openant_tools.gap.cause import catalogue
 from openant_tools.gap.diagnosis import Diagnosis, Found
 from openant_tools.gap.native import Edit, edit
-from openant_tools.gap.robot import Reference, Robot
+from openant_tools.gap.robot import Reference, Robot, Seen
 from openant_tools.model.body import floor_contacts
 from openant_tools.model.mjcf import document_text, write_model
 from openant_tools.model.plant import Plant, Setup, load_plant
@@ -110,7 +110,7 @@ def robot_of(
     n = len(plant.joints)
     reach = np.full(n, ANYWHERE_RAD)
     reference = Reference.of(
-        plant, floor=True, imu=True, tracker=True, speed=np.ones(n), low=-reach, high=reach
+        plant, floor=True, imu=True, tracker=True, seen=Seen(np.ones(n), -reach, reach, 0.0)
     )  # fmt: skip
     robot = Robot(n, -reach, reach)
     for kind, values in calibration.items():

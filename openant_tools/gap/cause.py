@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
@@ -14,7 +14,19 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.robot import Reference, Robot
 
-__all__ = ["Cause", "Quantity", "Scope", "Values", "amount", "catalogue", "factor", "rate", "shape"]
+__all__ = [
+    "Cause",
+    "Quantity",
+    "Scope",
+    "Values",
+    "amount",
+    "catalogue",
+    "enter",
+    "factor",
+    "rate",
+    "shape",
+    "usual_torque",
+]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -82,6 +94,11 @@ def shape(name: str, unit: str, low: float, high: float) -> Quantity:
     return Quantity(name, unit, lambda x, s: x, lambda v, s: v, low, high, False, _one, shape=True)
 
 
+def usual_torque(reference: Reference, joints: Ints) -> float:
+    """N·m that these joints' servos usually give: by it torques of effects are sized."""
+    return float(reference.torque[joints].mean())
+
+
 def everywhere(reference: Reference) -> bool:
     """It can show on any robot."""
     return True
@@ -118,6 +135,16 @@ class Cause:
     restored: Callable[[Values, Values, Reference, Ints], dict[str, float]] = lambda given, x, reference, joints: dict(
         given
     )
+
+    @property
+    def of_body(self) -> bool:
+        """Whether it belongs to the body or the world, and to no joint."""
+        return self.scopes == (Scope.BODY,)
+
+    @property
+    def beside_joints(self) -> bool:
+        """Whether joint positions say little of it: it acts on the body, or on another signal of the log."""
+        return self.of_body or self.signal is not None
 
     def values(self, x: Mapping[str, float], reference: Reference, joints: Ints) -> dict[str, float]:
         """The parameters at a point of the coordinates."""
@@ -163,6 +190,17 @@ class Cause:
             if q.shape:
                 out[q.name] = float(q.small * (q.large / q.small) ** rng.random())
         return out
+
+
+def enter(robot: Robot, reference: Reference, causes: Iterable[tuple[str, Sequence[int], Mapping[str, float]]]) -> None:
+    """Give a robot causes.
+
+    Args:
+        causes: names, indices of joints, and coordinates.
+    """
+    for name, joints, x in causes:
+        cause, at = catalogue()[name], np.array(joints)
+        cause.enter(robot, at, cause.values(x, reference, at))
 
 
 @cache

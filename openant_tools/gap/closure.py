@@ -6,19 +6,20 @@ Everything is judged as the gap is defined (formats, section 3): re-initialised 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.gap.cause import enter
 from openant_tools.gap.explain import Hypothesis
 from openant_tools.gap.protocol import Played, Protocol
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.tolerance import COULOMB_NM, DELAY_S, FACTORS, ZERO_RAD
 from openant_tools.model.floor import floors
-from openant_tools.model.gap import HORIZON_S, excess
+from openant_tools.model.gap import HORIZON_S, share_closed
 from openant_tools.model.plant import Setup
 from openant_tools.model.rollout import Rollouts
 
@@ -33,6 +34,8 @@ INDEPENDENT_S = 0.5
 #: standard deviation that sizes of causes keep from where they were found, as a share
 POLISH = 0.3
 ITERATIONS = 2
+#: rad, the least that a position is known to
+LEAST_SIGMA_RAD = 2e-4
 
 
 @dataclass(frozen=True)
@@ -99,19 +102,14 @@ class Windows:
         self._quick = [Rollouts(one.plant, [one.run], HORIZON_S) for one in coarse.runs]
         self._measured = [one.run.signal("pos", protocol.joints) for one in protocol.runs]
         self.floor = floors([one.run for one in protocol.runs], protocol.joints)[0]
-        self._sigma = np.maximum(np.maximum(self.floor, 2e-4), 0.0)
-        self.fitted = [k for k, one in enumerate(protocol.runs) if one.plant.setup is Setup.STAND] or list(
-            range(len(protocol.runs))
-        )
+        self._sigma = np.maximum(self.floor, LEAST_SIGMA_RAD)
 
     def robot(self, refit: Refit | None) -> Robot:
         reference = self.protocol.reference
         robot = Robot(len(self.protocol.joints), reference.low, reference.high)
         if refit is None:
             return robot
-        for part, x in zip(refit.hypothesis, refit.x, strict=True):
-            joints = np.array(part.joints)
-            part.definition.enter(robot, joints, part.definition.values(x, reference, joints))
+        enter(robot, reference, [(p.cause, p.joints, x) for p, x in zip(refit.hypothesis, refit.x, strict=True)])
         for one, u in zip(self.names, refit.nuisance, strict=True):
             if u:
                 one.enter(robot, float(u))
@@ -124,33 +122,32 @@ class Windows:
         out: Array = self._measured[k][None] - found.astype(np.float64)
         return out
 
-    def refit(self, start: Refit, leave_out: Sequence[Sequence[int]]) -> list[Refit]:
-        """Fit within tolerance, and polish sizes, once for each set of runs to leave out.
+    def refit(self, start: Refit, training: Sequence[int], leave_out: Sequence[int]) -> tuple[Refit, list[Refit]]:
+        """Fit within tolerance, and polish sizes: on all the runs to train on, and without each of some of them.
 
-        All share one linearisation, at what is found on all runs.
+        All share one linearisation, at what is found on all of the training runs. On the floor small causes make large
+        differences, so that only runs on the stand are fitted where there are any.
         """
+        runs = self.protocol.runs
+        fitted = [k for k in training if runs[k].plant.setup is Setup.STAND] or list(training)
         centre = _vector(start)
         scale = np.concatenate([np.maximum(POLISH * np.abs(centre), 1e-3), np.full(len(self.names), SPREAD)])
         u: Array = np.concatenate([centre, start.nuisance])
         prior = np.concatenate([centre, np.zeros(len(self.names))])
-        blocks: list[tuple[Array, Array]] = []
+        blocks: dict[int, tuple[Array, Array]] = {}
         at = u
         for _ in range(ITERATIONS):
             at = u
-            blocks = [
-                self._normal(k, start, at) if k in self.fitted else _nothing(len(u)) for k in range(len(self._quick))
-            ]
-            u = self._solve(at, prior, scale, blocks, ())
-        return [_from(start, self._solve(at, prior, scale, blocks, out)) for out in leave_out]
+            blocks = {k: self._normal(k, start, at) for k in fitted}
+            u = self._solve(at, prior, scale, blocks.values())
+        folds = [[block for k, block in blocks.items() if k != out] for out in leave_out]
+        return _from(start, u), [_from(start, self._solve(at, prior, scale, fold)) for fold in folds]
 
-    def _solve(
-        self, u: Array, prior: Array, scale: Array, blocks: Sequence[tuple[Array, Array]], out: Sequence[int]
-    ) -> Array:
-        """Where the runs' blocks, made at u, lead without those left out."""
+    def _solve(self, u: Array, prior: Array, scale: Array, blocks: Iterable[tuple[Array, Array]]) -> Array:
+        """Where the runs' blocks, made at u, lead."""
         normal, gradient = np.diag(1 / scale**2), (u - prior) / scale**2
-        for k, (more, slope) in enumerate(blocks):
-            if k not in out:
-                normal, gradient = normal + more, gradient + slope
+        for more, slope in blocks:
+            normal, gradient = normal + more, gradient + slope
         found = u - np.linalg.solve(normal, gradient)
         low, high = np.full(len(u), -END), np.full(len(u), END)
         n = len(u) - len(self.names)
@@ -216,16 +213,12 @@ def closures(
         held_out: runs that nothing was fitted on; empty to leave out each in turn.
         training: the runs to fit on.
     """
-    judged = list(held_out) or list(range(len(windows.protocol.runs)))
-    folds = [tuple(held_out)] if held_out else [(k,) for k in judged]
-    refits: list[list[Refit]] = []
-    for start in starts:
-        refits.append(windows.refit(start, [*folds, tuple(held_out)]))
+    judged = list(held_out or training)
+    fits = [windows.refit(start, training, () if held_out else judged) for start in starts]
     squares = np.zeros((len(starts) + 1, len(judged)))
     counts = np.zeros(len(judged))
     for n, k in enumerate(judged):
-        fold = 0 if held_out else n
-        errors = windows.errors(k, [None, *(mine[fold] for mine in refits)])
+        errors = windows.errors(k, [None, *(whole if held_out else folds[n] for whole, folds in fits)])
         good = np.isfinite(errors).all(axis=0)
         squares[:, n] = np.square(errors[:, good]).sum(axis=1)
         counts[n] = good.sum()
@@ -236,19 +229,19 @@ def closures(
         after = float(np.sqrt(squares[s + 1].sum() / counts.sum()))
         low, high = _interval(squares[0], squares[s + 1], counts, floor)
         each = [
-            _closed(np.sqrt(a / c), np.sqrt(b / c), floor)
+            _closed(float(np.sqrt(a / c)), float(np.sqrt(b / c)), floor)
             for a, b, c in zip(squares[0], squares[s + 1], counts, strict=True)
             if np.sqrt(a / c) > 1.5 * floor
         ]
         out.append(
-            Closure(after, _closed(before, after, floor), low, high, min(each, default=float("nan")), refits[s][-1])
+            Closure(after, _closed(before, after, floor), low, high, min(each, default=float("nan")), fits[s][0])
         )
     return before, floor, out
 
 
 def _closed(before: float, after: float, floor: float) -> float:
-    there = excess(before, floor)
-    return 1 - excess(after, floor) / there if there > 0 else 0.0
+    share = share_closed(before, after, floor)
+    return share if np.isfinite(share) else 0.0
 
 
 def _interval(before: Array, after: Array, counts: Array, floor: float) -> tuple[float, float]:
@@ -297,10 +290,6 @@ def calibration_of(windows: Windows, refit: Refit) -> dict[str, dict[str, float]
 def nothing(windows: Windows) -> Refit:
     """No cause at all, only what tolerances let move."""
     return Refit((), (), np.zeros(len(windows.names)))
-
-
-def _nothing(n: int) -> tuple[Array, Array]:
-    return np.zeros((n, n)), np.zeros(n)
 
 
 def _vector(refit: Refit) -> Array:

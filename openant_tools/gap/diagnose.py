@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.files import atomic_writer
 from openant_tools.gap.cause import Scope, catalogue
 from openant_tools.gap.closure import Closure, Refit, Windows, calibration_of, closures, nothing
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found, Span
-from openant_tools.gap.explain import Explained, Part, Scene, fit
+from openant_tools.gap.explain import Explained, Part, Scene, fit, robot_with
 from openant_tools.gap.features import Floats, differences
 from openant_tools.gap.judge import Judge, Judgement, train, whitening_of
 from openant_tools.gap.measure import Measurement, measure
@@ -90,17 +91,17 @@ def diagnose(
     tell(0.02, "simulated robots")
     prepared = prepare(protocol, robots, lambda share, words: tell(0.02 + 0.6 * share, words))
     training = list(range(len(runs)))
-    found = protocol.coarse().features()
+    coarse = protocol.started_as(prepared.protocol).coarse()
+    found = coarse.features()
     judge = _judge(prepared, training, [found[k][1] for k in training], tell)
-    x = np.concatenate([found[k][0][found[k][1]] for k in training])
-    judgement = judge.say(x)
     tell(0.7, "causes")
-    case = _Case(protocol, prepared, measured, judge, found, training, len(runs), model, runs, hold_out)
+    case = _Case(protocol, coarse, prepared, measured, judge, found, training, model, runs, hold_out)
+    judgement = judge.say(case.features)
     first = _shown(judgement, protocol)
     if first[0][1] < DOUBT and judgement.energy < STRANGE:
         tell(1.0, "done")
         return _healthy(case, judgement, first)
-    scenes = _scenes(prepared, protocol, found, training)
+    scenes = _scenes(prepared, coarse, found, training)
     # Where nothing is likely and yet the log is strange, the likeliest few have to answer.
     suspects = [name for n, (name, chance) in enumerate(first) if chance > SUSPECT or n < LIKELIEST][:SUSPECTS]
     explained = _explain(scenes, suspects, judgement)
@@ -116,15 +117,19 @@ def _shown(judgement: Judgement, protocol: Protocol) -> list[tuple[str, float]]:
 
 @dataclass(frozen=True)
 class _Case:
-    """What is known of the robot at hand."""
+    """What is known of the robot at hand.
+
+    Attributes:
+        coarse: its protocol, in the steps and from the starts of the simulated robots that it is compared with.
+    """
 
     protocol: Protocol
+    coarse: Protocol
     prepared: Prepared
     measured: Measurement
     judge: Judge
     found: Sequence[tuple[Floats, NDArray[np.bool_]]]
     training: list[int]
-    count: int
     model: Path
     runs: Sequence[Run]
     hold_out: Sequence[Run]
@@ -188,23 +193,21 @@ def _judge(prepared: Prepared, which: Sequence[int], columns: Sequence[NDArray[n
             path.unlink(missing_ok=True)
     tell(0.63, "training the judge")
     judge = train(prepared, which, columns)
-    partial = path.with_suffix(".tmp")
-    joblib.dump(judge, partial)
-    partial.replace(path)
+    with atomic_writer(path) as file:
+        joblib.dump(judge, file)
     return judge
 
 
 def _scenes(
     prepared: Prepared,
-    protocol: Protocol,
+    coarse: Protocol,
     found: Sequence[tuple[NDArray[np.float32], NDArray[np.bool_]]],
     training: Sequence[int],
 ) -> dict[Setup, Scene]:
     """Where hypotheses are compared: the runs of each setup."""
-    coarse = protocol.coarse()
     scenes = {}
     for setup in Setup:
-        mine = [k for k in training if protocol.runs[k].plant.setup is setup]
+        mine = [k for k in training if coarse.runs[k].plant.setup is setup]
         if not mine:
             continue
         whitening, columns = whitening_of(prepared, mine, [found[k][1] for k in mine])
@@ -214,7 +217,7 @@ def _scenes(
 
 
 def _scene_of(cause: str, scenes: dict[Setup, Scene]) -> Scene:
-    body = catalogue()[cause].scopes == (Scope.BODY,)
+    body = catalogue()[cause].of_body
     first = Setup.FLOOR if body else Setup.STAND
     return scenes.get(first) or next(iter(scenes.values()))
 
@@ -230,8 +233,8 @@ def _explain(scenes: dict[Setup, Scene], suspects: Sequence[str], judgement: Jud
             for where, x in judgement.places[name][:PLACES]
         }
         if known:
-            for one in fit(scene, [(part,) for part in known], known):
-                name = one.hypothesis[0].cause
+            for one in fit(scene, known):
+                name = one.part.cause
                 if name not in out or one.misfit < out[name].misfit:
                     out[name] = one
     return out
@@ -242,8 +245,8 @@ def _without(case: _Case, explained: Explained) -> Judgement:
 
     The features that the cause makes on the model are taken off; logarithms of sizes do not subtract, and stay as healthy.
     """
-    coarse = case.protocol.coarse()
-    scene = Scene.robot_of(case.protocol, explained.hypothesis, explained.x)
+    coarse = case.coarse
+    scene = robot_with(coarse.reference, (explained.part,), (explained.x,))
     parts = []
     for plant in {id(one.plant): one.plant for one in coarse.runs}.values():
         mine = [k for k in case.training if coarse.runs[k].plant is plant]
@@ -287,7 +290,7 @@ def _decide(
     scenes: dict[Setup, Scene],
 ) -> Diagnosis:
     windows = Windows(case.protocol)
-    held_out = list(range(case.count, len(case.protocol.runs)))
+    held_out = list(range(len(case.training), len(case.protocol.runs)))
     probability = dict(ranked)
     names = list(explained)
     starts = [nothing(windows), *(_start(windows, [explained[name]]) for name in names)]
@@ -313,15 +316,15 @@ def _decide(
             _, _, (both,) = closures(
                 windows, [_start(windows, [explained[one] for one in [*chosen, name]])], held_out, case.training
             )
-            body = catalogue()[name].scopes == (Scope.BODY,) or catalogue()[name].signal is not None
-            if both.closed > whole.closed + ADDS or (body and chance > FINDING and both.closed > whole.closed - ADDS):
+            beside = catalogue()[name].beside_joints
+            if both.closed > whole.closed + ADDS or (beside and chance > FINDING and both.closed > whole.closed - ADDS):
                 beyond[name] = both.closed - whole.closed
                 beyond[best] = both.closed - (alone[name].closed if name in alone else refit.closed)
                 chosen.append(name)
                 whole = both
                 probability[name] = max(probability[name], chance)
                 break
-    body = catalogue()[best].scopes == (Scope.BODY,) or catalogue()[best].signal is not None
+    beside = catalogue()[best].beside_joints
     sure = probability[best] > FINDING or (
         judgement.energy > 1 and beyond[best] > ADDS_ALONE and alone[best].closed > EXPLAINS
     )
@@ -330,14 +333,14 @@ def _decide(
     rivals = [
         name
         for name in names[1:3]
-        if not body
+        if not beside
         and abs(alone[name].closed - alone[best].closed) < APART
         and probability[name] > probability[best] / 2
     ]
     if not sure:
         verdict, selected = (NONE if judgement.energy < ODD else UNEXPLAINED), ()
     elif (
-        not body
+        not beside
         and probability[best] < CERTAIN
         and excess(before, floor) > LARGE * floor
         and whole.closed < EXPLAINS
@@ -369,7 +372,7 @@ def _rest(ranked: Sequence[tuple[str, float]], done: Sequence[str]) -> tuple[Fou
     return tuple(
         Found(
             name,
-            "body" if catalogue()[name].scopes == (Scope.BODY,) else "all",
+            "body" if catalogue()[name].of_body else "all",
             {},
             chance,
             None,
@@ -425,15 +428,14 @@ def _notes(case: _Case) -> tuple[str, ...]:
 
 
 def _start(windows: Windows, explained: Sequence[Explained]) -> Refit:
-    parts = tuple(part for one in explained for part in one.hypothesis)
-    x = tuple(point for one in explained for point in one.x)
+    parts, x = tuple(one.part for one in explained), tuple(one.x for one in explained)
     return Refit(parts, x, np.zeros(len(windows.names)))
 
 
 def _found(case: _Case, one: Explained, probability: float, closure: Closure | None) -> Found:
-    name = one.hypothesis[0].cause
+    name = one.part.cause
     cause = catalogue()[name]
-    part, x, std = one.hypothesis[0], dict(one.x[0]), one.std[0]
+    part, x, std = one.part, dict(one.x), one.std
     if closure is not None and len(closure.refit.x) == 1:
         x = dict(closure.refit.x[0])
     where = np.array(part.joints)
@@ -454,7 +456,7 @@ def _found(case: _Case, one: Explained, probability: float, closure: Closure | N
                     low[key], high[key] = min(low[key], value), max(high[key], value)
     everything = len(part.joints) == len(case.protocol.joints)
     joints: tuple[str, ...] | str = tuple(case.protocol.joints[j] for j in part.joints)
-    if cause.scopes == (Scope.BODY,):
+    if cause.of_body:
         joints = "body"
     elif everything and Scope.ALL in cause.scopes:
         joints = "all"

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.robot import Robot
+from openant_tools.gap.robot import USUAL_NOISE, Robot
 from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
 
@@ -171,8 +171,6 @@ def _width(signal: str, joints: int) -> int:
 
 
 def _least(signal: str) -> float:
-    from openant_tools.gap.robot import USUAL_NOISE
-
     return LEAST * USUAL_NOISE[signal]
 
 

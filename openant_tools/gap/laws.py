@@ -54,6 +54,9 @@ def first_laws(robots: Sequence[Robot], fields: Fields) -> list[Law]:
     derating = _table(robots, "derating")
     if np.isfinite(slew).any():
         laws.append(_slewing(slew))
+    steps = np.array([[robot.form.encoder_rad if robot.form else 0.0] for robot in robots])
+    if steps.any():
+        laws.append(_rounding(steps, _table(robots, "zero")))
     if derating.any():
         laws.append(_heating(derating, np.array([[robot.derating_s] for robot in robots])))
     if np.isfinite(no_load).any():
@@ -97,6 +100,17 @@ def _slewing(rate: Array) -> Law:
             at.append(step.setpoint.copy())
         at[0] += np.clip(step.setpoint - at[0], -rate * step.dt, rate * step.dt)
         step.setpoint = at[0].copy()
+
+    return act
+
+
+def _rounding(steps: Array, zero: Array) -> Law:
+    """The loop sees its joint in the encoder's steps; what it then asks for is a setpoint that is off by as much."""
+    size = np.maximum(steps, TINY)
+
+    def act(step: Step) -> None:
+        read = step.position + zero
+        step.setpoint = step.setpoint + np.where(steps > 0, read - np.round(read / size) * size, 0.0)
 
     return act
 
@@ -152,15 +166,18 @@ def _smoothing(reach: Array) -> Law:
 def _bending(bristle: Array, inertia: Array) -> Law:
     """LuGre's friction (Canudas de Wit 1995): z' = v − |v| σ₀ z / level, torque σ₀ z + σ₁ z', z taken implicitly."""
     mine = np.broadcast_to(bristle > 0, inertia.shape)
-    bent = np.zeros(inertia.shape)
+    bent: list[Array] = []
 
     def act(step: Step) -> None:
         level = np.maximum(step.friction, TINY)
         stiff = np.minimum(level / np.maximum(bristle, TINY), HARD * inertia / step.dt**2)
-        moved = (bent + step.dt * step.velocity) / (1 + step.dt * stiff * np.abs(step.velocity) / level)
-        damper = 2 * DAMPED * np.sqrt(stiff * inertia) * (moved - bent) / step.dt
+        if not bent:
+            # At rest the bristles hold what the motor and gravity push.
+            bent.append(np.clip(step.motor_torque - step.load, -level, level) / stiff)
+        moved = (bent[0] + step.dt * step.velocity) / (1 + step.dt * stiff * np.abs(step.velocity) / level)
+        damper = 2 * DAMPED * np.sqrt(stiff * inertia) * (moved - bent[0]) / step.dt
         step.torque -= np.where(mine, stiff * moved + damper, 0.0)
-        bent[:] = moved
+        bent[0] = moved
         step.friction = np.where(mine, 0.0, step.friction)
 
     return act

@@ -23,7 +23,7 @@ from openant_tools.errors import BadInput
 from openant_tools.gap.apply import robot_of
 from openant_tools.gap.diagnosis import NONE, Diagnosis, Found
 from openant_tools.gap.protocol import FLOOR_STEP_S, STAND_STEP_S
-from openant_tools.gap.robot import USUAL_NOISE, Reference, Robot
+from openant_tools.gap.robot import USUAL_NOISE, Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.tolerance import scatter
 from openant_tools.model.plant import Plant, Setup, load_plant
@@ -229,7 +229,7 @@ def _distances(
     cmd = run.signal("cmd", plant.joints)
     low, high = cmd.min(axis=0), cmd.max(axis=0)
     reference = Reference.of(
-        plant, floor=plant.setup is Setup.FLOOR, imu=True, tracker=True, speed=np.ones(n), low=low, high=high
+        plant, floor=plant.setup is Setup.FLOOR, imu=True, tracker=True, seen=Seen(np.ones(n), low, high, 0.0)
     )
     robots = [robot_of(plant, [one], found.calibration) for one in possible]
     chance = np.random.default_rng(0)  # the same robots for every protocol: what differs is the motion

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.cause import Cause, Scope, catalogue
+from openant_tools.gap.cause import Cause, Scope, catalogue, enter
 from openant_tools.gap.features import Floats, differences, with_noise
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
-from openant_tools.gap.tolerance import random_form, scatter
+from openant_tools.gap.tolerance import random_form, resting, scatter
 from openant_tools.model.rollout import Rollouts
 
 __all__ = ["Case", "applicable", "draw", "play", "templates"]
@@ -51,19 +51,10 @@ class Case:
 
 def applicable(protocol: Protocol) -> list[Cause]:
     """The causes that can show on what this protocol recorded."""
-    one = len(protocol.joints) == 1
-    found = []
-    for cause in catalogue().values():
-        # What is prepared serves robots with any sensors: what shows only to some is left to the judge.
-        everything = dataclasses.replace(
-            protocol.reference, imu=protocol.reference.floor, tracker=protocol.reference.floor
-        )
-        if not cause.shows(everything):
-            continue
-        if one and cause.name in ("weak_joint",):
-            continue  # with one joint it is stiffness and torque limit of all
-        found.append(cause)
-    return found
+    # What is prepared serves robots with any sensors: what shows only to some is left to the judge.
+    floor = protocol.reference.floor
+    everything = dataclasses.replace(protocol.reference, imu=floor, tracker=floor)
+    return [cause for cause in catalogue().values() if cause.shows(everything)]
 
 
 def draw(protocol: Protocol, seed: int, causes: list[Cause] | None = None) -> Case:
@@ -97,43 +88,32 @@ def place(cause: Cause, protocol: Protocol, rng: np.random.Generator) -> Ints:
 
 def robot_of(protocol: Protocol, case: Case) -> Robot:
     """The robot that a case describes."""
-    robot = Robot(len(protocol.joints), protocol.reference.low, protocol.reference.high)
+    reference = protocol.reference
+    robot = Robot(len(protocol.joints), reference.low, reference.high)
     if case.seed < 0:
-        for name, (joints, x) in case.causes.items():
-            cause, at = catalogue()[name], np.array(joints)
-            cause.enter(robot, at, cause.values(x, protocol.reference, at))
+        enter(robot, reference, [(name, joints, x) for name, (joints, x) in case.causes.items()])
         return robot
     rng = np.random.default_rng((977, case.seed))
-    scatter(robot, protocol.reference, rng, WIDTH)
+    scatter(robot, reference, rng, WIDTH)
     for name, (joints, x) in case.causes.items():
         cause = catalogue()[name]
-        if len(joints) == 1 or cause.scopes == (Scope.BODY,):
-            at = np.array(joints)
-            cause.enter(robot, at, cause.values(x, protocol.reference, at))
+        if len(joints) == 1 or not {Scope.JOINT, Scope.SERVO} & set(cause.scopes):
+            enter(robot, reference, [(name, joints, x)])
             continue
         for j in joints:
             own = {
-                q.name: value if q.shape else value * float(np.exp(UNEQUAL * rng.normal()))
+                q.name: x[q.name] if q.shape else x[q.name] * float(np.exp(UNEQUAL * rng.normal()))
                 for q in cause.quantities
-                for value in (x[q.name],)
             }
-            at = np.array([j])
-            values = cause.values(
-                own if Scope.JOINT in cause.scopes or Scope.SERVO in cause.scopes else x,
-                protocol.reference,
-                np.array(joints),
-            )
-            cause.enter(
-                robot, at if Scope.JOINT in cause.scopes or Scope.SERVO in cause.scopes else np.array(joints), values
-            )
-            if not (Scope.JOINT in cause.scopes or Scope.SERVO in cause.scopes):
-                break
-    robot.form = random_form(rng)
+            # Sized by all joints that share it, it sits at each of them.
+            cause.enter(robot, np.array([j]), cause.values(own, reference, np.array(joints)))
+    robot.form = random_form(rng, reference.seen.encoder_rad)
+    robot.start = resting(robot, reference, rng)
     return robot
 
 
 def templates(protocol: Protocol) -> list[Case]:
-    """Every cause at every place it may sit, in two sizes and either sign, on a robot that is else as the model says."""
+    """Every cause at every place it may sit, in several sizes and either sign, on a robot that is else as the model says."""
     out = []
     everything = tuple(range(len(protocol.joints)))
     for cause in applicable(protocol):

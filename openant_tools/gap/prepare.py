@@ -20,10 +20,10 @@ import joblib
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.files import write_text
+from openant_tools.files import atomic_writer, write_text
 from openant_tools.gap.features import Floats
 from openant_tools.gap.population import Case, applicable, draw, play, templates
-from openant_tools.gap.protocol import Protocol, reach, same
+from openant_tools.gap.protocol import Protocol, same, shown
 from openant_tools.recording.run import Run
 
 __all__ = ["Prepared", "cache_folder", "find", "prepare"]
@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 CACHE_VARIABLE = "OPENANT_CACHE"
 LARGEST_BYTES = 4 * 2**30
 #: what is stored is bound to the code that made it: raise it when simulated robots change
-VERSION = 4
+VERSION = 5
 #: robots of a part, and of a whole preparation where the robot has many joints and where it has one or two
 PART, ROBOTS, ROBOTS_ONE_JOINT = 96, 2400, 16_000
 Progress = Callable[[float, str], None]
@@ -137,7 +137,7 @@ def find(protocol: Protocol) -> tuple[Path, list[int]] | None:
     for folder in sorted(cache_folder().glob(f"v{VERSION}-{protocol.fingerprint()}-*")):
         try:
             with np.load(folder / "protocol.npz") as stored:
-                known = [stored[f"cmd{k}"] for k in range(len(stored.files) // 2)]
+                known = [stored[f"cmd{k}"] for k in range(len(stored.files))]
         except (OSError, KeyError, ValueError):
             continue
         order: list[int] = []
@@ -160,9 +160,7 @@ def _new(protocol: Protocol) -> Path:
             break
         except FileExistsError:
             number += 1
-    tables = {f"cmd{k}": table for k, table in enumerate(protocol.commands())}
-    tables |= {f"t{k}": one.run.t for k, one in enumerate(protocol.runs)}
-    _write(folder / "protocol.npz", tables)
+    _write(folder / "protocol.npz", {f"cmd{k}": table for k, table in enumerate(protocol.commands())})
     facts = {"model": str(protocol.model), "runs": [one.run.name for one in protocol.runs], "made": time.strftime("%F")}
     write_text(folder / "facts.json", json.dumps(facts, indent=2) + "\n")
     return folder
@@ -186,9 +184,8 @@ def _reference(folder: Path, protocol: Protocol) -> Protocol:
             run = Run(one.run.name, one.run.facts, mine.pop("t"), mine, one.run.path)
             runs.append(dataclasses.replace(one, run=run))
     found = dataclasses.replace(protocol, runs=tuple(runs))
-    speed, low, high = reach([one.run for one in runs], protocol.joints)
     return dataclasses.replace(
-        found, reference=dataclasses.replace(protocol.reference, speed=speed, low=low, high=high)
+        found, reference=dataclasses.replace(protocol.reference, seen=shown([one.run for one in runs], protocol.joints))
     )
 
 
@@ -197,12 +194,8 @@ def _part(folder: Path, part: int) -> Path:
 
 
 def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    partial = path.with_suffix(f".{os.getpid()}.tmp")
-    with partial.open("wb") as file:
+    with atomic_writer(path) as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]  # its stub takes the names for options
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, path)
 
 
 def _keep_small(kept: Path) -> None:

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.gap.features import COLUMNS, Floats, Layout, differences, logged
-from openant_tools.gap.robot import Reference, Robot
+from openant_tools.gap.robot import Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.floor import resolution
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 
-__all__ = ["Played", "Protocol", "reach", "same"]
+__all__ = ["Played", "Protocol", "same", "shown"]
 
 Array = NDArray[np.float64]
 
@@ -30,6 +30,10 @@ Array = NDArray[np.float64]
 GRID_S = 0.02
 #: rad: commands that differ by less on the whole are the same
 SAME_RAD = 0.01
+#: s at a run's beginning in which its positions say where it rests, and rad by which robots at rest differ at most
+BEGIN_S, ELSEWHERE_RAD = 0.1, 0.05
+#: smaller changes of a supply's share are rounding of numbers
+LEAST_CHANGE = 1e-6
 #: s, steps of simulated populations, in which they cost the least that does not show beside tolerances
 STAND_STEP_S, FLOOR_STEP_S = 0.0025, 0.004
 
@@ -101,7 +105,6 @@ class Protocol:
             if key not in plants:
                 plants[key] = load_plant(key[0], joints, key[1])
             played.append(Played.of(run, plants[key]))
-        speed, low, high = reach(runs, joints)
         seen = {name for one in played for name in one.seen}
         first = next((one.plant for one in played if one.plant.setup is Setup.FLOOR), played[0].plant)
         reference = Reference.of(
@@ -109,9 +112,7 @@ class Protocol:
             floor=any(one.plant.setup is Setup.FLOOR and one.plant.free_joint is not None for one in played),
             imu=bool({"gyro", "acc"} & seen),
             tracker="base" in seen,
-            speed=speed,
-            low=low,
-            high=high,
+            seen=shown(runs, joints),
         )
         return cls(model, tuple(joints), tuple(played), reference)
 
@@ -144,11 +145,25 @@ class Protocol:
 
     def resolution(self) -> dict[str, float]:
         """Signal → the steps of its sensor, as the runs show them."""
-        out: dict[str, float] = {}
-        for signal in ("pos", "vel"):
-            steps = [resolution(one.run, signal, joint) for one in self.runs for joint in self.joints]
-            out[signal] = float(np.median([step for step in steps if step > 0] or [0.0]))
-        return out
+        runs = [one.run for one in self.runs]
+        out = {signal: _resolution(runs, signal, self.joints) for signal in ("pos", "vel")}
+        changes = [np.abs(np.diff(one.seen["volt"][0], axis=0)) for one in self.runs if "volt" in one.seen]
+        out["volt"] = min((float(c[c > LEAST_CHANGE].min(initial=np.inf)) for c in changes), default=np.inf)
+        return {signal: step if np.isfinite(step) else 0.0 for signal, step in out.items()}
+
+    def started_as(self, other: Protocol) -> Protocol:
+        """The same, simulated from where another robot's runs began, unless they began elsewhere on purpose.
+
+        Dry friction lets every robot rest a little differently; only where all simulations begin at one place is that
+        among what healthy robots are seen to do.
+        """
+        return dataclasses.replace(
+            self,
+            runs=tuple(
+                dataclasses.replace(one, run=_begun(one.run, reference.run, self.joints))
+                for one, reference in zip(self.runs, other.runs, strict=True)
+            ),
+        )
 
     def nominal(self) -> list[dict[str, Floats]]:
         """Of each run, what the model does with its commands from its start on, at its own rows."""
@@ -205,8 +220,26 @@ def _on_grid(run: Run, joints: Sequence[str]) -> Array:
     return out
 
 
-def reach(runs: Sequence[Run], joints: Sequence[str]) -> tuple[Array, Array, Array]:
-    """What the commands ask for and where the joints went: rad/s, rad, rad, (joints,) each."""
+def _resolution(runs: Sequence[Run], signal: str, joints: Sequence[str]) -> float:
+    steps = [resolution(run, signal, joint) for run in runs for joint in joints]
+    return float(np.median([step for step in steps if step > 0] or [0.0]))
+
+
+def _begun(run: Run, other: Run, joints: Sequence[str]) -> Run:
+    """A run whose first positions are another's."""
+    columns = dict(run.columns)
+    for joint in joints:
+        own, given = run.column(f"pos.{joint}"), other.column(f"pos.{joint}")
+        rows = min(int(np.searchsorted(run.t, run.t[0] + BEGIN_S)), len(given))
+        apart = np.abs(own[:rows] - given[:rows])
+        if not np.isfinite(apart).all() or apart.max(initial=0.0) > ELSEWHERE_RAD:
+            return run
+        columns[f"pos.{joint}"] = np.concatenate([given[:rows], own[rows:]])
+    return dataclasses.replace(run, columns=columns)
+
+
+def shown(runs: Sequence[Run], joints: Sequence[str]) -> Seen:
+    """What the commands ask for, where the joints went and how finely that is known."""
     speeds, positions = [], []
     for run in runs:
         grid = _on_grid(run, joints)
@@ -217,4 +250,4 @@ def reach(runs: Sequence[Run], joints: Sequence[str]) -> tuple[Array, Array, Arr
     low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
     still = high - low < math.radians(1)
     low, high = np.where(still, low - math.radians(1), low), np.where(still, high + math.radians(1), high)
-    return np.maximum(np.max(speeds, axis=0), 0.1), low, high
+    return Seen(np.maximum(np.max(speeds, axis=0), 0.1), low, high, _resolution(runs, "pos", joints))

@@ -17,7 +17,7 @@ from openant_tools.model.body import floor_contacts, link_bodies, scale_mass, to
 from openant_tools.model.plant import Plant
 from openant_tools.sysid.kinds import KINDS, usual_torque
 
-__all__ = ["Cable", "Form", "Reference", "Robot", "tilted"]
+__all__ = ["Cable", "Form", "Reference", "Robot", "Seen", "tilted"]
 
 Array = NDArray[np.float64]
 
@@ -30,6 +30,9 @@ class Form:
         integrator: mjtIntegrator. elliptic: cones, else pyramids. impratio: how much stiffer friction is than contact.
         smooth_friction: dry friction as a steep function of velocity (rad/s where it is reached), 0 as a constraint.
         bristle: dry friction as bristles that bend by this angle (rad) before they slide (LuGre), 0 as a constraint.
+        encoder_rad: steps in which a servo's own loop sees its joint, 0 for none.
+        contact_damping, contact_give, contact_depth: factors on the damping ratio of contacts, on how far from rigid their
+            impedance is, and on the depth at which it is reached.
         loop_behind: a servo measures behind its play or spring, as encoders on output shafts do; a written MJCF, whose
             servos measure their own joint, cannot.
     """
@@ -39,7 +42,26 @@ class Form:
     impratio: float = 10.0
     smooth_friction: float = 0.0
     bristle: float = 0.0
+    encoder_rad: float = 0.0
+    contact_damping: float = 1.0
+    contact_give: float = 1.0
+    contact_depth: float = 1.0
     loop_behind: bool = True
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What runs show of a robot's motion.
+
+    Attributes:
+        speed: rad/s, (joints,) that the commands ask for at most. low, high: rad, between which the joint was seen.
+        encoder_rad: the steps of its encoders, 0 where none show.
+    """
+
+    speed: Array
+    low: Array
+    high: Array
+    encoder_rad: float
 
 
 @dataclass(frozen=True)
@@ -47,11 +69,10 @@ class Reference:
     """The given model's own numbers, per joint, by which sizes of effects are drawn and bounded.
 
     Attributes:
-        torque: N·m, what its servo usually gives. stiffness, damping, limit, armature: as the model says; limit may be inf.
+        torque: N·m, what its servo usually gives. stiffness, damping, limit, armature, friction: as the model says; limit may be inf.
         robot_kg: mass of everything that is not the world.
         floor: whether some run stands on a floor. imu, tracker: whether some run has them.
-        speed: rad/s, (joints,) that the commands ask for at most; travel: rad, how far they go; low, high: rad, between
-            which the joint was seen.
+        seen: what the runs show.
     """
 
     torque: Array
@@ -59,18 +80,27 @@ class Reference:
     damping: Array
     limit: Array
     armature: Array
+    friction: Array
     robot_kg: float
     floor: bool
     imu: bool
     tracker: bool
-    speed: Array
-    low: Array
-    high: Array
+    seen: Seen
+
+    @property
+    def speed(self) -> Array:
+        return self.seen.speed
+
+    @property
+    def low(self) -> Array:
+        return self.seen.low
+
+    @property
+    def high(self) -> Array:
+        return self.seen.high
 
     @classmethod
-    def of(
-        cls, plant: Plant, *, floor: bool, imu: bool, tracker: bool, speed: Array, low: Array, high: Array
-    ) -> Reference:
+    def of(cls, plant: Plant, *, floor: bool, imu: bool, tracker: bool, seen: Seen) -> Reference:
         n, model = range(len(plant.joints)), plant.model
 
         def read(kind: str) -> Array:
@@ -84,13 +114,12 @@ class Reference:
             damping=np.maximum(read("damping") + read("velocity_gain"), 1e-6),
             limit=read("torque_limit"),
             armature=read("armature"),
+            friction=read("coulomb_friction"),
             robot_kg=max(mass, 1e-3),
             floor=floor,
             imu=imu,
             tracker=tracker,
-            speed=speed,
-            low=low,
-            high=high,
+            seen=seen,
         )
 
 
@@ -111,7 +140,8 @@ class Robot:
         low, high: rad, between which each joint was seen to move.
         scale: kind → factor on what the model says ("stiffness", "damping" with the velocity gain, "armature",
             "torque_limit", "link_mass"). add: kind → what comes on top ("coulomb_friction", N·m; "armature", kg·m²).
-        zero: rad, added to what the encoder reads. delay, lag: s, of commands. slew: rad/s, inf for none.
+        zero: rad, added to what the encoder reads. start: rad, how far from where the runs begin it rests, as dry friction
+            lets it. length: factors on the links. delay, lag: s, of commands. slew: rad/s, inf for none.
         no_load: rad/s at which the torque limit has fallen to nothing, inf for none.
         electrical: share of the damping that goes with the torque.
         stop_low, stop_high: rad, where a stop stands that should not be there; ∓inf for none.
@@ -135,6 +165,8 @@ class Robot:
     scale: dict[str, Array] = field(default_factory=dict)
     add: dict[str, Array] = field(default_factory=dict)
     zero: Array = field(init=False)
+    start: Array = field(init=False)
+    length: Array = field(init=False)
     delay: Array = field(init=False)
     lag: Array = field(init=False)
     slew: Array = field(init=False)
@@ -170,8 +202,9 @@ class Robot:
 
     def __post_init__(self) -> None:
         n = self.joints
-        for name in ("zero", "delay", "lag", "electrical", "play", "compliance", "derating", "dropout"):
+        for name in ("zero", "start", "delay", "lag", "electrical", "play", "compliance", "derating", "dropout"):
             setattr(self, name, np.zeros(n))
+        self.length = np.ones(n)
         self.slew, self.no_load = np.full(n, np.inf), np.full(n, np.inf)
         self.stop_low, self.stop_high = np.full(n, -np.inf), np.full(n, np.inf)
 
@@ -207,6 +240,8 @@ class Robot:
             for j in np.flatnonzero(amounts):
                 value = KINDS[kind].read(model, plant, int(j)) + float(amounts[j])
                 KINDS[kind].write(model, plant, int(j), max(value, 0.0))
+        for j in np.flatnonzero(self.length != 1.0):
+            _stretch(model, link_bodies(model, plant, int(j)), float(self.length[j]))
         shared = self.electrical > 0
         model.dof_damping[plant.dof[shared]] *= 1 - self.electrical[shared]
         self._body(model, plant)
@@ -224,12 +259,32 @@ class Robot:
         model.pair_friction[contacts.pairs, :2] *= self.floor_friction
         model.geom_solref[contacts.geoms, 0] *= np.where(model.geom_solref[contacts.geoms, 0] > 0, self.softness, 1.0)
         model.pair_solref[contacts.pairs, 0] *= np.where(model.pair_solref[contacts.pairs, 0] > 0, self.softness, 1.0)
+        if self.form is not None:
+            self._contact_form(model, contacts.geoms)
         if self.adhesion_n:
             # Where the floor has priority, it alone decides what its contacts are like.
             model.flg_adhesion = True
             model.geom_adhesion[contacts.geoms] = self.adhesion_n
         if self.tilt.any():
             model.opt.gravity[:] = tilted(plant.model.opt.gravity, self.tilt)
+
+    def _contact_form(self, model: mujoco.MjModel, geoms: NDArray[np.int64]) -> None:
+        assert self.form is not None
+        standard = model.geom_solref[geoms, 0] > 0  # else it holds stiffness and damping themselves
+        model.geom_solref[geoms, 1] *= np.where(standard, self.form.contact_damping, 1.0)
+        model.geom_solimp[geoms, :2] = 1 - (1 - model.geom_solimp[geoms, :2]) * self.form.contact_give
+        model.geom_solimp[geoms, 2] *= self.form.contact_depth
+
+
+def _stretch(model: mujoco.MjModel, bodies: NDArray[np.int64], factor: float) -> None:
+    """Make links longer: where their own shapes, masses and the links after them are, in the frames of their joints."""
+    moved = np.flatnonzero(np.isin(model.body_parentid, bodies))
+    model.body_pos[moved] *= factor
+    model.body_ipos[bodies] *= factor
+    geoms = np.flatnonzero(np.isin(model.geom_bodyid, bodies))
+    model.geom_pos[geoms] *= factor
+    rods = geoms[np.isin(model.geom_type[geoms], _RODS)]
+    model.geom_size[rods, 1] *= factor
 
 
 def add_mass(model: mujoco.MjModel, body: int, mass: float, position: Array) -> None:
@@ -253,6 +308,8 @@ def tilted(gravity: Array, tilt: Array) -> Array:
     return out
 
 
+#: shapes whose second size is half their length
+_RODS = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
 #: signal → the sensors' own noise of one sample where nothing is known of them
 USUAL_NOISE: Mapping[str, float] = {
     "pos": 0.0008, "vel": 0.024, "torque": 0.02, "volt": 0.004, "gyro": 0.01, "acc": 0.08, "base": 0.002, "yaw": 0.007,

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from openant_tools.effects.rollout import laws_of
 from openant_tools.effects.servos import batch_of
@@ -89,7 +90,7 @@ class _Batch:
         self._zero = np.tile(np.array([robot.zero for robot in robots]), (copies, 1))
         self._take_forms()
         state = np.repeat([segment.state for segment in self._segments], self._n, axis=0)
-        state[:, 1 + plant.qpos] -= self._zero
+        state[:, 1 + plant.qpos] += np.tile(np.array([robot.start for robot in robots]), (copies, 1)) - self._zero
         self._batch.state[:] = state
         self._batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
         self._laws = self._make_laws()
@@ -325,8 +326,6 @@ def _without(values: Array, lost: NDArray[np.bool_]) -> Array:
 
 def _filtered(values: Array, ratio: float) -> Array:
     """First-order lag, exact for a piecewise constant input, from rest at the first value."""
-    from scipy.signal import lfilter
-
     keep = float(np.exp(-ratio))
     out, _ = lfilter([1 - keep], [1, -keep], values, zi=[keep * values[0]])
     filtered: Array = out

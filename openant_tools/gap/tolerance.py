@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.robot import USUAL_NOISE, Form, Reference, Robot
 
-__all__ = ["FACTORS", "random_form", "scatter"]
+__all__ = ["FACTORS", "random_form", "resting", "scatter"]
 
 Array = NDArray[np.float64]
 
@@ -19,6 +19,8 @@ FACTORS = {"stiffness": 0.15, "torque_limit": 0.15, "damping": 0.25, "armature":
 COULOMB_NM, ZERO_RAD, DELAY_S = 0.02, math.radians(0.5), 0.002
 TORSO_KG, FLOOR_FRICTION, SOFTNESS, TILT_RAD = 0.03, 0.15, 0.30, math.radians(0.5)
 IMU_RAD, GYRO_RAD_S, ACC_M_S2 = math.radians(1.0), 0.01, 0.1
+#: share of its length by which a link may be longer; Ω of a supply and its cables
+LENGTH, SUPPLY_OHM = 0.01, 0.05
 #: of the torso mass's tolerance on a robot that is not an Ant: share of its mass
 TORSO_SHARE = 0.03
 #: share by which a current or load sensor's scale is uncertain
@@ -27,6 +29,10 @@ TORQUE_SCALE = 0.03
 TORQUE_ZERO = 0.06
 #: s by which a velocity register is late at most on a healthy servo, and by which a row's stamp is off its samples
 VELOCITY_LATE_S, STAMP_S = 0.012, 0.0015
+#: logarithms of factors on what a contact is like beside its softness
+CONTACT_DAMPING, CONTACT_FORM = (-0.4, 0.15), (-0.6, 0.6)
+#: rad: no joint rests farther off than this
+FARTHEST_REST_RAD = 0.03
 #: logarithms between which a sensor's noise lies, as a factor on the usual: nobody says how good a sensor is
 NOISE = (-1.8, 0.5)
 
@@ -51,6 +57,8 @@ def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width:
     robot.more("coulomb_friction")[:] += COULOMB_NM * np.minimum(1.0, reference.torque / 0.2) * spread()
     robot.zero += width * ZERO_RAD * rng.uniform(-1, 1, n)
     robot.delay += DELAY_S * spread()
+    robot.length *= 1 + width * LENGTH * rng.uniform(-1, 1, n)
+    robot.law("voltage_sag", "resistance_ohm")[:] += float(rng.uniform(0, SUPPLY_OHM))
     robot.torso_kg += width * rng.uniform(-1, 1) * min(TORSO_KG, TORSO_SHARE * reference.robot_kg)
     robot.floor_friction *= math.exp(width * FLOOR_FRICTION * rng.uniform(-1, 1))
     robot.softness *= math.exp(width * SOFTNESS * rng.uniform(-1, 1))
@@ -69,7 +77,7 @@ def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width:
     robot.noise["torque_scale"] = float(np.exp(TORQUE_SCALE * rng.normal()))
 
 
-def random_form(rng: np.random.Generator) -> Form:
+def random_form(rng: np.random.Generator, encoder_rad: float) -> Form:
     """A numerical form at random: what names a cause in one only would name it wrongly on a robot."""
     pyramidal = rng.random() < 0.2
     impratio = float(np.exp(rng.uniform(0.0, math.log(30.0)))) if not pyramidal else float(rng.choice([1.0, 3.0, 10.0]))
@@ -77,4 +85,20 @@ def random_form(rng: np.random.Generator) -> Form:
     friction = rng.random()
     smooth = float(np.exp(rng.uniform(math.log(0.02), math.log(0.1)))) if friction < 0.2 else 0.0
     bristle = float(np.exp(rng.uniform(math.log(1e-4), math.log(3e-3)))) if friction > 0.6 else 0.0
-    return Form(int(integrator), not pyramidal, impratio, smooth, bristle)
+    return Form(
+        int(integrator), not pyramidal, impratio, smooth, bristle,
+        encoder_rad=encoder_rad if rng.random() < 0.7 else 0.0,
+        contact_damping=math.exp(rng.uniform(*CONTACT_DAMPING)),
+        contact_give=math.exp(rng.uniform(*CONTACT_FORM)),
+        contact_depth=math.exp(rng.uniform(*CONTACT_FORM)),
+    )  # fmt: skip
+
+
+def resting(robot: Robot, reference: Reference, rng: np.random.Generator) -> Array:
+    """(joints,) rad: how far from its setpoint each joint may have come to rest, held by dry friction."""
+    friction = np.maximum(reference.friction + robot.add.get("coulomb_friction", 0.0), 0.0)
+    share = rng.uniform(0, 1)
+    out: Array = (
+        share * rng.uniform(-1, 1, robot.joints) * np.minimum(friction / reference.stiffness, FARTHEST_REST_RAD)
+    )
+    return out

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from openant_tools.gap.cause import Cause, Ints, Scope, Values, amount
-from openant_tools.gap.robot import Reference, Robot
+from openant_tools.gap.cause import Cause, Ints, Scope, Values, amount, usual_torque
+from openant_tools.gap.robot import Robot
 
 __all__ = ["CAUSE"]
-
-
-def _torque(reference: Reference, joints: Ints) -> float:
-    return float(reference.torque[joints].mean())
 
 
 def _enter(robot: Robot, joints: Ints, values: Values) -> None:
@@ -23,8 +19,8 @@ CAUSE = Cause(
     words="dry friction differs by direction",
     scopes=(Scope.JOINT, Scope.SERVO, Scope.ALL),
     quantities=(
-        amount("positive_nm", "N·m", 0.035, 0.25, scale=_torque),
-        amount("negative_nm", "N·m", 0.035, 0.25, scale=_torque),
+        amount("positive_nm", "N·m", 0.035, 0.25, scale=usual_torque),
+        amount("negative_nm", "N·m", 0.035, 0.25, scale=usual_torque),
     ),
     enter=_enter,
     native=False,

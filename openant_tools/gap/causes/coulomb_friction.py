@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from openant_tools.gap.cause import Cause, Ints, Scope, Values, amount
-from openant_tools.gap.robot import Reference, Robot
+from openant_tools.gap.cause import Cause, Ints, Scope, Values, amount, usual_torque
+from openant_tools.gap.robot import Robot
 
 __all__ = ["CAUSE"]
-
-
-def _torque(reference: Reference, joints: Ints) -> float:
-    return float(reference.torque[joints].mean())
 
 
 def _enter(robot: Robot, joints: Ints, values: Values) -> None:
@@ -21,7 +17,7 @@ CAUSE = Cause(
     family="friction",
     words="dry friction is not what the model says",
     scopes=(Scope.JOINT, Scope.SERVO, Scope.ALL),
-    quantities=(amount("torque_nm", "N·m", 0.025, 0.22, signed=True, scale=_torque),),
+    quantities=(amount("torque_nm", "N·m", 0.025, 0.22, signed=True, scale=usual_torque),),
     enter=_enter,
     native=True,
 )

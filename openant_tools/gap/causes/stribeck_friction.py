@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from openant_tools.gap.cause import Cause, Ints, Scope, Values, amount, shape
-from openant_tools.gap.robot import Reference, Robot
+from openant_tools.gap.cause import Cause, Ints, Scope, Values, amount, shape, usual_torque
+from openant_tools.gap.robot import Robot
 
 __all__ = ["CAUSE"]
-
-
-def _torque(reference: Reference, joints: Ints) -> float:
-    return float(reference.torque[joints].mean())
 
 
 def _enter(robot: Robot, joints: Ints, values: Values) -> None:
@@ -23,7 +19,7 @@ CAUSE = Cause(
     words="dry friction is larger at rest than in motion",
     scopes=(Scope.JOINT, Scope.SERVO, Scope.ALL),
     quantities=(
-        amount("static_nm", "N·m", 0.03, 0.25, scale=_torque),
+        amount("static_nm", "N·m", 0.03, 0.25, scale=usual_torque),
         shape("velocity_rad_s", "rad/s", 0.05, 0.6),
     ),
     enter=_enter,

@@ -21,6 +21,8 @@ CAUSE = Cause(
     quantities=(amount("loss", "1", 0.18, 0.7),),
     enter=_enter,
     native=True,
+    # With one joint it is stiffness and torque limit of all.
+    shows=lambda reference: len(reference.torque) > 1,
     stated=lambda values, reference, joints: {"scale": 1 - values["loss"]},
     restored=lambda given, x, reference, joints: {"loss": 1 - given["scale"]},
 )
