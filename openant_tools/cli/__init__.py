@@ -34,6 +34,8 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "gap": ("gap", "Data", "How far a simulation is from its robot, and where."),
     "train": ("train", "Learning", "Train an agent to walk, in simulation."),
     "eval": ("eval", "Learning", "Play a trained agent and measure its reward per second."),
+    "plot": ("plot", "Learning", "Learning curves of several runs in one picture."),
+    "tune": ("tune", "Learning", "Search for settings of an agent, on as many machines as you like."),
 }
 
 INTERRUPTED = 130

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
 
 from openant_tools.cli.options import robot_folder
 from openant_tools.errors import BadInput
 
 if TYPE_CHECKING:
+    from openant_agents.drops import DropWatch
     from openant_agents.training import Progress
 
-__all__ = ["LearningBar", "need_torch", "robot_argument"]
+__all__ = ["LearningBar", "need_torch", "robot_argument", "settings_of", "settings_option"]
+
+Settings = TypeVar("Settings")
+
+settings_option = click.option(
+    "--settings", "settings_file", type=click.Path(path_type=Path, dir_okay=False, exists=True), metavar="FILE",
+    help="Settings that `openant tune --json` found. Options given here count more.",
+)  # fmt: skip
 
 
 def need_torch() -> None:
@@ -21,6 +33,41 @@ def need_torch() -> None:
 
     if importlib.util.find_spec("torch") is None:
         raise BadInput("agents need torch, which is not installed", remedy="pip install 'openant-tools[agents]'")
+
+
+def read_settings(file: Path | None, agent: str) -> dict[str, Any]:
+    """The settings of an agent that `openant tune --json` found; none without a file.
+
+    Raises:
+        BadInput: the file holds no settings, or another agent's.
+    """
+    if file is None:
+        return {}
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+        settings, of = dict(found["settings"]), found["agent"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise BadInput(
+            "it holds no settings of an agent", where=file, remedy="name what `openant tune --json` wrote"
+        ) from error
+    if of != agent:
+        raise BadInput(f"these are settings of {of}, not of {agent}", where=file, remedy=f"use `openant train {of}`")
+    return settings
+
+
+def settings_of(kind: type[Settings], file: Path | None, agent: str, given: Mapping[str, Any]) -> Settings:
+    """Settings of an agent: its defaults, what a file says, and over both what was given on the command line.
+
+    Raises:
+        BadInput: a setting that the agent does not have.
+    """
+    chosen = {**read_settings(file, agent), **{key: value for key, value in given.items() if value is not None}}
+    try:
+        return kind(**chosen)
+    except TypeError as error:
+        raise BadInput(
+            f"{agent} has no such setting: {error}", where=file, remedy="use what `openant tune` wrote"
+        ) from None
 
 
 def robot_argument(robot: Path | None, kit: str | None) -> dict[str, str]:
@@ -33,9 +80,14 @@ def robot_argument(robot: Path | None, kit: str | None) -> dict[str, str]:
 
 
 class LearningBar:
-    """Progress on stderr: steps, robot time, average reward, steps a second, time left."""
+    """Progress on stderr: steps, robot time, average reward, steps a second, time left.
 
-    def __init__(self, steps: int) -> None:
+    Args:
+        steps: wanted.
+        folder: of the run, where one is to be watched for reward drops.
+    """
+
+    def __init__(self, steps: int, folder: Path | None = None) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
         from rich.progress import Progress as RichProgress
@@ -49,7 +101,12 @@ class LearningBar:
             console=Console(stderr=True),
         )
         self._task = self._bar.add_task("learning", total=steps, words="")
-        self._begun = False
+        self._watch: DropWatch | None = None
+        if folder is not None:
+            from openant_agents.drops import DropWatch
+
+            self._watch = DropWatch(folder)
+        self._last: int | None = None
 
     def __enter__(self) -> LearningBar:
         self._bar.start()
@@ -57,12 +114,15 @@ class LearningBar:
 
     def __exit__(self, *exception: object) -> None:
         self._bar.stop()
+        if self._watch is not None:
+            self._watch.finish()
 
-    def show(self, progress: Progress) -> None:
-        if not self._begun:
-            # A run that goes on did not get this far in no time.
+    def show(self, progress: Progress, name: str | None = None) -> None:
+        """Show how far a run is, under its name or else what it is doing."""
+        if self._last is None or progress.step < self._last:
+            # A run that goes on did not get this far in no time, and the next run begins anew.
             self._bar.reset(self._task, completed=progress.step)
-            self._begun = True
+        self._last = progress.step
         speed = self._bar.tasks[self._task].speed
         words = [f"{100 * progress.average_reward_m_s:+5.1f} cm/s", f"{progress.robot_seconds / 60:5.1f} min walked"]
         if speed:
@@ -70,6 +130,12 @@ class LearningBar:
         self._bar.update(
             self._task,
             completed=progress.step,
-            description="learning" if progress.learning else "exploring",
+            description=name or ("learning" if progress.learning else "exploring"),
             words="  ".join(words),
         )
+        drop = self._watch.see(progress) if self._watch is not None else None
+        if drop is not None:
+            self._bar.console.print(
+                f"the reward dropped from {100 * drop.best_m_s:.1f} to {100 * drop.lowest_m_s:.1f} cm/s at"
+                f" {drop.from_s / 60:.0f} min: the checkpoint is kept in drops/; `openant plot` says what preceded it"
+            )

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from openant_tools.cli.learning import LearningBar, need_torch, robot_argument
+from openant_tools.cli.learning import LearningBar, need_torch, robot_argument, settings_of, settings_option
 from openant_tools.cli.options import json_option, robot_option
 
 __all__ = ["sarsa"]
@@ -33,9 +33,10 @@ __all__ = ["sarsa"]
     "--action-range", default="sarsa", show_default=True, metavar="NAME", help="paper, platform, sac, sarsa or limits."
 )
 @click.option("--effects/--no-effects", default=True, help="Whether the robot's [[effect]] entries act.  [default: on]")
-@click.option("--epsilon", type=click.FloatRange(0.0, 1.0), default=0.255, show_default=True, help="Share of chance.")
-@click.option("--step-size", type=click.FloatRange(min=0.0, min_open=True), default=1e-4, show_default=True)
-@click.option("--reward-scale", type=click.FloatRange(min=0.0, min_open=True), default=5.0, show_default=True)
+@click.option("--epsilon", type=click.FloatRange(0.0, 1.0), help="Share of chance.  [default: 0.255]")
+@click.option("--step-size", type=click.FloatRange(min=0.0, min_open=True), help="Of each weight.  [default: 0.0001]")
+@click.option("--reward-scale", type=click.FloatRange(min=0.0, min_open=True), help="Factor on rewards.  [default: 5]")
+@settings_option
 @click.option("--tensorboard", is_flag=True, help="Also write TensorBoard events into the run's folder.")
 @json_option
 def sarsa(
@@ -49,9 +50,10 @@ def sarsa(
     dt: float,
     action_range: str,
     effects: bool,
-    epsilon: float,
-    step_size: float,
-    reward_scale: float,
+    epsilon: float | None,
+    step_size: float | None,
+    reward_scale: float | None,
+    settings_file: Path | None,
     tensorboard: bool,
     json_file: Path | None,
 ) -> None:
@@ -80,9 +82,10 @@ def sarsa(
 
     name = "openant/Ant-v0"
     env = gymnasium.make(name, **options)
-    settings = Settings(epsilon=epsilon, step_size=step_size, reward_scale=reward_scale)
+    given = {"epsilon": epsilon, "step_size": step_size, "reward_scale": reward_scale}
+    settings = settings_of(Settings, settings_file, "sarsa", given)
     try:
-        with LearningBar(steps) as bar:
+        with LearningBar(steps, out) as bar:
             result = train_sarsa(
                 env,
                 folder=out,

@@ -1,0 +1,48 @@
+"""Where in a run someone or something had to help: what `interventions.csv` says."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+from openant_tools.errors import BadInput
+
+__all__ = ["Intervention", "read_interventions"]
+
+
+@dataclass(frozen=True)
+class Intervention:
+    """One help.
+
+    Attributes:
+        step: environment steps so far.
+        seconds: s, robot time so far.
+        reason: in words.
+    """
+
+    step: int
+    seconds: float
+    reason: str
+
+
+def read_interventions(folder: Path) -> list[Intervention]:
+    """The interventions of a run, in order; none where nobody ever had to help.
+
+    Raises:
+        BadInput: a row is not what it should be.
+    """
+    path = folder / "interventions.csv"
+    if not path.is_file():
+        return []
+    with path.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    found: list[Intervention] = []
+    for number, row in enumerate(rows, start=2):
+        try:
+            found.append(Intervention(int(row["step"]), float(row["seconds"]), str(row["reason"])))
+        except (KeyError, TypeError, ValueError):
+            if number == len(rows) + 1:
+                break  # the last line of a run that was killed while writing it
+            raise BadInput(f"row {number} is not step, seconds, reason", where=path, remedy="repair the row") from None
+    return found
