@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from openant_tools.gap.cause import Scope, catalogue
+from openant_tools.gap.cause import catalogue
 from openant_tools.gap.features import COLUMNS
 from openant_tools.gap.population import Case, draw, play, robot_of, templates
+from openant_tools.gap.prepare import CACHE_VARIABLE, cache_folder, prepare
 from openant_tools.gap.protocol import Protocol, same
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
@@ -59,8 +61,7 @@ def test_every_cause_of_the_catalogue_shows(protocol: Protocol) -> None:
     strongest: dict[str, Case] = {}
     for case in templates(protocol):
         ((name, (joints, _)),) = case.causes.items()
-        body = catalogue()[name].scopes == (Scope.BODY,)
-        if body or len(joints) == 8 or name not in strongest:
+        if catalogue()[name].of_body or len(joints) == 8 or name not in strongest:
             strongest[name] = case
     assert set(strongest) == set(catalogue())
     features = play(protocol, [Case({}, -1), *strongest.values()], 0)
@@ -82,6 +83,38 @@ def test_jitter_of_time_stamps_is_no_other_protocol(protocol: Protocol) -> None:
     rng = np.random.default_rng(3)
     jittered = dataclasses.replace(run, t=run.t + rng.uniform(-0.002, 0.002, len(run.t)))
     other = commanded("stand", seed=9)
-    first, again, different = (Protocol.of([r], MODEL, JOINT_NAMES, [None]).commands() for r in (run, jittered, other))
+    first, again, different = (
+        Protocol.of([r], MODEL, JOINT_NAMES, [None]).commands()[0] for r in (run, jittered, other)
+    )
     assert same(first, again)
     assert not same(first, different)
+
+
+def test_what_was_prepared_in_full_serves_a_part_of_it(
+    protocol: Protocol, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    monkeypatch.setattr("openant_tools.gap.prepare.PART", 4)
+    monkeypatch.setattr("openant_tools.gap.prepare.LEAST", 4)
+    monkeypatch.setattr("openant_tools.gap.prepare.templates", lambda protocol: [Case({}, -1)])
+    whole = prepare(protocol, seconds=0.0)
+    assert 4 <= len(whole.cases) < 2400, "the time was over at once"
+    backwards = dataclasses.replace(protocol, runs=protocol.runs[::-1])
+    assert len(prepare(backwards).cases) == len(whole.cases), "and stays over"
+    part = prepare(dataclasses.replace(protocol, runs=protocol.runs[1:]))
+    assert part.folder == whole.folder
+    assert np.array_equal(part.features[0], whole.features[1])
+    assert len(list(cache_folder().iterdir())) == 1
+
+
+def test_a_robot_at_hand_is_simulated_from_where_the_first_one_began(protocol: Protocol) -> None:
+    first = protocol.runs[0].run
+    joint = JOINT_NAMES[0]
+    for off, taken in ((0.004, True), (0.3, False)):
+        columns = dict(first.columns)
+        columns[f"pos.{joint}"] = first.column(f"pos.{joint}") + off
+        at_hand = dataclasses.replace(
+            protocol, runs=(dataclasses.replace(protocol.runs[0], run=dataclasses.replace(first, columns=columns)),)
+        )
+        begun = at_hand.started_as(dataclasses.replace(protocol, runs=protocol.runs[:1])).runs[0].run
+        assert (begun.column(f"pos.{joint}")[0] == first.column(f"pos.{joint}")[0]) is np.bool_(taken)

@@ -115,7 +115,7 @@ def prepare(
     wanted = joints_in_common(recordings, model, joints or None)
     protocol = Protocol.of(recordings, model, wanted, [own_model(run) for run in recordings])
     with progress() as tell:
-        made = prepared(protocol, robots, tell)
+        made = prepared(protocol, robots, progress=tell)
     click.echo(f"ready: {len(made.cases)} simulated robots of {len(wanted)} joints in {made.folder}")
 
 

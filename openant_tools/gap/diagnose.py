@@ -6,6 +6,7 @@ large it would be; held-out closure decides between them, and says when none wil
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
 from collections.abc import Callable, Sequence
@@ -57,6 +58,8 @@ ADDS, ADDS_ALONE, EXPLAINS = 0.02, 0.2, 0.35
 LARGE, STRANGE, ODD = 3.0, 5.0, 20.0
 #: sets whose closures differ by less are not told apart
 APART = 0.01
+#: s that a diagnosis gives to simulated robots where the protocol was never seen; `prepare` by itself takes what it needs
+PREPARE_S = 900.0
 #: how what is left of the gap counts beside the judge's probability
 LEFT_COUNTS = 3.0
 
@@ -86,14 +89,16 @@ def diagnose(
     _check(runs, hold_out)
     wanted = joints_in_common(everything, model, joints)
     _check_motion(everything, wanted)
-    protocol = Protocol.of(everything, model, wanted, [own_model(run) for run in everything])
+    played = Protocol.of(runs, model, wanted, [own_model(run) for run in runs])
     measured = measure(list(hold_out) or list(runs), model, wanted)
     tell(0.02, "simulated robots")
-    prepared = prepare(protocol, robots, lambda share, words: tell(0.02 + 0.6 * share, words))
-    training = list(range(len(runs)))
-    coarse = protocol.started_as(prepared.protocol).coarse()
+    prepared = prepare(played, robots, seconds=PREPARE_S, progress=lambda share, words: tell(0.02 + 0.6 * share, words))
+    coarse = played.started_as(prepared.protocol).coarse()
+    protocol = Protocol.of(everything, model, wanted, [own_model(run) for run in everything])
+    protocol = dataclasses.replace(protocol, reference=coarse.reference)
     found = coarse.features()
-    judge = _judge(prepared, training, [found[k][1] for k in training], tell)
+    training = list(range(len(runs)))
+    judge = _judge(prepared, training, [columns for _, columns in found], tell)
     tell(0.7, "causes")
     case = _Case(protocol, coarse, prepared, measured, judge, found, training, model, runs, hold_out)
     judgement = judge.say(case.features)

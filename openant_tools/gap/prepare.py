@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +38,8 @@ LARGEST_BYTES = 4 * 2**30
 VERSION = 5
 #: robots of a part, and of a whole preparation where the robot has many joints and where it has one or two
 PART, ROBOTS, ROBOTS_ONE_JOINT = 96, 2400, 16_000
+#: robots without which no judge is trained, and the file that says that no more are to be made unless asked for
+LEAST, CLOSED = 480, "closed"
 Progress = Callable[[float, str], None]
 
 
@@ -74,50 +77,63 @@ def robots_of(protocol: Protocol) -> int:
     return ROBOTS_ONE_JOINT if len(protocol.joints) <= 2 else ROBOTS
 
 
-def prepare(protocol: Protocol, robots: int | None = None, progress: Progress | None = None) -> Prepared:
+def prepare(
+    protocol: Protocol, robots: int | None = None, *, seconds: float | None = None, progress: Progress | None = None
+) -> Prepared:
     """Simulate what is missing of a protocol's robots and return them all.
 
     Args:
-        robots: how many; default by the number of joints.
+        robots: how many; default by the number of joints, or however many an earlier time limit left.
+        seconds: after which no more are begun, once there are enough to judge by at all.
         progress: told a share and words.
     """
-    robots = robots or robots_of(protocol)
-    folder, order = find(protocol) or (_new(protocol), list(range(len(protocol.runs))))
-    # From here on in the order of whoever prepared it first.
-    known = _reference(folder, dataclasses.replace(protocol, runs=tuple(protocol.runs[k] for k in order)))
-    coarse = known.coarse()
-    causes = applicable(coarse)
+    kept = find(protocol, whole=robots is not None) or _new(protocol)
+    protocol = _as_first(kept, protocol)
+    coarse = protocol.coarse()
     size = PART if len(protocol.joints) > 2 else 8 * PART
-    parts = -(-robots // size)
+    parts = -(-(robots or robots_of(protocol)) // size)
     bank = templates(coarse)
     banks = -(-len(bank) // size)
-    # Templates count below 0.
-    missing = [part for part in range(-banks, parts) if not _part(folder, part).is_file()]
-    whole, there = (parts + banks) * size, (parts + banks - len(missing)) * size
+    if robots is not None or not (kept.folder / CLOSED).exists():
+        _simulate(kept, coarse, range(-banks, parts), size, seconds, progress)
+    os.utime(kept.folder)
+    there = [part for part in range(parts) if _part(kept.folder, part).is_file()]
+    features: list[list[Floats]] = [[] for _ in coarse.runs]
+    for part in [*there, *range(-1, -banks - 1, -1)]:
+        with np.load(_part(kept.folder, part)) as stored:
+            for mine, k in zip(features, kept.which, strict=True):
+                mine.append(stored[f"run{k}"].astype(np.float32))
+    causes = applicable(coarse)
+    cases = [draw(coarse, part * size + k, causes) for part in there for k in range(size)]
+    n, whole = len(cases), [np.concatenate(mine) for mine in features]
+    return Prepared(
+        protocol, kept.folder, tuple(cases), tuple(x[:n] for x in whole), tuple(bank), tuple(x[n:] for x in whole)
+    )
+
+
+def _simulate(
+    kept: Kept, coarse: Protocol, parts: range, size: int, seconds: float | None, progress: Progress | None
+) -> None:
+    """Make the parts that are missing."""
+    folder, begun = kept.folder, time.monotonic()
+    missing = [part for part in parts if not _part(folder, part).is_file()]
+    if not missing:
+        return
+    ordered = dataclasses.replace(coarse, runs=tuple(coarse.runs[k] for k in np.argsort(kept.which)))
+    whole, there = len(parts) * size, (len(parts) - len(missing)) * size
     jobs = joblib.Parallel(n_jobs=-1, return_as="generator_unordered")
-    for done, _ in enumerate(jobs(joblib.delayed(_make)(coarse, n, size, _part(folder, n)) for n in missing), 1):
+    made = jobs(joblib.delayed(_make)(ordered, n, size, _part(folder, n)) for n in missing)
+    for done, _ in enumerate(made, 1):
         if progress is not None:
             progress(done / len(missing), f"{there + done * size} of {whole} simulated robots")
-    if missing:
-        _keep_small(folder)
-    os.utime(folder)
-    features: list[list[Floats]] = [[] for _ in coarse.runs]
-    for part in [*range(parts), *range(-1, -banks - 1, -1)]:
-        with np.load(_part(folder, part)) as stored:
-            for k in range(len(coarse.runs)):
-                features[k].append(stored[f"run{k}"].astype(np.float32))
-    cases = [draw(coarse, k, causes) for k in range(parts * size)]
-    n = len(cases)
-    back = [order.index(k) for k in range(len(order))]
-    mine = [np.concatenate(features[k]) for k in back]
-    return Prepared(
-        dataclasses.replace(known, runs=tuple(known.runs[k] for k in back)),
-        folder,
-        tuple(cases),
-        tuple(x[:n] for x in mine),
-        tuple(bank),
-        tuple(x[n:] for x in mine),
-    )
+        enough = all(_part(folder, part).is_file() for part in parts if part * size < LEAST)
+        if seconds is not None and enough and time.monotonic() - begun > seconds:
+            write_text(folder / CLOSED, "")
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # that what was begun is dropped is meant
+                made.close()
+            break
+    _keep_small(folder)
 
 
 def _make(protocol: Protocol, part: int, size: int, path: Path) -> None:
@@ -131,24 +147,47 @@ def _make(protocol: Protocol, part: int, size: int, path: Path) -> None:
     _write(path, {f"run{k}": x.astype(np.float16) for k, x in enumerate(found)})
 
 
-def find(protocol: Protocol) -> tuple[Path, list[int]] | None:
-    """The folder of the same model and commands, if it was ever begun, and which of the runs are its first, second …"""
-    commands = protocol.commands()
+@dataclass(frozen=True)
+class Kept:
+    """Where a protocol is kept.
+
+    Attributes:
+        which: for each of the runs at hand, which of the runs kept there it is.
+    """
+
+    folder: Path
+    which: tuple[int, ...]
+
+
+def find(protocol: Protocol, *, whole: bool = False) -> Kept | None:
+    """Where the same model and commands are kept, if they ever were begun.
+
+    Args:
+        whole: only with the very same runs. Else a finished one that has others besides will do.
+    """
+    commands, places = protocol.commands(), protocol.places()
+    more: Kept | None = None
     for folder in sorted(cache_folder().glob(f"v{VERSION}-{protocol.fingerprint()}-*")):
         try:
             with np.load(folder / "protocol.npz") as stored:
-                known = [stored[f"cmd{k}"] for k in range(len(stored.files))]
+                stood = stored["places"]
+                known = [stored[f"cmd{k}"] for k in range(len(stood))]
         except (OSError, KeyError, ValueError):
             continue
-        order: list[int] = []
-        for one in known:
-            order += [k for k, mine in enumerate(commands) if k not in order and same([one], [mine])][:1]
-        if len(order) == len(known) == len(commands):
-            return folder, order
-    return None
+        which: list[int] = []
+        for one, place in zip(commands, places, strict=True):
+            alike = [k for k in range(len(known)) if k not in which and (stood[k] == place).all()]
+            which += [k for k in alike if same(known[k], one)][:1]
+        if len(which) != len(commands):
+            continue
+        if len(known) == len(commands):
+            return Kept(folder, tuple(which))
+        if (folder / CLOSED).exists() and more is None:
+            more = Kept(folder, tuple(which))
+    return None if whole else more
 
 
-def _new(protocol: Protocol) -> Path:
+def _new(protocol: Protocol) -> Kept:
     base = cache_folder()
     base.mkdir(parents=True, exist_ok=True)
     stem = f"v{VERSION}-{protocol.fingerprint()}"
@@ -160,33 +199,39 @@ def _new(protocol: Protocol) -> Path:
             break
         except FileExistsError:
             number += 1
-    _write(folder / "protocol.npz", {f"cmd{k}": table for k, table in enumerate(protocol.commands())})
+    columns: dict[str, NDArray[np.float64]] = {}
+    for k, one in enumerate(protocol.runs):
+        columns[f"{k}|t"] = one.run.t
+        for name, values in one.run.columns.items():
+            if values.dtype.kind == "f":
+                columns[f"{k}|{name}"] = values
+    _write(folder / "first.npz", columns)
     facts = {"model": str(protocol.model), "runs": [one.run.name for one in protocol.runs], "made": time.strftime("%F")}
     write_text(folder / "facts.json", json.dumps(facts, indent=2) + "\n")
-    return folder
+    # Last: by it others find the folder.
+    tables = {f"cmd{k}": table for k, table in enumerate(protocol.commands())}
+    _write(folder / "protocol.npz", {"places": protocol.places(), **tables})
+    return Kept(folder, tuple(range(len(protocol.runs))))
 
 
-def _reference(folder: Path, protocol: Protocol) -> Protocol:
+def _as_first(kept: Kept, protocol: Protocol) -> Protocol:
     """The protocol as it was prepared: its runs' times and commands are those of whoever came first."""
-    path = folder / "first.npz"
-    if not path.is_file():
-        columns: dict[str, NDArray[np.float64]] = {}
-        for k, one in enumerate(protocol.runs):
-            columns[f"{k}|t"] = one.run.t
-            for name, values in one.run.columns.items():
-                if values.dtype.kind == "f":
-                    columns[f"{k}|{name}"] = values
-        _write(path, columns)
-    with np.load(path) as stored:
-        runs = []
-        for k, one in enumerate(protocol.runs):
-            mine = {name.partition("|")[2]: stored[name] for name in stored.files if name.startswith(f"{k}|")}
-            run = Run(one.run.name, one.run.facts, mine.pop("t"), mine, one.run.path)
+    runs = []
+    with np.load(kept.folder / "first.npz") as stored:
+        for k, one in zip(kept.which, protocol.runs, strict=True):
+            run = Run(one.run.name, one.run.facts, stored[f"{k}|t"], _columns(stored, k), one.run.path)
             runs.append(dataclasses.replace(one, run=run))
-    found = dataclasses.replace(protocol, runs=tuple(runs))
-    return dataclasses.replace(
-        found, reference=dataclasses.replace(protocol.reference, seen=shown([one.run for one in runs], protocol.joints))
-    )
+        everything = [
+            Run(str(k), protocol.runs[0].run.facts, stored[f"{k}|t"], _columns(stored, k))
+            for k in range(sum(name.endswith("|t") for name in stored.files))
+        ]
+    reference = dataclasses.replace(protocol.reference, seen=shown(everything, protocol.joints))
+    return dataclasses.replace(protocol, runs=tuple(runs), reference=reference)
+
+
+def _columns(stored: Mapping[str, NDArray[np.float64]], k: int) -> dict[str, NDArray[np.float64]]:
+    """The columns of the k-th run kept."""
+    return {name.partition("|")[2]: stored[name] for name in stored if name.startswith(f"{k}|") and name != f"{k}|t"}
 
 
 def _part(folder: Path, part: int) -> Path:

@@ -152,7 +152,9 @@ class Protocol:
         return {signal: step if np.isfinite(step) else 0.0 for signal, step in out.items()}
 
     def started_as(self, other: Protocol) -> Protocol:
-        """The same, simulated from where another robot's runs began, unless they began elsewhere on purpose.
+        """The same in the measures of another robot's, simulated from where its runs began.
+
+        Runs that began elsewhere on purpose stay as they are.
 
         Dry friction lets every robot rest a little differently; only where all simulations begin at one place is that
         among what healthy robots are seen to do.
@@ -160,9 +162,10 @@ class Protocol:
         return dataclasses.replace(
             self,
             runs=tuple(
-                dataclasses.replace(one, run=_begun(one.run, reference.run, self.joints))
-                for one, reference in zip(self.runs, other.runs, strict=True)
+                dataclasses.replace(one, run=_begun(one.run, first.run, self.joints))
+                for one, first in zip(self.runs, other.runs, strict=True)
             ),
+            reference=dataclasses.replace(self.reference, seen=other.reference.seen),
         )
 
     def nominal(self) -> list[dict[str, Floats]]:
@@ -184,28 +187,28 @@ class Protocol:
         """Of each run (times, joints) rad on a grid."""
         return [_on_grid(one.run, self.joints) for one in self.runs]
 
+    def places(self) -> Array:
+        """(runs, 2) of each run whether it stands on the floor, and its heading, rad."""
+        return np.array(
+            [[one.plant.setup is Setup.FLOOR, round(one.run.facts.heading_rad or 0.0, 1)] for one in self.runs], float
+        )
+
     def fingerprint(self) -> str:
-        """Of what decides the simulations but for the commands themselves: model, joints, setups, sensors."""
+        """Of what decides the simulations but for the runs themselves: model and joints."""
         state = hashlib.sha256()
         for path in sorted({one.plant.path for one in self.runs}):
             state.update(path.read_bytes())
-        facts = sorted([str(one.plant.setup), round(one.run.facts.heading_rad or 0.0, 1)] for one in self.runs)
-        state.update(json.dumps([list(self.joints), facts]).encode())
+        state.update(json.dumps(list(self.joints)).encode())
         return state.hexdigest()[:16]
 
 
-def same(a: Sequence[Array], b: Sequence[Array]) -> bool:
-    """Whether two sets of commands (as `Protocol.commands`) are the same but for jitter of their times."""
-    if len(a) != len(b):
+def same(one: Array, other: Array) -> bool:
+    """Whether commands of two runs (as `Protocol.commands`) are the same but for jitter of their times."""
+    n = min(len(one), len(other))
+    if abs(len(one) - len(other)) * GRID_S > 0.1 + 0.01 * n * GRID_S:
         return False
-    for one, other in zip(a, b, strict=True):
-        n = min(len(one), len(other))
-        if abs(len(one) - len(other)) * GRID_S > 0.1 + 0.01 * n * GRID_S:
-            return False
-        # A step that comes a sample early is a large difference for a moment: the median does not see it.
-        if float(np.quantile(np.abs(one[:n] - other[:n]).max(axis=1), 0.75)) > SAME_RAD:
-            return False
-    return True
+    # A step that comes a sample early is a large difference for a moment: the median does not see it.
+    return float(np.quantile(np.abs(one[:n] - other[:n]).max(axis=1), 0.75)) <= SAME_RAD
 
 
 def _on_grid(run: Run, joints: Sequence[str]) -> Array:
