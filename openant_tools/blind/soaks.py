@@ -171,14 +171,14 @@ def _parameters(cause: str, maker: str, chance: np.random.Generator) -> dict[str
     match cause:
         case "power_connector":
             if virtual:
-                return {"openings_per_rad": u(0.003, 0.03), "open_s": u(0.02, 0.12)}
+                return {"openings_per_rad": u(0.01, 0.06), "open_s": u(0.03, 0.25)}
             return {
                 "a_minute": u(0.7, 12),
                 "open_s": u(0.015, 0.25),
                 "by_motion": float(chance.choice([0.0, 1.0, 2.0])),
             }
         case "supply_weak":
-            return {"resistance_ohm": u(1.3, 2.6)} if virtual else {"drop_v": u(1.0, 3.5), "share": u(0.004, 0.08)}
+            return {"resistance_ohm": u(2.5, 5.0)} if virtual else {"drop_v": u(1.0, 3.5), "share": u(0.004, 0.08)}
         case "broken_wire":
             return {"share": u(0.03, 0.4), "flicker": float(np.round(chance.uniform(0.0, 0.6), 2)),
                     "above": bool(chance.random() < 0.5)}  # fmt: skip

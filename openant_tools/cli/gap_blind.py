@@ -13,7 +13,7 @@ import click
 from openant_tools.cli.options import json_option, out_option, report_option
 from openant_tools.errors import BadInput
 
-__all__ = ["blind"]
+__all__ = ["blind", "shown_progress"]
 
 
 @click.group()
@@ -89,7 +89,7 @@ def make(
             raise BadInput("the key would lie beside what it seals", where=key_file, remedy="keep it outside the set")
         key = read_key(key_file) if key_file.exists() else make_key(key_file)
     given: dict[str, Any] = {name: value for name, value in shares.items() if value is not None}
-    with _shown() as progress:
+    with shown_progress() as progress:
         commitment = make_set(
             out,
             count,
@@ -119,7 +119,7 @@ def run(folder: Path, jobs: int, backend: str, scheduler: str | None) -> None:
     """
     from openant_tools.blind.run import Backend, run_set
 
-    with _shown() as progress:
+    with shown_progress() as progress:
         done = run_set(
             folder, jobs=jobs, backend=cast("Backend", backend), scheduler=scheduler, progress=progress
         )  # fmt: skip
@@ -163,7 +163,7 @@ def score(folder: Path, key_file: Path | None, docs: Path | None, json_file: Pat
 
 
 @contextlib.contextmanager
-def _shown() -> Iterator[Callable[[str, float], None]]:
+def shown_progress() -> Iterator[Callable[[str, float], None]]:
     """A bar on stderr."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn

@@ -123,7 +123,7 @@ CAUSES: Mapping[str, Cause] = {
         "read register 9 of every servo (`openant config check`)",
         (0.45, 0.2, 0.35),
         {"all": 0.32, "behind": 0.2, "one": 0.22, "pair": 0.06, "scattered": 0.2},
-        {"crc": _SILENT, "late": (1.2, 0.8), "stairs": (6.0, 0.6), "together": (1.5, 1.5), "comb": (0.35, 9.0)},
+        {"crc": _SILENT, "late": (0.7, 0.55), "stairs": (6.0, 0.6), "together": (1.5, 1.5), "comb": (0.35, 9.0)},
     ),
     "latency_timer": Cause(
         "the adapter's latency timer of 16 ms",
@@ -132,7 +132,7 @@ CAUSES: Mapping[str, Cause] = {
         (0.5, 0.15, 0.35),
         {"all": 0.72, "behind": 0.1, "one": 0.05, "pair": 0.03, "scattered": 0.1},
         {
-            "crc": _SILENT, "late": (1.2, 0.8), "comb": (6.0, 0.6), "together": (2.0, 1.0), "stall": (0.35, 4.0),
+            "crc": _SILENT, "late": (0.7, 0.55), "comb": (6.0, 0.6), "together": (2.0, 1.0), "stall": (0.35, 4.0),
             "stairs": (0.35, 6.0),
         },
     ),
@@ -143,7 +143,7 @@ CAUSES: Mapping[str, Cause] = {
         (0.5, 0.15, 0.35),
         _ALL,
         {
-            "crc": _SILENT, "late": (1.0, 1.0), "stall": (6.0, 0.6), "host": (2.5, 0.8), "together": (3.0, 1.0),
+            "crc": _SILENT, "late": (0.6, 0.6), "stall": (6.0, 0.6), "host": (2.5, 0.8), "together": (3.0, 1.0),
             "rate": (0.4, 14.0), "single": (0.8, 1.0), "long": (1.0, 3.0),
         },
     ),

@@ -35,7 +35,7 @@ TIE = 0.4
 #: marks that do not come from losses
 _OF_TIME = frozenset({"stall", "comb", "stairs"})
 #: marks that stand for themselves: no other repeats what they say
-_DECISIVE = frozenset({"stall", "comb", "stairs", "port"})
+_DECISIVE = frozenset({"stall", "comb", "stairs", "port", "late"})
 
 _HEALTHY = Cause(
     "nothing wrong", "", "", (0.78, 0.2197, 0.0003),
@@ -209,7 +209,7 @@ def _terms(cause: Cause, measures: Measures) -> dict[str, float]:
         reach = measures.reach
         share = cause.reach[reach.kind]
         if reach.tied is not None:
-            share = 0.6 * share + 0.4 * cause.reach[reach.tied]
+            share = 0.75 * share + 0.25 * cause.reach[reach.tied]
         # A few losses say little of whom they concern.
         few = min(1.0, len(measures.episodes) / 6)
         terms["reach"] = few * math.log(share)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,9 @@ __all__ = ["Episode", "Reach", "cables", "episodes_of", "reach_of"]
 #: A servo belongs to those concerned where it loses at least this share of what the worst one loses.
 CONCERNED = 0.2
 #: of those concerned, where all are
-NEARLY_ALL = 0.85
+NEARLY_ALL = 0.8
+#: share of a servo's losses without those behind it, from which on it is known to lose by itself
+ALONE = 0.12
 
 
 @dataclass(frozen=True)
@@ -98,11 +100,16 @@ def reach_of(log: BusLog) -> Reach:
     without = _without_shadow(log)
     if without is None:
         return plain
-    # A cable explains what falls silent behind it better than the order of reading does.
-    if plain.kind == "behind" and any(plain.joints == tuple(wire[len(wire) - len(plain.joints) :]) for wire in wires):
-        return plain
     stripped = _reach(log, without, wires, shadow=True)
-    if plain.kind == "all" and (0 in stripped.joints or len(stripped.joints) > 2):
+    lost = log.lost[log.lossy]
+    alone = float((lost[lost[:, stripped.joints[0]]].sum(axis=1) == 1).mean())
+    if alone < ALONE and len(stripped.joints) == 1:
+        # It never falls silent alone: a cable before it, or (at the first one) all, does the same.
+        if stripped.joints == (0,):
+            return plain
+        if plain.kind == "behind":
+            return replace(plain, tied="one")
+    if len(stripped.joints) > len(log.joints) / 2 and stripped.kind != "behind":
         return plain
     return stripped
 
@@ -111,24 +118,24 @@ def _without_shadow(log: BusLog) -> Flags | None:
     """Losses without those of servos that only waited for a silent one before them; None where nothing looks so.
 
     In a sync read each servo waits for the answer before its own: behind a silent one all are silent. So in every row
-    the losses run through to the last servo, and begin at more than one place or in the midst of a cable.
+    either one servo alone is lost (its answer came broken), or the losses run through to the last servo.
     """
-    lossy = log.lossy & log.asked.all(axis=1)
-    lost = log.lost[lossy]
-    if not len(lost):
+    rows = np.flatnonzero(log.lossy & log.asked.all(axis=1))
+    lost = log.lost[rows]
+    if not len(lost) or lost.shape[1] < 3:
         return None
     j = lost.shape[1]
-    first = np.argmax(lost, axis=1)
-    through = lost.sum(axis=1) == j - first
+    first, count = np.argmax(lost, axis=1), lost.sum(axis=1)
     inner = first < j - 1
-    if not inner.any() or through[inner].mean() < 0.9 or (first == 0).mean() > 0.9:
+    if not inner.any():
+        return None
+    through = count[inner] == j - first[inner]
+    if (through | (count[inner] == 1)).mean() < 0.85 or through.sum() < max(2, 0.1 * inner.sum()):
         return None
     stripped = log.lost.copy()
-    rows = np.flatnonzero(log.lossy)
-    begin = np.argmax(log.lost[rows], axis=1)
     # What was garbled or late did answer: only silence can be a shadow.
     silent = (log.word[rows] == WORDS.index("timeout")) | (log.word[rows] == WORDS.index("lost"))
-    behind = np.arange(j)[None, :] > begin[:, None]
+    behind = np.arange(j)[None, :] > first[:, None]
     stripped[rows] &= ~(behind & silent)
     return stripped
 
@@ -150,7 +157,7 @@ def _reach(log: BusLog, lost: Flags, wires: Sequence[tuple[int, ...]], *, shadow
         kind = "one"
         if not wires or any(wire and wire[-1] == concerned[0] for wire in wires):
             tied = "behind"
-    elif len(concerned) >= 0.8 * j and j > 2:
+    elif len(concerned) >= NEARLY_ALL * j and j > 2:
         kind = "all"
         if set(concerned) != set(np.flatnonzero(seen).tolist()) and _behind(concerned, wires, log):
             tied = "behind"

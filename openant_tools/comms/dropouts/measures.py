@@ -426,19 +426,27 @@ def _waits(log: BusLog) -> tuple[Array, float, bool]:
     answers are handed over in portions."""
     rtt, j = log.rtt, log.rtt.shape[1]
     known = np.isfinite(rtt)
-    steps, together, fixed = np.full(j, np.nan), [], []
+    steps, together, portion = np.full(j, np.nan), [], []
     for k in range(1, j):
         both = known[:, k] & known[:, k - 1]
         if both.sum() >= FEWEST:
             between = rtt[both, k] - rtt[both, k - 1]
             low, high = np.quantile(between, [0.02, 0.98])
             steps[k] = float(np.clip(between, low, high).mean())
+            apart = between[between > 0.1e-3]
             together.append(float((np.abs(between) < 0.03e-3).mean()))
-            fixed.append(abs(2 * together[-1] - 1) > 0.9)
+            portion.append(float(np.median(apart)) if len(apart) else 0.0)
     known_baud = log.baud[np.isfinite(log.baud) & (log.baud > 0)]
     wire = LONGEST_ANSWER * 10 / (float(np.median(known_baud)) if len(known_baud) else 1e6)
-    # A timer that runs freely scatters over each step, and its mean stays what the servo took.
-    return steps, wire, bool(together) and max(together) > 0.15 and float(np.mean(fixed)) > 0.5
+    if not together or max(together) < 0.15:
+        return steps, wire, False
+    # Requests at all phases of the timer scatter each answer over a whole portion, and the mean of each step is about
+    # what the servo took; at one phase it is not.
+    with np.errstate(invalid="ignore"):
+        spread = [
+            float(np.ptp(np.quantile(one[np.isfinite(one)], [0.05, 0.95]))) for one in rtt.T if np.isfinite(one).any()
+        ]
+    return steps, wire, float(np.median(spread)) < 0.8 * max(max(portion), 0.25e-3)
 
 
 def _comb(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
