@@ -43,6 +43,8 @@ COOL_DOWN_S = 1200.0
 LOOK_S, STEPPED_LOOK_S = 1.0, 10.0
 #: s after the joints were loaded until they must be stalled, and the share of the wanted duty that proves it.
 STALL_S, STALLED = 3.0, 0.7
+#: The legs are let down until they stand still, in so many goes at most; rad that count as still.
+PRESSES, STILL_RAD = 20, 0.01
 #: K below a limit from which no soak begins: what is hot already is to cool first.
 BEGIN_K = 10.0
 #: A soak must outlive a noisy bus: s without an answer until a servo is given up.
@@ -285,6 +287,8 @@ def soak(
             start = played[0] if played is not None else _first_pose(plan, joints, found)
             if start is not None:
                 engine.ask(messages.Ramp(_within(start, config)))
+            if plan.load == "stall":
+                yield from _press(engine, config, plan, log, limits)
         facts = Facts(
             joints=joints,
             setup=plan.setup,
@@ -350,8 +354,6 @@ def _under_load(
     total = plan.seconds + plan.cool_down_s
     pose = -1
     number: int | None = None
-    if plan.load == "stall":
-        yield from _press(engine, config, plan, log, limits)
     begun, at = log.t, loaded
     while True:
         if plan.load in ("stand", "hang"):
@@ -411,13 +413,13 @@ def _press(
     joints = log.joints
     servos = {servo.joint: servo for servo in config.servos}
     registers = engine.description["registers"]
-    here = np.asarray(engine.ask(messages.Hold(0.5)), float)
-    goal = here.copy()
-    for k, joint in enumerate(joints):
-        if JOINTS[joint].kind != "knee":
-            continue
+    knees = [k for k, joint in enumerate(joints) if JOINTS[joint].kind == "knee"]
+    error = np.zeros(len(joints))
+    for k in knees:
+        joint = joints[k]
         allowed = registers[joint]["pwm_limit"] / PWM_FULL
-        if plan.effort > allowed + 1e-9:
+        # What the register holds is a whole count.
+        if plan.effort > allowed + 0.01:
             raise BadInput(
                 f"{joint} may use {allowed:.0%} of full duty, not {plan.effort:.0%}",
                 where=config.port,
@@ -427,15 +429,22 @@ def _press(
         pulses = plan.effort * PWM_FULL / max(gain, 1e-9)
         # Where all that the limit allows is wanted, a bit more error keeps it there whatever the leg gives way.
         pulses *= 1.3 if plan.effort > 0.95 * allowed else 1.0
-        goal[k] -= pulses * 2 * math.pi / PULSES_PER_TURN
-    engine.ask(messages.Ramp(_within(goal, config)))
+        error[k] = pulses * 2 * math.pi / PULSES_PER_TURN
+    here = np.asarray(engine.ask(messages.Hold(0.5)), float)
+    for _ in range(PRESSES):
+        was = here
+        here = np.asarray(engine.ask(messages.Ramp(_within(was - error, config))), float)
+        engine.ask(messages.Hold(0.5))
+        log.take(engine.telemetry())
+        if float(np.abs(here - was).max()) < STILL_RAD:
+            break
     engine.ask(messages.Hold(STALL_S))
     log.take(engine.telemetry())
     duty = np.abs(log.newest("pwm"))
-    for k, joint in enumerate(joints):
-        if JOINTS[joint].kind == "knee" and duty[k] < STALLED * plan.effort:
+    for k in knees:
+        if duty[k] < STALLED * plan.effort:
             raise BadInput(
-                f"{joint} is not stalled: it presses with {duty[k]:.0%} of full duty, not {plan.effort:.0%}",
+                f"{joints[k]} is not stalled: it presses with {duty[k]:.0%} of full duty, not {plan.effort:.0%}",
                 where=config.port,
                 remedy="let the robot lie on its belly, feet on the floor, and put more weight on it: 8 kg for the "
                 "standard robot, 5 kg for the Lite",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from openant_tools.robot.servo import ServoModel
@@ -12,6 +13,16 @@ __all__ = ["GEAR_STIFFNESS_NM_RAD", "MotorSettings"]
 GEAR_STIFFNESS_NM_RAD = 300.0
 #: N·m, gear friction of a healthy joint: the platform's own figure for its model.
 COULOMB_NM = 0.05
+
+
+#: servo model → heat, where a data sheet says nothing: sizes that give the paper's stress test (half duty against a stall:
+#: the XL430's case, plastic all round, passes 72 °C after half an hour; the XM430's, aluminium behind, comes to 80 °C).
+_HEAT: Mapping[str, Mapping[str, float]] = {
+    "XL430-W250-T": {"case_j_k": 48.0, "case_air_k_w": 16.5, "housing_k_w": 12.0, "winding_j_k": 8.0, "winding_case_k_w": 5.0},
+    "XC430-W240-T": {"case_j_k": 55.0, "case_air_k_w": 14.5, "housing_k_w": 7.0, "winding_j_k": 7.0, "winding_case_k_w": 5.0},
+    "XM430-W350-T": {"case_j_k": 68.0, "case_air_k_w": 10.8, "housing_k_w": 1.5, "winding_j_k": 7.0, "winding_case_k_w": 4.0},
+    "XM430-W210-T": {"case_j_k": 68.0, "case_air_k_w": 10.8, "housing_k_w": 1.5, "winding_j_k": 7.0, "winding_case_k_w": 4.0},
+}  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -92,8 +103,8 @@ class MotorSettings:
     housing_k_w: float = 3.0
     heat_sink_k_w: float = 0.0
     heat_sink_j_k: float = 0.0
-    air_exponent: float = 0.0
-    leg_w_k: float = 0.0
+    air_exponent: float = 0.15
+    leg_w_k: float = 0.01
     copper_per_k: float = 0.0039
     magnet_per_k: float = 0.001
     derating_per_k: float = 0.0
@@ -114,6 +125,7 @@ class MotorSettings:
             d_divisor=model.position_d_divisor,
             control_period_s=model.control_period_s,
             standby_a=model.standby_current_a,
+            **_HEAT.get(model.name, {}),  # type: ignore[arg-type]
         )
 
     @property
