@@ -19,7 +19,8 @@ Contract
 * **Many models.** A call rolls out V variants of the model in one batch on all cores. They must share the layout of the
   plant's model (same compiled sizes); parameters may differ freely. Results do not depend on the number of threads.
 * **Nothing idle is computed.** Sensors are off (positions and velocities are read from the state), and so are contacts on the
-  stand where, at the measured poses, no two parts of the robot come within CLEARANCE_M of each other.
+  stand where, at the measured poses, no two parts of the robot come within CLEARANCE_M of each other; without contacts
+  constraints are solved as one island, which is equal within the solver's tolerance.
 * **Memory** is bounded: states are sampled at the rows in chunks and never kept for a whole run.
 """
 
@@ -39,7 +40,7 @@ from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, position_servos
 from openant_tools.recording.run import Run
 
-__all__ = ["Rollouts", "Segment", "Trajectories", "initial_velocities"]
+__all__ = ["Rollouts", "Segment", "Staircase", "Trajectories", "initial_velocities"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -85,7 +86,7 @@ class Segment:
     row: Ints  # (rows,) index among the rows of all runs
     torque_off: dict[int, Bools]  # step → joints off from there on; always has 0
     start: float  # s, time of its first row
-    commands: _Staircase
+    commands: Staircase
 
 
 class Rollouts:
@@ -116,7 +117,8 @@ class Rollouts:
         self._batches: dict[int, Batch] = {}
         self._disable = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         if plant.setup is Setup.STAND and not any(_comes_close(plant, run) for run in runs):
-            self._disable |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+            # Without contacts a few joints' dry friction is solved sooner than it is sorted into islands.
+            self._disable |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
 
     @property
     def steps(self) -> int:
@@ -294,7 +296,7 @@ def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | 
     h, model = plant.timestep, plant.model
     torque_off = run.signal("torque", plant.joints, default=1.0) == 0
     flips = 1 + np.flatnonzero((torque_off[1:] != torque_off[:-1]).any(axis=1))
-    commands = _Staircase.of(run.command_times, cmd)
+    commands = Staircase.of(run.command_times, cmd)
     slewing = np.array([_limits_slew(model, int(i)) for i in plant.actuator])
     rest = _at_rest(model)
     segments = []
@@ -369,7 +371,7 @@ def _held(cmd: Array) -> Array | None:
 
 
 @dataclass(frozen=True)
-class _Staircase:
+class Staircase:
     """Commands in force: `values[k]` from `times[k]` until the next, before the first time the first value.
 
     Attributes:
@@ -381,12 +383,12 @@ class _Staircase:
     values: Array
 
     @classmethod
-    def of(cls, times: Array, values: Array) -> _Staircase:
+    def of(cls, times: Array, values: Array) -> Staircase:
         order = np.argsort(times, kind="stable")
         return cls(times[order], values[order])
 
-    def column(self, k: int) -> _Staircase:
-        return _Staircase(self.times, self.values[:, k : k + 1])
+    def column(self, k: int) -> Staircase:
+        return Staircase(self.times, self.values[:, k : k + 1])
 
     def _index(self, times: Array) -> Ints:
         return np.maximum(np.searchsorted(self.times, times, side="right") - 1, 0)

@@ -7,8 +7,9 @@ joint s² is the mean squared residual at the estimate times the integrated auto
 iteration. With a perfect model that is the sensor's noise, sample by sample; with an imperfect one it tempers the
 likelihood by itself, and intervals widen as they must.
 
-Rollouts are all of the cost. A Jacobian takes a dozen of them and is therefore used for several steps, as long as what it
-promises is what comes; weights are renewed at every step, which takes none.
+Rollouts are all of the cost. A Jacobian takes a dozen of them: it is taken in long time steps where short ones are not
+needed, and used for several steps, as long as what it promises is what comes. Weights take none: they follow what the
+Jacobian foresees, so that one step goes as far as it would in many.
 """
 
 from __future__ import annotations
@@ -55,12 +56,15 @@ MOST_STEPS = 20
 REACH, STALE = 3.0, 1.5
 #: so near the Jacobian's own place, prior deviations, it is as good as one taken anew
 SAME_PLACE = 0.3
-#: squared length of a step in posterior deviations, per parameter, below which a descent has arrived: near, and for good
-NEAR, ARRIVED = 0.05, 0.002
+#: squared length of a step in posterior deviations, per parameter, below which a descent has arrived: near, if the step is short
+#: in prior deviations too, and for good
+NEAR, ARRIVED = 5.0, 0.002
 #: shares of the promised gain: below the first a step is taken back; a Jacobian that keeps less than the second is stale
 WORSE, BROKEN = 0.05, 0.4
 #: nats per parameter that are not worth new derivatives; shorter steps in a row that are tried where none is any good
 TRIFLE, MOST_REFUSED = 0.05, 2
+#: rounds in which a step and the weights that it leads to find each other, before anything is simulated
+FORESEEN = 4
 #: a residual this small, in deviations that the encoder alone makes, has nothing in it that a second descent could find
 CLEAN = 1.5
 #: one effective sample per this many seconds where fits are compared whose residuals are model error
@@ -73,8 +77,8 @@ WHITE, SHORT_LIVED = 1.5, 10
 DECISIVE = 1.0
 #: half of the ±2 ms within which delays count as calibrated (effects.md)
 TIMING_STD_S = 1e-3
-#: s; the longest time step that first derivatives are taken with, where the model's own is at most half of it
-COARSEST_S = 0.0025
+#: s; the longest time step that derivatives are taken with, where the model's own is at most half of it
+COARSEST_S = 0.004
 #: share of the time step's effect that is taken as unknown: the rule is of first order
 RICHARDSON = 0.5
 #: delays (s) from which a fit starts where they explain the data far better than none
@@ -313,6 +317,8 @@ class Problem:
         shared = any(effect(name).shared for data in self.datasets for name, _ in data.acting)
         self._colours = colours(self.datasets[0].plant, self.parameters, coupled=floor or shared)
         self._on_floor = floor
+        # Laws that are compared shall differ in nothing but themselves.
+        self._coarse = not self.tempered and any(data.coarse is not data for data in self.datasets)
         chattering = [FLOOR_STEP_OF_BODY if p.definition.body else FLOOR_STEP for p in self.parameters]
         self._differences = np.array(chattering if self._on_floor else [STEP] * len(self.parameters))
         #: for each joint, the parameters that move it and their colours
@@ -485,18 +491,26 @@ class Problem:
             tangent: derivatives that are there already.
         """
         held = np.zeros(len(point.u), bool) if held is None else held
-        coarse, damping, refused = not central, 0.0, 0
+        # On the floor contacts chatter otherwise in long steps: these are good for a direction only.
+        coarse, damping, refused = self._coarse and not (central and self._on_floor), 0.0, 0
         for _ in range(MOST_STEPS):
-            if reweigh:
-                self._reweigh(point, driven_only)
             if tangent is None:
                 tangent = self._tangent(point, central, coarse)
                 tell()
-            precision, gradient = self._normal(tangent, point)
-            damped = precision + damping * np.diag(np.diag(precision))
-            step = self._step(damped, gradient, point.u, REACH, held)
+            step = np.zeros(len(point.u))
+            for _ in range(FORESEEN if reweigh and not self.tempered else 1):
+                # Weights follow from what a step leaves, and the step from them: what the derivatives foresee costs nothing.
+                if reweigh:
+                    foreseen = replace(point, residual=point.residual + self._along(tangent, step))
+                    self._reweigh(foreseen, driven_only)
+                precision, gradient = self._normal(tangent, point)
+                damped = precision + damping * np.diag(np.diag(precision))
+                before, step = step, self._step(damped, gradient, point.u, REACH, held)
+                if (step - before) @ precision @ (step - before) < enough * len(step):
+                    break
             away = float(np.abs(point.u - tangent.u).max(initial=0.0))
-            if step @ precision @ step < enough * len(step):
+            short = float(np.abs(step).max(initial=0.0)) < SAME_PLACE
+            if step @ precision @ step < (enough if short else ARRIVED) * len(step):
                 if away < SAME_PLACE or enough > ARRIVED:
                     return _Descent(point, tangent, True)
                 tangent = None
@@ -506,10 +520,13 @@ class Problem:
             promised = -float(gradient @ step + 0.5 * step @ precision @ step)
             kept = (self._cost(point) - self._cost(there)) / max(promised, 1e-300)
             if kept > WORSE:
-                self._correct(tangent, step, there.residual - point.residual)
+                if self.tempered or (np.abs(step) > self._differences).any():
+                    # A shorter step than the differences themselves tells less than they do, and more of stiction.
+                    self._correct(tangent, step, there.residual - point.residual)
                 point = there
                 damping, refused = damping / 10 if kept > BROKEN else damping, 0
-            if kept < BROKEN and promised < TRIFLE * len(step):
+            settled = short and (away < SAME_PLACE or enough > ARRIVED)
+            if promised < TRIFLE * len(step) and (kept < BROKEN or settled):
                 return _Descent(point, tangent, True)  # what friction makes of a hair's difference is all that is left
             if kept <= WORSE and away == 0.0:
                 damping, refused = max(0.3, 5 * damping), refused + 1
@@ -676,9 +693,14 @@ class Problem:
             if data.plant.model.nhistory:
                 out.append(np.zeros_like(data.measured))  # buffers hold a number of steps, too few at half of one
                 continue
-            half = data.stepped(0.5).simulate(self.parameters, [point.u]).pos[0]
-            self.evaluations += 2
-            out.append(2.0 * np.nan_to_num(half - (data.measured - point.residual[rows])))
+            simulated = data.measured - point.residual[rows]
+            self.evaluations += 1
+            if self._coarse and not self._on_floor and data.coarse is not data:
+                twice = data.coarse.simulate(self.parameters, [point.u]).pos[0]
+                out.append(np.nan_to_num(simulated - twice))
+            else:
+                half = data.stepped(0.5).simulate(self.parameters, [point.u]).pos[0]
+                out.append(2.0 * np.nan_to_num(half - simulated))
         return np.concatenate(out)
 
     def _wider_by_blocks(self, tangent: _Tangent, point: _Point, covariance: Array, free: Bools) -> Array:
@@ -865,7 +887,6 @@ class Problem:
                 moved[members] += step[members]
                 variants.append(moved)
         n = len(self._colours)
-        coarse &= any(data.coarse is not data for data in self.datasets)
         if coarse and not central:
             variants.append(u)  # what both differ from must be stepped alike
         self.evaluations += len(variants)
