@@ -35,6 +35,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "train": ("train", "Learning", "Train an agent to walk, in simulation."),
     "eval": ("eval", "Learning", "Play a trained agent and measure its reward per second."),
     "plot": ("plot", "Learning", "Learning curves of several runs in one picture."),
+    "policies": ("policies", "Learning", "Which simulation ranks policies as the robot does, and which fool it."),
     "tune": ("tune", "Learning", "Search for settings of an agent, on as many machines as you like."),
 }
 

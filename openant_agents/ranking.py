@@ -1,0 +1,248 @@
+"""Does a simulation rank policies as the robot does? The gap that matters to someone who picks a policy by simulation.
+
+With S_i the average reward of policy i in a simulation and R_i on the robot:
+
+- Spearman's ρ (Pearson's r of the ranks) and Kendall's τ, with intervals by bootstrap over policies, in which every reward
+  is also drawn anew within its own standard error;
+- mean maximum rank violation, (1/N) Σ_i max_j |R_i − R_j| · [(S_i > S_j) ≠ (R_i > R_j)] (SIMPLER, arXiv 2405.05941), in m/s,
+  0 at best;
+- regret of choosing the simulated best, max R − R[argmax S], in m/s and as a share of max R.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_agents.evaluate import evaluate
+from openant_agents.exploits import Twitch
+from openant_agents.policies import load_policy
+from openant_agents.runs import read_facts
+from openant_tools.errors import BadInput
+from openant_tools.files import write_text
+
+__all__ = [
+    "Agreement", "Interval", "Measured", "agreement", "find_policies", "play", "rank_violation", "read_measured", "regret",
+    "write_measured",
+]  # fmt: skip
+
+SCHEMA = "openant.policies/1"
+RESAMPLES = 2_000
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a policy achieved in one place.
+
+    Attributes:
+        average_reward_m_s: m/s, mean over plays.
+        standard_error_m_s: m/s, of that mean.
+        plays: m/s, each.
+        reversals_hz: how often the actions of a joint turned back, per second: walking does so once or twice.
+        helped: how often the robot had to be set up again.
+    """
+
+    average_reward_m_s: float
+    standard_error_m_s: float
+    plays: tuple[float, ...]
+    reversals_hz: float
+    helped: int
+
+    @classmethod
+    def of(cls, plays: Sequence[float], reversals_hz: float = math.nan, helped: int = 0) -> Measured:
+        n = len(plays)
+        error = float(np.std(plays, ddof=1) / math.sqrt(n)) if n > 1 else 0.0
+        return cls(float(np.mean(plays)), error, tuple(plays), reversals_hz, helped)
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A figure and its interval of 95 %."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well the rewards of a simulation foretell those of the robot.
+
+    Attributes:
+        policies: N.
+        spearman, kendall: ρ and τ.
+        rank_violation_m_s: mean maximum rank violation.
+        regret_m_s, regret_share: of choosing the simulated best.
+        best_is: place on the robot of the policy that is best in the simulation, 1 for the best.
+    """
+
+    policies: int
+    spearman: Interval
+    kendall: Interval
+    rank_violation_m_s: Interval
+    regret_m_s: Interval
+    regret_share: float
+    best_is: int
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+# ---------------------------------------------------------------------------------------------------------- figures
+
+
+def rank_violation(simulated: Array, real: Array) -> float:
+    """Mean maximum rank violation, in the unit of `real`; both (policies,)."""
+    wrong = np.greater.outer(simulated, simulated) != np.greater.outer(real, real)
+    return float((np.abs(np.subtract.outer(real, real)) * wrong).max(axis=1).mean())
+
+
+def regret(simulated: Array, real: Array) -> float:
+    """What the simulated best falls short of the real best, in the unit of `real`; both (policies,)."""
+    return float(real.max() - real[int(np.argmax(simulated))])
+
+
+def agreement(simulated: Sequence[Measured], real: Sequence[Measured], *, seed: int = 0) -> Agreement:
+    """Compare the rewards of the same policies in a simulation and on the robot.
+
+    Raises:
+        BadInput: fewer than three policies: ranks of two agree or do not.
+    """
+    from scipy.stats import kendalltau, spearmanr
+
+    n = len(simulated)
+    if n < 3 or n != len(real):
+        raise BadInput(f"{n} policies cannot be ranked", remedy="rank three or more, trained for different times")
+    s, r = (np.array([one.average_reward_m_s for one in which]) for which in (simulated, real))
+    se, re = (np.array([one.standard_error_m_s for one in which]) for which in (simulated, real))
+
+    figures: dict[str, Callable[[Array, Array], float]] = {
+        "spearman": lambda a, b: float(spearmanr(a, b).statistic),
+        "kendall": lambda a, b: float(kendalltau(a, b).statistic),
+        "rank_violation_m_s": rank_violation,
+        "regret_m_s": regret,
+    }
+    random = np.random.default_rng(seed)
+    drawn: dict[str, list[float]] = {name: [] for name in figures}
+    for _ in range(RESAMPLES):
+        chosen = random.integers(0, n, n)
+        if len(np.unique(chosen)) < 3:
+            continue
+        a = random.normal(s[chosen], se[chosen])
+        b = random.normal(r[chosen], re[chosen])
+        for name, figure in figures.items():
+            drawn[name].append(figure(a, b))
+    spans = {}
+    for name, figure in figures.items():
+        sound = np.array([value for value in drawn[name] if math.isfinite(value)])
+        low, high = np.percentile(sound, [2.5, 97.5]) if len(sound) else (math.nan, math.nan)
+        spans[name] = Interval(figure(s, r), float(low), float(high))
+    best = float(r.max())
+    return Agreement(
+        policies=n,
+        **spans,
+        regret_share=spans["regret_m_s"].value / best if best > 0.0 else math.nan,
+        best_is=1 + int((r > r[int(np.argmax(s))]).sum()),
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------- playing
+
+
+def find_policies(folder: Path) -> dict[str, Path]:
+    """The training runs in a folder by name, in order.
+
+    Raises:
+        BadInput: there is none.
+    """
+    runs = {path.parent.name: path.parent for path in sorted(folder.glob("*/run.json"))} if folder.is_dir() else {}
+    if not runs:
+        raise BadInput(
+            "there are no policies here", where=folder, remedy="name a folder with the --out folders of `openant train`"
+        )
+    return runs
+
+
+def play(
+    run: Path,
+    make_env: Callable[[Mapping[str, Any]], gymnasium.Env[Any, Any]],
+    *,
+    seconds: float,
+    plays: int,
+    report: Callable[[float], None] | None = None,
+) -> Measured:
+    """Play a policy some times, from other headings each.
+
+    Args:
+        run: the policy's.
+        make_env: makes the place from how the policy's own environment was made (its `run.json`).
+        seconds: s of robot time of each play.
+        plays: how many.
+        report: called with the share done.
+
+    Raises:
+        BadInput: no such policy, or one that does not fit the place.
+    """
+    env = Twitch(make_env(read_facts(run)["env"]))
+    try:
+        policy = load_policy(run, env)
+        averages: list[float] = []
+        helped = 0
+        for seed in range(plays):
+
+            def tell(done: float, average: float, seed: int = seed) -> None:
+                if report is not None:
+                    report((seed + done / seconds) / plays)
+
+            result, _ = evaluate(env, policy.act, seconds=seconds, seed=seed, begin=policy.begin, report=tell)
+            averages.append(result.average_reward_m_s)
+            helped += sum(result.helped.values())
+        return Measured.of(averages, env.reversals_hz, helped)
+    finally:
+        env.close()
+
+
+# ------------------------------------------------------------------------------------------------------------- files
+
+
+def write_measured(file: Path, measured: Mapping[str, Measured], **facts: Any) -> None:
+    """Write what policies achieved in one place, with whatever says where that was."""
+    policies = {name: asdict(one) for name, one in measured.items()}
+    write_text(file, json.dumps({"schema": SCHEMA, **facts, "policies": policies}, indent=1) + "\n")
+
+
+def read_measured(file: Path) -> dict[str, Measured]:
+    """What `write_measured` wrote, or rewards by name from elsewhere.
+
+    Raises:
+        BadInput: the file says something else.
+    """
+    try:
+        policies = json.loads(file.read_text(encoding="utf-8"))["policies"]
+        found = {}
+        for name, one in policies.items():
+            one = {"average_reward_m_s": one} if isinstance(one, int | float) else one
+            value = float(one["average_reward_m_s"])
+            found[name] = Measured(
+                value, float(one.get("standard_error_m_s", 0.0)), tuple(one.get("plays", (value,))),
+                float(one.get("reversals_hz", math.nan)), int(one.get("helped", 0)),
+            )  # fmt: skip
+    except OSError as error:
+        raise BadInput("it cannot be read", where=file, remedy="name what `openant policies play` wrote") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise BadInput(
+            "it does not say what policies achieved", where=file, remedy="name what `openant policies play` wrote"
+        ) from error
+    if not all(math.isfinite(one.average_reward_m_s) for one in found.values()):
+        raise BadInput("a reward in it is no number", where=file, remedy="measure that policy again")
+    return found

@@ -1,0 +1,277 @@
+"""`openant policies`: which simulation ranks policies as the robot does, and which policies it is fooled by."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from openant_tools.cli.learning import need_torch
+from openant_tools.cli.options import json_option, report_option
+from openant_tools.errors import BadInput
+
+if TYPE_CHECKING:
+    from openant_agents.ranking import Measured
+
+__all__ = ["policies"]
+
+policies_option = click.option(
+    "--policies", "folder", type=click.Path(path_type=Path), required=True, metavar="DIR",
+    help="A folder with runs of `openant train` in it.",
+)  # fmt: skip
+play_options = (
+    click.option(
+        "--seconds", type=click.FloatRange(min=0.0, min_open=True), default=60.0, show_default=True,
+        help="Robot time of a play.",
+    ),
+    click.option("--plays", type=click.IntRange(min=1), default=3, show_default=True, help="Of each policy."),
+)  # fmt: skip
+
+
+def _playing(command: Callable[..., Any]) -> Callable[..., Any]:
+    for option in (*play_options, policies_option):
+        command = option(command)
+    return command
+
+
+@click.group()
+def policies() -> None:
+    """Play a set of policies in several places and compare.
+
+    \b
+    A place is
+      nominal                 the bundled model of the standard kit (nominal:lite of the other)
+      DIR                     a robot's folder: its model and the effects of its robot.toml, simulated
+      virtual:SCENARIO.toml   a virtual robot behind its bus; virtual:default for a healthy one
+      hardware:DIR            the robot itself (needs --yes)
+      FILE.json               what was measured before: from `policies play`, or {"policies": {NAME: m/s}}
+    """
+
+
+@policies.command()
+@_playing
+@click.option("--on", "place", required=True, metavar="PLACE", help="Where: see `openant policies --help`.")
+@click.option("--yes", is_flag=True, help="The robot may move: do not ask.")
+@click.option(
+    "--json", "json_file", type=click.Path(path_type=Path, dir_okay=False), required=True, metavar="FILE",
+    help="What to write. A file that stands there goes on: what it has is not played again.",
+)  # fmt: skip
+def play(folder: Path, seconds: float, plays: int, place: str, yes: bool, json_file: Path) -> None:
+    """Play every policy in one place and write what each achieved."""
+    need_torch()
+    from openant_agents.ranking import find_policies, read_measured, write_measured
+
+    runs = find_policies(folder)
+    done = read_measured(json_file) if json_file.is_file() else {}
+    for name, measured in _play(runs, place, seconds, plays, yes, known=done):
+        done[name] = measured
+        write_measured(json_file, done, place=place, seconds=seconds)
+        click.echo(
+            f"{name:24} {100 * measured.average_reward_m_s:+6.1f} ± {100 * measured.standard_error_m_s:.1f} cm/s"
+        )
+
+
+@policies.command()
+@_playing
+@click.option("--real", required=True, metavar="PLACE", help="The robot: a place, or what was measured on it.")
+@click.option(
+    "--sim", "simulations", multiple=True, required=True, metavar="NAME=PLACE", help="A simulation of it. Repeatable."
+)
+@click.option(
+    "--flag-by",
+    metavar="NAME",
+    help="Flag exploits of this simulation. Default: the first. Give `none` to leave it out.",
+)
+@click.option("--yes", is_flag=True, help="The robot may move: do not ask.")
+@report_option
+@json_option
+def rank(
+    folder: Path,
+    seconds: float,
+    plays: int,
+    real: str,
+    simulations: tuple[str, ...],
+    flag_by: str | None,
+    yes: bool,
+    report: Path | None,
+    json_file: Path | None,
+) -> None:
+    """Say which simulation ranks policies as the robot does, and what choosing by it costs.
+
+    \b
+    Example:
+      openant policies rank --policies my-ant/runs --real measured.json \\
+        --sim nominal=nominal --sim calibrated=my-ant --sim diagnosed=my-ant-diagnosed --report ranking
+    """
+    need_torch()
+    from openant_agents.exploits import DISTURBANCES, flag
+    from openant_agents.ranking import agreement, find_policies
+    from openant_agents.ranking_figure import draw_ranking
+    from openant_tools.files import write_text
+
+    places = _simulations(simulations)
+    if flag_by is not None and flag_by != "none" and flag_by not in places:
+        raise BadInput(f"no simulation is called {flag_by}", remedy=f"choose one of {', '.join(places)}, or none")
+    runs = find_policies(folder)
+    on_robot = dict(_play(runs, real, seconds, plays, yes))
+    runs = {name: path for name, path in runs.items() if name in on_robot}
+    simulated = {name: dict(_play(runs, place, seconds, plays, False)) for name, place in places.items()}
+    names = list(runs)
+    for name, measured in simulated.items():
+        missing = [policy for policy in names if policy not in measured]
+        if missing:
+            raise BadInput(
+                f"{name} has no reward of {missing[0]}", remedy="play it there, or leave it out of --policies"
+            )
+
+    found = {
+        name: agreement([measured[policy] for policy in names], [on_robot[policy] for policy in names])
+        for name, measured in simulated.items()
+    }
+    chooser = next(iter(places)) if flag_by is None else flag_by
+    flags = []
+    if chooser != "none":
+        worse: dict[str, dict[str, Measured]] = {}
+        if not places[chooser].endswith(".json"):
+            for words, wrapper in DISTURBANCES.items():
+                worse[words] = dict(_play(runs, places[chooser], seconds, 1, False, wrapper=wrapper))
+        for policy in names:
+            otherwise = {words: measured[policy].average_reward_m_s for words, measured in worse.items()}
+            otherwise |= {
+                f"the {name} simulation": measured[policy].average_reward_m_s
+                for name, measured in simulated.items() if name != chooser
+            }  # fmt: skip
+            here = simulated[chooser][policy]
+            one = flag(policy, here.average_reward_m_s, otherwise, here.reversals_hz)
+            flags += [one] if one is not None else []
+
+    _print(names, on_robot, simulated, found)
+    for one in flags:
+        click.echo(f"exploit? {one.words}")
+    if report is not None:
+        picture = report / "ranking.png"
+        draw_ranking(names, on_robot, simulated, found, [one.policy for one in flags], picture)
+        click.echo(f"wrote {picture}", err=True)
+    if json_file is not None:
+        answer = {
+            "schema": "openant.ranking/1",
+            "policies": {
+                policy: {
+                    "real_m_s": on_robot[policy].average_reward_m_s,
+                    **{f"{name}_m_s": measured[policy].average_reward_m_s for name, measured in simulated.items()},
+                }
+                for policy in names
+            },
+            "agreement": {name: one.as_dict() for name, one in found.items()},
+            "flags": [
+                {"policy": one.policy, "keeps": dict(one.depends_on), "reversals_hz": one.reversals_hz} for one in flags
+            ],
+        }  # fmt: skip
+        write_text(json_file, json.dumps(answer, indent=1) + "\n")
+
+
+def _print(names: list[str], real: Mapping[str, Any], simulated: Mapping[str, Any], found: Mapping[str, Any]) -> None:
+    """Rewards by policy, the best on the robot first, and the figures of each simulation."""
+    click.echo(f"{'policy, cm/s':24} {'robot':>11}" + "".join(f" {name:>11}" for name in simulated))
+    for policy in sorted(names, key=lambda name: -real[name].average_reward_m_s):
+        cells = [real[policy], *(measured[policy] for measured in simulated.values())]
+        click.echo(
+            f"{policy:24} "
+            + " ".join(f"{100 * one.average_reward_m_s:+6.1f} ±{100 * one.standard_error_m_s:3.1f}" for one in cells)
+        )
+    for name, one in found.items():
+        s, k, v, r = one.spearman, one.kendall, one.rank_violation_m_s, one.regret_m_s
+        click.echo(
+            f"{name}: Spearman {s.value:.2f} [{s.low:.2f}, {s.high:.2f}], Kendall {k.value:.2f} [{k.low:.2f}, {k.high:.2f}],"
+            f" rank violation {100 * v.value:.1f} cm/s, regret {100 * r.value:.1f} cm/s"
+            f" ({100 * one.regret_share:.0f} %): its best is number {one.best_is} of {one.policies} on the robot"
+        )
+
+
+def _simulations(given: tuple[str, ...]) -> dict[str, str]:
+    places: dict[str, str] = {}
+    for text in given:
+        name, equals, place = text.partition("=")
+        if not (name and equals and place):
+            raise BadInput(f"--sim {text} is not NAME=PLACE", remedy="such as --sim calibrated=my-ant")
+        if name in places:
+            raise BadInput(f"two simulations are called {name}", remedy="give each a name of its own")
+        places[name] = place
+    return places
+
+
+def _play(
+    runs: Mapping[str, Path],
+    place: str,
+    seconds: float,
+    plays: int,
+    yes: bool,
+    *,
+    known: Mapping[str, Measured] | None = None,
+    wrapper: Callable[[Any], Any] | None = None,
+) -> Any:
+    """(name, what it achieved) of each policy, with progress; from a file where the place is one."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from openant_agents.ranking import play as play_one
+    from openant_agents.ranking import read_measured
+
+    if place.endswith(".json"):
+        measured = read_measured(Path(place))
+        yield from ((name, one) for name, one in measured.items() if name in runs)
+        return
+    make = _maker(place, yes)
+
+    def made(facts: Mapping[str, Any]) -> Any:
+        return make(facts) if wrapper is None else wrapper(make(facts))
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(place, total=1.0)
+
+        def tell(share: float) -> None:
+            bar.update(task, completed=share)
+
+        for number, (name, run) in enumerate(runs.items(), start=1):
+            if known and name in known:
+                continue
+            bar.update(task, completed=0.0, description=f"{place}: {name} ({number} of {len(runs)})")
+            yield name, play_one(run, made, seconds=seconds, plays=plays, report=tell)
+
+
+def _maker(place: str, yes: bool) -> Callable[[Mapping[str, Any]], Any]:
+    """How to make an environment of a place, with the task, step and range of actions that a policy was trained with.
+
+    Raises:
+        BadInput: no such place, or a robot that may not move.
+    """
+    import gymnasium
+
+    import openant_env  # noqa: F401  (registers the environments)
+    from openant_tools.cli.walking import HARDWARE_ID, SIMULATED_ID, may_move
+
+    kind, _, rest = place.partition(":")
+    name, chosen = SIMULATED_ID, {}
+    if place == "nominal" or kind == "nominal":
+        chosen = {"kit": rest or "standard"}
+    elif kind in ("virtual", "hardware"):
+        name = HARDWARE_ID
+        if kind == "virtual":
+            chosen = {"virtual": rest if rest == "default" else os.path.abspath(rest)}
+        else:
+            chosen = {"robot": os.path.abspath(rest)}
+            may_move(chosen, yes)
+    elif os.path.exists(place):
+        chosen = {"robot": os.path.abspath(place)}
+    else:
+        raise BadInput(f"there is no such place: {place}", remedy="see `openant policies --help` for what a place is")
+
+    def make(facts: Mapping[str, Any]) -> Any:
+        kept = {key: facts["options"][key] for key in ("task", "dt", "action_range") if key in facts["options"]}
+        return gymnasium.make(name, **kept, **chosen)
+
+    return make
