@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections import Counter
 from collections.abc import Mapping
@@ -192,7 +193,7 @@ def reliability_figure(found: SoakScore) -> Figure:
     right = np.array([case.ranked[0] == case.answer.cause for case in found.faulty if case.ranked])
     axes.plot([0, 1], [0, 1], color=plots.INK, lw=0.8, alpha=0.6, label="ideal")
     edges = np.array([0.0, 0.4, 0.6, 0.75, 0.9, 0.97, 1.001])
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in itertools.pairwise(edges.tolist()):
         inside = (stated >= low) & (stated < high)
         if not inside.any():
             continue

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,15 +19,16 @@ from numpy.typing import NDArray
 from openant_tools.blind.soaks import SoakAnswer
 from openant_tools.comms.protocol2 import Instruction, sync_read, sync_write
 from openant_tools.comms.servos import BLOCK, BLOCK_ADDRESS, BLOCK_SIZE, Block, Servo
+from openant_tools.comms.soak import MOVE_S, REST_S, soak_motion
 from openant_tools.recording.run import Facts, Run
 from openant_tools.robot.joints import JOINTS
-from openant_tools.robot.kit import home_angles
+from openant_tools.robot.kit import ANGLE_LIMIT_RAD, home_angles
 from openant_tools.virtual.faults import Faults
 from openant_tools.virtual.scenario import Scenario, parse_scenario
 from openant_tools.virtual.start import build
 from openant_tools.virtual.world import MOUNT_EIGHTHS, World
 
-__all__ = ["Host", "record_transactions", "soak_scenario", "soak_virtual"]
+__all__ = ["Host", "record_transactions", "soak_scenario", "soak_virtual", "swinging_soak"]
 
 Array = NDArray[np.float64]
 #: s, physics in steps of it is exact enough for angles that faults hang on
@@ -61,8 +62,6 @@ class Host:
 
 def soak_virtual(answer: SoakAnswer, name: str) -> Run:
     """The log of one soak of a set."""
-    from dataclasses import replace
-
     chance = np.random.default_rng(answer.seed)
     scenario = parse_scenario(tomllib.loads(soak_scenario(answer)))
     host = Host(build(scenario), answer.rate_hz, seed=answer.seed)
@@ -154,6 +153,36 @@ def soak_scenario(answer: SoakAnswer) -> str:
             "fault": faults,
         }
     )
+
+
+def swinging_soak(
+    scenario: Scenario,
+    seconds: float,
+    rate_hz: float,
+    name: str,
+    *,
+    still: bool = False,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Run:
+    """A soak of any scenario with the motion of `openant comms soak`, without bytes and ports."""
+    scenario.world.body.timestep_s = max(scenario.world.body.timestep_s, STEP_S)
+    scenario.world.doze = True
+    world = build(scenario)
+    joints = world.joints
+    limits = {joint: (-ANGLE_LIMIT_RAD[JOINTS[joint].kind], ANGLE_LIMIT_RAD[JOINTS[joint].kind]) for joint in joints}
+    fine = 50.0
+    pieces: dict[int, Array] = {}
+
+    def motion(t: float) -> Array:
+        piece, at = divmod(t, MOVE_S + REST_S)
+        if int(piece) not in pieces:
+            pieces.clear()
+            pieces[int(piece)] = soak_motion(joints, limits, fine, int(piece))
+        return pieces[int(piece)][0 if still else min(int(at * fine), len(pieces[int(piece)]) - 1)]
+
+    run = record_transactions(Host(world, rate_hz), scenario, seconds, name, motion=motion, progress=progress)
+    chain = [[joints[k] for k in cable] for cable in world.settings.bus.chains]
+    return replace(run, facts=replace(run.facts, extra={**run.facts.extra, "baud": world.line_baud, "chain": chain}))
 
 
 def record_transactions(

@@ -48,7 +48,7 @@ class SoakMix:
     """
 
     healthy: float = 1 / 3
-    virtual: float = 0.35
+    virtual: float = 0.25
     healthy_s: tuple[float, float] = (600.0, 900.0)
     faulty_s: tuple[float, float] = (120.0, 600.0)
 

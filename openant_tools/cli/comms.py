@@ -14,6 +14,7 @@ import click
 
 from openant_tools.cli.comms_blind import blind
 from openant_tools.cli.comms_diagnose import diagnose, timing
+from openant_tools.cli.comms_soak import soak
 from openant_tools.cli.options import json_option, robot_option
 from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_option, virtual_robot
 
@@ -39,7 +40,7 @@ def comms() -> None:
     """
 
 
-for _command in (blind, diagnose, timing):
+for _command in (blind, diagnose, soak, timing):
     comms.add_command(_command)
 
 

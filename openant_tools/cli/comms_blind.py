@@ -34,7 +34,7 @@ _jobs_option = click.option(
 @click.option("--seed", type=click.IntRange(0), metavar="S", help="Of everything that is drawn.")
 @click.option("--seed-from", "commit", metavar="COMMIT", help="Take the seed from a commit's hash: nobody chose it.")
 @click.option("--healthy", type=click.FloatRange(0, 1), metavar="SHARE", help="Healthy soaks. Default a third.")
-@click.option("--virtual", type=click.FloatRange(0, 1), metavar="SHARE", help="From the virtual robot. Default 0.35.")
+@click.option("--virtual", type=click.FloatRange(0, 1), metavar="SHARE", help="From the virtual robot. Default 0.25.")
 @_key_option
 @click.option("--open", "unsealed", is_flag=True, help="Leave the answers open: for development.")
 @_jobs_option

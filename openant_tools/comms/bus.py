@@ -176,6 +176,8 @@ class Bus:
     #: requests that may be sent again by `read` and `write` (never by sync reads); each is counted
     retries: int = 2
 
+    #: the last request of which something was lost, and all that came for it; for whoever keeps a log, who then clears it
+    failed: tuple[bytes, bytes] | None = field(default=None, init=False)
     #: when the first byte of the last request left, s
     request_at: float = field(default=0.0, init=False)
 
@@ -446,6 +448,8 @@ class Bus:
             for answer in answers:
                 self.statistics.count(answer.id, answer.cause, answer.rtt, answer.alert)
             self._unsettled = not all(answer.ok for answer in answers)
+            if self._unsettled:
+                self.failed = request.packet, data
         if data:
             self._quiet_from = edges[-1][1] - self.timing.write_read_gap_s
         rtt = answers[-1].rtt
@@ -587,6 +591,7 @@ class Bus:
             cause = Cause.TIMEOUT if broken <= 0 else Cause.SHORT if len(data) < expected else Cause.CRC
             self.statistics.count(ids[len(parts)], cause, None, False)
             self._unsettled = True
+            self.failed = request.packet, data
         return answers
 
     def _whole_joined(

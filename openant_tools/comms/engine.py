@@ -37,6 +37,7 @@ from openant_tools.comms.motion import Motion, catch, hold, play, ramp
 from openant_tools.comms.ports import WANTED_LATENCY_MS, Host, udev_rule
 from openant_tools.comms.ring import ERR_CODES, Ring
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Block, Servo, Servos
+from openant_tools.comms.thinning import Thinning
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
 from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.recording.resume import continuation
@@ -63,6 +64,8 @@ WATCHDOG_UNIT_S = 0.02
 RELEASE_S = 0.5
 #: How long the engine waits for a port that vanished to come back, between two tries.
 REOPEN_PERIOD_S = 0.5
+#: s between two losses whose raw bytes a thin recording keeps: a line that is dead says the same each time.
+RAW_PERIOD_S = 0.05
 #: The IMU's port is left alone for so long before a cycle begins.
 IMU_SLACK_S = 0.3e-3
 #: Operating modes (register 11).
@@ -103,6 +106,9 @@ class Engine:
         #: (number, until when) of commands that only let time pass
         self._looks: list[tuple[int, float]] = []
         self._recorder: RecordingWriter | None = None
+        self._thinning: Thinning | None = None
+        #: when the raw bytes of a loss were kept last, s
+        self._bytes_at = -np.inf
         self._overruns = 0
         self._worst_wake = 0.0
         #: when the servos were last asked, s
@@ -588,9 +594,25 @@ class Engine:
         goals: list[int | None] = [None] * n if self._counts is None else list(self._counts)
         try:
             torque = [self._torque and not limp for limp in self._limp.tolist()]
-            self._recorder.cycle(Cycle(t, goals, cmd_t, wake, recorded, torque))
+            cycle = Cycle(t, goals, cmd_t, wake, recorded, torque)
+            if self._thinning is None:
+                self._recorder.cycle(cycle)
+            else:
+                self._record_thinly(self._thinning, self._recorder, cycle)
         except RecordingStopped as error:
             self._recording_failed(error)
+
+    def _record_thinly(self, thinning: Thinning, recorder: RecordingWriter, cycle: Cycle) -> None:
+        for kept in thinning.take(cycle):
+            recorder.cycle(kept)
+        if self._bus.failed is not None:
+            (asked, heard), self._bus.failed = self._bus.failed, None
+            if cycle.t - self._bytes_at >= RAW_PERIOD_S:
+                self._bytes_at = cycle.t
+                recorder.event("bytes", asked=asked.hex(), heard=heard.hex())
+        counts = thinning.counts(cycle.t)
+        if counts is not None:
+            recorder.event("counts", **counts)
 
     def _recording_failed(self, error: RecordingStopped) -> None:
         """The disk is full: the robot must not go on moving for a recording that nobody will have."""
@@ -773,6 +795,8 @@ class Engine:
         if self.config.chain:
             extra["chain"] = [list(cable) for cable in self.config.chain]
         facts = replace(command.facts, joints=self._servos.joints, extra={**extra, **command.facts.extra})
+        if command.thin_s is not None:
+            facts = replace(facts, extra={**facts.extra, "rate_hz": self.config.rate_hz, "thinned_s": command.thin_s})
         self._registers = self._read_registers()
         continued = None
         if command.resume:
@@ -787,6 +811,8 @@ class Engine:
             overwrite=command.overwrite,
             continued=continued,
         )
+        self._thinning = None if command.thin_s is None else Thinning(command.thin_s, self._servos.joints)
+        self._bus.failed = None
         if continued is not None:
             self._recorder.event("resumed", pause_s=self.clock.now() + continued.shift_s - continued.last_s)
         return messages.Reply(number, value=str(self._recorder.path))
@@ -805,6 +831,8 @@ class Engine:
         if self._recorder is None:
             return None
         recorder, self._recorder = self._recorder, None
+        if self._thinning is not None:
+            recorder.event("counts", **self._thinning.rest(self.clock.now()))
         recorder.close()
         return str(recorder.path), recorder.cycles
 

@@ -155,6 +155,8 @@ class Record:
 
     Attributes:
         resume: go on with the recording that stands there, be it torn; its facts and config stay.
+        thin_s: keep one healthy cycle in so many s, all cycles around what is not as it should be, the raw bytes of what was
+            lost, and counts of the rest.
     """
 
     path: str
@@ -162,6 +164,7 @@ class Record:
     config: str | None = None
     overwrite: bool = False
     resume: bool = False
+    thin_s: float | None = None
 
 
 @dataclass(frozen=True)

@@ -122,6 +122,8 @@ def step_timing(run: Run) -> StepTiming:
     cmd = run.signal("cmd")
     if not np.isfinite(cmd).any():
         raise BadInput("there is no command in it", where=where, remedy="needed are cmd.J and, for true times, cmd_t")
+    if "thinned_s" in run.facts.extra:
+        raise BadInput("a soak that keeps few of its cycles", where=where, remedy="record it with --every-cycle")
     first = _new_commands(run, cmd)
     if len(first) < FEWEST_STEPS + 1:
         raise BadInput(

@@ -81,7 +81,7 @@ CAUSES: Mapping[str, Cause] = {
         {"all": 0.03, "behind": 0.43, "one": 0.44, "pair": 0.03, "scattered": 0.07},
         {
             "crc": (0.7, 3.0), "together": (2.0, 1.0), "rate": (0.7, 3.0), "single": (0.7, 1.3), "long": (1.2, 2.5),
-            "dip": (0.35, 6.0), "reset": (0.35, 3.0), "angle": (4.5, 0.8), "load": (0.7, 3.0), "low": (0.6, 4.0), "motion": (0.6, 3.5),
+            "dip": (0.35, 6.0), "reset": (0.35, 3.0), "angle": (4.5, 0.8), "load": (0.6, 1.8), "low": (0.5, 1.6), "motion": (0.6, 3.5),
         },
     ),
     "bad_servo": Cause(

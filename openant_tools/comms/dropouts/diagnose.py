@@ -130,7 +130,7 @@ class DropoutDiagnosis:
             "lost": {joint: int(count) for joint, count in zip(log.joints, log.lost.sum(axis=0), strict=True)},
             "loss": {
                 joint: float(count / max(1, asked))
-                for joint, count, asked in zip(log.joints, log.lost.sum(axis=0), log.asked.sum(axis=0), strict=True)
+                for joint, count, asked in zip(log.joints, log.lost.sum(axis=0), log.answers, strict=True)
             },
             "marks": {name: {"value": round(one.value, 4), "words": one.words} for name, one in m.marks.items()},
             "episodes": [
@@ -217,6 +217,8 @@ def _terms(cause: Cause, measures: Measures) -> dict[str, float]:
         if not lossy and name not in _OF_TIME:
             continue  # a few losses that any bus has say nothing of what else is wrong
         terms[name] = _density(seen.value, cause.marks.get(name, OTHERWISE[name]))
+        if name == "load" and "low" in measures.marks:
+            terms[name] *= 0.4  # the supply says the same, and better
         if name in _DECISIVE:
             terms[name] *= TEMPER
         if name in ("angle", "load", "low", "motion", "single", "together", "dip", "crc"):
@@ -247,7 +249,7 @@ def _log_sum(values: Sequence[float]) -> float:
 
 def _words(mark: str, measures: Measures) -> str:
     if mark == "losses":
-        lost, asked = int(measures.log.lost.sum()), int(measures.log.asked.sum())
+        lost, asked = int(measures.log.lost.sum()), int(measures.log.answers.sum())
         return f"{lost} of {asked} answers lost" if lost else f"none of {asked} answers lost"
     if mark == "reach":
         reach, log = measures.reach, measures.log
@@ -305,7 +307,7 @@ def _first(measures: Measures) -> int:
 
 def _sentence(verdict: str, best: Suspect, measures: Measures, tied: Sequence[str]) -> str:
     log = measures.log
-    lost, asked, reads = int(log.lost.sum()), int(log.asked.sum()), len(log.t)
+    lost, asked, reads = int(log.lost.sum()), int(log.answers.sum()), len(log.t)
     count = f"{lost} of {asked} answers lost in {log.seconds:.0f} s" if lost else f"no answer lost in {reads} reads"
     if verdict == "none":
         return f"{count}: nothing is wrong with the bus"

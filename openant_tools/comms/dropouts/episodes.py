@@ -141,7 +141,7 @@ def _without_shadow(log: BusLog) -> Flags | None:
 
 
 def _reach(log: BusLog, lost: Flags, wires: Sequence[tuple[int, ...]], *, shadow: bool) -> Reach:
-    asked = np.maximum(log.asked.sum(axis=0), 1)
+    asked = np.maximum(log.answers, 1)
     counts = lost.sum(axis=0)
     rate = counts / asked
     seen = log.asked.any(axis=0)

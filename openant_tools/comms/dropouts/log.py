@@ -48,6 +48,7 @@ class BusLog:
         chain: joints as they hang on each cable; empty where nobody said.
         baud: (runs,) 1/s, NaN where nobody said. facts: of each run.
         shake: (n,), what the body's sensors shake by, NaN without them.
+        weight: (n,) cycles that a row stands for: more than 1 where healthy ones were thinned out.
     """
 
     joints: tuple[str, ...]
@@ -64,6 +65,7 @@ class BusLog:
     speed: Array
     load: Array
     shake: Array
+    weight: Array
     wake: Array
     cmd_t: Array
     period_s: float
@@ -75,6 +77,12 @@ class BusLog:
     def seconds(self) -> float:
         """Of all runs together."""
         return float(sum(np.ptp(self.t[self.run == k]) for k in range(len(self.names)) if (self.run == k).any()))
+
+    @property
+    def answers(self) -> Array:
+        """(J,) answers that were asked for, those of thinned-out cycles included."""
+        wanted: Array = (self.asked * self.weight[:, None]).sum(axis=0)
+        return wanted
 
     @property
     def lossy(self) -> Flags:
@@ -102,7 +110,7 @@ def read_log(runs: Sequence[Run]) -> BusLog:
         times.append(part["t"] - part["t"][0] + start)
         part["cmd_t"] = part["cmd_t"] - part["t"][0] + start
         start = float(times[-1][-1]) + 1.0
-    steps = np.concatenate([np.diff(part["t"]) for part in parts] or [np.zeros(0)])
+    steps = np.concatenate([part.pop("steps") for part in parts])
     facts = tuple(_bus_facts(run) for run in runs)
     chain = next((one["chain"] for one in facts if one.get("chain")), ())
     together = {name: np.concatenate([part[name] for part in parts]) for name in parts[0] if name != "t"}
@@ -207,6 +215,13 @@ def _lagged(t: Array, command: Array, lag_s: float) -> Array:
 
 def _part(run: Run, joints: Sequence[str]) -> dict[str, Any]:
     t, n = run.t, len(run.t)
+    steps, weight = np.diff(t), np.ones(n)
+    rate = run.facts.extra.get("rate_hz")
+    if "thinned_s" in run.facts.extra and isinstance(rate, int | float) and rate > 0:
+        # A soak keeps few of its healthy cycles; each stands for those left out before it.
+        kept = float(run.facts.extra["thinned_s"])
+        weight[1:] = np.where(steps < 1.5 * kept + 1 / rate, np.maximum(1.0, np.round(steps * rate)), 1.0)
+        steps = np.full(1, 1 / rate)
     losses = [
         _losses(run, joint) if joint in run.joints else (np.zeros(n, bool), np.zeros(n, np.int8)) for joint in joints
     ]
@@ -249,6 +264,8 @@ def _part(run: Run, joints: Sequence[str]) -> dict[str, Any]:
         "speed": np.sum(speeds, axis=0) if speeds else np.full(n, np.nan),
         "load": load,
         "shake": _shaking(t, body),
+        "weight": weight,
+        "steps": steps,
         "wake": run.column("wake"),
         "cmd_t": run.column("cmd_t"),
     }

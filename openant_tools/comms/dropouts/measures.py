@@ -85,7 +85,7 @@ Look = Iterator[tuple[str, Measure, tuple[int, ...]]]
 def _kind_of_losses(log: BusLog, episodes: Sequence[Episode], reach: Reach, marks: Mapping[str, Measure]) -> str:
     if not episodes:
         return "no"
-    lost, asked = int(log.lost.sum()), max(1, int(log.asked.sum()))
+    lost, asked = int(log.lost.sum()), max(1, int(log.answers.sum()))
     rows = int(log.lossy.sum())
     told = any(marks[name].value > 0.3 for name in ("dip", "reset", "port") if name in marks)
     longest = max(one.stop - one.start for one in episodes)
@@ -281,7 +281,7 @@ def _explained(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     ]
     if lines:
         # Of many lines one fits by chance: all of them are given that chance.
-        value, n, edge = _half_lines([sign * log.angle[:, k] for k, sign in lines], weight, shifts)
+        value, n, edge = _half_lines([sign * log.angle[:, k] for k, sign in lines], weight, shifts, log.weight)
         k, sign = lines[n]
         side = f"{'above' if sign > 0 else 'below'} {sign * edge:.2f} rad"
         yield (
@@ -294,15 +294,15 @@ def _explained(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     if known.sum() > FEWEST and np.ptp(volts[known]) > 0.15:
         # Of what a lost read would have shown, its neighbours know the most.
         low = -np.minimum(np.interp(log.t, log.t[known], volts[known]), _around(volts))
-        value, edge = _half_line(low, starts, shifts)
+        value, edge = _half_line(low, starts, shifts, log.weight)
         yield "low", Measure(value, f"a supply below {-edge:.1f} V explains {value:.0%} of when it is lost"), ()
     if np.isfinite(log.load).all() and np.ptp(log.load) > 1e-6:
-        value, _ = _half_line(log.load, starts, shifts)
+        value, _ = _half_line(log.load, starts, shifts, log.weight)
         yield "load", Measure(value, f"high load of all servos together explains {value:.0%} of when it is lost"), ()
     values = []
     for signal in (log.speed, log.shake):
         if np.isfinite(signal).all() and np.ptp(signal) > 1e-6:
-            values.append(_half_line(signal, starts, shifts)[0])
+            values.append(_half_line(signal, starts, shifts, log.weight)[0])
     if values:
         value = max(values)
         yield "motion", Measure(value, f"fast motion explains {value:.0%} of when it is lost"), ()
@@ -329,16 +329,18 @@ def _elsewhere(log: BusLog, episodes: Sequence[Episode]) -> NDArray[np.int64]:
     return moves
 
 
-def _half_line(values: Array, weight: Array, shifts: NDArray[np.int64]) -> tuple[float, float]:
+def _half_line(values: Array, weight: Array, shifts: NDArray[np.int64], duration: Array) -> tuple[float, float]:
     """`_half_lines` of one signal: (value, edge)."""
-    value, _, edge = _half_lines([values], weight, shifts)
+    value, _, edge = _half_lines([values], weight, shifts, duration)
     return value, edge
 
 
-def _half_lines(signals: Sequence[Array], weight: Array, shifts: NDArray[np.int64]) -> tuple[float, int, float]:
+def _half_lines(
+    signals: Sequence[Array], weight: Array, shifts: NDArray[np.int64], duration: Array
+) -> tuple[float, int, float]:
     """(c − o)/(1 − o) of the best region `signal ≥ edge`, less what chance reaches; which signal, and its edge.
 
-    c is the share of losses in the region, o the share of the time. Chance is the same losses at other times.
+    c is the share of losses in the region, o the share of the time (`duration`, (n,), of each row). Chance is the same losses at other times.
     """
     rows = np.flatnonzero(weight)
     total, n = float(weight.sum()), len(weight)
@@ -348,7 +350,7 @@ def _half_lines(signals: Sequence[Array], weight: Array, shifts: NDArray[np.int6
     for number, values in enumerate(signals):
         edges = np.unique(np.quantile(values, np.r_[np.linspace(0.3, 0.9, 16), np.linspace(0.92, 0.995, 12)]))
         bins = np.searchsorted(edges, values, side="right")
-        time = np.bincount(bins, minlength=len(edges) + 1)
+        time = np.bincount(bins, duration, minlength=len(edges) + 1)
         # Share at or above each edge: the bins beyond it.
         o = (time[::-1].cumsum()[::-1] / time.sum())[1:]
 
@@ -384,7 +386,7 @@ def _host(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     step[first] = log.period_s
     extra = step - log.period_s
     # A read that waits in vain takes its time; only what a good read left behind is the host's.
-    gap = np.where(bad_before | first, 0.0, extra)
+    gap = np.where(bad_before | first | (log.weight > 1), 0.0, extra)
     if np.isfinite(late).all():
         late = np.where(bad_before, 0.0, late)
         # Where the loop says how late it was, a gap that it does not own up to is a row that nobody kept.

@@ -38,7 +38,7 @@ def dropouts_finding(
     """
     log = found.measures.log
     source = ", ".join(recordings)
-    asked, lost = int(log.asked.sum()), int(log.lost.sum())
+    asked, lost = int(log.answers.sum()), int(log.lost.sum())
     low, high = _wilson(lost, asked)
     evidence = [
         Evidence("time watched", round(log.seconds, 3), "s", source),

@@ -50,7 +50,7 @@ def dropouts_report(found: DropoutDiagnosis) -> Report:
     """Verdict, evidence, and every episode."""
     log = found.measures.log
     report = Report("The bus", ", ".join(log.names), made_by="openant comms diagnose")
-    lost, asked = int(log.lost.sum()), int(log.asked.sum())
+    lost, asked = int(log.lost.sum()), int(log.answers.sum())
     report.key_figures(
         KeyFigure("verdict", found.verdict, found.what),
         KeyFigure("lost", f"{lost / max(1, asked):.2%}", f"{lost} of {asked} answers"),

@@ -1,0 +1,195 @@
+"""`openant comms soak`: hours of traffic while the robot moves, and what it lost."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from openant_tools.cli.options import finite, json_option, rate_option, robot_option
+from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, clock_of_its_own, virtual_option, virtual_robot
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+__all__ = ["soak"]
+
+#: cycles a second of a soak on the transaction level, where none is named
+TRANSACTIONS_HZ = 10.0
+
+
+@click.command()
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), required=True, metavar="RUN", help="What to make."
+)
+@click.option(
+    "--minutes", type=click.FloatRange(min=0.02), callback=finite, default=15.0, show_default=True, metavar="M"
+)
+@click.option("--still", is_flag=True, help="Do not move: torque stays off.")
+@click.option("--resume", is_flag=True, help="Go on with the soak that was cut short at --out, as one recording.")
+@click.option(
+    "--every-cycle", is_flag=True, help="Keep every cycle. Default: all around errors, ten healthy ones a second."
+)
+@click.option(
+    "--transactions",
+    is_flag=True,
+    help="With --virtual: without bytes and ports, many times faster than real time, 10 cycles a second; RUN is a .parquet.",
+)
+@click.option("--yes", is_flag=True, help="The robot may move: do not ask. Needed where no terminal is attached.")
+@click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one plugged in.")
+@virtual_option
+@robot_option
+@rate_option
+@json_option
+@click.pass_context
+def soak(
+    context: click.Context,
+    out: Path,
+    minutes: float,
+    still: bool,
+    resume: bool,
+    every_cycle: bool,
+    transactions: bool,
+    yes: bool,
+    port: str | None,
+    virtual_source: str | None,
+    robot: Path | None,
+    rate_hz: float,
+    json_file: Path | None,
+) -> None:
+    """Read and write at full rate for hours while the legs swing, log every loss with all that was seen around it.
+
+    The robot is on its stand, legs free. A guard that stops it is told, and the soak goes on. Ctrl-C ends it with torque
+    off and the log whole; --resume goes on with it.
+
+    \b
+      openant comms soak --robot my-ant --out soak.mcap --minutes 60
+      openant comms soak --virtual loose-plug.toml --out soak.mcap --minutes 2 --yes
+      openant comms diagnose soak.mcap
+    """
+    from openant_tools.errors import BadInput
+
+    if transactions:
+        if virtual_source is None:
+            raise BadInput("only a virtual robot can be asked without bytes", remedy="add --virtual [SCENARIO]")
+        given = context.get_parameter_source("rate_hz") is not click.core.ParameterSource.DEFAULT
+        _transactions(virtual_source, out, minutes * 60, rate_hz if given else TRANSACTIONS_HZ, still)
+        return
+    _on_the_bus(out, minutes * 60, still, resume, every_cycle, yes, port, virtual_source, robot, rate_hz, json_file)
+
+
+def _on_the_bus(
+    out: Path, seconds: float, still: bool, resume: bool, every_cycle: bool, yes: bool, port: str | None,
+    virtual_source: str | None, robot: Path | None, rate_hz: float, json_file: Path | None,
+) -> None:  # fmt: skip
+    import contextlib
+    import json
+
+    from rich.console import Console
+
+    from openant_tools.cli.sysid_record import robot_of
+    from openant_tools.comms.setup import config_of_robot, config_of_unknown_robot, find_bus
+    from openant_tools.comms.soak import THIN_S
+    from openant_tools.comms.soak import soak as soak_bus
+    from openant_tools.errors import BadInput
+    from openant_tools.files import write_text
+    from openant_tools.recording.writer import recording_path
+
+    path = recording_path(out)
+    if path.exists() and not resume:
+        raise BadInput("there is a soak already", where=path, remedy="go on with it by --resume, or name another file")
+    if resume and not path.exists():
+        raise BadInput("there is no soak to go on with", where=path, remedy="leave out --resume")
+    console = Console(stderr=True)
+    folder = robot_of(robot, needed=False)
+    with contextlib.ExitStack() as stack:
+        control = None
+        if virtual_source is not None:
+            found = stack.enter_context(virtual_robot(virtual_source, clock=clock_of_its_own(virtual_source)))
+            port, control = port or found["bus"], found["control"]
+        if folder is not None:
+            config = config_of_robot(folder.config(), port, control=control, rate_hz=rate_hz)
+        else:
+            config = config_of_unknown_robot(find_bus(port), control, rate_hz=rate_hz)
+        if not still:
+            console.print(
+                f"all {len(config.servos)} joints swing by up to 0.25 rad; the robot must be on its stand, legs free"
+            )
+            if not yes:
+                if not sys.stdin.isatty():
+                    raise BadInput(
+                        "the robot would move and nobody is there to ask", remedy="add --yes if it may, or --still"
+                    )
+                click.confirm("May it move?", abort=True, err=True)
+        shown = stack.enter_context(_bar(console))
+        try:
+            done = soak_bus(
+                config, path, seconds, move=not still, resume=resume, thin_s=None if every_cycle else THIN_S,
+                robot_toml=None if folder is None else folder.config_file.read_text(),
+                progress=shown, notice=lambda words: console.print(words, highlight=False),
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            console.print(f"kept as far as it got: {path}; go on with --resume")
+            raise
+    click.echo(f"{done.path}  {done.seconds:.0f} s, {done.cycles} rows kept")
+    for servo in done.statistics["servos"]:
+        lost = ", ".join(f"{cause} {count}" for cause, count in servo["lost"].items())
+        click.echo(f"  {servo['joint']:8} {servo['loss']:7.3%} of {servo['asked']} lost  {lost}")
+    for stop in done.stops:
+        click.echo(f"stopped: {stop}")
+    if json_file:
+        content = {"run": str(done.path), "seconds": done.seconds, "rows": done.cycles, "stops": list(done.stops),
+                   "whole": done.whole, "statistics": done.statistics}  # fmt: skip
+        write_text(json_file, json.dumps(content, indent=1) + "\n")
+    click.echo(f"`openant comms diagnose {done.path}` says why", err=True)
+    if not done.whole:
+        raise SystemExit(1)
+
+
+def _bar(console: Any) -> Any:
+    import contextlib
+
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    @contextlib.contextmanager
+    def shown() -> Any:
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=console, transient=True) as bar:
+            task = bar.add_task("soaking", total=1.0)
+
+            def update(share: float, statistics: Mapping[str, Any]) -> None:
+                asked = sum(servo["asked"] for servo in statistics["servos"])
+                answered = sum(servo["answered"] for servo in statistics["servos"])
+                bar.update(task, completed=share, description=f"{asked - answered} of {asked} answers lost")
+
+            yield update
+
+    return shown()
+
+
+def _transactions(source: str, out: Path, seconds: float, rate_hz: float, still: bool) -> None:
+    from rich.console import Console
+
+    from openant_tools.blind.soak_virtual import swinging_soak
+    from openant_tools.errors import BadInput
+    from openant_tools.recording.tables import write_table
+    from openant_tools.virtual.scenario import Scenario, load_scenario
+
+    if out.suffix not in (".parquet", ".csv"):
+        raise BadInput("this soak is a table", where=out, remedy=f"name it {out.with_suffix('.parquet').name}")
+    if out.exists():
+        raise BadInput("there is a run already", where=out, remedy="name another file")
+    if source != VIRTUAL_DEFAULT and not source.endswith(".toml"):
+        raise BadInput(
+            "a running robot has ports only", where=source, remedy="name a scenario, or leave out --transactions"
+        )
+    scenario = Scenario() if source == VIRTUAL_DEFAULT else load_scenario(Path(source))
+    progress: Callable[[float, Mapping[str, Any]], None]
+    with _bar(Console(stderr=True)) as progress:
+        run = swinging_soak(
+            scenario, seconds, rate_hz, out.stem, still=still, progress=lambda share: progress(share, {"servos": []})
+        )
+    write_table(run, out)
+    click.echo(f"{out}  {run.duration_s:.0f} s, {len(run.t)} rows")

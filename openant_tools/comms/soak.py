@@ -1,0 +1,160 @@
+"""A soak of the bus: hours of traffic at full rate while the robot moves, so that a rare loss is seen and its cause told.
+
+The legs swing gently around the home pose and rest now and then, so that angles, loads and shaking all vary. The log is
+one recording that keeps what is not as it should be, with the raw bytes around it, and few of the healthy cycles. What a
+guard stops is gone on with once the servos answer again: it is the losses that are wanted here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.comms import messages
+from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.messages import EngineConfig
+from openant_tools.errors import HardwareFault
+from openant_tools.recording.reader import read_recording
+from openant_tools.recording.run import Facts
+from openant_tools.robot.joints import JOINTS
+from openant_tools.robot.kit import HOME_RAD
+
+__all__ = ["THIN_S", "Soaked", "soak", "soak_motion", "soaked_seconds"]
+
+Array = NDArray[np.float64]
+
+#: s between two healthy cycles that are kept
+THIN_S = 0.1
+#: rad that joints swing to either side of home, and the share of their way to a limit that they take at most
+SWING_RAD, LIMIT_SHARE = 0.25, 0.8
+#: s of swinging and of rest in one piece; Hz of the joints, no two alike, none a multiple of another
+MOVE_S, REST_S = 24.0, 6.0
+SLOWEST_HZ, FASTEST_HZ = 0.23, 1.1
+#: s to wait before going on after a stop, and stops in a row without a whole piece in between that end the soak
+PAUSE_S, MOST_STOPS = 5.0, 12
+
+
+@dataclass(frozen=True)
+class Soaked:
+    """What came of a soak.
+
+    Attributes:
+        path: the recording. cycles: rows kept in it. seconds: of soaking, earlier parts included.
+        statistics: of the bus, as `openant comms watch` has them, of this part.
+        stops: what stopped it meanwhile.
+        whole: whether it lasted as long as was asked for.
+    """
+
+    path: Path
+    cycles: int
+    seconds: float
+    statistics: Mapping[str, Any]
+    stops: tuple[str, ...]
+    whole: bool
+
+
+def soak_motion(
+    joints: tuple[str, ...], limits: Mapping[str, tuple[float, float]], rate_hz: float, piece: int
+) -> Array:
+    """(n, joints) rad of one piece: a swing of all joints around home, then rest.
+
+    Args:
+        piece: number of the piece; each has phases of its own.
+    """
+    t = np.arange(round((MOVE_S + REST_S) * rate_hz)) / rate_hz
+    chance = np.random.default_rng(piece)
+    hz = chance.permutation(np.geomspace(SLOWEST_HZ, FASTEST_HZ, len(joints)))
+    out = np.empty((len(t), len(joints)))
+    # Begin and end at rest: a swing that grows and dies away.
+    shape = np.clip(np.minimum(t, MOVE_S - t) / 2.0, 0.0, 1.0)
+    for k, joint in enumerate(joints):
+        home = HOME_RAD[JOINTS[joint].kind] if joint in JOINTS else 0.0
+        low, high = limits.get(joint, (home - SWING_RAD, home + SWING_RAD))
+        home = min(max(home, low), high)
+        reach = min(SWING_RAD, LIMIT_SHARE * min(high - home, home - low))
+        out[:, k] = home + reach * shape * np.sin(2 * np.pi * hz[k] * t + chance.uniform(0, 2 * np.pi))
+    return out
+
+
+def soaked_seconds(path: Path) -> float:
+    """How long a soak that stands there lasted so far, s.
+
+    Raises:
+        BadInput: it is no recording, or one torn before its first row.
+    """
+    return read_recording(path).run.duration_s
+
+
+def soak(
+    config: EngineConfig,
+    out: Path,
+    seconds: float,
+    *,
+    move: bool = True,
+    resume: bool = False,
+    thin_s: float | None = THIN_S,
+    robot_toml: str | None = None,
+    progress: Callable[[float, Mapping[str, Any]], None] = lambda share, statistics: None,
+    notice: Callable[[str], None] = lambda words: None,
+) -> Soaked:
+    """Soak until the log is `seconds` (s) long.
+
+    Args:
+        config: the robot, see `comms.setup`.
+        move: swing the legs; else the robot stays limp.
+        resume: go on with the soak that stands at `out`.
+        thin_s: one healthy cycle in so many s is kept; None keeps all.
+        progress: called with the share done and the bus's statistics.
+
+    Raises:
+        HardwareFault: the robot does not answer at the start.
+        KeyboardInterrupt: torque is off and the recording whole when it arrives.
+    """
+    joints = tuple(servo.joint for servo in config.servos)
+    before = soaked_seconds(out) if resume and out.exists() else 0.0
+    stops: list[str] = []
+    done = before
+    with EngineProcess(config) as engine:
+        for event in engine.events():
+            notice(str(event.text) if isinstance(event, messages.Notice) else str(event))
+        facts = Facts(joints=joints, setup="stand", protocol="comms soak", extra={"rate_hz": config.rate_hz})
+        engine.ask(messages.Record(str(out), facts, robot_toml, resume=resume and out.exists(), thin_s=thin_s))
+        statistics: Mapping[str, Any] = engine.ask(messages.Statistics())
+        piece, in_a_row = int(before // (MOVE_S + REST_S)), 0
+        moving = False
+        while done < seconds and in_a_row < MOST_STOPS:
+            length = min(MOVE_S + REST_S, seconds - done)
+            try:
+                if move and not moving:
+                    engine.ask(messages.Torque(True))
+                    moving = True
+                if move:
+                    commands = soak_motion(joints, config.limits_rad, config.rate_hz, piece)
+                    engine.ask(messages.Play(commands[: max(2, round(length * config.rate_hz))], "soak"))
+                else:
+                    engine.ask(messages.Look(length))
+                in_a_row = 0
+            except HardwareFault as fault:
+                stops.append(str(fault))
+                notice(f"{fault}; going on in {PAUSE_S:.0f} s")
+                moving, in_a_row = False, in_a_row + 1
+                if engine.ended:
+                    raise
+                engine.ask(messages.Look(PAUSE_S))
+                length = min(length, PAUSE_S)
+            piece += 1
+            done += length
+            with contextlib.suppress(HardwareFault):  # a port that is gone has nothing to add
+                statistics = engine.ask(messages.Statistics())
+            progress(min(1.0, done / seconds), statistics)
+        if moving:
+            engine.ask(messages.Torque(False))
+        closed = engine.ask(messages.StopRecording())
+    path, cycles = (str(out), 0) if closed is None else closed
+    return Soaked(Path(path), cycles, done, statistics, tuple(stops), done >= seconds)
