@@ -10,7 +10,7 @@ narrow, since a hundred crossings of one drift are not a hundred witnesses.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -205,6 +205,15 @@ class Fit:
                 held[:, k] = np.exp(theta[:, place])
         return Variants(servos, state, offset, held)
 
+    def windings(self) -> Array:
+        """(m, joints) °C of the windings over the run, by the best estimate."""
+        theta = self.theta[None, :]
+        servos, start = _servos(self.inputs, self.layout, theta)
+        out = np.empty_like(self.inputs.drive)
+        for i, state in enumerate(_states(self.inputs, self.layout, theta, servos, start)):
+            out[i] = state.winding[0]
+        return out
+
     def replayed(self, inputs: Inputs, count: int = 1, seed: int = 0) -> Array:
         """(count, m, joints) °C of the cases over a run that begins as this one does: cells' ends, the first the estimate."""
         random = np.random.default_rng(seed)
@@ -369,24 +378,27 @@ def _servos(run: Inputs, layout: _Layout, theta: Array) -> tuple[Servos, State]:
 
 def _simulated(run: Inputs, layout: _Layout, theta: Array, servos: Servos, start: State) -> tuple[Array, State]:
     """(b, m, joints) °C of the cases at the cells' ends, and the state at the last."""
-    b, m = len(theta), len(run.edges) - 1
-    out = np.empty((b, m, len(run.joints)))
+    out = np.empty((len(theta), len(run.edges) - 1, len(run.joints)))
     state = start
-    steps = np.diff(run.edges)
-    drive = np.broadcast_to(run.drive, (m, len(run.joints)))
-    unknown = sorted({k for k, _ in layout.held})
-    last = max((stretch for _, stretch in layout.held), default=0)
-    for i in range(m):
-        here: Array = drive[i]
-        if unknown:
-            here = np.broadcast_to(here, (b, len(run.joints))).copy()
-            for k in unknown:
-                # A pose that was not fitted is taken to be as the last one that was.
-                stretch = min(int(run.stretch[i, k]), last)
-                here[:, k] = np.exp(theta[:, layout.held[k, stretch]])
-        state = advance(servos, state, float(steps[i]), here, run.gear[i], run.idle[i])
+    for i, state in enumerate(_states(run, layout, theta, servos, start)):
         out[:, i] = state.case
     return out, state
+
+
+def _states(run: Inputs, layout: _Layout, theta: Array, servos: Servos, start: State) -> Iterator[State]:
+    """The state at each cell's end."""
+    state, steps = start, np.diff(run.edges)
+    unknown = sorted({k for k, _ in layout.held})
+    last = {k: max(stretch for one, stretch in layout.held if one == k) for k in unknown}
+    for i in range(len(steps)):
+        here: Array = run.drive[i]
+        if unknown:
+            here = np.broadcast_to(here, (len(theta), len(run.joints))).copy()
+            for k in unknown:
+                # A pose that was not fitted is taken to be as the last one that was.
+                here[:, k] = np.exp(theta[:, layout.held[k, min(int(run.stretch[i, k]), last[k])]])
+        state = advance(servos, state, float(steps[i]), here, run.gear[i], run.idle[i])
+        yield state
 
 
 # ---- the fit ----

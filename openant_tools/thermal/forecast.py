@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.robot.derating import Derating, Joint
 from openant_tools.thermal.fit import Fit, Variants
-from openant_tools.thermal.physics import Servos, State, advance, steady_drive
+from openant_tools.thermal.physics import COPPER_PER_K, Servos, State, advance, by_duty, steady_drive
 
 __all__ = [
     "COOLED_K", "HORIZON_S", "Forecast", "Interval", "JointForecast", "Load", "cool_down", "derating", "forecast", "present_load",
@@ -30,8 +30,10 @@ Array = NDArray[np.float64]
 HORIZON_S = 8 * 3600.0
 STEP_S = 20.0
 DRAWS = 400
-#: s over which the present load is averaged: several rounds of any gait, short against a case
-PRESENT_S = 60.0
+#: s of a block of the present load: several rounds of any gait, short against a case
+BLOCK_S = 45.0
+#: by how much a block may be away from those after it to be of the same load: share, and standard deviations of theirs
+CHANGED, CHANGED_SD = 0.5, 6.0
 #: K per √h by which a room goes its own way: a window, the sun, a heating that switches
 ROOM_K = 1.0
 #: probability from which on a shutdown is spoken of at all: with less its interval would begin beyond the horizon
@@ -67,13 +69,22 @@ class Interval:
 class Load:
     """What the servos do from now on.
 
+    A pose that holds a weight needs a torque, and so a current; a joint pressed against a stop has a duty, from which less
+    current comes the hotter the winding is. Which of the two goes on as it was is a matter of evidence.
+
     Attributes:
-        drive: (joints,) A² or V² as the fit takes it, or (b, joints). gear, idle: (joints,) W. words: for people.
+        current: (k, joints) A², means of the square over k successive blocks: how much, and how it varies.
+        push: (k, joints) V², the same of what the duty puts over the windings.
+        gear, idle: (joints,) W.
+        by_duty: (joints,) probability that duty is what goes on.
+        words: for people.
     """
 
-    drive: Array
+    current: Array
+    push: Array
     gear: Array
     idle: Array
+    by_duty: Array
     words: str
 
 
@@ -156,13 +167,76 @@ class Forecast:
         return min(due, key=lambda one: (one.seconds_to_limit.value, -one.probability), default=None)  # type: ignore[union-attr]
 
 
-def present_load(found: Fit, seconds: float | None = PRESENT_S) -> Load:
-    """The mean load of the fitted run's last `seconds`, of all of it for None."""
+def present_load(found: Fit, *, whole: bool = False) -> Load:
+    """The load at the end of the fitted run, over as long as it has been like this; over all of the run if `whole`."""
     run = found.inputs
-    rows = np.ones(len(run.edges) - 1, bool) if seconds is None else run.edges[1:] > run.duration_s - seconds
-    rows[-1] = True
-    words = "the load of the whole run" if seconds is None else "the present load"
-    return Load(run.drive[rows].mean(axis=0), run.gear[rows].mean(axis=0), run.idle[rows].mean(axis=0), words)
+    width = max(1, round(BLOCK_S / float(np.diff(run.edges).mean())))
+    ends = range(len(run.drive), 0, -width)
+    rows = [slice(max(0, end - width), end) for end in ends]
+    means = np.array([run.drive[block].mean(axis=0) for block in rows])
+    count = len(means) if whole else _alike(means)
+    first = rows[count - 1].start
+    ohm = _resistance(found)
+    duty = by_duty(run.source)
+    push = np.where(duty, run.drive, run.drive * ohm**2)
+    current = np.where(duty, run.drive / ohm**2, run.drive)
+    return Load(
+        np.array([current[block].mean(axis=0) for block in rows[:count]]),
+        np.array([push[block].mean(axis=0) for block in rows[:count]]),
+        run.gear[first:].mean(axis=0), run.idle[first:].mean(axis=0), _held_by_duty(found, ohm, slice(first, len(push))),
+        "the load of the whole run" if whole else "the present load",
+    )  # fmt: skip
+
+
+def _resistance(found: Fit) -> Array:
+    """(m, joints) Ω over the run, by the best estimate."""
+    cold = np.array([model.resistance_ohm if model else 1.0 for model in found.inputs.models])
+    return np.asarray(cold * (1 + COPPER_PER_K * (found.windings() - 25.0)))
+
+
+def _alike(means: Array) -> int:
+    """How many of (k, joints) block means, the newest first, are of the same load."""
+    size = np.maximum(np.median(means, axis=0), 1e-9)
+    # A single change of load hides in the median of the steps from block to block.
+    scatter = (
+        np.median(np.abs(np.diff(means, axis=0)), axis=0) / 0.6745 / math.sqrt(2) / size if len(means) > 2 else 0.0
+    )
+    reach = np.maximum(CHANGED, CHANGED_SD * scatter * np.ones(len(size)))
+    count = 1
+    while count < len(means) and (np.abs(means[count] - means[:count].mean(axis=0)) / size < reach).all():
+        count += 1
+    return count
+
+
+def _held_by_duty(found: Fit, ohm: Array, rows: slice) -> Array:
+    """(joints,) probability that a load keeps its duty rather than its current, by which of them drifts less.
+
+    As a winding warms, one of the two must give way to its resistance.
+    """
+    run = found.inputs
+    out = np.full(len(run.joints), 0.5)
+    t = run.edges[1:][rows]
+    for k, source in enumerate(run.source):
+        if source in ("load", "unknown") or len(t) < 4:
+            out[k] = 0.0 if source in ("load", "unknown") else 0.5
+            continue
+        push = run.push[rows, k]
+        square = run.drive[rows, k] if source == "current" else push / ohm[rows, k] ** 2
+        if not np.isfinite(push).all() or push.mean() <= 0 or square.mean() <= 0:
+            continue
+        drifts = [_drift(t, values / values.mean()) for values in (push, square)]
+        # Either is told by the chance that its drift is none: by scatter, and by a percent for all the rest.
+        unlikely = [-0.5 * (drift / math.hypot(error, 0.01)) ** 2 for drift, error in drifts]
+        out[k] = 1.0 / (1.0 + math.exp(min(max(unlikely[1] - unlikely[0], -50.0), 50.0)))
+    return out
+
+
+def _drift(t: Array, values: Array) -> tuple[float, float]:
+    """Relative change over the window by a straight line, and its standard error; neighbouring cells are alike."""
+    x = (t - t.mean()) / max(float(t[-1] - t[0]), 1e-9)
+    slope = float(x @ values / (x @ x))
+    rest = values - values.mean() - slope * x
+    return slope, float(math.sqrt(max(rest @ rest, 0.0) / max(len(t) - 2, 1) / float(x @ x)) * 2.0)
 
 
 def torque_load(found: Fit, torque_nm: Mapping[str, float]) -> Load:
@@ -172,7 +246,8 @@ def torque_load(found: Fit, torque_nm: Mapping[str, float]) -> Load:
         BadInput: no such joint, or one whose servo model is not known.
     """
     load = present_load(found)
-    drive = load.drive.copy()
+    current, push, keeps = load.current.copy(), load.push.copy(), load.by_duty.copy()
+    ohm = _resistance(found)[-1]
     for joint, torque in torque_nm.items():
         if joint not in found.inputs.joints:
             raise BadInput(f"the run has no joint {joint!r}", remedy=f"one of {', '.join(found.inputs.joints)}")
@@ -184,10 +259,13 @@ def torque_load(found: Fit, torque_nm: Mapping[str, float]) -> Load:
                 where=found.inputs.name,
                 remedy="record current, duty or load too: `openant thermal soak` does",
             )
-        current = torque / model.kt_nm_a
-        drive[k] = (current * model.resistance_ohm) ** 2 if found.inputs.source[k] == "duty" else current**2
+        # A torque asks for a current, whatever duty that takes as the winding warms.
+        current[:, k] = (torque / model.kt_nm_a) ** 2
+        push[:, k], keeps[k] = current[:, k] * ohm[k] ** 2, 0.0
     words = ", ".join(f"{torque:g} N·m at {joint}" for joint, torque in torque_nm.items())
-    return replace(load, drive=drive, gear=np.where(drive != load.drive, 0.0, load.gear), words=words)
+    named = np.array([joint in torque_nm for joint in found.inputs.joints])
+    gear = np.where(named, 0.0, load.gear)
+    return replace(load, current=current, push=push, by_duty=keeps, gear=gear, words=words)
 
 
 def forecast(
@@ -208,7 +286,7 @@ def forecast(
     limit = run.limit_c + 1.0
     t, paths = _paths(found, variants, load, steps, seed, from_cold)
     beyond: NDArray[np.bool_] = np.greater_equal(paths, limit)
-    reached = beyond.any(axis=1)
+    reached: NDArray[np.bool_] = np.asarray(beyond.any(axis=1))
     first = beyond.argmax(axis=1)
     before = np.take_along_axis(paths, np.maximum(first - 1, 0)[:, None, :], axis=1)[:, 0]
     at = np.take_along_axis(paths, first[:, None, :], axis=1)[:, 0]
@@ -250,95 +328,99 @@ def _paths(found: Fit, variants: Variants, load: Load, steps: int, seed: int, fr
     room: Array = servos.room_c.copy()
     fade = math.exp(-STEP_S / found.disturbance_s)
     shake = found.disturbance_k * math.sqrt(1 - fade**2)
-    drive = _driven(found, variants, load)
+    servos, current, push = _going_on(found, variants, load, random)
+    # Each draw believes in blocks of its own, fewer than there are, since neighbours are alike.
+    pool = random.integers(0, len(load.current), (b, max(1, len(load.current) // 2)))
+    every = max(1, round(BLOCK_S / STEP_S))
     out = np.empty((b, steps, n))
     for i in range(steps):
+        if i % every == 0:
+            chosen = pool[np.arange(b), random.integers(0, pool.shape[1], b)]
+            now = np.where(servos.by_duty, push * load.push[chosen], current * load.current[chosen])
         room = room + ROOM_K * math.sqrt(STEP_S / HOUR_S) * random.standard_normal((b, 1))
-        state = advance(servos, state, STEP_S, drive, load.gear, load.idle, room)
+        state = advance(servos, state, STEP_S, now, load.gear, load.idle, room)
         offset = offset * fade + shake * random.standard_normal((b, n))
         out[:, i] = state.case + offset
     t: Array = STEP_S * np.arange(1, steps + 1, dtype=float)
     return t, out
 
 
-def _driven(found: Fit, variants: Variants, load: Load) -> Array:
+def _going_on(found: Fit, variants: Variants, load: Load, random: np.random.Generator) -> tuple[Servos, Array, Array]:
+    """Servos in which each draw keeps duty or current, as the load is believed to do, and (b, joints) scales of both.
+
+    One of the two was measured; the other follows with the resistance that a draw believes in.
+    """
+    servos, b = variants.servos, len(variants.state.case)
+    ratio = (1 + COPPER_PER_K * (variants.state.winding - 25.0)) / (1 + COPPER_PER_K * (found.windings()[-1] - 25.0))
     unknown = np.array([source == "unknown" for source in found.inputs.source])
-    return np.where(unknown, variants.held, load.drive)
+    keeps = (random.random(variants.state.case.shape) < load.by_duty) & ~unknown
+    current = np.where(servos.by_duty, 1 / ratio**2, np.ones((b, 1)))
+    # Heat of unknown cause is its own drive, in W, in the place of the nothing that was recorded.
+    current = np.where(unknown, variants.held / np.maximum(load.current.mean(axis=0), 1e-12), current)
+    return replace(servos, by_duty=keeps), current, np.where(servos.by_duty, 1.0, ratio**2)
 
 
-def _torque(found: Fit, k: int, drive: Array) -> Interval | None:
-    """Drives as N·m at standstill, by the data sheet's constant; None where the drive is unknown heat."""
+def _mean_drive(found: Fit, variants: Variants, load: Load) -> tuple[Servos, Array]:
+    """Servos that keep their mean current, and (b, joints) that current squared; heat of unknown cause in W."""
+    current = np.broadcast_to(load.current.mean(axis=0), variants.state.case.shape)
+    unknown = np.array([source == "unknown" for source in found.inputs.source])
+    return replace(variants.servos, by_duty=np.zeros(len(unknown), bool)), np.where(unknown, variants.held, current)
+
+
+def _torque(found: Fit, k: int, square: Array) -> Interval | None:
+    """Squares of currents (A²) as N·m at standstill, by the data sheet's constant; None where loads were not recorded."""
     model = found.inputs.models[k]
     if model is None or found.inputs.source[k] == "unknown":
         return None
-    current = np.sqrt(np.maximum(drive, 0.0))
-    if found.inputs.source[k] == "duty":
-        current = current / model.resistance_ohm
-    return Interval.of(model.kt_nm_a * current)
+    return Interval.of(model.kt_nm_a * np.sqrt(np.maximum(square, 0.0)))
 
 
 def _continuous(found: Fit, variants: Variants, load: Load) -> Array:
-    """(b, joints) drives that each joint could bear for ever, its neighbour at the load given."""
-    run, servos = found.inputs, variants.servos
-    warmed = variants.state
-    drive = _driven(found, variants, load)
+    """(b, joints) A² that each joint could bear for ever, its neighbour at the load given."""
+    run = found.inputs
+    servos, drive = _mean_drive(found, variants, load)
     limit: Array = np.asarray(run.limit_c, float)
-    others = np.empty_like(warmed.case)
+    others = np.empty_like(variants.state.case)
     for k, partner in enumerate(run.partner.tolist()):
         if partner < 0:
             continue
         # The neighbour settles beside a case at its limit.
-        held = State(warmed.winding.copy(), warmed.case.copy())
+        held = State(variants.state.winding.copy(), variants.state.case.copy())
         for _ in range(SETTLING):
-            held.case[:, k] = float(run.limit_c[k])
+            held.case[:, k] = float(limit[k])
             held = advance(servos, held, SETTLING_S, drive, load.gear, load.idle)
         others[:, partner] = held.case[:, partner]
-    return _by_voltage(found, servos, steady_drive(servos, limit, load.idle, others), limit, load.idle, others)
+    return steady_drive(servos, limit, load.idle, others)
 
 
 #: steps, and s of each, in which a case comes to rest beside a neighbour held at a temperature
 SETTLING, SETTLING_S = 12, 900.0
 
 
-def _by_voltage(found: Fit, servos: Servos, drive: Array, limit: Array, idle: Array, others: Array) -> Array:
-    """Drives of duty as those of the same current in a cold winding: torque is current's."""
-    rise = np.maximum(limit - servos.room_c, 0.0)
-    air = servos.air_w_k * rise * (np.maximum(rise, 0.5) / 30.0) ** servos.exponent
-    leg = servos.leg_w_k * (servos.partner >= 0) * (limit - others[:, servos.partner])
-    power = np.maximum(air + leg - servos.idle * idle, 0.0)
-    hot = 1 + 0.0039 * (limit + power / servos.winding_w_k - 25.0)
-    return np.where(servos.by_duty, drive / hot**2, drive)
-
-
 def _for_an_hour(found: Fit, variants: Variants, load: Load) -> Array:
-    """(b, joints) drives under which a cold servo comes to its limit in just an hour, its neighbour at the load given."""
-    run, servos = found.inputs, variants.servos
-    b, n = variants.state.case.shape
+    """(b, joints) A² under which a cold servo comes to its limit in just an hour, its neighbour at the load given."""
+    run, shape = found.inputs, variants.state.case.shape
+    servos, present = _mean_drive(found, variants, load)
     limit = run.limit_c + 1.0
-    present = np.broadcast_to(_driven(found, variants, load), (b, n))
-    out = np.zeros((b, n))
-    halves = [np.array([(joint.startswith("knee")) == knee for joint in run.joints]) for knee in (True, False)]
-    resistance = servos.resistance
-    for tried in halves:
-        if not tried.any():
-            continue
-        # Torque is current's, so the search is in A², whatever the source; a duty has the voltage of that current when hot.
-        low, high = np.zeros((b, n)), np.full((b, n), 25.0)
-        current_only = replace(servos, by_duty=servos.by_duty & ~tried)
+    out = np.zeros(shape)
+    for kind in ("knee", "hip"):
+        tried = np.array([joint.startswith("knee") == (kind == "knee") for joint in run.joints])
+        low, high = np.zeros(shape), np.full(shape, MOST_A2)
         for _ in range(BISECTIONS):
             middle = (low + high) / 2
-            state = State(np.broadcast_to(servos.room_c, (b, n)).copy(), np.broadcast_to(servos.room_c, (b, n)).copy())
+            cold = np.broadcast_to(servos.room_c, shape).copy()
+            state = State(cold, cold.copy())
             drive = np.where(tried, middle, present)
             for _ in range(int(HOUR_S / HOUR_STEP_S)):
-                state = advance(current_only, state, HOUR_STEP_S, drive, load.gear, load.idle)
+                state = advance(servos, state, HOUR_STEP_S, drive, load.gear, load.idle)
             too_warm = state.case >= limit
             high, low = np.where(too_warm, middle, high), np.where(too_warm, low, middle)
-        found_a2 = (low + high) / 2
-        out = np.where(tried, np.where(servos.by_duty, found_a2 * resistance**2, found_a2), out)
+        out = np.where(tried, (low + high) / 2, out)
     return out
 
 
-BISECTIONS, HOUR_STEP_S = 12, 60.0
+#: A², more than any X430 draws; halvings; s of a step
+MOST_A2, BISECTIONS, HOUR_STEP_S = 25.0, 14, 60.0
 
 
 # ---- advice ----
@@ -386,18 +468,18 @@ def rest_advice(found: Fit, load: Load | None = None, *, draws: int = 100, seed:
     variants = found.variants(draws, seed)
     cold = np.broadcast_to(variants.servos.room_c, variants.state.case.shape).copy()
     state = State(cold, cold.copy())
-    drive = _driven(found, variants, load)
+    servos, drive = _mean_drive(found, variants, load)
     for _ in range(max(1, int(work / STEP_S))):
-        state = advance(variants.servos, state, STEP_S, drive, load.gear, load.idle)
+        state = advance(servos, state, STEP_S, drive, load.gear, load.idle)
     goal = float(run.limit_c[k]) - COOLED_K
     rest = 0.0
     while rest < HORIZON_S and np.quantile(state.case[:, k], 0.95) > goal:
-        state = advance(variants.servos, state, STEP_S, np.zeros_like(drive), np.zeros_like(load.gear), load.idle)
+        state = advance(servos, state, STEP_S, np.zeros_like(drive), np.zeros_like(load.gear), load.idle)
         rest += STEP_S
     # From warm the next work is shorter: until the decider is at its limit again.
     again = 0.0
     while again < work and np.quantile(state.case[:, k], 0.95) < run.limit_c[k]:
-        state = advance(variants.servos, state, STEP_S, drive, load.gear, load.idle)
+        state = advance(servos, state, STEP_S, drive, load.gear, load.idle)
         again += STEP_S
     return Rest(again, rest, again / max(again + rest, 1e-9), joint)
 
@@ -440,7 +522,7 @@ def derating(
     for k, one in enumerate(told.joints):
         if (joints and one.joint not in joints) or (not joints and one.seconds_to_limit is None):
             continue
-        asked = _torque(found, k, np.atleast_1d(load.drive[..., k]))
+        asked = _torque(found, k, np.atleast_1d(load.current[:, k].mean()))
         if one.continuous_torque_nm is None or asked is None or asked.value <= 0:
             continue
         # The cautious end of what can be borne, with a tenth in hand, so that the servo cools at the hot end.

@@ -62,6 +62,7 @@ class Inputs:
         edges: (m + 1,) s from the run's first row.
         source: (joints,) where each servo's heat is known from.
         drive: (m, joints) means over the cell of I² (A²), or of (d·V − ke·ω)² (V²) where duty is the source.
+        push: (m, joints) V², means of (d·V − ke·ω)² whatever the source, NaN where no duty was recorded.
         gear: (m, joints) W, means of |kt·I·ω|: what the motor gives to the gear. idle: (m, joints) W of the electronics.
         stretch: (m, joints) number of the pose held, for servos whose heat is unknown.
         observed: of each joint. readings: (m, joints) °C, means, NaN where none; for pictures.
@@ -76,6 +77,7 @@ class Inputs:
     edges: Array
     source: tuple[Source, ...]
     drive: Array
+    push: Array
     gear: Array
     idle: Array
     stretch: NDArray[np.intp]
@@ -105,8 +107,8 @@ class Inputs:
         """What was known at `t` (s from the start)."""
         m = max(1, int(np.searchsorted(self.edges, t, side="right")) - 1)
         return Inputs(
-            self.name, self.joints, self.models, self.edges[: m + 1], self.source, self.drive[:m], self.gear[:m],
-            self.idle[:m], self.stretch[:m], tuple(one.until(float(self.edges[m])) for one in self.observed),
+            self.name, self.joints, self.models, self.edges[: m + 1], self.source, self.drive[:m], self.push[:m],
+            self.gear[:m], self.idle[:m], self.stretch[:m], tuple(one.until(float(self.edges[m])) for one in self.observed),
             self.readings[:m], self.limit_c, self.glitches, self.ambient_c, self.heat_sinks,
         )  # fmt: skip
 
@@ -134,7 +136,7 @@ def inputs_of(run: Run) -> Inputs:
     models = tuple(SERVO_MODELS.get(run.facts.motors.get(joint, "")) for joint in joints)
     shape = (m, len(joints))
     drive, gear, idle = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    readings, stretch = np.full(shape, np.nan), np.zeros(shape, np.intp)
+    readings, push, stretch = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, np.intp)
     source, observed, glitches = list[Source](), list[Observed](), np.zeros(len(joints), np.intp)
     limits = np.zeros(len(joints))
     for k, (joint, model) in enumerate(zip(joints, models, strict=True)):
@@ -150,6 +152,8 @@ def inputs_of(run: Run) -> Inputs:
             awake = _awake(t, m, edges)
             drive[:, k] = _mean(place, square, m) * awake
             gear[:, k] = _mean(place, power, m) * awake
+            if model is not None and run.has("pwm", [joint]):
+                push[:, k] = _mean(place, _push(run, joint, model), m) * awake
         volts = run.column(f"volt.{joint}")
         supply = run.facts.supply_v or (model.nominal_voltage_v if model else 12.0)
         idle[:, k] = (model.standby_current_a if model else 0.045) * _mean(place, volts, m, start=supply)
@@ -158,7 +162,7 @@ def inputs_of(run: Run) -> Inputs:
     sinks = tuple(soak.get("heat_sinks", ())) if isinstance(soak, dict) else ()
     sinks = sinks or tuple(str(joint) for joint in run.facts.extra.get("heat_sinks", ()))
     return Inputs(
-        run.name, joints, models, edges, tuple(source), drive, gear, idle, stretch, tuple(observed), readings, limits,
+        run.name, joints, models, edges, tuple(source), drive, push, gear, idle, stretch, tuple(observed), readings, limits,
         glitches, run.facts.ambient_c, sinks,
     )  # fmt: skip
 
@@ -176,21 +180,26 @@ def _effort(run: Run, joint: str, model: ServoModel | None) -> tuple[Source, Arr
     nothing = np.zeros(len(run.t))
     if model is None:
         return "unknown", nothing, nothing
-    torque = np.nan_to_num(run.signal("torque", [joint], default=1.0)[:, 0], nan=1.0)
     velocity = np.nan_to_num(run.column(f"vel.{joint}"))
     if run.has("cur", [joint]):
         current = run.column(f"cur.{joint}")
         return "current", current**2, np.abs(model.kt_nm_a * current * velocity)
     if run.has("pwm", [joint]):
-        volts = run.column(f"volt.{joint}")
-        volts = np.where(np.isfinite(volts), volts, run.facts.supply_v or model.nominal_voltage_v)
-        # With torque off the bridge is open, whatever the register says.
-        over = (run.column(f"pwm.{joint}") * volts - model.ke_v_s_rad * velocity) * torque
-        return "duty", over**2, np.abs(model.kt_nm_a * over / model.resistance_ohm * velocity)
+        push = _push(run, joint, model)
+        return "duty", push, np.abs(model.kt_nm_a * np.sqrt(push) / model.resistance_ohm * velocity)
     if run.has("load", [joint]):
         current = run.column(f"load.{joint}") * model.stall_current_a
         return "load", current**2, np.abs(model.kt_nm_a * current * velocity)
     return "unknown", nothing, nothing
+
+
+def _push(run: Run, joint: str, model: ServoModel) -> Array:
+    """(n,) V², what the bridge puts over the winding's resistance, squared. With torque off the bridge is open."""
+    volts = run.column(f"volt.{joint}")
+    volts = np.where(np.isfinite(volts), volts, run.facts.supply_v or model.nominal_voltage_v)
+    back = model.ke_v_s_rad * np.nan_to_num(run.column(f"vel.{joint}"))
+    on = np.nan_to_num(run.signal("torque", [joint], default=1.0)[:, 0], nan=1.0)
+    return np.asarray(((run.column(f"pwm.{joint}") * volts - back) * on) ** 2)
 
 
 def _mean(place: NDArray[np.intp], values: Array, m: int, *, fill: bool = True, start: float = 0.0) -> Array:
