@@ -20,8 +20,11 @@ from openant_tools.errors import BadInput
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run, write_table
-from openant_tools.robot.joints import JOINT_NAMES
+from openant_tools.robot.joints import JOINT_NAMES, JOINTS
+from openant_tools.robot.kit import PLATFORM_PWM_LIMIT_COUNTS
+from openant_tools.robot.kit import kit as kit_by_name
 from openant_tools.robot.mjcf import nominal_mjcf
+from openant_tools.sysid.data_sheet import data_sheet_model
 from openant_tools.sysid.fit import autocorrelation_time
 from openant_tools.sysid.identify import Identification, Value, calibrated, identify
 from openant_tools.sysid.protocols import CommandSpace, protocol
@@ -284,6 +287,35 @@ def test_tied_joints_share_a_value(tmp_path: Path) -> None:
     alone = [value(apart, f"coulomb_friction.{joint}") for joint in both]
     assert tied.high - tied.low < max(one.high - one.low for one in alone)
     assert np.ptp(calibrated(servo).dof_frictionloss) == 0
+
+
+def test_the_data_sheet_says_what_the_nominal_ant_is_and_what_registers_change(tmp_path: Path) -> None:
+    plant = load_plant(plants.write(tmp_path / "ant.xml", nominal_mjcf("lite")), list(JOINT_NAMES), Setup.STAND)
+    kit = kit_by_name("lite")
+    motors = {name: kit.servo(joint.kind).name for name, joint in JOINTS.items()}
+    registers = {name: {"pwm_limit": PLATFORM_PWM_LIMIT_COUNTS} for name in motors}
+    t = np.arange(2.0)
+    columns = {f"{signal}.{name}": t for signal in ("cmd", "pos") for name in motors}
+
+    def of(**facts: Any) -> mujoco.MjModel | None:
+        return data_sheet_model(plant, [plants.run_of(columns, t, list(motors), supply_v=kit.supply_v, **facts)])
+
+    same = of(motors=motors, registers=registers)
+    assert same is not None
+    for field in ("actuator_gainprm", "actuator_biasprm", "dof_damping"):
+        assert getattr(same, field) == pytest.approx(getattr(plant.model, field), rel=1e-4), field
+    assert same.actuator_forcerange == pytest.approx(plant.model.actuator_forcerange, rel=2e-3)  # whole counts of PWM
+    # A softer P gain in one servo is half the stiffness there, and nothing elsewhere.
+    soft = of(motors=motors, registers=registers | {"knee_fl": {"position_p_gain": 320.0}})
+    assert soft is not None
+    factory = kit.servo("knee").register("position_p_gain").default
+    assert factory is not None
+    j = plant.joints.index("knee_fl")
+    stiff = -plant.model.actuator_biasprm[plant.actuator, 1]
+    assert -soft.actuator_biasprm[plant.actuator, 1] / stiff == pytest.approx(
+        [320.0 / factory if k == j else 1.0 for k in range(8)], rel=1e-4
+    )
+    assert of(motors=dict.fromkeys(motors, "SG90")) is None
 
 
 def test_each_run_is_simulated_with_the_model_that_it_names(model: Path, tmp_path: Path) -> None:

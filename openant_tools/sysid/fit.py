@@ -715,21 +715,21 @@ class Problem:
         count = int(block.max()) + 1
         if count < FEWEST_BLOCKS:
             return np.ones(len(self.parameters))
-        n = int(free.sum())
-        told, pulled = np.zeros((count, len(free), len(free))), np.zeros((count, len(free)))
-        edges = np.flatnonzero(np.diff(block, prepend=-1, append=count))
-        for j, (p, _) in enumerate(self._movers):
-            moves = self._moves(tangent, j) * self._weight[:, j]
-            left = self._weight[:, j] * np.nan_to_num(point.residual[:, j])
-            for b, (first, stop) in enumerate(itertools.pairwise(edges)):
-                part = moves[:, first:stop]
-                told[b][np.ix_(p, p)] += part @ part.T
-                pulled[b][p] += part @ left[first:stop]
+        precision, _ = self._normal(tangent, point)
         inside = np.ix_(free, free)
-        without = told.sum(axis=0)[inside] + np.eye(n) - told[:, free][:, :, free]
-        moved = np.linalg.solve(without, pulled[:, free, None])[..., 0]
+        moved = np.empty((count, int(free.sum())))
+        edges = np.flatnonzero(np.diff(block, prepend=-1, append=count))
+        # Block by block: there are the more of them the longer the runs are, and all they tell at once would fill memory.
+        for b, (first, stop) in enumerate(itertools.pairwise(edges)):
+            told, pulled = np.zeros(precision.shape), np.zeros(len(free))
+            weight, left = self._weight[first:stop], np.nan_to_num(point.residual[first:stop])
+            for j, (p, colour) in enumerate(self._movers):
+                part = tangent.change[colour, first:stop, j] * weight[:, j]
+                told[np.ix_(p, p)] += part @ part.T
+                pulled[p] += part @ (weight[:, j] * left[:, j])
+            moved[b] = np.linalg.solve((precision - told)[inside], pulled[free])
         moved -= moved.mean(axis=0)
-        give = np.linalg.inv(told.sum(axis=0)[inside] + np.eye(n))
+        give = np.linalg.inv(precision[inside])
         robust = (count - 1) / count * (moved**2).sum(axis=0) + (give**2).sum(axis=0)
         wider = np.ones(len(free))
         wider[free] = np.sqrt(np.maximum(1.0, robust / np.diag(covariance)[free]))

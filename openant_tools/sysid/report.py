@@ -14,6 +14,7 @@ from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.report import Details, Figure, KeyFigure, Mark, Part, Report, plots
 from openant_tools.report.parts import Tone
+from openant_tools.sysid.data_sheet import data_sheet_model
 from openant_tools.sysid.fit import Dataset
 from openant_tools.sysid.identify import Identification, Value
 
@@ -73,7 +74,8 @@ def fit_report(result: Identification) -> Report:
     report.section("How far").figure(
         _error_against_horizon(result),
         "Root mean square error of joint positions on held-out runs, re-initialised from measurement every so often. "
-        "The model is better where its line is lower; a full run never re-initialises.",
+        "The model is better where its line is lower; a full run never re-initialises. Where the runs name their servos, the "
+        "third line is the given model with what their data sheet and registers say of stiffness, damping and torque limit.",
     )
     report.section("What was found").table(
         ["parameter", "given", "value", "from", "to", "unit", "verdict"], [_row(value) for value in result.values]
@@ -170,21 +172,30 @@ def _error_against_horizon(result: Identification) -> MatplotlibFigure:
     figure: MatplotlibFigure
     figure, axes = plots.figure(height=2.8)
     given, calibrated = [], []
+    sheets = [data_sheet_model(data.plant, data.runs) for data in result.held_out]
+    by_sheet: list[float] = []
     longest = max(run.duration_s for data in result.held_out for run in data.runs)
     horizons = [horizon for horizon in HORIZONS_S if horizon < longest / 2]
     for horizon in [*horizons, None]:
-        measured, before, after = [], [], []
-        for data in result.held_out:
-            pos = _simulated(result, data, Rollouts(data.plant, data.runs, horizon))
+        measured, before, after, sheet = [], [], [], []
+        for k, data in enumerate(result.held_out):
+            rollouts = Rollouts(data.plant, data.runs, horizon)
+            pos = _simulated(result, data, rollouts)
             measured.append(data.measured)
             before.append(pos[0])
             after.append(pos[1])
+            if (model := sheets[k]) is not None:
+                sheet.append(rollouts([model]).pos[0])
         truth = np.concatenate(measured)
         given.append(1e3 * gap(truth, np.concatenate(before)))
         calibrated.append(1e3 * gap(truth, np.concatenate(after)))
+        if len(sheet) == len(sheets):
+            by_sheet.append(1e3 * gap(truth, np.concatenate(sheet)))
     x = np.arange(len(given))
     with plots.style():
         axes.plot(x, given, "s--", label="given model")
+        if by_sheet:
+            axes.plot(x, by_sheet, "^-.", label="data sheet and registers")
         axes.plot(x, calibrated, "o-", label="calibrated model")
         axes.axhline(1e3 * result.floor, linestyle=":", color=plots.INK, label="floor")
         axes.set_xticks(x, [f"{horizon:g}" for horizon in horizons] + ["full run"])
