@@ -10,6 +10,7 @@ what the sensors read at the last physics step of that time, all at the same ins
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from openant_env.rendering import Painter
 from openant_env.robots import DT_S, simulated_robot
 from openant_env.tasks import BackAndForth
 from openant_tools.effects.acting import Acting
+from openant_tools.effects.commands import CommandPath
 from openant_tools.errors import BadInput
 from openant_tools.model.rollout import fill_setpoints
 
@@ -106,8 +108,8 @@ class Ant(AntBase):
         # MuJoCo would start a simulation that has come apart afresh without a word.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.data = mujoco.MjData(self.model)
-        self._acting = Acting(self._plant, self.data, self.robot.effects) if self.robot.effects else None
         self._substeps = _whole_steps(self.dt, self.model.opt.timestep, self.robot.model_path)
+        self._take_effects()
         self.render_mode = render_mode
         self._size = (width, height)
         self._painter: Painter | None = None
@@ -133,6 +135,24 @@ class Ant(AntBase):
         self._sensor_index = index
         self._observation = np.zeros(len(index))
         self._direction_at = self.layout.slices["direction"].start
+
+    def _take_effects(self) -> None:
+        """What acts beside the model: between its steps, on the way of commands, and in sensors."""
+        robot, timestep, sensing = self.robot, self.model.opt.timestep, self.robot.sensing
+        stepped = bool(robot.effects) or robot.commands is not None
+        self._acting = Acting(self._plant, self.data, robot.effects) if stepped else None
+        self._path = None if robot.commands is None else CommandPath(robot.commands, timestep)
+        self._bias: NDArray[np.float64] | None = None
+        if sensing is not None and (sensing.gyro_bias.any() or sensing.acc_bias.any()):
+            self._bias = np.zeros(len(self.layout))
+            self._bias[self.layout.slices["gyro"]] = sensing.gyro_bias
+            self._bias[self.layout.slices["acc"]] = sensing.acc_bias
+        self._tracker = sensing if sensing is not None and sensing.tracks_wrong else None
+        # The pose that the tracker tells is so many steps of the environment and of the physics old.
+        late = 0 if self._tracker is None else round(self._tracker.latency_s / timestep)
+        steps_late, self._late = divmod(late, self._substeps)
+        self._poses: deque[tuple[float, float, float, float]] = deque(maxlen=steps_late + 1)
+        self._plain = self._path is None and self._tracker is None
 
     def _settle(self) -> NDArray[np.float64]:
         """The state of a robot that stands with the command of action 0: setpoint filters and delay buffers full."""
@@ -191,13 +211,36 @@ class Ant(AntBase):
         data.qpos[free + 3 : free + 7] = turned
         mujoco.mj_forward(model, data)
 
-        torso_x, torso_y, _ = self._torso_position.tolist()
-        self.task.reset(torso_x, torso_y, self.np_random, chosen.get("direction_rad"))
+        self._poses.extend([self._pose()] * (self._poses.maxlen or 0))
+        if self._acting is not None:
+            self._acting.reset()
+        if self._path is not None:
+            self._path.reset(self.actions.rest)
+        x, y, hx, hy = self._pose()
+        if self._tracker is not None:
+            x, y, hx, hy = self._tracker.tracked(x, y, hx, hy)
+        self.task.reset(x, y, self.np_random, chosen.get("direction_rad"))
         self.average_reward.clear()
         self._seconds = 0.0
-        hx, hy = unit(self._torso_rotation[0], self._torso_rotation[3])
         observation = self._observe(hx, hy)
-        return observation, self._info(torso_x, torso_y, hx, hy, self._observation)
+        return observation, self._info(x, y, hx, hy, self._observation)
+
+    def _advance_imperfectly(self) -> None:
+        """A step in which commands scatter or a tracker is late."""
+        before = self._substeps - self._late
+        if self._path is None or self._acting is None:
+            self._advance(before)
+            self._poses.append(self._pose())
+            self._advance(self._late)
+            return
+        setpoints = self._path.play(self._command, self._substeps, self.np_random)
+        self._acting.play(setpoints[:before])
+        self._poses.append(self._pose())
+        self._acting.play(setpoints[before:])
+
+    def _pose(self) -> tuple[float, float, float, float]:
+        x, y, _ = self._torso_position.tolist()
+        return x, y, *unit(self._torso_rotation[0], self._torso_rotation[3])
 
     def _advance(self, steps: int) -> None:
         if self._acting is None:
@@ -222,7 +265,10 @@ class Ant(AntBase):
         """
         self._set_command(action)
         self._ctrl[self._setpoints] = self._command
-        self._advance(self._substeps)
+        if self._plain:
+            self._advance(self._substeps)
+        else:
+            self._advance_imperfectly()
         self._seconds += self.dt
 
         x, y, z = self._torso_position.tolist()
@@ -234,6 +280,8 @@ class Ant(AntBase):
             return self._observation.astype(np.float32), 0.0, False, True, info
         forward_x, _, _, forward_y, _, _, _, _, up_z = self._torso_rotation.tolist()
         hx, hy = unit(forward_x, forward_y)
+        if self._tracker is not None:
+            x, y, hx, hy = self._tracker.tracked(*self._poses[0])
         reward = self.task.reward(x, y)
         self.average_reward.add(reward, self.dt)
         observation = self._observe(hx, hy)
@@ -251,6 +299,8 @@ class Ant(AntBase):
         observation = self._observation
         # mode="clip" lets numpy write into `out` without a buffer between; every index is in range.
         self._sensordata.take(self._sensor_index, out=observation, mode="clip")
+        if self._bias is not None:
+            observation += self._bias
         at = self._direction_at
         observation[at], observation[at + 1] = self.task.observed_direction(hx, hy)
         return observation.astype(np.float32)
@@ -291,6 +341,9 @@ class Ant(AntBase):
             "seconds": self._seconds,
             "observation": self._observation.copy(),
             "random": self.np_random.bit_generator.state,
+            "effects": [] if self._acting is None else self._acting.get_state(),
+            "commands": {} if self._path is None else self._path.get_state(),
+            "poses": [list(pose) for pose in self._poses],
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -315,6 +368,11 @@ class Ant(AntBase):
         self._seconds = float(state["seconds"])
         self._observation[:] = np.asarray(state["observation"])
         self.np_random.bit_generator.state = state["random"]
+        if self._acting is not None:
+            self._acting.set_state(state["effects"])
+        if self._path is not None:
+            self._path.set_state(state["commands"])
+        self._poses.extend(tuple(pose) for pose in state["poses"])
 
     def __getstate__(self) -> dict[str, Any]:
         return {"arguments": self._arguments, "spec": self.spec, "state": self.get_state()}

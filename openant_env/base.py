@@ -34,6 +34,8 @@ class AntBase(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         BadInput: in one line, which argument cannot be used.
     """
 
+    metadata: dict[str, Any] = {}  # noqa: RUF012
+
     def __init__(
         self,
         robot: SimulatedRobot,
@@ -56,7 +58,7 @@ class AntBase(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
             raise BadInput(f"the time limit is {time_limit_s} s", remedy="give a time above 0, or None for no limit")
         self.robot = robot
         self.dt = robot.dt_s if dt is None else float(dt)
-        self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self.dt)) if self.dt > 0.0 else 1}
+        self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.dt)) if self.dt > 0.0 else 1}
         joints = robot.joints
         self.actions = action_map(
             robot.action_range if action_range is None else action_range, joints, robot.low, robot.high

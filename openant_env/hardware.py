@@ -36,9 +36,7 @@ __all__ = ["AntHardware"]
 Array = NDArray[np.float64]
 
 #: s for the legs to come to rest after the ramp to the start
-SETTLE_S = 0.5
-#: s without a pose after which the robot counts as lost (the published software's patience)
-TAG_PATIENCE_S = 2.0
+SETTLE_S = 0.3
 #: s without a sample of the IMU
 IMU_PATIENCE_S = 0.5
 #: s upside down: a robot that tumbles for a moment has not fallen
@@ -65,7 +63,8 @@ class AntHardware(AntBase):
     Spaces, reward and info are those of `openant/Ant-v0` (`openant_env.ant`). In addition info holds `period_s` (s, from
     the last command to this one), `overruns` (steps so far that began late), `observation_age_s` (s, of joints, IMU and
     position, as of the step's end), `missed` (answers of servos that did not come in this step), `joint_temperatures`
-    (°C), `joint_loads` (A or share of full load, as the servos measure) and `supply_v`.
+    (°C), `joint_loads` (A or share of full load, as the servos measure) and `supply_v`; and `void` where a stop came in the
+    way of a step: its action was not carried out, so that there is nothing to learn from it.
 
     Args:
         robot: a robot's folder (or its robot.toml). None only with `virtual`: an Ant as the guide says.
@@ -76,6 +75,7 @@ class AntHardware(AntBase):
             circle's centre is where the robot stands first, unless `task_options` say otherwise.
         bus, imu, camera: in place of what robot.toml names.
         recordings: folder for the recording of every connection; None: `recordings/` of the robot's folder.
+        tag_patience_s: s without a pose, which keeps its last value meanwhile, after which the robot counts as lost.
         patience_s: s that `reset` waits for a robot that needs help before it gives up; None: for ever.
         notice: called with what the user should know; default: the log.
 
@@ -102,16 +102,13 @@ class AntHardware(AntBase):
         imu: str | None = None,
         camera: str | int | None = None,
         recordings: str | Path | None = None,
+        tag_patience_s: float = 2.0,
         patience_s: float | None = None,
         notice: Callable[[str], None] | None = None,
         render_mode: None = None,
     ) -> None:
         if robot is None and virtual is None:
             raise BadInput("no robot is named", remedy="give robot=DIR, or virtual='default' for a virtual one")
-        if render_mode is not None:
-            raise BadInput(
-                f"render mode {render_mode!r} does not exist", remedy="look at the robot; its runs are recorded"
-            )
         super().__init__(
             simulated_robot(robot, effects=False),
             task=task, task_options=task_options, dt=dt, action_range=action_range, observation_order=observation_order,
@@ -119,6 +116,7 @@ class AntHardware(AntBase):
         )  # fmt: skip
         self.render_mode = None
         self._chosen_origin = "origin" in (task_options or {})
+        self._tag_patience_s = float(tag_patience_s)
         self._patience_s = math.inf if patience_s is None else float(patience_s)
         self._notice = notice or _log.warning
         self._paused = threading.Event()
@@ -292,7 +290,7 @@ class AntHardware(AntBase):
         self._seconds += self.dt
         x, y, yaw = self._pose.tolist()
         hx, hy = math.cos(yaw), math.sin(yaw)
-        info = self._info(x, y, hx, hy, self._observation) | self._more(math.nan, 0) | {"reason": why}
+        info = self._info(x, y, hx, hy, self._observation) | self._more(math.nan, 0) | {"reason": why, "void": True}
         return self._observation.astype(np.float32), 0.0, False, True, info
 
     def _take(self, rows: Array) -> None:
@@ -346,7 +344,7 @@ class AntHardware(AntBase):
         if self._fallen_s >= FALLEN_S and self._on_fall != "ignore":
             info["reason"] = "the robot lies on its back"
             return self._on_fall == "terminate", self._on_fall == "truncate"
-        if lost > TAG_PATIENCE_S:
+        if lost > self._tag_patience_s:
             info["reason"] = f"the camera has not seen the robot for {lost:.1f} s"
         elif silent > IMU_PATIENCE_S:
             info["reason"] = f"the IMU has sent nothing for {silent:.1f} s"
@@ -474,7 +472,7 @@ class AntHardware(AntBase):
 
     def _unseen(self) -> str | None:
         """Which reading is missing, so that there is nothing to learn from."""
-        if not self._t - self._pose_t < TAG_PATIENCE_S:
+        if not self._t - self._pose_t < self._tag_patience_s:
             return "the camera does not see the robot: look at light, focus, and both tags in view"
         if not self._t - self._imu_t < IMU_PATIENCE_S:
             return "the IMU sends nothing: look at its cable"

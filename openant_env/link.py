@@ -66,6 +66,15 @@ def engine_config(
     Raises:
         BadInput, HardwareFault: one of the three is not known or not there.
     """
+    if robot is not None:
+        assumed = [joint for joint in robot.motors if _nominal(robot, f"motors.{joint}.zero_offset_rad")]
+        if assumed:
+            raise BadInput(
+                f"the zeros of {', '.join(assumed[:2])}{' …' if len(assumed) > 2 else ''} were never measured: the robot "
+                "would move otherwise than it is told",
+                where="robot.toml",
+                remedy="calibrate it: `openant bringup`, or `openant calib zeros`",
+            )
     seen = {"imu": imu_of_robot(robot, imu), "camera": camera_of_robot(robot, camera)}
     for what, port, step in (("flight controller", "ports.imu", "imu"), ("overhead camera", "ports.camera", "arena")):
         if seen[step if step == "imu" else "camera"] is None:
@@ -281,6 +290,12 @@ class RobotLink:
                 self._notice(event.text)
             elif isinstance(event, messages.Stopped):
                 self._standing = False
+
+
+def _nominal(robot: RobotConfig, path: str) -> bool:
+    """Whether a value is what the kit's guide says, and nobody has looked."""
+    entry = robot.provenance_of(path)
+    return entry is None or entry.how == "nominal"
 
 
 def _free_name(folder: Path) -> Path:

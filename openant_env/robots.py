@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_env.observations import Layout
-from openant_tools.effects.entries import values_of
+from openant_tools.effects.commands import CommandEffects
+from openant_tools.effects.entries import commands_of, sensing_of, values_of
 from openant_tools.effects.rollout import EffectValues
+from openant_tools.effects.sensing import SensingEffects
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.robot.config import ACTION_PRESETS, ActionRange, Effect
@@ -46,7 +48,7 @@ class SimulatedRobot:
         dt_s: s, the length of a step unless someone asks for another.
         measured_bounds: name of an observation → (low, high), as far as they were measured.
         folder: the robot's folder, None for the nominal one.
-        effects: what acts beside the model.
+        effects: what acts beside the model, between its steps; commands: on the way to the servos; sensing: in sensors.
     """
 
     model_path: Path
@@ -57,6 +59,8 @@ class SimulatedRobot:
     measured_bounds: Mapping[str, tuple[float, float]]
     folder: Path | None
     effects: EffectValues = field(default_factory=dict)
+    commands: CommandEffects | None = None
+    sensing: SensingEffects | None = None
     joints: tuple[str, ...] = tuple(JOINTS)
 
     def load(self) -> Plant:
@@ -126,7 +130,7 @@ def simulated_robot(
     folder = RobotFolder.at(robot)
     config = folder.config()
     present = [effect for effect in config.effects if effect.enabled]
-    acting = values_of(_chosen(present, effects, folder), tuple(JOINTS), folder.config_file)
+    acting = _chosen(present, effects, folder)
     motors = [config.motors[joint] for joint in JOINTS]
     return SimulatedRobot(
         model_path=folder.model_path(config),
@@ -136,7 +140,9 @@ def simulated_robot(
         dt_s=config.timing.dt_s,
         measured_bounds=config.observation,
         folder=folder.path,
-        effects=acting,
+        effects=values_of(acting, tuple(JOINTS), folder.config_file),
+        commands=commands_of(acting, tuple(JOINTS), folder.config_file),
+        sensing=sensing_of(acting, folder.config_file),
     )
 
 

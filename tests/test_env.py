@@ -358,15 +358,15 @@ def test_an_argument_that_cannot_be_is_refused_in_one_line(options, words):
     assert "\n" not in str(refusal.value)
 
 
-def test_effects_that_do_not_act_yet_are_refused_by_name_unless_left_out(robot):
+def test_effects_that_the_model_carries_are_refused_by_name_unless_left_out(robot):
     robot.update(
-        effects=[Effect("thermal_derating", ("knee_fl",), {"gain": 0.1}), Effect("voltage_sag", enabled=False)]
+        effects=[Effect("action_delay", ("knee_fl",), {"delay_s": 0.1}), Effect("voltage_sag", enabled=False)]
     )
-    with pytest.raises(BadInput, match=r"robot\.toml: the effect thermal_derating cannot act .* `--no-effects`"):
+    with pytest.raises(BadInput, match=r"robot\.toml: the effect action_delay does not act as an entry.* `--no-effects`"):
         make(robot=robot.path)
-    with pytest.raises(BadInput, match="the effect thermal_derating cannot act"):
-        make(robot=robot.path, effects=["thermal_derating"])
-    with pytest.raises(BadInput, match="no enabled effect is called voltage_sag → it has thermal_derating"):
+    with pytest.raises(BadInput, match="the effect action_delay does not act as an entry"):
+        make(robot=robot.path, effects=["action_delay"])
+    with pytest.raises(BadInput, match="no enabled effect is called voltage_sag → it has action_delay"):
         make(robot=robot.path, effects=["voltage_sag"])
     make(robot=robot.path, effects=False)
     make(robot=robot.path, effects=[])

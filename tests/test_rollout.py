@@ -141,7 +141,7 @@ def test_the_mean_of_a_staircase_over_steps_is_exact(
     times = clock + np.concatenate([[0.0], np.cumsum(gaps)])
     values = np.array(levels[: len(times)], float)
     edges = clock + start + step * np.arange(count + 1)
-    mean = rollout._Staircase.of(times, values[:, None]).mean(edges)[:, 0]
+    mean = rollout.Staircase.of(times, values[:, None]).mean(edges)[:, 0]
 
     def in_force(at: float) -> float:
         before = np.flatnonzero(times <= at)

@@ -312,13 +312,16 @@ def test_commands_refuse_in_one_line(trained, tmp_path, capsys, monkeypatch):
     damaged.mkdir()
     (damaged / "run.json").write_text((out / "run.json").read_text())
     other = create_robot(tmp_path / "other")
-    other.update(effects=[Effect("thermal_derating", ("knee_fl",), {"gain": 0.1})])
+    other.update(effects=[Effect("action_delay", ("knee_fl",), {"delay_s": 0.1})])
     cases = [
         (("train", "sac", "--out", "x"), "there is no robot.toml here"),
-        (("train", "sac", "--robot", robot.path, "--env", "hardware", "--out", "x"), "'hardware' is not 'sim'"),
+        (("train", "sac", "--robot", robot.path, "--env", "hardware", "--out", "x"), "nobody is there to ask"),
+        (("train", "sac", "--robot", robot.path, "--env", "hardware", "--yes", "--out", "x"), "were never measured"),
+        (("train", "sac", "--kit", "lite", "--env", "hardware", "--yes", "--out", "x"), "--kit is a simulated robot"),
+        (("train", "sac", "--virtual", "--out", "x"), "--virtual is a robot behind its ports"),
         (("train", "sac", "--robot", robot.path, "--kit", "lite", "--out", "x"), "--robot and --kit name two robots"),
         (("train", "sac", "--kit", "lite", "--dt", 0.0005, "--out", "x"), "dt = 0.0005 s is no whole number"),
-        (("train", "sac", "--robot", other.path, "--out", "x"), "the effect thermal_derating cannot act"),
+        (("train", "sac", "--robot", other.path, "--out", "x"), "the effect action_delay does not act as an entry"),
         (("train", "sac", "--robot", robot.path, "--seed", 2, "--out", out), "this folder holds another run"),
         (("train", "sac", "--kit", "lite", "--device", "abacus", "--out", "x"), "torch cannot compute on abacus"),
         (("eval", tmp_path), "there is no training run here"),

@@ -11,11 +11,18 @@ import tomlkit
 from numpy.typing import NDArray
 
 from openant_tools.effects.catalogue import catalogue
+from openant_tools.effects.commands import SEND_S, CommandEffects
 from openant_tools.effects.rollout import EffectValues
+from openant_tools.effects.sensing import SensingEffects
 from openant_tools.errors import BadInput
 from openant_tools.robot.config import Effect as Entry
 
-__all__ = ["as_toml", "entries_of", "values_of"]
+__all__ = ["as_toml", "commands_of", "entries_of", "sensing_of", "values_of"]
+
+#: effects that act between the steps of an environment, not between those of its physics, with their parameters
+ON_COMMANDS = {"clock_jitter": ("std_s",), "command_dropout": ("fraction", "longest_s")}
+_AXES = tuple(f"{sensor}_{axis}" for sensor in ("gyro", "acc") for axis in "xyz")
+ON_SENSORS = {"imu_bias": ("rad_s", "m_s2", *_AXES), "tracker_scale": ("scale", "yaw_rad", "latency_s")}
 
 
 def values_of(entries: Sequence[Entry], joints: Sequence[str], where: str | Path | None = None) -> EffectValues:
@@ -31,14 +38,15 @@ def values_of(entries: Sequence[Entry], joints: Sequence[str], where: str | Path
     """
     values: dict[tuple[str, str], NDArray[np.float64]] = {}
     for entry in entries:
-        if not entry.enabled:
+        if not entry.enabled or entry.effect in ON_COMMANDS or entry.effect in ON_SENSORS:
             continue
         effect = catalogue().get(entry.effect)
         if effect is None:
             raise BadInput(
-                f"the effect {entry.effect} cannot act in this simulation yet",
+                f"the effect {entry.effect} does not act as an entry: MuJoCo carries it, in the model",
                 where=where,
-                remedy="simulate without: effects=False, `--no-effects`, or enabled = false in the file",
+                remedy="write it into the model with `openant gap apply`, or leave it out: effects=False, `--no-effects`, "
+                "enabled = false",
             )
         known = {quantity.name: quantity for quantity in effect.quantities}
         chosen = list(joints) if isinstance(entry.joints, str) else list(entry.joints)
@@ -62,6 +70,92 @@ def values_of(entries: Sequence[Entry], joints: Sequence[str], where: str | Path
                 )
             values.setdefault((entry.effect, name), np.zeros(len(joints)))[rows] = float(number)
     return values
+
+
+def commands_of(
+    entries: Sequence[Entry], joints: Sequence[str], where: str | Path | None = None
+) -> CommandEffects | None:
+    """What `[[effect]]` entries say of commands on their way; None where they say nothing.
+
+    Raises:
+        BadInput: a parameter that an effect does not have, or a value out of bounds.
+    """
+    jitter_s, longest_s, shared, fraction = 0.0, SEND_S, True, np.zeros(len(joints))
+    for entry in entries:
+        if not entry.enabled or entry.effect not in ON_COMMANDS:
+            continue
+        given = _numbers(entry, ON_COMMANDS[entry.effect], where)
+        if entry.effect == "clock_jitter":
+            jitter_s = float(np.hypot(jitter_s, _within(entry, "std_s", given, 0.0, 1.0, where)))
+            continue
+        chosen = joints if isinstance(entry.joints, str) else entry.joints
+        rows = [k for k, joint in enumerate(joints) if joint in chosen]
+        fraction[rows] = np.maximum(fraction[rows], _within(entry, "fraction", given, 0.0, 0.95, where))
+        longest_s = max(longest_s, _within(entry, "longest_s", given, 0.0, 10.0, where))
+        shared = shared and len(rows) == len(joints)
+    return CommandEffects(jitter_s, fraction, longest_s, shared) if jitter_s or fraction.any() else None
+
+
+def sensing_of(entries: Sequence[Entry], where: str | Path | None = None) -> SensingEffects | None:
+    """What `[[effect]]` entries say of the IMU and the tracker; None where they say nothing.
+
+    Biases are `rad_s` and `m_s2` (effects.md), three numbers each, or axis by axis as diagnoses write them.
+
+    Raises:
+        BadInput: a parameter that an effect does not have, or a value out of bounds.
+    """
+    biases = {"gyro": np.zeros(3), "acc": np.zeros(3)}
+    scale, yaw_rad, latency_s = 1.0, 0.0, 0.0
+    mine = [entry for entry in entries if entry.enabled and entry.effect in ON_SENSORS]
+    for entry in mine:
+        given = _numbers(entry, ON_SENSORS[entry.effect], where)
+        if entry.effect == "imu_bias":
+            for sensor, whole in (("gyro", "rad_s"), ("acc", "m_s2")):
+                parts = [given.get(f"{sensor}_{axis}", [0.0])[0] for axis in "xyz"]
+                vector = given.get(whole, parts)
+                if len(vector) != 3:
+                    raise BadInput(f"imu_bias.{whole} is no vector of three", where=where, remedy="give x, y and z")
+                biases[sensor] += vector
+            continue
+        scale *= _within(entry, "scale", given, 0.1, 10.0, where, 1.0)
+        yaw_rad += _within(entry, "yaw_rad", given, -math.pi, math.pi, where)
+        latency_s += _within(entry, "latency_s", given, 0.0, 2.0, where)
+    return SensingEffects(biases["gyro"], biases["acc"], scale, yaw_rad, latency_s) if mine else None
+
+
+def _numbers(entry: Entry, known: Sequence[str], where: str | Path | None) -> dict[str, list[float]]:
+    out = {}
+    for name, value in entry.parameters.items():
+        if name not in known:
+            raise BadInput(
+                f"{entry.effect} has no parameter {name!r}", where=where, remedy=f"it has {', '.join(known)}"
+            )
+        numbers = value if isinstance(value, list) else [value]
+        if not numbers or not all(
+            isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x) for x in numbers
+        ):
+            raise BadInput(f"{entry.effect}.{name} is no number: {value!r}", where=where, remedy="give it in SI units")
+        out[name] = [float(x) for x in numbers]
+    return out
+
+
+def _within(
+    entry: Entry,
+    name: str,
+    given: dict[str, list[float]],
+    low: float,
+    high: float,
+    where: str | Path | None,
+    absent: float = 0.0,
+) -> float:
+    number = given.get(name, [absent])[0]
+    if not low <= number <= high:
+        raise BadInput(
+            f"{entry.effect}.{name} = {number:g} is not physical",
+            where=where,
+            remedy=f"it lies between {low:g} and {high:g}",
+        )
+    return number
 
 
 def entries_of(values: EffectValues, joints: Sequence[str]) -> list[Entry]:

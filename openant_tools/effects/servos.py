@@ -59,6 +59,9 @@ class Servos:
         self._group = fields.actuator_group[:, i].copy()
         self._on = np.ones((self._n, len(i)), bool)
         self._rest = self._read()
+        # Of the gain on the setpoint to that on the position; from here, so that no rounding piles up from step to step.
+        stiffness = -fields.actuator_biasprm[:, i, 1]
+        self._ratio = fields.actuator_gainprm[:, i, 0] / np.where(stiffness == 0.0, 1.0, stiffness)
         self._changed = dict.fromkeys(("stiffness", "velocity_gain", "limit"), False)
 
     @property
@@ -140,7 +143,7 @@ class Servos:
                 gain[:, KP] = value
             else:
                 if self._fixed[j]:
-                    gain[:, 0] *= value / -bias[:, 1]
+                    gain[:, 0] = self._ratio[:, j] * value
                 bias[:, 1] = -value
         elif name == "velocity_gain":
             if motor:

@@ -1,0 +1,59 @@
+"""A servo gives less the warmer it is.
+
+How warm it is follows the square of the torque that it gives, with one time constant: standing at its limit for good it
+ends `FULL_HEAT_C` above where it began. Every degree takes a share of its gains and of its torque, down to `COLDEST`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.effects.effect import Effect, Quantity, Values
+from openant_tools.effects.step import Step
+
+__all__ = ["EFFECT"]
+
+#: °C by which a winding that gives all its torque warms up in the end
+FULL_HEAT_C = 60.0
+#: least share of the torque that heat leaves
+COLDEST = 0.2
+#: s, where only a loss is named
+USUAL_S = 20.0
+#: numbers that only must not be zero
+TINY = 1e-9
+
+
+class _Heating:
+    """heat' = (FULL_HEAT_C (torque/limit)² − heat) / time constant, explicitly; share left = 1 − loss · heat.
+
+    Attributes:
+        state: (n, joints) °C above where it began.
+    """
+
+    def __init__(self, values: Values) -> None:
+        self._loss = values["loss_per_c"]
+        seconds = values["time_constant_s"]
+        self._seconds = np.where(seconds > 0.0, seconds, USUAL_S)
+        self.state: NDArray[np.float64] = np.zeros(self._loss.shape)
+
+    def __call__(self, step: Step) -> None:
+        share = np.minimum(np.abs(step.motor_torque) / np.maximum(step.limit, TINY), 1.0)
+        self.state += step.dt / self._seconds * (FULL_HEAT_C * share**2 - self.state)
+        left = np.maximum(1 - self._loss * self.state, COLDEST)
+        step.stiffness *= left
+        step.velocity_gain *= left
+        step.limit *= left
+
+
+EFFECT = Effect(
+    name="thermal_derating",
+    family="torque supply",
+    words="torque falls as the servo warms up",
+    quantities=(
+        Quantity("loss_per_c", "1/°C", 0.01, high=0.1),
+        Quantity("time_constant_s", "s", 10.0, high=3600.0),
+    ),
+    order=5,
+    law=_Heating,
+)

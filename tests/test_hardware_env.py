@@ -1,0 +1,281 @@
+"""The robot itself as an environment, played by a virtual one behind its ports: in stepped time, as it stands on a floor."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import openant_env  # noqa: F401
+from openant_env.link import engine_rate
+from openant_tools.cli import main
+from openant_tools.comms.clock import VirtualControl
+from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.recording.reader import read_recording
+from openant_tools.robot.config import Provenance
+from openant_tools.robot.folder import RobotFolder, create_robot
+
+#: the whole picture is 360 lines high, and the robot stays in it: a quarter of the time that full pictures take
+SCENARIO = """
+[robot]
+setup = "floor"
+[camera]
+width = 640
+height = 360
+position = [-0.35, 0.2, 1.3]
+look_at = [-0.35, 0.2, 0.0]
+[clock]
+mode = "stepped"
+"""
+STILL = np.zeros(8, np.float32)
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scenario") / "floor.toml"
+    path.write_text(SCENARIO)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> RobotFolder:
+    """A robot whose zeros someone has measured, and whose tag is known."""
+    return create_robot(
+        tmp_path_factory.mktemp("robot") / "my-ant",
+        values={"camera.body_tag_id": 12},
+        provenance={"motors": Provenance("measured", "openant calib zeros")},
+    )
+
+
+class Walker:
+    """An environment on a running virtual robot, with all that was said, and a hand on the robot's faults."""
+
+    def __init__(self, ready: Path, folder: RobotFolder, **options: object) -> None:
+        self.said: list[str] = []
+        self.env = gymnasium.make(
+            "openant/AntHardware-v0", robot=folder.path, virtual=str(ready), notice=self.said.append, **options
+        ).unwrapped
+        self._control = VirtualControl(self.env.link.config.control)
+
+    @contextlib.contextmanager
+    def fault(self, cause: str, **more: object) -> Iterator[None]:
+        self._control.ask("fault", cause=cause, on=True, **more)
+        try:
+            yield
+        finally:
+            self._control.ask("fault", cause=cause, on=False, **more)
+
+    def until_it_ends(self, steps: int = 20) -> dict[str, object]:
+        for _ in range(steps):
+            _, reward, _, truncated, info = self.env.step(STILL)
+            assert math.isfinite(reward)
+            if truncated:
+                return info
+        raise AssertionError("nothing ended it")
+
+    def close(self) -> None:
+        self.env.close()
+        self._control.close()
+
+
+@pytest.fixture(scope="module")
+def ready(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The ready file of a virtual robot in stepped time."""
+    path = tmp_path_factory.mktemp("ready") / "ready.json"
+    with subprocess.Popen(
+        [sys.executable, "-m", "openant_tools.cli", "virtual", "start", "--scenario", scenario, "--ready-file", path]
+    ) as process:
+        try:
+            give_up = time.monotonic() + 100
+            while not path.is_file():
+                assert process.poll() is None
+                assert time.monotonic() < give_up
+                time.sleep(0.05)
+            yield path
+        finally:
+            process.terminate()
+
+
+@pytest.fixture(scope="module")
+def on_the_floor(ready: Path, folder: RobotFolder) -> Iterator[Walker]:
+    one = Walker(ready, folder, tag_patience_s=0.4)
+    try:
+        yield one
+    finally:
+        one.close()
+
+
+@pytest.fixture
+def walker(on_the_floor: Walker) -> Walker:
+    """Standing; one for all tests, since getting up takes the robot its time."""
+    on_the_floor.env._patience_s = 20.0
+    on_the_floor.env.resume()
+    on_the_floor.env.reset(seed=0)
+    on_the_floor.said.clear()
+    return on_the_floor
+
+
+# ------------------------------------------------------------------------------------------------- spaces and timing
+
+
+def test_it_has_the_spaces_and_words_of_the_simulation(walker: Walker, folder: RobotFolder) -> None:
+    simulated = gymnasium.make("openant/Ant-v0", robot=folder.path).unwrapped
+    real = walker.env
+    assert real.observation_space == simulated.observation_space
+    assert real.action_space == simulated.action_space
+    assert real.describe() == simulated.describe()
+    (first, before), (theirs, info) = real.reset(seed=3), simulated.reset(seed=3)
+    assert before.keys() >= info.keys()
+    seen = dict(zip(real.observation_names, zip(first, theirs, strict=True), strict=True))
+    for name, (mine, other) in seen.items():
+        if not name.startswith("direction"):  # its heading is another one
+            assert mine == pytest.approx(other, abs=0.3 if name.startswith("acc") else 0.06), name
+    for _ in range(4):
+        observation, reward, _, _, info = real.step(STILL)
+    assert observation.dtype == np.float32
+    assert abs(reward) < 0.01
+    assert info["period_s"] == pytest.approx(0.12, abs=1e-6)
+    assert info["dt"] == pytest.approx(0.12, abs=1e-6)
+    assert info["overruns"] == 0
+    assert 0.0 <= info["observation_age_s"]["imu"] < 0.03
+    assert 0.05 < info["observation_age_s"]["position"] < 0.2
+    assert info["supply_v"] == pytest.approx(12.0, abs=0.3)
+    assert (info["joint_temperatures"] > 15).all()
+    simulated.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*Box observation space.*:UserWarning")
+def test_gymnasium_finds_nothing_wrong(walker: Walker) -> None:
+    check_env(walker.env, skip_render_check=True, skip_close_check=True)
+
+
+def test_a_step_is_a_whole_number_of_cycles_of_the_engine() -> None:
+    assert engine_rate(0.12) == pytest.approx(100.0)
+    assert engine_rate(0.05) == pytest.approx(100.0)
+    assert engine_rate(0.025) * 0.025 == pytest.approx(round(engine_rate(0.025) * 0.025))
+    for dt in (0.0, 0.003, float("nan"), -1.0):
+        with pytest.raises((BadInput, ValueError)):
+            engine_rate(dt)
+
+
+# ------------------------------------------------------------------------------------------ what befalls a real robot
+
+
+def test_a_lost_tag_holds_the_position_and_then_truncates(walker: Walker) -> None:
+    before = walker.env.step(STILL)[4]
+    with walker.fault("camera_stalled"):
+        info = walker.until_it_ends()
+    assert str(info["reason"]).startswith("the camera has not seen the robot for 0.")
+    assert "void" not in info
+    assert info["position"] == pytest.approx(before["position"], abs=5e-3)
+
+
+def test_a_silent_imu_truncates_and_no_number_is_made_up(walker: Walker) -> None:
+    with walker.fault("imu_silent"):
+        info = walker.until_it_ends()
+    assert "the IMU has sent nothing for 0." in str(info["reason"])
+    assert "void" not in info
+
+
+def test_a_cable_that_comes_off_ends_the_step_and_walking_goes_on_once_it_is_back(walker: Walker) -> None:
+    with walker.fault("broken_wire", where="knee_fl"):
+        info = walker.until_it_ends()
+        assert "knee_fl" in str(info["reason"])
+        assert info["void"]
+        with pytest.raises(BadInput, match="reset the environment first"):
+            walker.env.step(STILL)
+        walker.env._patience_s = 0.3
+        with pytest.raises(HardwareFault, match="the robot cannot go on"):
+            walker.env.reset()
+    assert any(words.startswith("waiting: ") for words in walker.said)
+    walker.env._patience_s = 20.0
+    observation, _ = walker.env.reset()
+    assert np.isfinite(observation).all()
+    assert not walker.env.step(STILL)[3]
+
+
+def test_pause_ends_the_step_and_reset_waits_for_resume(walker: Walker) -> None:
+    walker.env.pause()
+    info = walker.until_it_ends(1)
+    assert info["reason"] == "paused by hand"
+    walker.env._patience_s = 0.3
+    with pytest.raises(HardwareFault, match="the robot cannot go on: paused by hand"):
+        walker.env.reset()
+    assert not walker.env.link.standing  # nobody wants knees to bear it for hours
+
+
+def test_a_cable_wound_up_and_a_fall_need_someone(walker: Walker) -> None:
+    walker.env._wound_rad = 2.1 * 2 * math.pi
+    assert "the cable is wound up by 2.1 turns to the left" in str(walker.until_it_ends(1)["reason"])
+    walker.env._patience_s = 0.3
+    with pytest.raises(HardwareFault, match="turn the robot back by hand"):
+        walker.env.reset()
+    up, info = walker.env.layout.slices["acc"].start + 2, dict[str, object]()
+    walker.env.resume()  # someone has looked
+    walker.env._observation[up] = -9.8
+    endings = [walker.env._judge(0.12, info) for _ in range(9)]
+    assert endings[:8] == [(False, False)] * 8
+    assert endings[8] == (False, True)
+    assert info["reason"] == "the robot lies on its back"
+
+
+# ---------------------------------------------------------------------------------------------------- what is refused
+
+
+def test_what_cannot_walk_is_refused_in_one_line(scenario: Path, folder: RobotFolder, tmp_path: Path) -> None:
+    uncalibrated = create_robot(tmp_path / "new", values={"camera.body_tag_id": 12})
+    measured = {"motors": Provenance("measured", "openant calib zeros")}
+    blind = create_robot(tmp_path / "blind", provenance=measured)
+    cases: list[tuple[dict[str, object], str]] = [
+        ({}, "no robot is named"),
+        ({"robot": tmp_path / "nowhere", "virtual": str(scenario)}, "there is no robot.toml here"),
+        ({"robot": uncalibrated.path, "bus": "/dev/null"}, "the zeros of hip_rr, knee_rr … were never measured"),
+        ({"robot": blind.path, "bus": "/dev/null"}, "the robot has no flight controller yet"),
+        ({"robot": folder.path, "bus": "/dev/null", "imu": "/dev/null"}, "the robot has no overhead camera yet"),
+        ({"virtual": "default", "dt": 0.003}, "dt = 0.003 s is too short for the bus"),
+        ({"virtual": "default", "task": "swim"}, "no such task"),
+        ({"virtual": str(tmp_path / "no.toml")}, "there is no such scenario"),
+    ]
+    for options, words in cases:
+        with pytest.raises((BadInput, HardwareFault), match=words.replace("(", r"\(")):
+            gymnasium.make("openant/AntHardware-v0", **options)
+
+
+def test_actions_that_are_none_are_refused(walker: Walker) -> None:
+    for action, words in ((np.full(8, np.nan), "an action is not finite"), (np.zeros(7), "an action has shape")):
+        with pytest.raises(BadInput, match=words):
+            walker.env.step(action)
+    with pytest.raises(BadInput, match="no such reset option on a robot: heading_rad"):
+        walker.env.reset(options={"heading_rad": 1.0})
+
+
+def test_what_walks_is_recorded_and_the_gap_reads_it(ready: Path, folder: RobotFolder, tmp_path: Path) -> None:
+    """Last, since it needs the robot for itself, and lays it down."""
+    one = Walker(ready, folder, recordings=tmp_path)
+    one.env.reset(seed=0)
+    commands = np.random.default_rng(0).uniform(-1, 1, (6, 8)).astype(np.float32)
+    for action in commands:
+        one.env.step(action)
+    one.close()
+    [path] = one.env.link.recorded
+    run = read_recording(path).run
+    assert run.facts.setup == "floor"
+    assert run.facts.extra["dt_s"] == 0.12
+    played = run.signal("cmd")[np.isfinite(run.signal("cmd")).all(axis=1)]
+    wanted = one.env.actions.centre + one.env.actions.half * commands[4]
+    assert np.abs(played - wanted).max(axis=1).min() < 2e-3
+    out = tmp_path / "gap.json"
+    with pytest.raises(SystemExit) as end:
+        main(["gap", "measure", str(path), "--model", str(one.env.robot.model_path), "--json", str(out)])
+    assert end.value.code == 0
+    assert 0.0 < json.loads(out.read_text())["gap"] < 0.5
