@@ -5,10 +5,12 @@
     transitions.f32      every transition, rows of float32 in the order of the replay buffer, appended
     learning_curve.csv   step, seconds, average_reward_m_s, appended
     learning_curve.png   the same as a picture
+    interventions.csv    step, seconds, reason: where someone or something had to help
 
 A checkpoint replaces the last one in one stroke, after the transitions and the curve that belong to it are on the disk;
 it says how long both files were. Whatever a killed process had appended beyond is cut off on resuming, so that a
-resumed run goes on as if it had never been stopped.
+resumed run goes on as if it had never been stopped. Where learning runs beside acting, transitions stand in the file as
+soon as they are made, and a run goes on with all of them, those after the last checkpoint included.
 """
 
 from __future__ import annotations
@@ -30,10 +32,11 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.files import write_bytes, write_text
 
-__all__ = ["SCHEMA", "CurvePoint", "Run", "read_curve"]
+__all__ = ["SCHEMA", "CurvePoint", "Run", "load_checkpoint", "read_curve", "read_facts", "save_checkpoint"]
 
 SCHEMA = "openant.train/1"
 CURVE_COLUMNS = ("step", "seconds", "average_reward_m_s")
+INTERVENTION_COLUMNS = ("step", "seconds", "reason")
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,7 @@ class Run:
             write_text(path, json.dumps(self.facts, indent=2, ensure_ascii=False) + "\n")
         self._saved_rows = 0
         self._curve: io.TextIOWrapper | None = None
+        self._log: io.FileIO | None = None
 
     def resume(self) -> dict[str, Any] | None:
         """The last checkpoint, with the curve and the transitions cut back to it; None where there is none yet."""
@@ -91,7 +95,54 @@ class Run:
         if curve_bytes == 0:
             curve.write(",".join(CURVE_COLUMNS) + "\n")
             curve.flush()
+        self._cut_interventions(0 if checkpoint is None else int(checkpoint["step"]))
         return checkpoint
+
+    def go_on(self, width: int) -> tuple[dict[str, Any] | None, NDArray[np.float32]]:
+        """The last checkpoint, if there is one, and every transition that was ever appended, (rows, width).
+
+        For a run that is learned beside acting: nothing is cut back but what a kill left half written.
+        """
+        path = self.folder / "checkpoint.pt"
+        checkpoint = load_checkpoint(self.folder) if path.is_file() else None
+        log = self.folder / "transitions.f32"
+        rows = log.stat().st_size // (4 * width) if log.is_file() else 0
+        known = 0 if checkpoint is None else int(checkpoint["transitions"])
+        self._cut(log, max(rows, known) * 4 * width)
+        self._log = log.open("ab", buffering=0)
+        curve = self.folder / "learning_curve.csv"
+        text = curve.read_bytes() if curve.is_file() else b""
+        self._cut(curve, text.rfind(b"\n") + 1)
+        self._curve = curve.open("a", encoding="utf-8", newline="")
+        if not text:
+            self._curve.write(",".join(CURVE_COLUMNS) + "\n")
+            self._curve.flush()
+        return checkpoint, np.fromfile(log, np.float32).reshape(-1, width)
+
+    def append(self, row: NDArray[np.float32]) -> None:
+        """Put one transition, (width,), at the end of the file, where a kill no longer reaches it."""
+        assert self._log is not None
+        self._log.write(row.tobytes())
+
+    def _cut_interventions(self, step: int) -> None:
+        path = self.folder / "interventions.csv"
+        if not path.is_file():
+            return
+        with path.open(encoding="utf-8", newline="") as stream:
+            rows = [row for row in csv.reader(stream) if row and (not row[0].isdigit() or int(row[0]) <= step)]
+        text = io.StringIO(newline="")
+        csv.writer(text).writerows(rows)
+        write_text(path, text.getvalue())
+
+    def add_intervention(self, step: int, seconds: float, reason: str) -> None:
+        """Note that someone or something had to help, and why."""
+        path = self.folder / "interventions.csv"
+        new = not path.is_file()
+        with path.open("a", encoding="utf-8", newline="") as stream:
+            writer = csv.writer(stream)
+            if new:
+                writer.writerow(INTERVENTION_COLUMNS)
+            writer.writerow((step, f"{seconds:.3f}", reason))
 
     def _cut(self, path: Path, size: int) -> None:
         if size == 0:
@@ -129,16 +180,7 @@ class Run:
         assert self._curve is not None
         self._curve.flush()
         os.fsync(self._curve.fileno())
-        whole = {
-            **state,
-            "schema": SCHEMA,
-            "transitions": self._saved_rows,
-            "transition_bytes": new_transitions.shape[1] * 4,
-            "curve_bytes": self._curve.tell(),
-        }
-        buffer = io.BytesIO()
-        torch.save(_plain(whole), buffer)
-        write_bytes(self.folder / "checkpoint.pt", buffer.getvalue())
+        save_checkpoint(self.folder, state, self._saved_rows, new_transitions.shape[1], self._curve.tell())
 
     def add_curve_point(self, point: CurvePoint) -> None:
         assert self._curve is not None
@@ -146,9 +188,26 @@ class Run:
         self._curve.flush()
 
     def close(self) -> None:
-        if self._curve is not None:
-            self._curve.close()
-            self._curve = None
+        for stream in (self._curve, self._log):
+            if stream is not None:
+                stream.close()
+        self._curve = self._log = None
+
+
+def save_checkpoint(folder: Path, state: Mapping[str, Any], transitions: int, width: int, curve_bytes: int) -> None:
+    """Replace a run's checkpoint in one stroke.
+
+    Args:
+        state: tensors, numbers, texts, lists and dictionaries.
+        transitions: how many rows of the file belong to it, of `width` numbers each; they are on the disk already.
+        curve_bytes: how much of the learning curve belongs to it.
+    """
+    whole = {
+        **state, "schema": SCHEMA, "transitions": transitions, "transition_bytes": width * 4, "curve_bytes": curve_bytes
+    }  # fmt: skip
+    buffer = io.BytesIO()
+    torch.save(_plain(whole), buffer)
+    write_bytes(folder / "checkpoint.pt", buffer.getvalue())
 
 
 def read_facts(folder: Path) -> dict[str, Any]:

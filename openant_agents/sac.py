@@ -39,7 +39,10 @@ from openant_agents.training import CHECKPOINT_EVERY_S, REPORT_EVERY_S, Progress
 from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput
 
-__all__ = ["Actor", "Critics", "Progress", "Replay", "Sac", "Settings", "load_policy", "train"]
+__all__ = [
+    "Actor", "Critics", "Progress", "Replay", "Sac", "Settings", "device_of", "finite_or_raise", "load_policy", "run_facts",
+    "sizes", "train",
+]  # fmt: skip
 
 Array = NDArray[np.float32]
 
@@ -176,6 +179,11 @@ class Replay:
         row[o + a + 3 :] = next_observation
         self.added += 1
 
+    def extend(self, rows: Array) -> None:
+        """Add whole rows, (n, width), oldest first; n is at most the capacity."""
+        self.rows[np.arange(self.added, self.added + len(rows)) % self.capacity] = rows
+        self.added += len(rows)
+
     def sample(self, size: int, random: np.random.Generator) -> Tensor:
         """(size, width), drawn with replacement."""
         return self._tensor.index_select(0, torch.from_numpy(random.integers(0, len(self), size)))
@@ -296,6 +304,21 @@ class Sac:
         entropy_loss.backward()
         self.entropy_optimiser.step()
 
+    def sound_or_raise(self, folder: Path) -> None:
+        """Refuse to go on with weights that are no numbers; the last checkpoint has others.
+
+        Raises:
+            BadInput: something in it has come apart.
+        """
+        with torch.no_grad():
+            total = sum(weight.square().sum() for weight in self._actor_weights) + self.log_alpha.exp()
+        if not torch.isfinite(total):
+            raise BadInput(
+                f"the agent's weights are no numbers any more after {self.updates} updates",
+                where=folder,
+                remedy="the last checkpoint is sound; look at rewards and observations in transitions.f32",
+            )
+
     def _normal(self, rows: int) -> Tensor:
         return torch.randn(rows, self.replay.actions, generator=self.noise, device=self.device)
 
@@ -337,6 +360,33 @@ class Sac:
 CURVE_EVERY = 100
 
 
+def run_facts(
+    env: gymnasium.Env[Any, Any], settings: Settings, seed: int, env_facts: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """What `run.json` says of a run of SAC."""
+    observations, actions = sizes(env)
+    describe = getattr(env.unwrapped, "describe", None)
+    return {
+        "agent": "sac", "seed": seed, "settings": settings.as_dict(), "env": dict(env_facts or {}),
+        "trained_on": {} if describe is None else dict(describe()), "observations": observations, "actions": actions,
+        "versions": {"torch": torch.__version__, "numpy": np.__version__, "gymnasium": gymnasium.__version__},
+    }  # fmt: skip
+
+
+def finite_or_raise(observation: NDArray[Any], reward: float, step: int, folder: Path) -> None:
+    """Refuse what nothing can be learned from.
+
+    Raises:
+        BadInput: the reward or a number of the observation is none.
+    """
+    if not math.isfinite(reward + float(observation.sum())):
+        raise BadInput(
+            f"step {step} gave a reward or an observation that is no number",
+            where=folder,
+            remedy="look at the environment; the last checkpoint is sound",
+        )
+
+
 def train(
     env: gymnasium.Env[Any, Any],
     *,
@@ -368,18 +418,9 @@ def train(
         KeyboardInterrupt: asked for by SIGINT or SIGTERM; the run is saved and goes on with the same call.
     """
     settings = settings or Settings()
-    observations, actions = _sizes(env)
-    describe = getattr(env.unwrapped, "describe", None)
-    described = dict(describe()) if describe is not None else {}
-    agent = Sac(observations, actions, settings, seed=seed, device=_device(device))
-    run = Run(
-        folder,
-        {
-            "agent": "sac", "seed": seed, "settings": settings.as_dict(), "env": dict(env_facts or {}),
-            "trained_on": described, "observations": observations, "actions": actions,
-            "versions": {"torch": torch.__version__, "numpy": np.__version__, "gymnasium": gymnasium.__version__},
-        },
-    )  # fmt: skip
+    observations, actions = sizes(env)
+    agent = Sac(observations, actions, settings, seed=seed, device=device_of(device))
+    run = Run(folder, run_facts(env, settings, seed, env_facts))
     events = event_writer(folder) if tensorboard else None
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -442,24 +483,23 @@ def _train(
         action = agent.random_action() if random else agent.act(observation)
         next_observation, reward, terminated, truncated, info = env.step(action)
         reward = float(reward)
-        if not math.isfinite(reward + float(next_observation.sum())):
-            raise BadInput(
-                f"step {step} gave a reward or an observation that is no number",
-                where=run.folder,
-                remedy="look at the environment; the last checkpoint is sound",
-            )
+        finite_or_raise(next_observation, reward, step, run.folder)
         dt = float(info.get("dt", 1.0))
-        replay.add(observation, action, reward, dt, terminated, next_observation)
-        average.add(reward, dt)
+        if not info.get("void", False):  # of a robot that was stopped: nothing was done in that step
+            replay.add(observation, action, reward, dt, terminated, next_observation)
+            average.add(reward, dt)
         observation = next_observation
         step += 1
         seconds += dt
         if terminated or truncated:
-            helped[str(info.get("reason", "the episode ended"))] += 1
+            reason = str(info.get("reason", "the episode ended"))
+            helped[reason] += 1
+            run.add_intervention(step, seconds, reason)
             observation, _ = env.reset()
         if step > settings.learning_start:
             agent.update()
         if step % CURVE_EVERY == 0:
+            agent.sound_or_raise(run.folder)
             run.add_curve_point(CurvePoint(step, seconds, average.value))
             if events is not None:
                 events.add_scalar("average_reward_m_s", average.value, step)
@@ -486,7 +526,7 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
         BadInput: no such run, or one whose observations or actions are not the environment's.
     """
     facts = read_facts(folder)
-    observations, actions = _sizes(env)
+    observations, actions = sizes(env)
     if (facts["observations"], facts["actions"]) != (observations, actions):
         raise BadInput(
             f"its policy takes {facts['observations']} observations and gives {facts['actions']} actions, "
@@ -516,7 +556,12 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
     return agent, int(checkpoint["step"])
 
 
-def _device(name: str) -> torch.device:
+def device_of(name: str) -> torch.device:
+    """Where torch is to compute.
+
+    Raises:
+        BadInput: it cannot.
+    """
     try:
         device = torch.device(name)
         torch.zeros(1, device=device)
@@ -526,7 +571,12 @@ def _device(name: str) -> torch.device:
     return device
 
 
-def _sizes(env: gymnasium.Env[Any, Any]) -> tuple[int, int]:
+def sizes(env: gymnasium.Env[Any, Any]) -> tuple[int, int]:
+    """How many numbers an observation and an action have.
+
+    Raises:
+        BadInput: they are no vectors, or actions do not go from −1 to 1.
+    """
     observation, action = env.observation_space, env.action_space
     box = gymnasium.spaces.Box
     if not (isinstance(observation, box) and len(observation.shape) == 1):

@@ -31,6 +31,8 @@ class Progress:
         average_reward_m_s: m/s, over the last 120 s of it.
         learning: whether updates have begun.
         helped: why and how often the robot had to be set up again.
+        late: steps that began later than they should, of a robot in real time.
+        updates: how often the agent has learned; None where that follows from the steps.
     """
 
     step: int
@@ -39,6 +41,8 @@ class Progress:
     average_reward_m_s: float
     learning: bool
     helped: Mapping[str, int]
+    late: int = 0
+    updates: int | None = None
 
 
 def event_writer(folder: Path) -> Any:

@@ -9,6 +9,14 @@ from pathlib import Path
 import click
 
 from openant_tools.cli.options import json_option
+from openant_tools.cli.walking import (
+    HARDWARE_ID,
+    SIMULATED_ID,
+    environment,
+    hardware_options,
+    hardware_robot,
+    may_move,
+)
 from openant_tools.errors import BadInput
 
 #: pictures in a strip, s between them at least, and s of walking before the first
@@ -25,6 +33,11 @@ STRIP_FROM_S = 6.0
     "--robot", type=click.Path(path_type=Path), metavar="DIR",
     help="Play it on another robot than it was trained on.",
 )  # fmt: skip
+@click.option(
+    "--env", "where", type=click.Choice(["sim", "hardware"]),
+    help="In the simulation, or on the robot itself (with --virtual on a virtual one).  [default: where it was trained]",
+)  # fmt: skip
+@hardware_options
 @click.option("--explore", is_flag=True, help="Sample actions as in training, instead of taking the likeliest.")
 @click.option(
     "--strip", type=click.Path(path_type=Path, dir_okay=False), metavar="PNG",
@@ -32,22 +45,31 @@ STRIP_FROM_S = 6.0
 )  # fmt: skip
 @json_option
 def eval_(
-    run: Path, seconds: float, seed: int, robot: Path | None, explore: bool, strip: Path | None, json_file: Path | None
+    run: Path,
+    seconds: float,
+    seed: int,
+    robot: Path | None,
+    where: str | None,
+    virtual_source: str | None,
+    clock: str | None,
+    yes: bool,
+    explore: bool,
+    strip: Path | None,
+    json_file: Path | None,
 ) -> None:
     """Play the agent of a training run and measure its average reward per second.
 
     \b
     Example:
       openant eval my-ant/runs/sac-1 --seconds 120 --json eval.json --strip walk.png
+      openant eval my-ant/runs/sac-1 --seconds 120 --env hardware --robot my-ant
     """
     from openant_tools.cli.learning import need_torch
 
     need_torch()
-    import gymnasium
     from rich.console import Console
     from rich.progress import Progress
 
-    import openant_env  # noqa: F401  (registers the environment)
     from openant_agents.evaluate import evaluate
     from openant_agents.policies import load_policy
     from openant_agents.runs import read_facts
@@ -56,15 +78,31 @@ def eval_(
 
     facts = read_facts(run)
     options = dict(facts["env"]["options"])
-    if robot is not None:
+    name = {None: facts["env"]["id"], "sim": SIMULATED_ID, "hardware": HARDWARE_ID}[where]
+    if name == HARDWARE_ID:
+        if where is not None or virtual_source is not None or robot is not None:
+            for key in ("kit", "effects", "virtual", "clock", "robot"):
+                options.pop(key, None)
+            options |= hardware_robot(robot, None, virtual_source, clock)
+        if strip is not None:
+            raise BadInput(
+                "a robot paints no pictures of itself", remedy="leave --strip out; its recording can be replayed"
+            )
+        may_move(options, yes)
+    elif virtual_source is not None:
+        raise BadInput("--virtual is a robot behind its ports", remedy="add --env hardware")
+    else:
+        for key in ("virtual", "clock"):
+            options.pop(key, None)
+    if name == SIMULATED_ID and robot is not None:
         options.pop("kit", None)
         options["robot"] = os.path.abspath(robot)
     elif not os.path.exists(options.get("robot", os.curdir)):
         raise BadInput(
             f"the robot it was trained on is no longer at {options['robot']}", where=run, remedy="name it with --robot"
         )
-    env = gymnasium.make(facts["env"]["id"], render_mode="rgb_array", **options)
-    try:
+    more = {"render_mode": "rgb_array"} if name == SIMULATED_ID else {}
+    with environment(name, options, run / "recordings", **more) as env:
         policy = load_policy(run, env, explore=explore)
         apart = max(1, round(STRIP_EVERY_S / env.unwrapped.dt))
         if strip is not None:
@@ -87,8 +125,6 @@ def eval_(
                 frame_every=apart,
                 begin=policy.begin,
             )
-    finally:
-        env.close()
     if strip is not None:
         write_strip(pictures, strip, seconds_apart=apart * result.seconds / result.steps)
         click.echo(f"strip: {strip}")

@@ -11,6 +11,15 @@ import click
 from openant_tools.cli.learning import LearningBar, need_torch, robot_argument
 from openant_tools.cli.options import json_option, robot_option
 from openant_tools.cli.train_sarsa import sarsa
+from openant_tools.cli.walking import (
+    HARDWARE_ID,
+    SIMULATED_ID,
+    environment,
+    hardware_options,
+    hardware_robot,
+    may_move,
+)
+from openant_tools.errors import BadInput
 
 
 @click.group()
@@ -24,7 +33,11 @@ def train() -> None:
 @train.command()
 @robot_option
 @click.option("--kit", type=click.Choice(["standard", "lite"]), help="The bundled nominal robot, instead of --robot.")
-@click.option("--env", "where", type=click.Choice(["sim"]), default="sim", show_default=True, help="Where to train.")
+@click.option(
+    "--env", "where", type=click.Choice(["sim", "hardware"]), default="sim", show_default=True,
+    help="Where to train: in the simulation, or on the robot itself (with --virtual on a virtual one).",
+)  # fmt: skip
+@hardware_options
 @click.option(
     "--steps", type=click.IntRange(min=1), default=30_000, show_default=True,
     help="Train until the run is this long; 30,000 steps of 0.12 s are an hour.",
@@ -46,6 +59,15 @@ def train() -> None:
     "--entropy-start", type=click.FloatRange(min=0.0, min_open=True), default=1.0, show_default=True, metavar="ALPHA",
     help="Weight of the entropy at first; 0.1 explores less and walks sooner.",
 )  # fmt: skip
+@click.option(
+    "--learn", "learn", type=click.Choice(["between", "beside"]),
+    help="Updates between the steps, reproducibly, or beside them in a process of their own, so that acting never waits.  "
+    "[default: between in the simulation, beside on a robot]",
+)  # fmt: skip
+@click.option(
+    "--updates-per-step", type=click.FloatRange(min=0.0, min_open=True), default=1.0, show_default=True,
+    help="With --learn beside: updates for each step at most.",
+)  # fmt: skip
 @click.option("--device", default="cpu", show_default=True, help="Where torch computes, such as cpu or cuda.")
 @click.option("--tensorboard", is_flag=True, help="Also write TensorBoard events into the run's folder.")
 @json_option
@@ -53,6 +75,9 @@ def sac(
     robot: Path | None,
     kit: str | None,
     where: str,
+    virtual_source: str | None,
+    clock: str | None,
+    yes: bool,
     steps: int,
     seed: int,
     out: Path,
@@ -62,6 +87,8 @@ def sac(
     effects: bool,
     learning_start: int,
     entropy_start: float,
+    learn: str | None,
+    updates_per_step: float,
     device: str,
     tensorboard: bool,
     json_file: Path | None,
@@ -72,54 +99,64 @@ def sac(
     Example:
       openant train sac --robot my-ant --steps 30000 --seed 1 --out my-ant/runs/sac-1
       openant eval my-ant/runs/sac-1 --seconds 120
+      openant train sac --env hardware --robot my-ant --out my-ant/runs/real-1
     """
     need_torch()
-    options: dict[str, Any] = {**robot_argument(robot, kit), "task": task}
+    hardware = where == "hardware"
+    if virtual_source is not None and not hardware:
+        raise BadInput("--virtual is a robot behind its ports", remedy="add --env hardware")
+    chosen = hardware_robot(robot, kit, virtual_source, clock) if hardware else robot_argument(robot, kit)
+    options: dict[str, Any] = {**chosen, "task": task}
     if dt is not None:
         options["dt"] = dt
     if action_range is not None:
         options["action_range"] = action_range
-    if not effects:
+    if not effects and not hardware:
         options["effects"] = False
+    if learn is None:
+        learn = "beside" if hardware else "between"
 
-    import gymnasium
-
-    import openant_env  # noqa: F401  (registers the environment)
+    from openant_agents.beside import train_beside
     from openant_agents.curves import plot_curves
     from openant_agents.runs import read_curve
     from openant_agents.sac import Settings
     from openant_agents.sac import train as train_sac
 
-    name = "openant/Ant-v0"
-    env = gymnasium.make(name, **options)
+    if hardware:
+        may_move(options, yes)
+    name = HARDWARE_ID if hardware else SIMULATED_ID
     settings = Settings(learning_start=learning_start, entropy_start=entropy_start)
-    try:
-        with LearningBar(steps) as bar:
-            result = train_sac(
-                env,
-                folder=out,
-                steps=steps,
-                seed=seed,
-                settings=settings,
-                env_facts={"id": name, "options": options},
-                device=device,
-                tensorboard=tensorboard,
-                report=bar.show,
-            )
-    except KeyboardInterrupt:
-        click.echo(f"saved in {out}; the same command goes on from there", err=True)
-        raise
-    finally:
-        env.close()
+    more: dict[str, Any] = {"updates_per_step": updates_per_step} if learn == "beside" else {}
+    with environment(name, options, out / "recordings") as env:
+        try:
+            with LearningBar(steps) as bar:
+                result = (train_beside if learn == "beside" else train_sac)(
+                    env,
+                    folder=out,
+                    steps=steps,
+                    seed=seed,
+                    settings=settings,
+                    env_facts={"id": name, "options": options},
+                    device=device,
+                    tensorboard=tensorboard,
+                    report=bar.show,
+                    **more,
+                )
+        except KeyboardInterrupt:
+            click.echo(f"saved in {out}; the same command goes on from there", err=True)
+            raise
+        dt = env.unwrapped.dt
     curve = read_curve(out)
     picture = out / "learning_curve.png"
     if curve:
-        plot_curves({"sac": curve}, picture, learning_from_s=settings.learning_start * env.unwrapped.dt)
+        plot_curves({"sac": curve}, picture, learning_from_s=settings.learning_start * dt)
     helped = ", ".join(f"{count}× {reason}" for reason, count in result.helped.items())
     click.echo(
         f"{result.step} steps, {result.robot_seconds / 60:.1f} min of robot time: "
         f"{100 * result.average_reward_m_s:+.1f} cm/s over the last 120 s"
         + (f" (set up again: {helped})" if helped else "")
+        + (f", {result.late} steps began late" if result.late else "")
+        + ("" if result.updates is None else f", {result.updates} updates")
     )
     click.echo(f"run: {out}" + (f"   curve: {picture}" if curve else ""))
     click.echo(f"next: openant eval {out} --seconds 120")
@@ -128,7 +165,7 @@ def sac(
 
         answer = {
             "steps": result.step, "seconds": result.robot_seconds, "average_reward_m_s": result.average_reward_m_s,
-            "helped": dict(result.helped), "run": str(out),
+            "helped": dict(result.helped), "late": result.late, "updates": result.updates, "run": str(out),
         }  # fmt: skip
         write_text(json_file, json.dumps(answer, indent=2) + "\n")
 

@@ -1,0 +1,320 @@
+"""SAC on a robot that does not wait: this process acts, another one learns (`openant_agents.learner`).
+
+Between an observation and its action lies nothing but the policy; the transition goes into the run's file, which is all
+that the learner needs. So a run can be killed at any instant, either half of it, and goes on with every transition that
+was made. What chance decides (exploration, batches) differs from run to run: `sac.train` is the exact form.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from openant_agents.learner import Job, SharedWeights
+from openant_agents.runs import CurvePoint, Run
+from openant_agents.sac import CURVE_EVERY, Sac, Settings, device_of, finite_or_raise, run_facts, sizes
+from openant_agents.training import REPORT_EVERY_S, Progress, event_writer, stop_on_signal
+from openant_env.metrics import AverageReward
+from openant_tools.errors import BadInput, HardwareFault
+
+__all__ = ["train_beside"]
+
+Array = NDArray[np.float32]
+
+#: torch takes seconds to load on a busy machine, and an hour's transitions to be read
+START_TIMEOUT_S = 120.0
+#: the learner finishes an update, saves and goes
+END_TIMEOUT_S = 60.0
+#: s between two words to the learner about how far the robot is
+STATE_EVERY_S = 1.0
+
+
+class _LearnerProcess:
+    """The learner from outside.
+
+    Args:
+        agent: whose actor's weights follow the learner's, newest first.
+
+    Attributes:
+        updates: behind the weights that were taken last.
+    """
+
+    def __init__(self, job: Job, agent: Sac) -> None:
+        self._weights = list(agent.actor.parameters())
+        count = sum(weight.numel() for weight in self._weights)
+        self._flat = np.empty(count, np.float32)
+        self._views = torch.split(torch.from_numpy(self._flat), [weight.numel() for weight in self._weights])
+        self._shared = SharedWeights(count)
+        self._version = 0
+        self.updates = 0
+        self._folder = job.folder
+        ours, theirs = socket.socketpair()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "openant_agents.learner", str(theirs.fileno()), str(self._shared.fd)],
+            pass_fds=(theirs.fileno(), self._shared.fd),
+            start_new_session=True,
+        )
+        theirs.close()
+        self._connection = Connection(ours.detach())
+        self._connection.send((job, count))
+        self._expect("ready", START_TIMEOUT_S)
+        self.follow()
+
+    def follow(self) -> None:
+        """Take the newest weights, if there are newer ones; refuse to go on where nobody learns any more."""
+        if self._connection.poll(0):
+            self._hear()
+        if self._shared.version == self._version:
+            return
+        self._version, self.updates = self._shared.take(self._flat), self._shared.updates
+        with torch.no_grad():
+            for weight, view in zip(self._weights, self._views, strict=True):
+                weight.copy_(view.view_as(weight))
+
+    def tell(self, state: Mapping[str, Any]) -> None:
+        """How far the robot is, for the next checkpoint."""
+        with contextlib.suppress(OSError):  # `follow` finds out why
+            self._connection.send(("state", dict(state)))
+
+    def end(self, state: Mapping[str, Any]) -> None:
+        """Have it save and go."""
+        with contextlib.suppress(OSError):
+            self._connection.send(("end", dict(state)))
+        try:
+            self._expect("saved", END_TIMEOUT_S)
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """End it; it saves once it finds nobody there. May be called again."""
+        if self._connection.closed:
+            return
+        self._connection.close()
+        try:
+            self._process.wait(END_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._shared.close()
+
+    def _expect(self, what: str, timeout_s: float) -> None:
+        give_up = time.monotonic() + timeout_s
+        while time.monotonic() < give_up:
+            if self._connection.poll(0.1) and self._hear() == what:
+                return
+        raise HardwareFault("the learner does not answer", where=self._folder, remedy="repeat the command: it goes on")
+
+    def _hear(self) -> str:
+        try:
+            what, value = self._connection.recv()
+        except (EOFError, OSError):
+            code = self._process.wait(END_TIMEOUT_S)
+            raise HardwareFault(
+                f"the learner has died (exit status {code})",
+                where=self._folder,
+                remedy="repeat the command: every transition is kept",
+            ) from None
+        if what == "error":
+            words, where, remedy = value
+            raise BadInput(words, where=where, remedy=remedy)
+        self.updates = int(value)
+        return str(what)
+
+
+def train_beside(
+    env: gymnasium.Env[Any, Any],
+    *,
+    folder: Path,
+    steps: int,
+    seed: int,
+    settings: Settings | None = None,
+    env_facts: Mapping[str, Any] | None = None,
+    device: str = "cpu",
+    tensorboard: bool = False,
+    report: Callable[[Progress], None] | None = None,
+    updates_per_step: float = 1.0,
+) -> Progress:
+    """As `sac.train`, with the updates in a process of their own.
+
+    Args:
+        updates_per_step: updates for each transition at most; a slow computer does fewer.
+
+    Raises:
+        BadInput: as `sac.train`.
+        HardwareFault: the robot cannot go on, or the learner has died; the same call goes on from there.
+        KeyboardInterrupt: asked for by SIGINT or SIGTERM; the run is saved.
+    """
+    settings = settings or Settings()
+    observations, actions = sizes(env)
+    # Its replay stays empty and its critics are not used: the learner has both.
+    agent = Sac(observations, actions, replace(settings, buffer=1), seed=seed)
+    run = Run(folder, run_facts(env, settings, seed, env_facts) | {"learning": {"updates_per_step": updates_per_step}})
+    events = event_writer(folder) if tensorboard else None
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    device_of(device)
+    learner: _LearnerProcess | None = None
+    try:
+        with stop_on_signal() as stop:
+            checkpoint, rows = run.go_on(agent.replay.width)
+            learner = _LearnerProcess(
+                Job(folder, settings, observations, actions, seed, device, updates_per_step), agent
+            )
+            walk = _Walk(env, run, agent, settings, learner, steps, events, report, stop)
+            walk.remember(checkpoint, rows)
+            try:
+                walk.go(seed)
+            except BaseException:
+                learner.close()  # it saves what it has
+                raise
+            learner.end(walk.state)
+            if report is not None:
+                report(walk.progress)
+            if stop.is_set() and walk.step < steps:
+                raise KeyboardInterrupt
+            return walk.progress
+    finally:
+        torch.set_num_threads(threads)
+        if learner is not None:
+            learner.close()
+        run.close()
+        if events is not None:
+            events.close()
+
+
+class _Walk:
+    """The acting half: observation, action, transition, again and again."""
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        run: Run,
+        agent: Sac,
+        settings: Settings,
+        learner: _LearnerProcess,
+        steps: int,
+        events: Any,
+        report: Callable[[Progress], None] | None,
+        stop: threading.Event,
+    ) -> None:
+        self._env, self._run, self._agent, self._settings = env, run, agent, settings
+        self._learner, self._steps, self._events = learner, steps, events
+        self._report, self._stop = report, stop
+        self._average = AverageReward()
+        self._helped: Counter[str] = Counter()
+        self._seconds, self._late, self.step = 0.0, 0, 0
+        self._row = np.empty(agent.replay.width, np.float32)
+
+    def remember(self, checkpoint: Mapping[str, Any] | None, rows: NDArray[np.float32]) -> None:
+        """Go on behind every transition that was made."""
+        at = self._agent.replay.observations + self._agent.replay.actions
+        for reward, dt in rows[-20_000:, at : at + 2].tolist():  # more than a window holds
+            self._average.add(reward, dt)
+        self._seconds, self.step = float(rows[:, at + 1].sum(dtype=np.float64)), len(rows)
+        if checkpoint is not None:
+            self._helped.update(checkpoint.get("helped", {}))
+        # Chance goes on elsewhere than it began, or every resumed stretch would explore alike.
+        self._agent.random = np.random.default_rng((self._agent.noise.initial_seed(), len(rows)))
+        self._agent.noise.manual_seed(self._agent.noise.initial_seed() + len(rows))
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """For the checkpoint."""
+        return {"step": self.step, "seconds": self._seconds, "helped": dict(self._helped)}
+
+    @property
+    def progress(self) -> Progress:
+        learning = self.step > self._settings.learning_start
+        return Progress(
+            self.step, self._steps, self._seconds, self._average.value, learning, dict(self._helped), self._late,
+            self._learner.updates,
+        )  # fmt: skip
+
+    def go(self, seed: int) -> None:
+        """Until the run is long enough, or someone wants it to stop."""
+        env, agent, learner, settings = self._env, self._agent, self._learner, self._settings
+        observation = self._reset(seed)
+        told = reported = time.monotonic()
+        while observation is not None and self.step < self._steps and not self._stop.is_set():
+            learner.follow()
+            random = self.step < settings.learning_start
+            action = agent.random_action() if random else agent.act(observation)
+            seen, reward, terminated, truncated, info = env.step(action)
+            finite_or_raise(seen, float(reward), self.step, self._run.folder)
+            if not info.get("void", False):
+                self._keep(observation, action, float(reward), float(info.get("dt", 1.0)), terminated, seen)
+            self._late = int(info.get("overruns", 0))
+            observation = seen
+            if terminated or truncated:
+                reason = str(info.get("reason", "the episode ended"))
+                self._helped[reason] += 1
+                self._run.add_intervention(self.step, self._seconds, reason)
+                learner.tell(self.state)
+                observation = self._reset(None)
+            now = time.monotonic()
+            if now - told > STATE_EVERY_S:
+                told = now
+                learner.tell(self.state)
+            if self._report is not None and now - reported > REPORT_EVERY_S:
+                reported = now
+                self._report(self.progress)
+
+    def _keep(self, observation: Array, action: Array, reward: float, dt: float, terminated: bool, seen: Array) -> None:
+        row, o, a = self._row, self._agent.replay.observations, self._agent.replay.actions
+        row[:o], row[o : o + a], row[o + a + 3 :] = observation, action, seen
+        row[o + a : o + a + 3] = reward, dt, terminated
+        self._run.append(row)
+        self.step += 1
+        self._seconds += dt
+        self._average.add(reward, dt)
+        if self.step % CURVE_EVERY == 0:
+            self._run.add_curve_point(CurvePoint(self.step, self._seconds, self._average.value))
+            if self._events is not None:
+                self._events.add_scalar("average_reward_m_s", self._average.value, self.step)
+                self._events.add_scalar("updates", self._learner.updates, self.step)
+
+    def _reset(self, seed: int | None) -> Array | None:
+        """The first observation; a robot that needs help may keep us waiting, and Ctrl-C ends that at once."""
+        if self._stop.is_set():
+            return None
+        with _interruptible():
+            try:
+                observation: Array = self._env.reset(seed=seed)[0]
+            except KeyboardInterrupt:
+                self._stop.set()
+                return None
+        return observation
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """Signals raise here, as nothing can be cut in half."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,140 @@
+"""What commands share that let a robot walk, simulated or real: which one, whether it may move, the key that pauses it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from openant_tools.cli.learning import robot_argument
+from openant_tools.cli.virtual_for_command import virtual_option
+from openant_tools.errors import BadInput
+
+if TYPE_CHECKING:
+    from openant_env.hardware import AntHardware
+
+__all__ = ["HARDWARE_ID", "SIMULATED_ID", "environment", "hardware_options", "hardware_robot", "may_move"]
+
+SIMULATED_ID, HARDWARE_ID = "openant/Ant-v0", "openant/AntHardware-v0"
+
+
+def hardware_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """`--virtual`, `--clock`, `--yes`, of commands that may let a robot walk."""
+    for option in (
+        click.option("--yes", is_flag=True, help="The robot may move: do not ask."),
+        click.option(
+            "--clock", type=click.Choice(["real", "stepped"]),
+            help="Time of a virtual robot that is started here. Default: stepped, unless its scenario says otherwise.",
+        ),
+        virtual_option,
+    ):  # fmt: skip
+        command = option(command)
+    return command
+
+
+def hardware_robot(
+    robot: Path | None, kit: str | None, virtual_source: str | None, clock: str | None
+) -> dict[str, Any]:
+    """How `openant/AntHardware-v0` is told which robot."""
+    if kit is not None:
+        raise BadInput("--kit is a simulated robot", remedy="name the robot with --robot, or use --virtual")
+    options: dict[str, Any] = {}
+    if virtual_source is None or robot is not None or "OPENANT_ROBOT" in os.environ or Path("robot.toml").is_file():
+        options |= robot_argument(robot, None)
+    if virtual_source is not None:
+        options["virtual"] = virtual_source if not Path(virtual_source).exists() else os.path.abspath(virtual_source)
+    if clock is not None:
+        if virtual_source is None:
+            raise BadInput("--clock is for virtual robots", remedy="leave it out")
+        options["clock"] = clock
+    return options
+
+
+def may_move(options: Mapping[str, Any], yes: bool) -> None:
+    """Ask whether the robot may walk.
+
+    Raises:
+        BadInput: nobody is there to ask.
+    """
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise BadInput("the robot would walk and nobody is there to ask", remedy="add --yes if it may")
+    which = "The virtual robot" if "virtual" in options else f"The robot of {options['robot']}"
+    click.echo(
+        f"{which} will stand up and walk: it must be on the floor, in the camera's view, with room around it.", err=True
+    )
+    click.confirm("May it?", abort=True, err=True)
+
+
+def _notice(words: str) -> None:
+    """A line about the robot, on stderr."""
+    click.echo(f"openant: {words}", err=True)
+
+
+@contextlib.contextmanager
+def environment(name: str, options: Mapping[str, Any], recordings: Path, **more: Any) -> Iterator[Any]:
+    """An environment by its id, closed in the end; a robot can be paused meanwhile.
+
+    Args:
+        options: what a run's `run.json` keeps, to make it again.
+        recordings: where a robot's runs go. more: for the simulated one.
+    """
+    import gymnasium
+
+    import openant_env  # noqa: F401  (registers the environments)
+
+    if name != HARDWARE_ID:
+        env = gymnasium.make(name, **options, **more)
+        try:
+            yield env
+        finally:
+            env.close()
+        return
+    env = gymnasium.make(name, **options, recordings=recordings, notice=_notice)
+    try:
+        with _pause_key(env.unwrapped):
+            yield env
+    finally:
+        env.close()
+
+
+@contextlib.contextmanager
+def _pause_key(env: AntHardware) -> Iterator[None]:
+    """While a terminal is attached, the space bar pauses the robot and lets it go on."""
+    if not sys.stdin.isatty():
+        yield
+        return
+    import select
+    import termios
+    import tty
+
+    fd = sys.stdin.fileno()
+    before = termios.tcgetattr(fd)
+    ended = threading.Event()
+
+    def listen() -> None:
+        while not ended.is_set():
+            if not select.select([fd], [], [], 0.1)[0] or os.read(fd, 1) != b" ":
+                continue
+            if env.paused:
+                env.resume()
+            else:
+                env.pause("paused; the space bar goes on")
+
+    thread = threading.Thread(target=listen, name="pause-key", daemon=True)
+    tty.setcbreak(fd)
+    _notice("the space bar pauses the robot; Ctrl-C saves and stops")
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join(1.0)
+        termios.tcsetattr(fd, termios.TCSADRAIN, before)
