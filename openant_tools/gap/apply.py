@@ -86,12 +86,7 @@ def apply(found: Diagnosis, model: Path, out: Path, *, robot: Path | None = None
     ]
     if not selected:
         carried.append("no effect was selected: the model is the given one, calibrated as far as the diagnosis went")
-    idle = [
-        f"{entry.effect} does not act between steps yet: it stands in {where}, not enabled"
-        for entry in entries
-        if not entry.enabled
-    ]
-    return Applied(tuple(written), tuple(carried), (*edited.notes, *idle))
+    return Applied(tuple(written), tuple(carried), edited.notes)
 
 
 def robot_of(
@@ -201,7 +196,7 @@ def _lengthen_keys(root: etree._Element, plant: Plant, done: Edit) -> None:
 
 
 def _entries(plant: Plant, selected: list[Found], robot: Robot) -> list[Effect]:
-    """What stands beside the model: laws that act between steps, and what does not act yet."""
+    """What stands beside the model: laws that act between steps, and what acts on commands and sensors."""
     laws: dict[tuple[str, str], NDArray[np.float64]] = {
         key: values for key, values in robot.laws.items() if key[0] not in NATIVE_LAWS
     }
@@ -213,7 +208,7 @@ def _entries(plant: Plant, selected: list[Found], robot: Robot) -> list[Effect]:
         if catalogue()[one.effect].native or any(entry.effect == one.effect for entry in entries):
             continue
         values = {name: float(f"{span.value:.6g}") for name, span in one.parameters.items()}
-        entries.append(Effect(one.effect, one.joints, values, enabled=False))
+        entries.append(Effect(one.effect, one.joints, values))
     return entries
 
 
