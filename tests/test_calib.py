@@ -22,7 +22,7 @@ from openant_tools.calib.imu import POSES, imu, mounting
 from openant_tools.calib.inventory import inventory
 from openant_tools.calib.legs import legs
 from openant_tools.calib.undo import undo
-from openant_tools.calib.zeros import straight, zeros
+from openant_tools.calib.zeros import straight, torso_answer, zeros
 from openant_tools.comms.body_imu import rotation
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import Journal
@@ -279,8 +279,9 @@ FAST = ("hip_rr", "knee_rr", "hip_fr")
 def test_a_well_built_robot_has_its_zeros_on_the_grid(tmp_path):
     zero = [{"effect": "zero_offset", "joints": ["knee_rr"], "parameters": {"angle_rad": 0.03}}]
     with robot(tmp_path / "ant", effect=zero) as ant:
-        finding, _ = ant.do(zeros(replace(ant.bench, joints=FAST)))
+        finding, builder = ant.do(zeros(replace(ant.bench, joints=FAST)))
         assert (finding.ok, finding.problems) == (True, ())
+        assert "the stand holds the torso so still that its gyro does not see the nudges" in builder.said
         assert ant.folder.config().motors["knee_rr"].zero_offset_rad == pytest.approx(math.pi + 0.03, abs=0.004)
         assert not any(ant.torque())
 
@@ -320,6 +321,26 @@ def test_ctrl_c_in_the_midst_of_nudges_leaves_torque_off(tmp_path):
         with pytest.raises(KeyboardInterrupt):
             ant.do(zeros(replace(ant.bench, joints=HIP)), ant.builder(before=interrupt))
         assert not any(ant.torque())
+
+
+@pytest.mark.parametrize(
+    ("moved", "way", "verdict"),
+    [
+        ("hip_fl", 1, "confirmed"),
+        ("knee_rr", 1, "confirmed"),
+        ("hip_fl", -1, "contradicted"),
+        ("knee_fr", 1, "another"),
+    ],
+)
+def test_a_torso_that_answers_a_nudge_tells_which_leg_moved_and_which_way(moved, way, verdict):
+    """On a soft stand the torso turns against the leg; `moved` really moved, and the joint named did as its encoder says."""
+    named = "knee_rr" if moved == "knee_fr" else moved
+    t = np.arange(0, 1.0, 0.01)
+    rate = 0.4 * np.sin(2 * np.pi * 1.5 * t)
+    axis = np.asarray(JOINTS[moved].axis, float) / np.linalg.norm(JOINTS[moved].axis)
+    noise = np.random.default_rng(0).normal(0.0, 0.004, (len(t), 3))
+    assert torso_answer(named, -0.05 * way * np.outer(rate, axis) + noise + 0.01, rate).verdict == verdict
+    assert torso_answer(named, noise, rate).verdict == "unseen"
 
 
 @given(eighths=st.integers(-3, 3), off=st.floats(-0.35, 0.35))

@@ -21,6 +21,7 @@ from openant_tools.calib.wires import engine_config
 from openant_tools.comms import messages
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.ring import columns
 from openant_tools.procedure.finding import Evidence, Finding, keep
 from openant_tools.procedure.step import Bench, Event, Hands, Intent, Live, Procedure, RegisterChange, Say, Step
 from openant_tools.recording.run import Facts, Run
@@ -29,7 +30,8 @@ from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.app import SCENARIOS, SCREENS, OpenAnt
 from openant_tools.tui.choices import Choices
-from openant_tools.tui.feeds import ReplayFeed
+from openant_tools.tui.faults import Faults, condition
+from openant_tools.tui.feeds import History, ReplayFeed
 from openant_tools.tui.leg_map import REST_S
 from openant_tools.tui.marks import plain
 from openant_tools.tui.page import Page
@@ -330,6 +332,44 @@ def test_a_fault_stays_until_it_has_been_seen(robot: RobotFolder) -> None:
             await pilot.press("f8")
             await pilot.pause()
             assert "FAULT" not in screen_text(app)
+
+    asyncio.run(look())
+
+
+def test_an_observation_outside_its_bounds_is_shown_and_stays_until_seen(robot: RobotFolder) -> None:
+    robot.update({"observation.pos.hip_fl": [-0.5, 0.5], "observation.gyro.z": [-1.0, 1.0]})
+    rows = np.zeros((1, len(columns(JOINT_NAMES))))
+    for name in columns(JOINT_NAMES):
+        if name.startswith("ok."):
+            rows[0, columns(JOINT_NAMES).index(name)] = 1.0
+    history = History(JOINT_NAMES, robot.config().observation)
+    faults = Faults()
+    history.add(rows)
+    faults.watch(history)
+    assert faults.unseen == ()
+    rows[0, columns(JOINT_NAMES).index("pos.hip_fl")] = 0.6
+    rows[0, columns(JOINT_NAMES).index("gyro.z")] = -1.5
+    history.add(rows)
+    assert (condition(history, "hip_fl").mark, condition(history, "hip_fl").word) == ("warn", "outside")
+    assert condition(history, "knee_fl").word == "ok"
+    faults.watch(history)
+    assert [str(fault) for fault in faults.unseen] == [
+        "hip_fl: pos.hip_fl is 0.6, outside its bounds -0.5 ... 0.5",
+        "gyro.z: gyro.z is -1.5, outside its bounds -1 ... 1",
+    ]
+
+
+def test_a_replay_shows_what_was_outside_the_bounds_of_this_robot(robot: RobotFolder) -> None:
+    robot.update({"observation.pos.hip_fl": [-0.1, 0.1]})
+    run = a_run(robot.path.parent)
+
+    async def look() -> None:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(80, 24)) as pilot:
+            await _go(pilot, "live")
+            frozen(app, run, 7.0)
+            await pilot.pause()
+            assert any(line.startswith("hip_fl") and "outside" in line for line in screen_text(app).splitlines())
 
     asyncio.run(look())
 

@@ -26,6 +26,7 @@ WALK: Mapping[str, Step] = {
             "openant_tools.calib.connect:connect",
             table="the U2D2 and the flight controller plugged in, or a virtual robot",
             changes="the ports in robot.toml",
+            sees=True,
             minutes=1,
         ),
         Step(
@@ -120,8 +121,9 @@ WALK: Mapping[str, Step] = {
             "openant_tools.calib.arena:arena",
             needs=("zeros", "imu"),
             table="the camera above the floor, the origin's tag, the robot on the floor",
-            changes="[camera] in robot.toml",
+            changes="[camera] and [arena] in robot.toml",
             moves=True,
+            sees=True,
             minutes=10,
         ),
         Step(

@@ -53,8 +53,8 @@ BY_EYE_RAD = math.radians(8)
 WIGGLE_RAD, WIGGLE_HZ, WIGGLE_S, HOLD_S = 0.35, 0.8, 6.0, 1.5
 #: s; stamps that are as good as this are left as they are
 LATE_S = 0.008
-#: m; the circle of the platform's task
-RADIUS_M = 0.3
+#: The hips' share of the body's turn: feet that slide leave less, joints that turn the other way a negative one.
+TURNED_SHARE = 0.3
 #: Views of a ChArUco board, and the longest wait for the next one that differs, s.
 VIEWS, VIEW_S = 10, 60.0
 #: as `calibrate` calls its source
@@ -99,7 +99,7 @@ def judge_sizes(lying_m: float, standing_m: float, camera_m: float, tag_m: float
 
 
 def arena(bench: Bench) -> Procedure:
-    """Look, measure, judge, write `[camera]`.
+    """Look, measure, judge, write `[camera]` and `[arena]`.
 
     Raises:
         HardwareFault: there is no camera, or the tags are not in its picture.
@@ -191,6 +191,17 @@ def arena(bench: Bench) -> Procedure:
         Evidence("rise seen over rise by legs", sizes.step_ratio, "1", "standing up"),
         Evidence("tag yaw", yaw, "rad", "robot placed along the origin's tag"),
     ]
+    share = _turned(record, turning)
+    evidence.append(Evidence("body's turn over the hips', opposite", share, "1", "camera, feet in place"))
+    if share < TURNED_SHARE:
+        problems.append(
+            f"with its feet in place the body turned by {share:+.2f} of what its hips turned the other way → "
+            + (
+                "hips turn the wrong way: `openant calib zeros`"
+                if share < -TURNED_SHARE
+                else "do its feet slide? `openant calib zeros` if not"
+            )
+        )
     latency_s: float | None = None
     try:
         late = camera_latency(turning["t"], turning["yaw"], record.imu.t, record.imu.columns["gyro.z"])
@@ -209,12 +220,13 @@ def arena(bench: Bench) -> Procedure:
             )
         if abs(late.latency_s) > LATE_S and latency_s > 0:
             values["camera.latency_s"] = round(latency_s, 4)
-    radius = yield Ask("Radius of the circle?", unit="m", default=RADIUS_M, low=0.1, high=5.0)
+    radius = yield Ask("Radius of the circle?", unit="m", default=config.arena.radius_m, low=0.1, high=5.0)
     centre = [round(float(np.median(lying[axis])), 4) for axis in ("x", "y")]
+    values |= {"arena.centre_m": centre, "arena.radius_m": radius}
     yield Hands("Put it back on its stand.", "place", setup="stand")
     rest(bench)
     bench.folder.update(values, provenance=Provenance("measured", COMMAND, bench.folder.relative(_path(bench))))
-    ok = not sizes.wrong and latency_s is not None
+    ok = not sizes.wrong and latency_s is not None and share > -TURNED_SHARE
     return Finding(
         "arena",
         ok,
@@ -355,6 +367,16 @@ def _between(record: Recording, phase: str) -> dict[str, Array]:
         )
     columns = record.pose.columns
     return {"t": record.pose.t[rows], **{name: columns[f"base.{name}"][rows] for name in ("x", "y", "z", "yaw")}}
+
+
+def _turned(record: Recording, turning: dict[str, Array]) -> float:
+    """How far the body turned over how far all hips turned together the other way: 1 where no foot slides."""
+    run = record.run
+    hips = [joint for joint in run.joints if JOINTS[joint].kind == "hip"]
+    angle = np.interp(turning["t"], run.t, np.nanmean(run.signal("pos", hips), axis=1))
+    yaw = np.unwrap(turning["yaw"])
+    angle, yaw = angle - angle.mean(), yaw - yaw.mean()
+    return float(-(yaw @ angle) / (angle @ angle))
 
 
 def _height(poses: dict[str, Array]) -> float:

@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from openant_tools.calib.wires import SETTLE_S, engine_config, opened_bus, robot_servos, servo_angles, wait
 from openant_tools.comms import messages
@@ -38,9 +40,11 @@ from openant_tools.robot.joints import JOINT_NAMES, JOINTS
 from openant_tools.robot.kit import ANGLE_LIMIT_RAD, NOMINAL_ZERO_RAD
 from openant_tools.robot.registers import RAD_PER_PULSE
 
-__all__ = ["Moved", "Straight", "straight", "zeros"]
+__all__ = ["Moved", "Straight", "TorsoAnswer", "straight", "torso_answer", "zeros"]
 
 COMMAND = "openant calib zeros"
+Array = NDArray[np.float64]
+
 #: Horns go on in eighths of a turn.
 GRID_RAD = math.pi / 4
 READINGS = 25
@@ -49,6 +53,9 @@ STRAIGHT_RAD = math.radians(8)
 #: By how much the builder moves a joint, and how much of it must be seen.
 BY_HAND_RAD, SEEN_RAD = 0.5, 0.15
 NUDGE_RAD, NUDGED_RAD = 0.12, 0.07
+#: A torso that answers a nudge stands out of its gyro's noise by so many standard errors, along the joint's axis within
+#: this cosine.
+SEEN_ERRORS, SEEN_COSINE = 6.0, 0.7
 WAYS = {"hip": "counter-clockwise seen from above", "knee": "up: lift its foot"}
 DRAWING = """\
             front
@@ -81,6 +88,47 @@ def straight(angle_rad: float) -> Straight:
     away = angle - NOMINAL_ZERO_RAD
     eighths = round(away / GRID_RAD)
     return Straight(angle, eighths, away - eighths * GRID_RAD)
+
+
+@dataclass(frozen=True)
+class TorsoAnswer:
+    """How the torso turned while one joint was nudged: against the leg, as far as its stand lets it.
+
+    Attributes:
+        share: the torso's rate over the joint's, along the joint's axis; negative is against it, as it must be.
+        cosine: between the torso's axis and the joint's. errors: of the share, how many it is away from zero.
+    """
+
+    share: float
+    cosine: float
+    errors: float
+
+    @property
+    def verdict(self) -> Literal["confirmed", "contradicted", "another", "unseen"]:
+        if not self.errors > SEEN_ERRORS:
+            return "unseen"
+        if abs(self.cosine) < SEEN_COSINE:
+            return "another"
+        return "confirmed" if self.cosine < 0 else "contradicted"
+
+
+def torso_answer(joint: str, gyro: Array, rate: Array) -> TorsoAnswer:
+    """What the gyro (n, 3), rad/s in the body's frame, says of a nudge in which `joint` turned at `rate` (n,), rad/s.
+
+    The torso's rate is regressed on the joint's: momentum that the leg takes up, the torso gives.
+    """
+    known = np.isfinite(gyro).all(axis=1) & np.isfinite(rate)
+    gyro, rate = gyro[known] - gyro[known].mean(axis=0), rate[known] - rate[known].mean()
+    power = float(rate @ rate)
+    if len(rate) < 10 or power == 0.0:
+        return TorsoAnswer(math.nan, math.nan, math.nan)
+    turn = gyro.T @ rate / power
+    axis = np.asarray(JOINTS[joint].axis, float) / np.linalg.norm(JOINTS[joint].axis)
+    size = float(np.linalg.norm(turn))
+    noise = float((gyro - np.outer(rate, turn)).std()) / math.sqrt(power)
+    return TorsoAnswer(
+        float(turn @ axis), float(turn @ axis) / size if size else 0.0, size / noise if noise else math.inf
+    )
 
 
 @dataclass(frozen=True)
@@ -272,17 +320,22 @@ def _nudge_all(bench: Bench, joints: tuple[str, ...]) -> Generator[Event, Answer
         engine.ask(messages.Torque(True))
         limits = np.array([engine.config.limits_rad[name] for name in names])
         start = np.clip(start, limits[:, 0], limits[:, 1])
+        view, answers = engine.second_view(), dict[str, TorsoAnswer]()
         for k, joint in enumerate(joints):
             yield Progress(0.8 + 0.2 * k / len(joints), f"nudging {joint}")
             at = names.index(joint)
             there = start.copy()
             there[at] += NUDGE_RAD if start[at] + NUDGE_RAD < limits[at, 1] else -NUDGE_RAD
-            before = _measured(engine, names)
+            before, begun = _measured(engine, names), view.count
             engine.ask(messages.Ramp(there))
             engine.ask(messages.Hold(0.3))
             reached = _measured(engine, names)
             engine.ask(messages.Ramp(start))
             engine.ask(messages.Hold(0.2))
+            rows = dict(zip(engine.columns, view.since(begun)[0].T, strict=True))
+            answers[joint] = torso_answer(
+                joint, np.column_stack([rows[f"gyro.{axis}"] for axis in "xyz"]), rows[f"vel.{joint}"]
+            )
             went = reached - before
             sign = math.copysign(1.0, there[at] - start[at])
             others = [name for n, name in enumerate(names) if n != at and abs(went[n]) > NUDGED_RAD]
@@ -295,7 +348,41 @@ def _nudge_all(bench: Bench, joints: tuple[str, ...]) -> Generator[Event, Answer
                 problems.append(f"{joint}: {', '.join(others)} moved with it → look for two servos with one id")
             evidence.append(Evidence(f"nudge of {joint}", float(went[at]), "rad", "encoder, motor commanded"))
         engine.ask(messages.Torque(False))
+        view.close()
+    # Before the IMU's own step nobody knows how its board sits in the torso, and with it which way it turned.
+    board_known = bench.folder.config().imu.acc_counts_per_g > 0
+    for joint, answer in answers.items():
+        if math.isfinite(answer.share):
+            evidence.append(
+                Evidence(
+                    f"torso's answer to {joint}", answer.share, "1", f"gyro over the joint's rate: {answer.verdict}"
+                )
+            )
+        if board_known and answer.verdict in ("contradicted", "another"):
+            went = "the leg went the other way" if answer.verdict == "contradicted" else "another leg moved"
+            problems.append(
+                f"{joint}: the gyro says that {went} → look which leg moves, and which way; then `openant calib imu`"
+            )
+    yield Say(*_seen_words(answers, board_known))
     return _Nudged(not problems, tuple(problems), tuple(evidence))
+
+
+def _seen_words(answers: Mapping[str, TorsoAnswer], board_known: bool) -> tuple[str, Literal["ok", "info"]]:
+    """What the gyro had to say of the nudges, and how well that is."""
+    alone = "hands and encoders alone have told which leg moves and which way"
+    if not any(math.isfinite(answer.share) for answer in answers.values()):
+        return f"no IMU was there to see the nudges: {alone}", "info"
+    if not board_known and any(answer.verdict != "unseen" for answer in answers.values()):
+        return (
+            "the gyro sees the nudges; once the IMU step is done, this step again lets it confirm leg and way",
+            "info",
+        )
+    seen = [joint for joint, answer in answers.items() if answer.verdict == "confirmed"]
+    if not seen:
+        return f"the stand holds the torso so still that its gyro does not see the nudges: {alone}", "info"
+    unseen = [joint for joint, answer in answers.items() if answer.verdict == "unseen"]
+    more = f"; not seen: {', '.join(unseen)}" if unseen else ""
+    return f"the gyro confirms leg and way of {', '.join(seen)}{more}", "ok"
 
 
 def _measured(engine: EngineProcess, names: list[str]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

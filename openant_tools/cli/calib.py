@@ -67,9 +67,10 @@ def robot_of(robot: Path | None) -> Any:
 @contextlib.contextmanager
 def bench_of(
     robot: Path | None, port: str | None, imu: str | None, camera: str | None, virtual_source: str | None, yes: bool,
-    joints: tuple[str, ...] = (),
+    joints: tuple[str, ...] = (), *, sees: bool = False,
 ) -> Iterator[tuple[Bench, Any]]:  # fmt: skip
-    """The bench and the face that a step runs with; a virtual robot started for it ends with the block."""
+    """The bench and the face that a step runs with; a virtual robot started for it, with a camera where the step `sees`,
+    ends with the block."""
     from openant_tools.bringup.virtual_hands import VirtualHands
     from openant_tools.cli.face import CommandFace
     from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_robot
@@ -79,7 +80,7 @@ def bench_of(
         if virtual_source is None:
             yield Bench(folder, port, imu, camera, None, joints), CommandFace(yes=yes)
             return
-        found = stack.enter_context(virtual_robot(virtual_source, clock=clock_of_its_own(virtual_source)))
+        found = stack.enter_context(virtual_robot(virtual_source, clock=clock_of_its_own(virtual_source), camera=sees))
         control = str(found["control"])
         hands = VirtualHands(control)
         stack.callback(hands.close)
@@ -119,7 +120,7 @@ def _command(step: Step) -> click.Command:
         for joint in joints:
             if joint not in JOINT_NAMES:
                 raise BadInput(f"there is no joint {joint!r}", remedy=f"the joints are {', '.join(JOINT_NAMES)}")
-        with bench_of(robot, port, imu, camera, virtual_source, yes, joints) as (bench, face):
+        with bench_of(robot, port, imu, camera, virtual_source, yes, joints, sees=step.sees) as (bench, face):
             finding = run_step(step, bench, face)
         echo_finding(finding)
         if json_file is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from pathlib import Path
@@ -45,8 +46,18 @@ key_file_option = click.option(
     help="Real time, or time that moves only by the control socket. Default: what the scenario says, else real.",
 )
 @key_file_option
+@click.option("--no-camera", is_flag=True, help="Leave the camera out, whatever the scenario says.")
+@click.option("--until-eof", is_flag=True, hidden=True, help="End when standard input does, with who started it.")
 @click.option("--tcp", is_flag=True, help="Put the bus on a TCP port (pyserial's socket://) instead of a terminal.")
-def start(scenario: Path | None, ready_file: Path | None, clock: str | None, key_file: Path | None, tcp: bool) -> None:
+def start(
+    scenario: Path | None,
+    ready_file: Path | None,
+    clock: str | None,
+    key_file: Path | None,
+    no_camera: bool,
+    until_eof: bool,
+    tcp: bool,
+) -> None:
     """Run until interrupted; prints where to connect.
 
     \b
@@ -56,13 +67,15 @@ def start(scenario: Path | None, ready_file: Path | None, clock: str | None, key
     """
     from openant_tools.virtual.start import serve
 
-    with serve(scenario, clock=clock, tcp=tcp, key_file=key_file) as server:
+    # Interrupting is how one ends it (formats, section 6): no failure. A flag, since an exception that is raised
+    # wherever the loop happens to be can be swallowed there.
+    ended = threading.Event()
+    if until_eof:
+        threading.Thread(target=_await_eof, args=(ended,), daemon=True).start()
+    with serve(scenario, clock=clock, tcp=tcp, key_file=key_file, camera=False if no_camera else None) as server:
         for name, value in server.addresses.items():
             if value is not None:
                 click.echo(f"{name:8} {value}")
-        # Interrupting is how one ends it (formats, section 6): no failure. A flag, since an exception that is raised
-        # wherever the loop happens to be can be swallowed there.
-        ended = threading.Event()
         before = {
             number: signal.signal(number, lambda *_: ended.set())
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -75,6 +88,12 @@ def start(scenario: Path | None, ready_file: Path | None, clock: str | None, key
             for number, handler in before.items():
                 signal.signal(number, handler)
         click.echo("stopped", err=True)
+
+
+def _await_eof(ended: threading.Event) -> None:
+    while os.read(0, 4096):
+        pass
+    ended.set()
 
 
 @virtual.command()

@@ -216,6 +216,7 @@ class Step:
         table: what must be at hand.
         changes: what it writes (registers, robot.toml); "" where it changes nothing.
         moves: whether the robot moves.
+        sees: whether it looks through the camera.
         minutes: of the builder's time, about.
         safe_to_repeat: nothing is lost by doing it again.
         procedure: "module:function", imported when it is run.
@@ -229,6 +230,7 @@ class Step:
     table: str = ""
     changes: str = ""
     moves: bool = False
+    sees: bool = False
     minutes: float = 1.0
     safe_to_repeat: bool = True
 

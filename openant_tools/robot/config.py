@@ -24,7 +24,7 @@ from openant_tools.robot.kit import KITS, PLATFORM_PWM_LIMIT
 from openant_tools.robot.servo import BAUD_CODES, SERVO_MODELS, ServoModel
 
 __all__ = [
-    "ACTION_PRESETS", "CONFIG_NAME", "ActionRange", "Actions", "Bus", "Camera", "Effect", "Imu", "Motor", "Ports",
+    "ACTION_PRESETS", "CONFIG_NAME", "ActionRange", "Actions", "Arena", "Bus", "Camera", "Effect", "Imu", "Motor", "Ports",
     "Problem", "Provenance", "RobotConfig", "Timing", "covers", "parse_config", "read_document",
 ]  # fmt: skip
 
@@ -181,6 +181,19 @@ class Camera:
 
 
 @dataclass(frozen=True)
+class Arena:
+    """The circle on the floor in which the robot learns, in the frame of the origin's tag.
+
+    Attributes:
+        centre_m: x and y of its centre; absent while it has not been measured.
+        radius_m: of the circle; the paper's where nobody says otherwise.
+    """
+
+    centre_m: tuple[float, ...] | None = vector(2, -100, 100, "m", None)
+    radius_m: float = number(0.05, 50, "m", 0.3)
+
+
+@dataclass(frozen=True)
 class Timing:
     """The control loop.
 
@@ -305,6 +318,7 @@ class RobotConfig:
     motors: Mapping[str, Motor] = field(default_factory=dict)
     imu: Imu = Imu()
     camera: Camera = Camera()
+    arena: Arena = Arena()
     timing: Timing = Timing()
     actions: Actions = Actions()
     observation: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -335,7 +349,8 @@ def covers(entry: str, path: str) -> bool:
 
 
 _SECTIONS: Mapping[str, type[Any]] = {
-    "ports": Ports, "bus": Bus, "imu": Imu, "camera": Camera, "timing": Timing, "actions": Actions,
+    "ports": Ports, "bus": Bus, "imu": Imu, "camera": Camera, "arena": Arena, "timing": Timing,
+    "actions": Actions,
 }  # fmt: skip
 _KNOWN = {"schema", "name", "kit", "model", *_SECTIONS, "motors", "observation", "effect", "provenance", "platform"}
 

@@ -465,6 +465,9 @@ tag_family = "tagCircle21h7"  # or tag36h11, tag25h9, tag16h5
 body_tag_position_m = [0.0, 0.0, 0.085]  # its centre in the torso's frame
 body_tag_yaw_rad = 0.0  # its up-direction against the torso's x axis (forward)
 
+[arena]  # the circle to learn in; centre_m, in the frame of the origin's tag, once it is measured
+radius_m = 0.3
+
 [timing]
 dt_s = 0.12  # from one action to the next
 

@@ -122,10 +122,11 @@ class OpenAnt(App[int]):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("space", "stop", "STOP", priority=True, show=False),
         Binding("ctrl+c", "interrupt", show=False, priority=True),
-        Binding("f1", "help", "Help", key_display="F1"),
+        # tmux makes alt+f1 of an Esc and an F1 that come soon after each other.
+        Binding("f1,alt+f1", "help", "Help", key_display="F1"),
         Binding("ctrl+o", "jump", "Jump", show=False),
         Binding("ctrl+p", "command_palette", "All", key_display="^P"),
-        Binding("f8", "see", "Seen", show=False),
+        Binding("f8,alt+f8", "see", "Seen", show=False),
         Binding("p", "pause", "Pause", show=False),
         Binding("comma", "seek(-0.1)", show=False),
         Binding("full_stop", "seek(0.1)", show=False),

@@ -49,6 +49,9 @@ def _condition(history: History, joint: str) -> Condition:
         if silent >= SILENT_S:
             return Condition("fail", "silent", f"does not answer ({word or 'no word'}): look at its cable")
         return Condition("warn", word or "late")
+    outside = history.outside(f"pos.{joint}") or history.outside(f"vel.{joint}")
+    if outside:
+        return Condition("warn", "outside", outside)
     return Condition("ok", "ok")
 
 
@@ -104,6 +107,12 @@ class Faults:
                 self.note(joint, one.fault)
             elif one.mark == "ok":
                 self.is_over(joint)
+        for name in (name for name in history.bounds if name.partition(".")[2] not in history.joints):
+            outside = history.outside(name)
+            if outside:
+                self.note(name, outside)
+            else:
+                self.is_over(name)
 
     def see(self) -> None:
         """Somebody has looked at all of them; what is still wrong comes again."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 #: what the strips show
 WINDOW_S = 10.0
+#: of the width of its bounds: what a value must be beyond them, so that noise at an end is no news
+OUTSIDE_SHARE = 0.02
 
 
 class Feed(Protocol):
@@ -118,10 +120,12 @@ class History:
 
     Attributes:
         t: (n,) s. rows: (n, columns).
+        bounds: name of a column → measured (low, high) of it, for what is observed (`[observation]` of robot.toml).
     """
 
-    def __init__(self, joints: Sequence[str]) -> None:
+    def __init__(self, joints: Sequence[str], bounds: Mapping[str, tuple[float, float]] | None = None) -> None:
         self.joints = tuple(joints)
+        self.bounds = dict(bounds or {})
         self._index = {name: k for k, name in enumerate(columns(joints))}
         self.rows: Array = np.empty((0, len(self._index)))
         #: what others have worked out of these rows, by joint; gone with the next rows
@@ -149,6 +153,15 @@ class History:
     def newest(self, name: str) -> float:
         """The last value of a column; NaN where there is none."""
         return float(self.rows[-1, self._index[name]]) if len(self.rows) else float("nan")
+
+    def outside(self, name: str) -> str:
+        """How the newest value of a column is outside its measured bounds, in words; "" where it is not."""
+        low, high = self.bounds.get(name, (-np.inf, np.inf))
+        slack = OUTSIDE_SHARE * (high - low) if np.isfinite(high - low) else 0.0
+        value = self.newest(name) if name in self._index else np.nan
+        if not (value < low - slack or value > high + slack):
+            return ""
+        return f"{name} is {value:.3g}, outside its bounds {low:.3g} ... {high:.3g}"
 
     def last_known(self, name: str) -> float:
         """The last value that is a number, of those in the window; NaN where there is none."""

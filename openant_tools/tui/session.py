@@ -203,7 +203,20 @@ class Session:
         if self.feed is not None:
             self.feed.close()
         self.feed = feed
-        self.history = History(JOINT_NAMES if feed is None else feed.joints)
+        self.history = History(JOINT_NAMES if feed is None else feed.joints, self._bounds())
+
+    def _bounds(self) -> Mapping[str, tuple[float, float]]:
+        """Between what this robot's observations were measured, while it is watched or replayed.
+
+        A step that has the bus may be the one that measures them anew, or teach a leg where its ends are.
+        """
+        folder = self.folder
+        if folder is None or (self._engine is None and self.replay is None):
+            return {}
+        try:
+            return folder.config().observation
+        except BadInput:
+            return {}
 
     def _hear(self, engine: EngineProcess) -> None:
         try:

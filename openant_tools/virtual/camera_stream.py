@@ -40,7 +40,8 @@ __all__ = ["CAMERA_FAULTS", "VirtualCamera"]
 
 #: frozen: the same picture again and again; stalled: no more pictures; gone: the camera is unplugged.
 CAMERA_FAULTS = ("frozen", "stalled", "gone")
-START_TIMEOUT_S = 30.0
+#: of a process that loads OpenCV on a machine that has much else to do
+START_TIMEOUT_S = 120.0
 #: Exposures kept for snapshots of the past.
 MEMORY = 256
 #: As many pictures as a driver's queue holds; what comes while it is full is lost.

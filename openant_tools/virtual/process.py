@@ -19,16 +19,18 @@ __all__ = ["VIRTUAL_DEFAULT", "clock_of_its_own", "placeable", "placed", "virtua
 
 #: the source that stands for a healthy standard Ant on its stand
 VIRTUAL_DEFAULT = "default"
-START_TIMEOUT_S = 60.0
+#: of a machine that has much else to do; a robot that cannot start says so at once
+START_TIMEOUT_S = 180.0
 
 
 @contextlib.contextmanager
-def virtual_robot(source: str, *, clock: str | None = None) -> Iterator[Mapping[str, str | None]]:
+def virtual_robot(source: str, *, clock: str | None = None, camera: bool = True) -> Iterator[Mapping[str, str | None]]:
     """What a ready file says of the virtual robot meant by `source`; one that was started ends with the block.
 
     Args:
         source: a scenario (NAME.toml), the ready file of a running one, or `VIRTUAL_DEFAULT`.
         clock: "real" or "stepped" for a robot started here; None for what its scenario says.
+        camera: False leaves the camera of a robot started here out, for who does not look: it takes long to start.
     """
     if source != VIRTUAL_DEFAULT and not source.endswith(".toml"):
         yield _read(Path(source))
@@ -41,14 +43,20 @@ def virtual_robot(source: str, *, clock: str | None = None) -> Iterator[Mapping[
         command = [sys.executable, "-m", "openant_tools.cli", "virtual", "start", "--ready-file", str(ready)]
         command += [] if source == VIRTUAL_DEFAULT else ["--scenario", source]
         command += [] if clock is None else ["--clock", clock]
+        command += [] if camera else ["--no-camera"]
         with open(Path(folder) / "log", "w+") as log:
-            # A session of its own: Ctrl-C is for the command, which then ends the robot after torque is off.
-            process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+            # A session of its own: Ctrl-C is for the command, which then ends the robot after torque is off. Its input is
+            # a pipe from here, which breaks however this process ends: a robot does not outlive who started it.
+            process = subprocess.Popen(
+                [*command, "--until-eof"], stdin=subprocess.PIPE, stdout=log, stderr=log, start_new_session=True
+            )
             try:
                 _await(process, ready, log.name)
                 yield _read(ready)
             finally:
                 process.terminate()
+                assert process.stdin is not None
+                process.stdin.close()
                 try:
                     process.wait(5.0)
                 except subprocess.TimeoutExpired:

@@ -86,7 +86,13 @@ def assemble(script: Scenario, *, clock: str | None = None, tcp: bool = False, c
 
 
 def serve(
-    scenario: Path | None = None, *, clock: str | None = None, tcp: bool = False, key_file: Path | None = None
+    scenario: Path | None = None,
+    *,
+    clock: str | None = None,
+    tcp: bool = False,
+    key_file: Path | None = None,
+    camera: bool | None = None,
 ) -> Server:
     """`assemble` for a scenario file; None for a healthy standard Ant on its stand. Raises BadInput."""
-    return assemble(load_scenario(scenario, key_file) if scenario is not None else Scenario(), clock=clock, tcp=tcp)
+    script = load_scenario(scenario, key_file) if scenario is not None else Scenario()
+    return assemble(script, clock=clock, tcp=tcp, camera=camera)
