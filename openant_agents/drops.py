@@ -87,7 +87,7 @@ class DropFinder:
                 self.open = drop
             return False
         self._best = max(self._best, value)
-        if value >= RECOVERED * self._best:
+        if value >= RECOVERED * max(self._best, WALKS_M_S):
             self._walks_since = seconds if self._walks_since is None else self._walks_since
             self._walked_s = seconds - self._walks_since
             return False

@@ -40,7 +40,9 @@ def read_interventions(folder: Path) -> list[Intervention]:
     found: list[Intervention] = []
     for number, row in enumerate(rows, start=2):
         try:
-            found.append(Intervention(int(row["step"]), float(row["seconds"]), str(row["reason"])))
+            if row["reason"] is None:
+                raise ValueError("the row is cut")
+            found.append(Intervention(int(row["step"]), float(row["seconds"]), row["reason"]))
         except (KeyError, TypeError, ValueError):
             if number == len(rows) + 1:
                 break  # the last line of a run that was killed while writing it

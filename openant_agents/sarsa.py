@@ -38,7 +38,7 @@ from openant_agents.runs import CurvePoint, Run, load_checkpoint, read_facts
 from openant_agents.tile_coding import Rows, TileCoder
 from openant_agents.training import CHECKPOINT_EVERY_S, REPORT_EVERY_S, Progress, event_writer, stop_on_signal
 from openant_env.metrics import AverageReward
-from openant_tools.errors import BadInput
+from openant_tools.errors import BadInput, HardwareFault
 
 __all__ = ["Sarsa", "SarsaPolicy", "Settings", "load_policy", "train"]
 
@@ -314,6 +314,7 @@ def train(
 
     Raises:
         BadInput: the folder holds another run, the environment does not suit, or a number that is none came up.
+        HardwareFault: the robot cannot go on; the run is saved and goes on with the same call.
         KeyboardInterrupt: asked for by SIGINT or SIGTERM; the run is saved and goes on with the same call.
     """
     settings = settings or Settings()
@@ -357,7 +358,7 @@ def _train(
     columns = _Columns(len(bounds.low))
     average = AverageReward()
     helped: Counter[str] = Counter()
-    step, seconds = 0, 0.0
+    step, seconds, late = 0, 0.0, 0
     random = np.random.default_rng(seed)
     agent = _agent(bounds, len(gait), settings, seed) if bounds.complete else None
     observation, _ = env.reset(seed=seed)
@@ -397,63 +398,77 @@ def _train(
         scribe.write(run.save, state, rows)
 
     def progress() -> Progress:
-        return Progress(step, steps, seconds, average.value, agent is not None, dict(helped))
+        return Progress(step, steps, seconds, average.value, agent is not None, dict(helped), late)
 
     if action is None:
         action = choose(observation)
-    while step < steps and not stop.is_set():
-        reward = took = 0.0
-        terminated = truncated = False
-        for command in gait.actions(action):
-            seen, r, terminated, truncated, info = env.step(command.astype(np.float32))
-            r = float(r)
-            if not math.isfinite(r + float(seen.sum())):
-                raise BadInput(
-                    f"step {step} gave a reward or an observation that is no number",
-                    where=run.folder,
-                    remedy="look at the environment; what was saved until then is sound",
-                )
-            dt = float(info["dt"])
-            gait.sent(command)
-            reward += settings.gamma ** (took / STEP_S) * r
-            took += dt
-            average.add(r, dt)
-            step += 1
-            if agent is None:
-                bounds.see(seen)
-            if step % CURVE_EVERY == 0:
-                scribe.write(run.add_curve_point, CurvePoint(step, seconds + took, average.value))
+    try:
+        while step < steps and not stop.is_set():
+            reward = took = 0.0
+            terminated = truncated = void = False
+            for command in gait.actions(action):
+                seen, r, terminated, truncated, info = env.step(command.astype(np.float32))
+                r = float(r)
+                if not math.isfinite(r + float(seen.sum())):
+                    raise BadInput(
+                        f"step {step} gave a reward or an observation that is no number",
+                        where=run.folder,
+                        remedy="look at the environment; what was saved until then is sound",
+                    )
+                # Of a robot that was stopped: nothing was done in that step.
+                void = bool(info.get("void", False))
+                late = int(info.get("overruns", 0))
+                if void:
+                    break
+                dt = float(info["dt"])
+                gait.sent(command)
+                reward += settings.gamma ** (took / STEP_S) * r
+                took += dt
+                average.add(r, dt)
+                step += 1
+                if agent is None:
+                    bounds.see(seen)
+                if step % CURVE_EVERY == 0:
+                    scribe.write(run.add_curve_point, CurvePoint(step, seconds + took, average.value))
+                if terminated or truncated:
+                    break
+            seconds += took
+            next_action = choose(seen)
+            if void:
+                pass
+            elif agent is None:
+                if seconds > settings.bounds_from_s - 0.5 * STEP_S:
+                    agent = _agent(bounds, len(gait), settings, seed)
+            else:
+                log.append(columns.row(observation, action, reward, took, terminated, seen, next_action))
+                error = columns.learn(agent, log[-1])
+                if not math.isfinite(error):
+                    raise BadInput(
+                        f"the values grew without bound after {agent.decisions} decisions",
+                        where=run.folder,
+                        remedy="use a smaller step size",
+                    )
+                if events is not None and agent.decisions % 20 == 0:
+                    scribe.write(events.add_scalar, "average_reward_m_s", average.value, step)
+                    scribe.write(events.add_scalar, "error", error, step)
+            observation, action = seen, next_action
             if terminated or truncated:
-                break
-        seconds += took
-        next_action = choose(seen)
-        if agent is None:
-            if seconds > settings.bounds_from_s - 0.5 * STEP_S:
-                agent = _agent(bounds, len(gait), settings, seed)
-        else:
-            log.append(columns.row(observation, action, reward, took, terminated, seen, next_action))
-            error = columns.learn(agent, log[-1])
-            if not math.isfinite(error):
-                raise BadInput(
-                    f"the values grew without bound after {agent.decisions} decisions",
-                    where=run.folder,
-                    remedy="use a smaller step size",
-                )
-            if events is not None and agent.decisions % 20 == 0:
-                scribe.write(events.add_scalar, "average_reward_m_s", average.value, step)
-                scribe.write(events.add_scalar, "error", error, step)
-        observation, action = seen, next_action
-        if terminated or truncated:
-            helped[str(info.get("reason", "the episode ended"))] += 1
-            observation, _ = env.reset()
-            gait.rest()
-            action = choose(observation)
-        now = time.monotonic()
-        if now - last_save > CHECKPOINT_EVERY_S:
-            save()
-        if report is not None and now - last_report > REPORT_EVERY_S:
-            last_report = now
-            report(progress())
+                reason = str(info.get("reason", "the episode ended"))
+                helped[reason] += 1
+                scribe.write(run.add_intervention, step, seconds, reason)
+                observation, _ = env.reset()
+                gait.rest()
+                action = choose(observation)
+            now = time.monotonic()
+            if now - last_save > CHECKPOINT_EVERY_S:
+                save()
+            if report is not None and now - last_report > REPORT_EVERY_S:
+                last_report = now
+                report(progress())
+    except HardwareFault:
+        save()  # what was learned until the robot could not go on
+        scribe.finish()
+        raise
     save()
     scribe.finish()
     if report is not None:

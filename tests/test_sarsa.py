@@ -22,13 +22,14 @@ torch = pytest.importorskip("torch")
 
 import openant_env  # noqa: E402, F401
 from openant_agents import sarsa  # noqa: E402
+from openant_agents.interventions import read_interventions  # noqa: E402
 from openant_agents.policies import load_policy  # noqa: E402
 from openant_agents.primitives import LEGS, PRIMITIVES, Gait  # noqa: E402
 from openant_agents.runs import load_checkpoint, read_curve  # noqa: E402
 from openant_agents.sarsa import Sarsa, Settings, train  # noqa: E402
 from openant_agents.tile_coding import TileCoder  # noqa: E402
 from openant_tools.cli import main  # noqa: E402
-from openant_tools.errors import BadInput  # noqa: E402
+from openant_tools.errors import BadInput, HardwareFault  # noqa: E402
 from openant_tools.robot.folder import create_robot  # noqa: E402
 
 JOINTS = tuple(f"{part}_{leg}" for leg in LEGS for part in ("hip", "knee"))
@@ -423,3 +424,38 @@ def test_train_and_eval_from_the_command_line(tmp_path, capsys):
     for words, message in refused:
         assert run_command(*words) == 2
         assert message in capsys.readouterr().err
+
+
+def test_a_robot_that_cannot_go_on_leaves_a_run_that_can(tmp_path):
+    class Breaks(gymnasium.Wrapper):
+        steps = 0
+
+        def step(self, action):
+            self.steps += 1
+            if self.steps == 155:
+                raise HardwareFault("the bus is gone", remedy="plug it in")
+            return self.env.step(action)
+
+    with pytest.raises(HardwareFault, match="the bus is gone"):
+        train(Breaks(ant()), folder=tmp_path, steps=300, seed=0, settings=QUICK)
+    assert load_checkpoint(tmp_path)["agent"]["decisions"] == 10  # and five before the bounds were known
+    assert train(ant(), folder=tmp_path, steps=300, seed=0, settings=QUICK).step >= 300
+
+
+def test_a_step_that_was_not_carried_out_teaches_nothing(tmp_path):
+    class Stopped(gymnasium.Wrapper):
+        steps = 0
+
+        def step(self, action):
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            self.steps += 1
+            if self.steps % 50 == 3:
+                return observation, 0.0, False, True, {**info, "void": True, "reason": "the pause key"}
+            return observation, reward, terminated, truncated, {**info, "overruns": 7}
+
+    result = train(Stopped(ant()), folder=tmp_path, steps=200, seed=0, settings=QUICK)
+    assert result.helped == {"the pause key": 5}
+    assert result.late == 7
+    rows = np.fromfile(tmp_path / "transitions.f32", np.float32).reshape(-1, 53)
+    assert rows[:, 26].tolist() == pytest.approx([0.5] * len(rows))
+    assert [event.reason for event in read_interventions(tmp_path)] == ["the pause key"] * 5

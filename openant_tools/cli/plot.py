@@ -49,7 +49,7 @@ def plot(runs: tuple[Path, ...], out: Path, singly: bool, json_file: Path | None
         click.echo(
             f"{name}: {last:+.1f}{spread} cm/s after {together.minutes[-1]:.0f} min,"
             f" {together.runs} {'seeds' if together.runs > 1 else 'seed'}"
-            + (f", {helped} interventions" if helped else "")
+            + (f", {helped} intervention{'s' if helped > 1 else ''}" if helped else "")
         )
         answer.append(
             {

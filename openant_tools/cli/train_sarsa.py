@@ -10,6 +10,15 @@ import click
 
 from openant_tools.cli.learning import LearningBar, need_torch, robot_argument, settings_of, settings_option
 from openant_tools.cli.options import json_option, robot_option
+from openant_tools.cli.walking import (
+    HARDWARE_ID,
+    SIMULATED_ID,
+    environment,
+    hardware_options,
+    hardware_robot,
+    may_move,
+)
+from openant_tools.errors import BadInput
 
 __all__ = ["sarsa"]
 
@@ -17,7 +26,11 @@ __all__ = ["sarsa"]
 @click.command()
 @robot_option
 @click.option("--kit", type=click.Choice(["standard", "lite"]), help="The bundled nominal robot, instead of --robot.")
-@click.option("--env", "where", type=click.Choice(["sim"]), default="sim", show_default=True, help="Where to train.")
+@click.option(
+    "--env", "where", type=click.Choice(["sim", "hardware"]), default="sim", show_default=True,
+    help="Where to train: in the simulation, or on the robot itself (with --virtual on a virtual one).",
+)  # fmt: skip
+@hardware_options
 @click.option(
     "--steps", type=click.IntRange(min=1), default=72_000, show_default=True,
     help="Train until the run is this long; 72,000 steps of 0.05 s are an hour.",
@@ -43,6 +56,9 @@ def sarsa(
     robot: Path | None,
     kit: str | None,
     where: str,
+    virtual_source: str | None,
+    clock: str | None,
+    yes: bool,
     steps: int,
     seed: int,
     out: Path,
@@ -66,41 +82,43 @@ def sarsa(
     Example:
       openant train sarsa --robot my-ant --steps 72000 --seed 1 --out my-ant/runs/sarsa-1
       openant eval my-ant/runs/sarsa-1 --seconds 120
+      openant train sarsa --env hardware --robot my-ant --out my-ant/runs/real-sarsa-1
     """
     need_torch()
-    options: dict[str, Any] = {**robot_argument(robot, kit), "task": task, "dt": dt, "action_range": action_range}
-    if not effects:
+    hardware = where == "hardware"
+    if virtual_source is not None and not hardware:
+        raise BadInput("--virtual is a robot behind its ports", remedy="add --env hardware")
+    chosen = hardware_robot(robot, kit, virtual_source, clock) if hardware else robot_argument(robot, kit)
+    options: dict[str, Any] = {**chosen, "task": task, "dt": dt, "action_range": action_range}
+    if not effects and not hardware:
         options["effects"] = False
 
-    import gymnasium
-
-    import openant_env  # noqa: F401  (registers the environment)
     from openant_agents.curves import plot_curves
     from openant_agents.runs import load_checkpoint, read_curve
     from openant_agents.sarsa import Settings
     from openant_agents.sarsa import train as train_sarsa
 
-    name = "openant/Ant-v0"
-    env = gymnasium.make(name, **options)
+    if hardware:
+        may_move(options, yes)
+    name = HARDWARE_ID if hardware else SIMULATED_ID
     given = {"epsilon": epsilon, "step_size": step_size, "reward_scale": reward_scale}
     settings = settings_of(Settings, settings_file, "sarsa", given)
-    try:
-        with LearningBar(steps, out) as bar:
-            result = train_sarsa(
-                env,
-                folder=out,
-                steps=steps,
-                seed=seed,
-                settings=settings,
-                env_facts={"id": name, "options": options},
-                tensorboard=tensorboard,
-                report=bar.show,
-            )
-    except KeyboardInterrupt:
-        click.echo(f"saved in {out}; the same command goes on from there", err=True)
-        raise
-    finally:
-        env.close()
+    with environment(name, options, out / "recordings") as env:
+        try:
+            with LearningBar(steps, out) as bar:
+                result = train_sarsa(
+                    env,
+                    folder=out,
+                    steps=steps,
+                    seed=seed,
+                    settings=settings,
+                    env_facts={"id": name, "options": options},
+                    tensorboard=tensorboard,
+                    report=bar.show,
+                )
+        except KeyboardInterrupt:
+            click.echo(f"saved in {out}; the same command goes on from there", err=True)
+            raise
     curve = read_curve(out)
     picture = out / "learning_curve.png"
     if curve:
@@ -111,6 +129,7 @@ def sarsa(
         f"{result.step} steps, {result.robot_seconds / 60:.1f} min of robot time: "
         f"{100 * result.average_reward_m_s:+.1f} cm/s over the last 120 s"
         + (f" (set up again: {helped})" if helped else "")
+        + (f", {result.late} steps began late" if result.late else "")
     )
     collisions = f"{learned['shared']} look-ups of tiles that share a row" if learned["shared"] else "no collision"
     click.echo(
@@ -124,7 +143,7 @@ def sarsa(
 
         answer = {
             "steps": result.step, "seconds": result.robot_seconds, "average_reward_m_s": result.average_reward_m_s,
-            "helped": dict(result.helped), "run": str(out), "decisions": learned["decisions"],
+            "helped": dict(result.helped), "late": result.late, "run": str(out), "decisions": learned["decisions"],
             "tiles": learned["tiles"], "table": settings.table, "collisions": learned["shared"],
         }  # fmt: skip
         write_text(json_file, json.dumps(answer, indent=2) + "\n")
