@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from openant_tools.blind.soaks import SoakAnswer
 from openant_tools.recording.run import Facts, Run
@@ -68,17 +69,13 @@ class _Soak:
             steps = chance.uniform(-1, 1, (n // hold + 2, j))
             cmd = middle + reach * np.repeat(steps, hold, axis=0)[:n]
         else:  # many sines, with pauses
-            hz = chance.uniform(0.1, 2.5, (j, 4))
-            phases = chance.uniform(0, 2 * np.pi, (j, 4))
-            cmd = middle + reach / 2 * np.sin(2 * np.pi * hz * t[:, None, None] + phases).sum(axis=2)
+            each, phases = chance.uniform(0.1, 2.5, (j, 4)), chance.uniform(0, 2 * np.pi, (j, 4))
+            cmd = middle + reach / 2 * np.sin(2 * np.pi * each * t[:, None, None] + phases).sum(axis=2)
             pause = (np.floor(t / 20) % 4) == 3
             cmd[pause] = middle
         self.cmd = cmd
         lag = np.exp(-1 / (self.answer.rate_hz * 0.06))
-        pos = np.empty_like(cmd)
-        pos[0] = cmd[0]
-        for k in range(1, n):
-            pos[k] = lag * pos[k - 1] + (1 - lag) * cmd[k]
+        pos = lfilter([1 - lag], [1, -lag], cmd - cmd[0], axis=0) + cmd[0]
         self.pos = pos + chance.normal(0, 7e-4, pos.shape)
         self.vel = np.gradient(pos, t, axis=0)
         accel = np.gradient(self.vel, t, axis=0)

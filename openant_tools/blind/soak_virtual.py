@@ -92,7 +92,7 @@ def _motion(answer: SoakAnswer) -> Callable[[float], Array]:
 
     def at(t: float) -> Array:
         swing = reach * np.sin(2 * np.pi * hz * t + phase)
-        return home + (swing if (t / 8.0) % 1.0 < busy else 0.0)
+        return np.asarray(home + (swing if (t / 8.0) % 1.0 < busy else 0.0))
 
     return at
 

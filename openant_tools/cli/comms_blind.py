@@ -74,10 +74,11 @@ def make(
         if key_file.resolve().is_relative_to(out.resolve()):
             raise BadInput("the key would lie beside what it seals", where=key_file, remedy="keep it outside the set")
         key = read_key(key_file) if key_file.exists() else make_key(key_file)
-    shares = {name: value for name, value in (("healthy", healthy), ("virtual", virtual)) if value is not None}
+    usual = SoakMix()
+    mix = SoakMix(usual.healthy if healthy is None else healthy, usual.virtual if virtual is None else virtual)
     with shown_progress() as progress:
         commitment = make_soaks(
-            out, count, seed, mix=SoakMix(**shares), commit=full, key=key, jobs=jobs, progress=progress
+            out, count, seed, mix=mix, commit=full, key=key, jobs=jobs, progress=progress
         )
     click.echo(f"{count} soaks in {out}")
     click.echo(f"commitment of their answers: {commitment}")
