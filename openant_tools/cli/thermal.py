@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from openant_tools.cli.thermal_analysis import compare, fit, forecast
 from openant_tools.cli.thermal_soak import soak
 
 __all__ = ["thermal"]
@@ -21,4 +22,5 @@ def thermal() -> None:
     """
 
 
-thermal.add_command(soak)
+for command in (soak, fit, forecast, compare):
+    thermal.add_command(command)

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from openant_tools.robot.joints import JOINTS
 from openant_tools.thermal.inputs import Inputs
 from openant_tools.thermal.physics import Servos, State, advance, by_duty
 
-__all__ = ["ALIKE", "PRIORS", "Estimate", "Fit", "HeldOut", "Prior", "Variants", "fit", "held_out"]
+__all__ = ["ALIKE", "PRIORS", "Estimate", "Fit", "HeldOut", "Known", "Prior", "Variants", "fit", "held_out"]
 
 Array = NDArray[np.float64]
 
@@ -150,6 +151,43 @@ class Variants:
 
 
 @dataclass(frozen=True)
+class Known:
+    """What runs have taught of a robot's servos, for runs to come.
+
+    Attributes:
+        joints, models: of the robot; a model is "" where nobody says.
+        names: (name, joint or "") of each number. theta, covariance: of the numbers.
+    """
+
+    joints: tuple[str, ...]
+    models: tuple[str, ...]
+    names: tuple[tuple[str, str], ...]
+    theta: Array
+    covariance: Array
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in fit.json, below `known`."""
+        return {
+            "joints": list(self.joints), "models": list(self.models), "names": [list(name) for name in self.names],
+            "theta": self.theta.tolist(), "covariance": self.covariance.tolist(),
+        }  # fmt: skip
+
+    @classmethod
+    def of_json(cls, content: Any, where: str) -> Known:
+        """The inverse of `as_json`; BadInput where it did not write this."""
+        try:
+            table = content["known"]
+            names = tuple((str(name), str(joint)) for name, joint in table["names"])
+            theta, covariance = np.array(table["theta"], float), np.array(table["covariance"], float)
+            if theta.shape != (len(names),) or covariance.shape != (len(names), len(names)):
+                raise ValueError
+            return cls(tuple(table["joints"]), tuple(table["models"]), names, theta, covariance)
+        except (KeyError, TypeError, ValueError):
+            remedy = "name the fit.json that `openant thermal fit` wrote"
+            raise BadInput("this is no fit of heat", where=where, remedy=remedy) from None
+
+
+@dataclass(frozen=True)
 class Fit:
     """What is known of a robot's heat after a run.
 
@@ -166,7 +204,21 @@ class Fit:
     disturbance_k: float
     disturbance_s: float
     residual_k: Array
-    _offset: tuple[Array, Array]
+    _points: _Points
+    _residual: Array
+
+    @property
+    def known(self) -> Known:
+        """What is known of the servos: the room and the start are the run's own."""
+        keep = [k for k, (name, _) in enumerate(self.layout.names) if name in ALIKE]
+        return Known(
+            self.inputs.joints, _models(self.inputs), tuple(self.layout.names[k] for k in keep), self.theta[keep],
+            self.covariance[np.ix_(keep, keep)],
+        )  # fmt: skip
+
+    def at(self, t: float) -> Fit:
+        """The same knowledge, looked at from `t` (s) of the run: its state and its load then."""
+        return replace(self, inputs=self.inputs.until(t))
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
@@ -196,7 +248,7 @@ class Fit:
         theta[0] = self.theta
         servos, start = _servos(self.inputs, self.layout, theta)
         _, state = _simulated(self.inputs, self.layout, theta, servos, start)
-        mean, deviation = self._offset
+        mean, deviation = _disturbed(self.inputs, self._points, self._residual, self.disturbance_k, self.disturbance_s)
         offset = mean + deviation * random.standard_normal((count, len(mean)))
         offset[0] = mean
         held = np.zeros((count, len(self.inputs.joints)))
@@ -224,30 +276,36 @@ class Fit:
         return case
 
 
-def fit(runs: Sequence[Inputs], *, after: Fit | None = None) -> Fit:
+def fit(runs: Sequence[Inputs], *, after: Known | None = None) -> Fit:
     """Fit one robot's heat to its runs, one after the other: what a run teaches is believed before the next.
 
     Args:
         runs: of the same servos, in the order in which they were recorded.
-        after: an earlier fit of them, to begin from.
+        after: what earlier runs taught.
 
     Raises:
         BadInput: no runs, or runs of different servos.
     """
     if not runs:
         raise BadInput("no run to fit", remedy="name one or more recordings with temperatures")
-    found = after
+    found: Fit | None = None
+    known = after
     for one in runs:
-        if found is not None and (one.joints, one.models) != (found.inputs.joints, found.inputs.models):
+        if known is not None and (one.joints, _models(one)) != (known.joints, known.models):
             raise BadInput(
-                f"{one.name} is of other servos than {found.inputs.name}", remedy="fit the runs of one robot at a time"
+                f"{one.name} is of other servos than what is known", remedy="fit the runs of one robot at a time"
             )
-        found = _fit_one(one, found)
+        found = _fit_one(one, known)
+        known = found.known
     assert found is not None
     return found
 
 
-def held_out(run: Inputs, *, share: float = TRAINED, after: Fit | None = None, draws: int = 200) -> HeldOut:
+def _models(run: Inputs) -> tuple[str, ...]:
+    return tuple(model.name if model else "" for model in run.models)
+
+
+def held_out(run: Inputs, *, share: float = TRAINED, after: Known | None = None, draws: int = 200) -> HeldOut:
     """Fit the first part of a run and meet the rest, whose loads are known and whose temperatures are not."""
     split = share * run.duration_s
     trained = fit([run.until(split)], after=after)
@@ -287,7 +345,7 @@ def _unit(name: str) -> str:
     }.get(name) or PRIORS[name].unit  # fmt: skip
 
 
-def _layout(run: Inputs, before: Fit | None) -> _Layout:
+def _layout(run: Inputs, before: Known | None) -> _Layout:
     names: list[tuple[str, str]] = []
     mean, spread, log = list[float](), list[float](), list[bool]()
 
@@ -342,9 +400,9 @@ def _layout(run: Inputs, before: Fit | None) -> _Layout:
 CASE_J_K: Mapping[str, float] = {"XL430-W250-T": 45.0, "XC430-W240-T": 52.0, "XM430-W350-T": 64.0, "XM430-W210-T": 64.0}
 
 
-def _believe(names: list[tuple[str, str]], mean: list[float], covariance: Array, before: Fit) -> None:
+def _believe(names: list[tuple[str, str]], mean: list[float], covariance: Array, before: Known) -> None:
     """What an earlier run taught, in place of the priors; the room and the start are each run's own."""
-    theirs = {name: k for k, name in enumerate(before.layout.names) if name[0] in ALIKE}
+    theirs = {name: k for k, name in enumerate(before.names)}
     ours = [k for k, name in enumerate(names) if name in theirs]
     places = [theirs[names[k]] for k in ours]
     covariance[np.ix_(ours, ours)] = before.covariance[np.ix_(places, places)]
@@ -435,7 +493,7 @@ class _Points:
         return np.asarray(np.diag(self.sd**2) + deviation**2 * np.exp(-apart / tau) * same)
 
 
-def _fit_one(run: Inputs, before: Fit | None) -> Fit:
+def _fit_one(run: Inputs, before: Known | None) -> Fit:
     layout, points = _layout(run, before), _Points.of(run)
     if len(points.t) < 2:
         raise BadInput("there are no temperatures in this part of the run", where=run.name)
@@ -454,8 +512,7 @@ def _fit_one(run: Inputs, before: Fit | None) -> Fit:
         [np.sqrt(np.mean(residual[points.joint == k] ** 2)) if (points.joint == k).any() else np.nan
          for k in range(len(run.joints))]
     )  # fmt: skip
-    offset = _disturbed(run, points, residual, deviation, tau)
-    return Fit(run, layout, theta, (covariance + covariance.T) / 2, deviation, tau, rms, offset)
+    return Fit(run, layout, theta, (covariance + covariance.T) / 2, deviation, tau, rms, points, residual)
 
 
 def _linearised(run: Inputs, layout: _Layout, points: _Points, theta: Array) -> tuple[Array, Array]:

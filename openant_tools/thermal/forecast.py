@@ -21,7 +21,7 @@ from openant_tools.thermal.physics import COPPER_PER_K, Servos, State, advance, 
 
 __all__ = [
     "COOLED_K", "HORIZON_S", "Forecast", "Interval", "JointForecast", "Load", "cool_down", "derating", "forecast", "present_load",
-    "rest_advice", "torque_load",
+    "rest_advice", "settled", "torque_load",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -139,7 +139,14 @@ class JointForecast:
                 f"not before {when.low / 60:.0f} min"
             )
         half = (when.high - when.low) / 120
+        if when.high - when.value > LOPSIDED * (when.value - when.low):
+            span = f"{when.low / 60:.0f} to {when.high / 60:.0f}"
+            return f"{self.joint} reaches {self.limit_c:.0f} °C after {when.value / 60:.0f} min, {span}"
         return f"{self.joint} reaches {self.limit_c:.0f} °C after {when.value / 60:.0f} ± {half:.0f} min"
+
+
+#: how many times longer the late side of an interval may be for "±" to be said of it
+LOPSIDED = 2.0
 
 
 def _about(interval: Interval) -> str:
@@ -202,8 +209,12 @@ def _alike(means: Array) -> int:
         np.median(np.abs(np.diff(means, axis=0)), axis=0) / 0.6745 / math.sqrt(2) / size if len(means) > 2 else 0.0
     )
     reach = np.maximum(CHANGED, CHANGED_SD * scatter * np.ones(len(size)))
-    count = 1
-    while count < len(means) and (np.abs(means[count] - means[:count].mean(axis=0)) / size < reach).all():
+    # Two blocks in a row say that it was another load; one is an accident.
+    count = min(2, len(means))
+    while count < len(means):
+        older = means[count : count + 2].mean(axis=0)
+        if (np.abs(older - means[:count].mean(axis=0)) / size > reach).any():
+            break
         count += 1
     return count
 
@@ -365,6 +376,17 @@ def _mean_drive(found: Fit, variants: Variants, load: Load) -> tuple[Servos, Arr
     current = np.broadcast_to(load.current.mean(axis=0), variants.state.case.shape)
     unknown = np.array([source == "unknown" for source in found.inputs.source])
     return replace(variants.servos, by_duty=np.zeros(len(unknown), bool)), np.where(unknown, variants.held, current)
+
+
+def settled(found: Fit, load: Load, room_c: float, draws: int, seed: int = 0) -> Array:
+    """(draws, joints) °C as read, where the cases come to rest under a mean load in a room of that temperature."""
+    variants = found.variants(draws, seed)
+    servos, drive = _mean_drive(found, variants, load)
+    servos = replace(servos, room_c=np.full((draws, 1), room_c + 0.5))
+    state = State(servos.room_c + 0.0 * drive, servos.room_c + 0.0 * drive)
+    for _ in range(4 * SETTLING):
+        state = advance(servos, state, SETTLING_S / 3, drive, load.gear, load.idle)
+    return state.case - 0.5
 
 
 def _torque(found: Fit, k: int, square: Array) -> Interval | None:

@@ -37,6 +37,8 @@ PAUSE_S = 10.0
 CROSSING_SD_K, ENTERED_SD_K = 0.12, 0.29
 #: rad between two samples of a log without loads that mean another pose, and so another heat
 MOVED_RAD = 0.1
+#: share of its largest drive from which on a servo works
+WORKS = 0.1
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,14 @@ class Inputs:
             if len(others) == 1:
                 out[k] = others[0]
         return out
+
+    @property
+    def loaded_s(self) -> float:
+        """When the load ended, s: the end of the last cell in which a servo worked; of the run where loads are unknown."""
+        most = self.drive.max(axis=0, initial=0.0)
+        works = (self.drive > WORKS * most) & (most > 0)
+        rows = np.flatnonzero(works.any(axis=1))
+        return float(self.edges[rows[-1] + 1]) if len(rows) and "unknown" not in self.source else self.duration_s
 
     def until(self, t: float) -> Inputs:
         """What was known at `t` (s from the start)."""

@@ -1,0 +1,364 @@
+"""`openant thermal fit | forecast | compare`: what recordings say of heat."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from openant_tools.cli.options import finite, json_option, report_option, robot_option
+
+if TYPE_CHECKING:
+    from openant_tools.robot.folder import RobotFolder
+    from openant_tools.thermal.fit import Known
+    from openant_tools.thermal.inputs import Inputs
+
+__all__ = ["compare", "fit", "forecast"]
+
+after_option = click.option(
+    "--after", type=click.Path(path_type=Path, dir_okay=False), metavar="FIT.json",
+    help="Begin from what an earlier `thermal fit` of this robot taught.",
+)  # fmt: skip
+
+
+@click.command()
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN...")
+@after_option
+@robot_option
+@json_option
+@report_option
+def fit(
+    runs: tuple[Path, ...], after: Path | None, robot: Path | None, json_file: Path | None, report: Path | None
+) -> int:
+    """Fit the two-node model (winding and case) to recordings with temperatures, in the order in which they were made.
+
+    Any run table with temp.J will do; the load is taken from cur.J, else from pwm.J and volt.J, else from load.J, and is
+    fitted itself where none of them was logged. The last run's first 60 % are fitted apart and meet the rest.
+
+    \b
+      openant thermal fit soak.mcap --robot my-ant --json fit.json --report fit
+      openant thermal fit monday.mcap tuesday.mcap --json fit.json
+
+    Exit code 1: the fit of the first part misses the later one by more than 2 K.
+    """
+    from openant_tools.thermal.finding import BELIEVED_K
+    from openant_tools.thermal.fit import fit as fit_runs
+    from openant_tools.thermal.fit import held_out
+    from openant_tools.thermal.forecast import forecast as look_ahead
+    from openant_tools.thermal.forecast import rest_advice
+
+    inputs = [_read(path) for path in runs]
+    known = _known(after)
+    earlier = fit_runs(inputs[:-1], after=known).known if len(inputs) > 1 else known
+    found = fit_runs(inputs[-1:], after=earlier)
+    held = held_out(inputs[-1], after=earlier) if inputs[-1].duration_s >= LEAST_HELD_OUT_S else None
+    for one in found.estimates:
+        if one.name in SHOWN:
+            mark = "" if one.informed > 0.5 else "  mostly believed before"
+            click.echo(
+                f"{one.joint or 'all':9} {one.name:12} {one.value:8.3g}  [{one.low:.3g}, {one.high:.3g}] {one.unit:4}{mark}"
+            )
+    click.echo(
+        f"crossings missed by {float(max(found.residual_k)):.2f} K rms at the worst joint; slow disturbance "
+        f"{found.disturbance_k:g} K over {found.disturbance_s / 60:.0f} min"
+    )
+    if held is not None:
+        click.echo(
+            f"fitted until {held.from_s / 60:.0f} min, the later part is missed by {held.rms_k:.2f} K rms, {held.worst_k:.1f} K "
+            f"at most ({held.worst}); {held.within:.0%} of it inside the 95 % band"
+        )
+    if json_file is not None:
+        _write(json_file, {
+            "schema": "openant.thermal-fit/1", "runs": [str(path) for path in runs],
+            "parameters": {
+                f"{one.joint}.{one.name}" if one.joint else one.name: {
+                    "value": one.value, "low": one.low, "high": one.high, "unit": one.unit, "informed": one.informed,
+                }
+                for one in found.estimates
+            },
+            "held_out": None if held is None else vars(held),
+            "disturbance": {"deviation_k": found.disturbance_k, "time_s": found.disturbance_s},
+            "glitches": dict(zip(inputs[-1].joints, map(int, inputs[-1].glitches), strict=True)),
+            "known": found.known.as_json(),
+        })  # fmt: skip
+    if report is not None:
+        from openant_tools.thermal.report import fit_report
+
+        click.echo(f"wrote {fit_report(found, inputs, held, _command()).write_folder(report)}", err=True)
+    folder = _folder(robot)
+    if folder is not None:
+        from openant_tools.procedure.finding import keep
+        from openant_tools.thermal.finding import thermal_finding
+
+        then = found.at(inputs[-1].loaded_s)
+        finding = thermal_finding(
+            then, look_ahead(then), command=_command(), recording=folder.relative(runs[-1]), held=held,
+            rest=rest_advice(then), warning=_warning(folder),
+        )  # fmt: skip
+        click.echo(f"wrote {keep(finding, folder, folder.relative(runs[-1]))}", err=True)
+    return 1 if held is not None and held.rms_k > BELIEVED_K else 0
+
+
+#: s; a shorter run has no later part to speak of
+LEAST_HELD_OUT_S = 300.0
+SHOWN = ("case_j_k", "air_w_k", "winding_w_k", "scale", "leg_w_k", "room_c", "exponent", "held_w")
+
+
+@click.command()
+@click.argument("run", type=click.Path(path_type=Path), metavar="RUN")
+@click.option(
+    "--at", "at_min", type=click.FloatRange(min=0.5), callback=finite, metavar="MIN",
+    help="Know only the run's first MIN minutes.  [default: all of it, looked at from the end of its load]",
+)  # fmt: skip
+@click.option("--load", "loads", multiple=True, metavar="JOINT=NM", help="Hold this torque instead; repeatable.")
+@click.option("--from-cold", is_flag=True, help="From the room's temperature instead of from the run's state.")
+@click.option(
+    "--whole", is_flag=True, help="Take the mean load of the whole run, not that at its end: a policy's recording."
+)
+@after_option
+@click.option(
+    "--derate", is_flag=True, help="Write the rule under which this load can go on into robot.toml, [derating]."
+)
+@robot_option
+@json_option
+@report_option
+def forecast(
+    run: Path,
+    at_min: float | None,
+    loads: tuple[str, ...],
+    from_cold: bool,
+    whole: bool,
+    after: Path | None,
+    derate: bool,
+    robot: Path | None,
+    json_file: Path | None,
+    report: Path | None,
+) -> int:
+    """When each servo would shut down if this went on, what it could hold, and how long to rest.
+
+    A servo shuts down when its reading passes its own limit. Intervals are 95 %; they are open where the servo may well
+    never get there (8 hours are looked ahead).
+
+    \b
+      openant thermal forecast soak.mcap --at 10
+      openant thermal forecast walk.mcap --whole --from-cold --after fit.json
+      openant thermal forecast soak.mcap --load knee_fl=0.6
+      openant thermal forecast soak.mcap --derate --robot my-ant
+
+    Exit code 1: a servo is more likely than not to shut down.
+    """
+    from openant_tools.errors import BadInput
+    from openant_tools.thermal.fit import fit as fit_runs
+    from openant_tools.thermal.forecast import (
+        HORIZON_S,
+        cool_down,
+        derating,
+        present_load,
+        rest_advice,
+        torque_load,
+    )  # fmt: skip
+    from openant_tools.thermal.forecast import forecast as look_ahead
+
+    inputs = _read(run)
+    known = _known(after)
+    if at_min is not None and at_min * 60 > inputs.duration_s + 1:
+        raise BadInput(f"the run ends after {inputs.duration_s / 60:.1f} min", where=run, remedy="give --at less")
+    if at_min is not None:
+        found = fit_runs([inputs.until(at_min * 60)], after=known)
+    else:
+        found = fit_runs([inputs], after=known).at(inputs.loaded_s)
+    load = torque_load(found, _torques(loads)) if loads else present_load(found, whole=whole)
+    told = look_ahead(found, load, from_cold=from_cold)
+    rest = rest_advice(found, load)
+    click.echo(f"{load.words}, {'from cold' if from_cold else f'from {found.inputs.duration_s / 60:.1f} min on'}:")
+    for one in told.joints:
+        torque = one.continuous_torque_nm
+        hold = "" if torque is None else f"; {torque.value:.2f} [{torque.low:.2f}, {torque.high:.2f}] N·m for ever"
+        if one.hour_torque_nm is not None:
+            hold += f", {one.hour_torque_nm.value:.2f} for an hour"
+        click.echo(f"  {one.words} (now {one.temperature_c:.0f} °C){hold}")
+    click.echo(f"advice: {rest.words}")
+    cooling = {}
+    for one in told.joints:
+        interval = cool_down(found, one.joint)
+        if interval.value > 0:
+            cooling[one.joint] = interval
+            click.echo(f"  {one.joint} has cooled {interval.value / 60:.0f} min after torque goes off")
+    rules = derating(found, load, told=told)
+    for joint, rule in rules.joints.items():
+        click.echo(
+            f"  derating {joint}: all of its torque up to {rule.start_c:.0f} °C, {rule.least:.0%} of it from {rule.stop_c:.0f} °C on"
+        )
+    folder = _folder(robot)
+    if warning := None if folder is None else _warning(folder):
+        click.echo(warning)
+    if derate:
+        if folder is None:
+            raise BadInput("no robot to write the rule to", remedy="name it with --robot DIR")
+        _keep_rules(folder, rules.as_table(), run)
+    if json_file is not None:
+        _write(json_file, {
+            "schema": "openant.thermal-forecast/1", "run": str(run), "load": load.words,
+            "at_s": found.inputs.duration_s, "horizon_s": HORIZON_S, "from_cold": from_cold,
+            "joints": [one.as_json() for one in told.joints], "rest": vars(rest), "derating": rules.as_table(),
+            "cool_down_s": {joint: interval.as_json() for joint, interval in cooling.items()},
+        })  # fmt: skip
+    if report is not None:
+        from openant_tools.thermal.report import forecast_report
+
+        shown = None if at_min is None or from_cold else inputs
+        page = forecast_report(found, told, rest.words, _command(), shown).write_folder(report)
+        click.echo(f"wrote {page}", err=True)
+    return 1 if any(one.probability > 0.5 for one in told.joints) else 0
+
+
+@click.command()
+@click.argument("a", type=click.Path(path_type=Path), metavar="A")
+@click.argument("b", type=click.Path(path_type=Path), metavar="[B]", required=False)
+@click.option(
+    "--joint",
+    "pairs",
+    multiple=True,
+    metavar="JOINT[:OTHER]",
+    help="Only this joint, or A's against another of B; repeatable.",
+)
+@click.option("--paper", is_flag=True, help="A against the paper's stress test of the same servo.")
+@json_option
+@report_option
+def compare(
+    a: Path, b: Path | None, pairs: tuple[str, ...], paper: bool, json_file: Path | None, report: Path | None
+) -> int:
+    """Two soaks: with and without heat sink, two motors, two dates; or one soak against the paper's curves.
+
+    Rooms and loads differ between soaks: compared is where each servo settles under one torque in a room of 25 °C.
+
+    \b
+      openant thermal compare bare.mcap finned.mcap
+      openant thermal compare soak.mcap soak.mcap --joint knee_fl:knee_fr
+      openant thermal compare stress.mcap --paper
+    """
+    from openant_tools.errors import BadInput
+    from openant_tools.thermal.compare import against_paper
+    from openant_tools.thermal.compare import compare as subtract
+    from openant_tools.thermal.fit import fit as fit_runs
+
+    if (b is None) == (not paper):
+        raise BadInput("name two soaks, or one and --paper", remedy="openant thermal compare A B")
+    one = fit_runs([_read(a)])
+    if b is None:
+        words = against_paper(one.at(one.inputs.loaded_s))
+        click.echo(words)
+        if json_file is not None:
+            _write(json_file, {"schema": "openant.thermal-compare/1", "a": str(a), "paper": words})
+        return 0
+    chosen = None
+    if pairs:
+        chosen = {first: second or first for first, _, second in (pair.partition(":") for pair in pairs)}
+    differences = subtract(one, fit_runs([_read(b)]), joints=chosen)
+    for d in differences:
+        click.echo(
+            f"{d.joint:9} at {d.torque_nm:.2f} N·m: {d.a_c.value:.0f} → {d.b_c.value:.0f} °C, {d.difference_k.value:+.1f} "
+            f"[{d.difference_k.low:+.1f}, {d.difference_k.high:+.1f}] K{' *' if d.certain else ''}"
+        )
+    click.echo("* beyond what either soak leaves open (95 %)")
+    if json_file is not None:
+        _write(json_file, {
+            "schema": "openant.thermal-compare/1", "a": str(a), "b": str(b),
+            "joints": [
+                {"joint": d.joint, "torque_nm": d.torque_nm, "a_c": d.a_c.as_json(), "b_c": d.b_c.as_json(),
+                 "difference_k": d.difference_k.as_json(), "time_constant_s": d.time_constant_s.as_json(), "certain": d.certain}
+                for d in differences
+            ],
+        })  # fmt: skip
+    if report is not None:
+        from openant_tools.thermal.report import compare_report
+
+        page = compare_report(differences, str(a), str(b), _command()).write_folder(report)
+        click.echo(f"wrote {page}", err=True)
+    return 0
+
+
+# ---- reading and writing ----
+
+
+def _read(path: Path) -> Inputs:
+    from openant_tools.recording.tables import read_run
+    from openant_tools.thermal.inputs import inputs_of
+
+    return inputs_of(read_run(path, need=()))
+
+
+def _known(path: Path | None) -> Known | None:
+    from openant_tools.errors import BadInput
+    from openant_tools.thermal.fit import Known
+
+    if path is None:
+        return None
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        what = error.strerror if isinstance(error, OSError) else "is no JSON"
+        raise BadInput(str(what), where=path, remedy="name the fit.json that `openant thermal fit` wrote") from None
+    return Known.of_json(content, str(path))
+
+
+def _folder(robot: Path | None) -> RobotFolder | None:
+    from openant_tools.robot.folder import RobotFolder
+
+    return None if robot is None else RobotFolder.at(robot)
+
+
+def _warning(folder: RobotFolder) -> str | None:
+    """What the torque table says before anything is hot."""
+    from openant_tools.robot.kit import kit
+    from openant_tools.thermal.finding import torque_warning
+
+    config = folder.config()
+    knees = [(motor.joint, motor.servo) for motor in config.motors.values() if motor.kind == "knee"]
+    parts = kit(config.kit)
+    return torque_warning(knees, parts, supply_v=parts.supply_v, pwm_limit=config.bus.pwm_limit)
+
+
+def _keep_rules(folder: RobotFolder, rules: dict[str, dict[str, float]], run: Path) -> None:
+    """Put the rules into robot.toml, each with where it came from."""
+    import datetime
+
+    from openant_tools.robot.config import Provenance
+
+    if not rules:
+        click.echo("no servo needs derating under this load; robot.toml is left as it is", err=True)
+        return
+    now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+    source = Provenance("forecast", _command(), folder.relative(run), now)
+    values = {f"derating.{joint}.{key}": value for joint, rule in rules.items() for key, value in rule.items()}
+    folder.update(values, provenance={f"derating.{joint}": source for joint in rules})
+    click.echo(f"wrote {folder.config_file}", err=True)
+
+
+def _torques(loads: tuple[str, ...]) -> dict[str, float]:
+    from openant_tools.errors import BadInput
+
+    out = {}
+    for text in loads:
+        joint, _, number = text.partition("=")
+        try:
+            out[joint.strip()] = float(number)
+        except ValueError:
+            out[joint.strip()] = math.nan
+        if not math.isfinite(out[joint.strip()]):
+            raise BadInput(f"{text!r} is no load", remedy="write --load knee_fl=0.6, in N·m")
+    return out
+
+
+def _write(path: Path, content: dict[str, Any]) -> None:
+    from openant_tools.files import write_text
+
+    write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+
+
+def _command() -> str:
+    return " ".join(["openant", *sys.argv[1:]])
