@@ -6,6 +6,10 @@ held out; beside it what the same law leaves of runs that it was fitted to. Fini
 interrupted run goes on where it was.
 
     python benchmarks/friction_ladder.py ../shared/realdata/bam-xl330 [--rung load] [--cache FILE]
+    python benchmarks/friction_ladder.py ../shared/realdata/bam-xl330 --motions [--rung load]
+
+With --motions each gain is fitted by itself instead: each of its motions by what was fitted to its other motions alone, beside
+the error of the model as it was given.
 
 The folder holds run tables, and beside each the model of its gain that its facts name.
 """
@@ -17,11 +21,14 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from openant_tools.files import write_text
+from openant_tools.model.gap import gap
 from openant_tools.model.plant import Setup, load_plant
+from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
 from openant_tools.sysid.fit import Dataset, Problem, gaps, sensor_floor
@@ -72,15 +79,53 @@ def error(datasets: Sequence[Dataset], kinds: Sequence[str], u: dict[str, float]
     return float(gaps(datasets, parameters, [np.array([u[p.kind] for p in parameters])])[0].full)
 
 
+def by_motion(runs: Sequence[Run], rung: str, volts: bool, cache: dict[str, Any], file: Path) -> None:
+    """Each motion of each gain, fitted to the others of that gain: a row of errors over the given model's."""
+    models: dict[Path, list[Run]] = {}
+    for run in runs:
+        assert run.model_path is not None
+        models.setdefault(run.model_path, []).append(run)
+    cells, samples, squares = [], [], []
+    for path, members in sorted(models.items()):
+        for held in members:
+            key = f"{rung}, {'logged' if volts else 'nominal'}, {held.name}"
+            shown = list(by_model([held], volts=volts).values())
+            if key not in cache:
+                others = by_model([run for run in members if run is not held], volts=volts)
+                u = fit(list(others.values()), RUNGS[rung], {})
+                cache[key] = {"u": u, "error": error(shown, RUNGS[rung], u)}
+                write_text(file, json.dumps(cache, indent=1) + "\n")
+            plant = load_plant(path)
+            given = gap(held.signal("pos", plant.joints), Rollouts(plant, [held])().pos[0])
+            found = cache[key]["error"]
+            cells.append(f"{found / given:.2f}")
+            samples.append(int(np.isfinite(shown[0].measured).sum()))
+            squares.append((given**2, found**2))
+    before, after = np.sqrt(np.average(squares, axis=0, weights=samples))
+    supply = "logged" if volts else "nominal"
+    row = " | ".join([*cells, f"{before:.4f} → {after:.4f}", f"{after / before:.2f}"])
+    print(f"| {rung} | {supply} | {row} |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--rung", action="append", choices=list(RUNGS))
     parser.add_argument("--cache", type=Path, default=Path("friction_ladder.json"))
+    parser.add_argument("--motions", action="store_true", help="one gain at a time, each motion held out")
     options = parser.parse_args()
     runs = [read_run(path) for path in sorted(options.folder.glob("*.parquet"))]
     cache = json.loads(options.cache.read_text()) if options.cache.exists() else {}
 
+    if options.motions:
+        names = [run.name for path in sorted({str(run.model_path) for run in runs}) for run in runs
+                 if str(run.model_path) == path]  # fmt: skip
+        print(f"| rung | supply | {' | '.join(names)} | pooled, rad | ratio |")
+        print("|---|---|" + "---|" * (len(names) + 2))
+        for rung in options.rung or RUNGS:
+            for volts in (False, True):
+                by_motion(runs, rung, volts, cache, options.cache)
+        return
     print(
         "| rung | supply | fitted to all | " + " | ".join(p.stem for p in by_model(runs, volts=False)) + " | held out |"
     )

@@ -59,6 +59,8 @@ SAME_PLACE = 0.3
 #: squared length of a step in posterior deviations, per parameter, below which a descent has arrived: near, if the step is short
 #: in prior deviations too, and for good
 NEAR, ARRIVED = 5.0, 0.002
+#: the first where laws are compared that differ by little
+NEAR_TEMPERED = 0.05
 #: shares of the promised gain: below the first a step is taken back; a Jacobian that keeps less than the second is stale
 WORSE, BROKEN = 0.05, 0.4
 #: nats per parameter that are not worth new derivatives; shorter steps in a row that are tried where none is any good
@@ -463,7 +465,7 @@ class Problem:
         if self._has_limp and not self.tempered:
             # Nothing in driven stretches tells the valleys; their prior alone must not move them out of theirs.
             point = self._approach(point, tell, enough=NEAR, driven_only=True, held=self._valley).point
-        near = self._approach(point, tell, enough=NEAR)
+        near = self._approach(point, tell, enough=NEAR_TEMPERED if self.tempered else NEAR)
         # Differences to one side are good enough to get near. Where parameters almost undo each other (all torques a
         # per cent larger) they are not: there the minimum and the intervals come from both sides.
         return self._approach(near.point, tell, central=True)
@@ -509,7 +511,7 @@ class Problem:
                 if (step - before) @ precision @ (step - before) < enough * len(step):
                     break
             away = float(np.abs(point.u - tangent.u).max(initial=0.0))
-            short = float(np.abs(step).max(initial=0.0)) < SAME_PLACE
+            short = self.tempered or float(np.abs(step).max(initial=0.0)) < SAME_PLACE
             if step @ precision @ step < (enough if short else ARRIVED) * len(step):
                 if away < SAME_PLACE or enough > ARRIVED:
                     return _Descent(point, tangent, True)
@@ -525,7 +527,7 @@ class Problem:
                     self._correct(tangent, step, there.residual - point.residual)
                 point = there
                 damping, refused = damping / 10 if kept > BROKEN else damping, 0
-            settled = short and (away < SAME_PLACE or enough > ARRIVED)
+            settled = short and not self.tempered and (away < SAME_PLACE or enough > ARRIVED)
             if promised < TRIFLE * len(step) and (kept < BROKEN or settled):
                 return _Descent(point, tangent, True)  # what friction makes of a hair's difference is all that is left
             if kept <= WORSE and away == 0.0:
