@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -98,12 +99,15 @@ def open_study(url: str, name: str, facts: Mapping[str, Any]) -> optuna.Study:
         if url.startswith("redis"):
             storage = optuna.storages.get_storage(url)
         else:
-            storage = optuna.storages.RDBStorage(
-                url,
-                heartbeat_interval=HEARTBEAT_S,
-                grace_period=GIVEN_UP_S,
-                failed_trial_callback=optuna.storages.RetryFailedTrialCallback(max_retry=RETRIES),
-            )
+            with warnings.catch_warnings():
+                # Signs of life have been called experimental since 2021.
+                warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+                storage = optuna.storages.RDBStorage(
+                    url,
+                    heartbeat_interval=HEARTBEAT_S,
+                    grace_period=GIVEN_UP_S,
+                    heartbeat_stale_trial_callback=optuna.storages.RetryHeartbeatStaleTrialCallback(max_retry=RETRIES),
+                )
         study = optuna.create_study(storage=storage, study_name=name, direction="maximize", load_if_exists=True)
     except Exception as error:  # of SQLAlchemy, its drivers, redis: a dozen kinds without a common parent
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]

@@ -56,16 +56,16 @@ def test_the_spaces_are_the_papers():
 
 
 def test_a_study_goes_on_and_is_shared(tmp_path):
-    url, facts = f"sqlite:///{tmp_path}/tune.db", {"agent": "sarsa", "steps": 1300}
+    url, facts = f"sqlite:///{tmp_path}/tune.db", {"agent": "sarsa", "steps": 100}
     told = []
     study = open_study(url, "sarsa", facts)
     with pytest.raises(BadInput, match="no trial is complete yet"):
         best_settings(study)
-    search(study, "sarsa", make_env, trials=1, steps=1300, seeds=[0, 1], done=lambda _, trial: told.append(trial.value))
+    search(study, "sarsa", make_env, trials=1, steps=100, seeds=[0, 1], done=lambda _, trial: told.append(trial.value))
     # another process, for all that it knows
     other = open_study(url, "sarsa", facts)
-    search(other, "sarsa", make_env, trials=2, steps=1300, seeds=[0, 1])
-    search(other, "sarsa", make_env, trials=2, steps=1300, seeds=[0, 1])  # has enough
+    search(other, "sarsa", make_env, trials=2, steps=100, seeds=[0, 1])
+    search(other, "sarsa", make_env, trials=2, steps=100, seeds=[0, 1])  # has enough
     assert len(study.trials) == 2
     trial = study.trials[0]
     assert told == [trial.value]
@@ -94,7 +94,7 @@ def test_from_the_command_line_with_a_kill_between(tmp_path, capsys, monkeypatch
     monkeypatch.chdir(tmp_path)
     words = ["tune", "sarsa", "--kit", "standard", "--seeds", "1", "--storage", "sqlite:///t.db", "--trials", "2"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "openant_tools.cli", *words, "--steps", "1300"],
+        [sys.executable, "-m", "openant_tools.cli", *words, "--steps", "100"],
         stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     try:
@@ -105,7 +105,7 @@ def test_from_the_command_line_with_a_kill_between(tmp_path, capsys, monkeypatch
     finally:
         process.send_signal(signal.SIGKILL)
         process.wait()
-    assert run_command(*words, "--steps", "1300", "--json", "best.json") == 0
+    assert run_command(*words, "--steps", "100", "--json", "best.json") == 0
     found = json.loads((tmp_path / "best.json").read_text())
     assert found["agent"] == "sarsa"
     assert "cm/s while learning" in capsys.readouterr().out
