@@ -115,10 +115,13 @@ class Inputs:
 
     def until(self, t: float) -> Inputs:
         """What was known at `t` (s from the start)."""
-        m = max(1, int(np.searchsorted(self.edges, t, side="right")) - 1)
+        t = float(min(max(t, self.edges[1] / 2), self.edges[-1]))
+        # The last cell ends there; its mean load is the whole cell's, some seconds.
+        m = int(np.searchsorted(self.edges, t, side="left"))
+        edges = np.append(self.edges[:m], t)
         return Inputs(
-            self.name, self.joints, self.models, self.edges[: m + 1], self.source, self.drive[:m], self.push[:m],
-            self.gear[:m], self.idle[:m], self.stretch[:m], tuple(one.until(float(self.edges[m])) for one in self.observed),
+            self.name, self.joints, self.models, edges, self.source, self.drive[:m], self.push[:m],
+            self.gear[:m], self.idle[:m], self.stretch[:m], tuple(one.until(t) for one in self.observed),
             self.readings[:m], self.limit_c, self.glitches, self.ambient_c, self.heat_sinks,
         )  # fmt: skip
 

@@ -90,7 +90,7 @@ def forecast_picture(
             panel.set_ylabel(plots.axis_label("case", "°C"))
             panel.set_title(next(one.words for one in told.joints if one.joint == joint))
         axes[-1, 0].set_xlabel(plots.axis_label("time", "min"))
-        plots.legend(axes[0, 0])
+        plots.legend(axes[0, 0], loc="lower right", bbox_to_anchor=(1.0, 0.0))
     return figure
 
 
