@@ -142,8 +142,8 @@ class Learner:
         agent, settings, job = self._agent, self._job.settings, self._job
         self._read()
         self._publish()
-        self._connection.send(("ready", agent.updates))
         try:
+            self._say("ready", agent.updates)
             while True:
                 self._read()
                 due = job.updates_per_step * (agent.replay.added - settings.learning_start)
@@ -158,8 +158,8 @@ class Learner:
         except _Stopped:
             self._read()
             self._save()
-            with contextlib.suppress(OSError):
-                self._connection.send(("saved", agent.updates))
+            with contextlib.suppress(_Stopped):
+                self._say("saved", agent.updates)
 
     def _read(self) -> None:
         """Take in the whole rows that were appended since the last look."""
@@ -172,6 +172,12 @@ class Learner:
             rows = np.frombuffer(data, np.float32).reshape(-1, replay.width)
             replay.extend(rows)
             new -= len(rows)
+
+    def _say(self, what: str, value: Any) -> None:
+        try:
+            self._connection.send((what, value))
+        except OSError:
+            raise _Stopped from None
 
     def _listen(self, wait_s: float) -> None:
         try:
@@ -216,10 +222,13 @@ def main() -> None:
     weights = SharedWeights(count, int(sys.argv[2]))
     try:
         Learner(job, connection, weights).run()
+        return
     except OpenAntError as error:
-        connection.send(("error", (error.what, error.where, error.remedy)))
+        words = error.what, error.where, error.remedy
     except OSError as error:
-        connection.send(("error", (f"the run cannot be saved: {error.strerror}", str(job.folder), "make room there")))
+        words = f"the run cannot be saved: {error.strerror}", str(job.folder), "make room there"
+    with contextlib.suppress(OSError):  # nobody is there to be told
+        connection.send(("error", words))
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_env.base import AntBase, Observation, OnFall, unit
+from openant_env.randomise import Randomiser, intervals_of
 from openant_env.rendering import Painter
 from openant_env.robots import DT_S, simulated_robot
 from openant_env.tasks import BackAndForth
@@ -27,6 +28,7 @@ from openant_tools.effects.acting import Acting
 from openant_tools.effects.commands import CommandPath
 from openant_tools.errors import BadInput
 from openant_tools.model.rollout import fill_setpoints
+from openant_tools.robot.folder import RobotFolder
 
 __all__ = ["Ant"]
 
@@ -62,6 +64,8 @@ class Ant(AntBase):
             robot's folder says, which is the paper's unless changed.
         observation_order: `"platform"` or `"paper"` (`openant_env.observations`).
         effects: which of the robot's `[[effect]]` entries act: True (all that are enabled), False, or their names.
+        randomise: at every reset another robot, drawn from the intervals of the identification in robot.toml
+            (`openant_env.randomise`).
         on_fall: what lying on the back means: `"truncate"`, `"terminate"`, or `"ignore"`.
         time_limit_s: s after which to truncate; None: never.
         render_mode: None or `"rgb_array"`.
@@ -84,6 +88,7 @@ class Ant(AntBase):
         action_range: str | None = None,
         observation_order: str = "platform",
         effects: bool | Sequence[str] = True,
+        randomise: bool = False,
         on_fall: OnFall = "truncate",
         time_limit_s: float | None = None,
         render_mode: str | None = None,
@@ -93,7 +98,7 @@ class Ant(AntBase):
         self._arguments = {
             "robot": robot, "kit": kit, "task": task, "task_options": task_options, "dt": dt,
             "action_range": action_range, "observation_order": observation_order, "effects": effects,
-            "on_fall": on_fall, "time_limit_s": time_limit_s, "render_mode": render_mode, "width": width,
+            "randomise": randomise, "on_fall": on_fall, "time_limit_s": time_limit_s, "render_mode": render_mode, "width": width,
             "height": height,
         }  # fmt: skip
         if render_mode not in (None, "rgb_array"):
@@ -104,6 +109,15 @@ class Ant(AntBase):
             on_fall=on_fall, time_limit_s=time_limit_s,
         )  # fmt: skip
         self._plant = self.robot.load()
+        self._randomiser: Randomiser | None = None
+        if randomise:
+            if self.robot.folder is None:
+                raise BadInput(
+                    "the nominal robot was not identified: there are no intervals to draw from",
+                    remedy="name a robot whose folder has a fit, or leave randomise out",
+                )
+            folder = RobotFolder(self.robot.folder)
+            self._randomiser = Randomiser(self._plant, intervals_of(folder, folder.config()), self.robot.effects)
         self.model: mujoco.MjModel = self._plant.model
         # MuJoCo would start a simulation that has come apart afresh without a word.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -140,7 +154,8 @@ class Ant(AntBase):
         """What acts beside the model: between its steps, on the way of commands, and in sensors."""
         robot, timestep, sensing = self.robot, self.model.opt.timestep, self.robot.sensing
         stepped = bool(robot.effects) or robot.commands is not None
-        self._acting = Acting(self._plant, self.data, robot.effects) if stepped else None
+        effects = robot.effects if self._randomiser is None else self._randomiser.effects
+        self._acting = Acting(self._plant, self.data, effects) if stepped else None
         self._path = None if robot.commands is None else CommandPath(robot.commands, timestep)
         self._bias: NDArray[np.float64] | None = None
         if sensing is not None and (sensing.gyro_bias.any() or sensing.acc_bias.any()):
@@ -150,9 +165,15 @@ class Ant(AntBase):
         self._tracker = sensing if sensing is not None and sensing.tracks_wrong else None
         # The pose that the tracker tells is so many steps of the environment and of the physics old.
         late = 0 if self._tracker is None else round(self._tracker.latency_s / timestep)
-        steps_late, self._late = divmod(late, self._substeps)
+        steps_late = late // self._substeps
+        self._late = late % self._substeps
         self._poses: deque[tuple[float, float, float, float]] = deque(maxlen=steps_late + 1)
         self._plain = self._path is None and self._tracker is None
+
+    def _become(self) -> None:
+        """Stand as the robot that was drawn."""
+        self._take_effects()
+        self._settled = self._settle()
 
     def _settle(self) -> NDArray[np.float64]:
         """The state of a robot that stands with the command of action 0: setpoint filters and delay buffers full."""
@@ -188,6 +209,9 @@ class Ant(AntBase):
                 them.
         """
         super().reset(seed=seed)
+        if self._randomiser is not None:
+            self._randomiser.draw(self.np_random)
+            self._become()
         chosen = options or {}
         unknown = set(chosen) - {"heading_rad", "position", "direction_rad"}
         if unknown:
@@ -344,6 +368,7 @@ class Ant(AntBase):
             "effects": [] if self._acting is None else self._acting.get_state(),
             "commands": {} if self._path is None else self._path.get_state(),
             "poses": [list(pose) for pose in self._poses],
+            "drawn": [] if self._randomiser is None else self._randomiser.drawn.tolist(),
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -359,6 +384,9 @@ class Ant(AntBase):
                 where=self.robot.model_path,
                 remedy="use the model that it was saved with",
             )
+        if self._randomiser is not None:
+            self._randomiser.become(np.asarray(state["drawn"]))
+            self._become()
         mujoco.mj_setState(self.model, self.data, physics, _STATE)
         mujoco.mj_forward(self.model, self.data)
         # mj_forward leaves a warm start of its own behind; the saved one makes the next step the same, bit for bit.

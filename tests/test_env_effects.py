@@ -22,7 +22,7 @@ from openant_tools.gap.robot import Robot
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run
-from openant_tools.robot.config import Effect
+from openant_tools.robot.config import Effect, Provenance
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 
@@ -214,3 +214,77 @@ def test_entries_that_cannot_be_are_refused_in_one_line(entry, words, robot):
     robot.update(effects=[entry])
     with pytest.raises(BadInput, match=words):
         gymnasium.make("openant/Ant-v0", robot=robot.path)
+
+
+# ------------------------------------------------------------------------------------------------ domain randomisation
+
+
+def test_robots_are_drawn_from_the_intervals_of_the_identification_and_nothing_else_varies(robot):
+    nominal = gymnasium.make("openant/Ant-v0", robot=robot.path).unwrapped
+    knee = int(nominal._plant.actuator[KNEE])
+    stiffness = float(-nominal.model.actuator_biasprm[knee, 1])
+    effect = Effect("load_friction", ("knee_fl",), {"coefficient": 0.1})
+    fitted = Provenance("fitted", "openant sysid fit", low=0.9 * stiffness, high=1.05 * stiffness)
+    robot.update(
+        {
+            "identified.stiffness.knee_fl": stiffness,
+            "identified.load_friction.knee_fl": 0.1,
+            "identified.damping.knee_fl": 0.5,
+            "identified.armature.knee_rr": 0.01,
+        },
+        provenance={
+            "identified.stiffness.knee_fl": fitted,
+            "identified.load_friction.knee_fl": Provenance("fitted", low=0.05, high=0.2),
+            "identified.damping.knee_fl": Provenance("as given"),
+            # an older fit's: this model has another armature
+            "identified.armature.knee_rr": Provenance("fitted", low=0.0, high=0.02),
+        },
+        effects=[effect],
+    )
+    env = gymnasium.make("openant/Ant-v0", robot=robot.path, randomise=True).unwrapped
+    assert env._randomiser.fixed == ("armature.knee_rr",)
+    drawn = []
+    for seed in range(12):
+        env.reset(seed=seed)
+        drawn.append(
+            (-env.model.actuator_biasprm[knee, 1], env._randomiser.effects["load_friction", "coefficient"][KNEE])
+        )
+        env.step(np.zeros(8, np.float32))
+    stiff, rubbing = np.array(drawn).T
+    assert 0.9 * stiffness <= stiff.min() < stiffness < stiff.max() <= 1.05 * stiffness
+    assert 0.05 <= rubbing.min() < 0.1 < rubbing.max() <= 0.2
+    env.model.actuator_biasprm[knee], env.model.actuator_gainprm[knee] = (
+        nominal.model.actuator_biasprm[knee],
+        nominal.model.actuator_gainprm[knee],
+    )
+    for field in ("body_mass", "dof_damping", "dof_armature", "actuator_biasprm", "actuator_gainprm", "geom_friction"):
+        np.testing.assert_array_equal(getattr(env.model, field), getattr(nominal.model, field))
+
+
+def test_a_drawn_robot_is_the_same_for_the_same_seed_and_goes_on_in_a_pickled_copy(robot):
+    robot.update(
+        {"identified.damping.knee_fl": 0.852, "identified.torso_mass.robot": 0.324},
+        provenance={
+            "identified.damping.knee_fl": Provenance("fitted", low=0.7, high=1.0),
+            "identified.torso_mass.robot": Provenance("fitted", low=0.3, high=0.35),
+        },
+    )
+    env = gymnasium.make("openant/Ant-v0", robot=robot.path, randomise=True).unwrapped
+    actions = np.random.default_rng(0).uniform(-1, 1, (3, 8)).astype(np.float32)
+
+    def walk(of):
+        return np.array([of.step(action)[0] for action in actions])
+
+    env.reset(seed=4)
+    first = walk(env)
+    copied = pickle.loads(pickle.dumps(env))
+    np.testing.assert_array_equal(walk(copied), walk(env))
+    env.reset(seed=4)
+    np.testing.assert_array_equal(walk(env), first)
+
+
+def test_what_was_never_identified_is_not_drawn_from_guesses(robot):
+    with pytest.raises(BadInput, match="nothing was identified yet whose interval could be drawn from"):
+        gymnasium.make("openant/Ant-v0", robot=robot.path, randomise=True)
+    with pytest.raises(BadInput, match="the nominal robot was not identified"):
+        gymnasium.make("openant/Ant-v0", randomise=True)

@@ -84,7 +84,7 @@ class CommandPath:
                 values[k] = np.where(lost, before, values[k])
             before = values[k]
         way = Staircase(np.concatenate([self._times, arriving]), np.concatenate([self._values, values]))
-        edges = self._now + self._timestep * np.arange(steps + 1)
+        edges: Array = self._now + self._timestep * np.arange(steps + 1, dtype=np.float64)
         acting = way.mean(edges)
         # Time starts anew with every step of the environment, so that days of it are as exact as the first second.
         kept = max(0, int(np.searchsorted(way.times, edges[-1], side="right")) - 1)
