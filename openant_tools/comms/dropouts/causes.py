@@ -102,7 +102,7 @@ CAUSES: Mapping[str, Cause] = {
         _LOSES,
         {"all": 0.06, "behind": 0.77, "one": 0.1, "pair": 0.02, "scattered": 0.05},
         {
-            "crc": (0.9, 1.6), "together": (1.4, 0.9), "rate": (0.6, 4.0), "single": (1.2, 1.0), "long": (0.8, 3.5),
+            "crc": (0.7, 1.4), "together": (1.8, 0.8), "rate": (0.6, 4.0), "single": (1.2, 1.0), "long": (0.8, 3.5),
             "reset": (0.35, 4.0), "dip": (0.35, 6.0), "motion": (0.6, 3.5),
         },
     ),

@@ -212,7 +212,7 @@ def _terms(cause: Cause, measures: Measures) -> dict[str, float]:
             share = 0.75 * share + 0.25 * cause.reach[reach.tied]
         # A few losses say little of whom they concern.
         few = min(1.0, len(measures.episodes) / 6)
-        terms["reach"] = few * math.log(share)
+        terms["reach"] = TEMPER * few * math.log(share)
     for name, seen in measures.marks.items():
         if not lossy and name not in _OF_TIME:
             continue  # a few losses that any bus has say nothing of what else is wrong

@@ -47,13 +47,13 @@ def episodes_of(log: BusLog) -> list[Episode]:
     firsts, lasts = np.r_[rows[0], rows[breaks + 1]], np.r_[rows[breaks], rows[-1]]
     found = []
     for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True):
-        part = slice(first, last + 1)
-        joints = tuple(np.flatnonzero(log.lost[part].any(axis=0)).tolist())
-        codes = np.unique(log.word[part])
+        word = log.word[first : last + 1]
+        joints = tuple(np.flatnonzero(word.any(axis=0)).tolist())
+        codes = set(word.ravel().tolist())
         found.append(
             Episode(
                 first, last + 1, float(log.t[first]), float(log.t[last]), joints,
-                tuple(WORDS[code] for code in codes if code),
+                tuple(WORDS[code] for code in sorted(codes) if code),
             )
         )  # fmt: skip
     return found
@@ -151,7 +151,7 @@ def _reach(log: BusLog, lost: Flags, wires: Sequence[tuple[int, ...]], *, shadow
         return Reach("one", (), 0.0, rate, shadow, lost)
     top = rate.max()
     concerned = tuple(np.flatnonzero(seen & (rate >= CONCERNED * top) & (counts > 0)).tolist())
-    together = float(lost[np.ix_(lossy, concerned)].mean()) if concerned else 0.0
+    together = float(lost[lossy][:, list(concerned)].mean()) if concerned else 0.0
     kind, tied = "scattered", None
     if len(concerned) == 1:
         kind = "one"

@@ -87,8 +87,7 @@ class BusLog:
     @property
     def lossy(self) -> Flags:
         """(n,) rows in which something was lost."""
-        flags: Flags = self.lost.any(axis=1)
-        return flags
+        return np.asarray(self.lost.any(axis=1), bool)
 
 
 def read_log(runs: Sequence[Run]) -> BusLog:
@@ -160,10 +159,11 @@ def _losses(run: Run, joint: str) -> tuple[Flags, NDArray[np.int8]]:
     known = False
     said = run.columns.get(f"err.{joint}")
     if said is not None and said.dtype.kind in "OU":
-        text = np.array([str(one).strip().lower() if one is not None else "" for one in said])
-        for word in np.unique(text):
+        raw = np.array(["" if one is None else str(one) for one in said.tolist()], dtype=object)
+        for written in {*raw.tolist()}:
+            word = written.strip().lower()
             code = 0 if word in ("", "alert", "nan", "none", "ok") else _CODE.get(word, _CODE["lost"])
-            words[text == word] = code
+            words[raw == written] = code
         known = True
     ok = _numbers(run, "ok", joint)
     if np.isfinite(ok).any():
@@ -200,7 +200,8 @@ def _filled(t: Array, values: Array, command: Array) -> Array:
             left = float(np.var(values[good] - np.polyval(fit, follows[good])))
             if left < scatter:
                 scatter, best = left, np.polyval(fit, follows)
-        filled = filled if best is None else best
+        if best is not None:
+            filled = np.asarray(best, float)
     return np.where(good, values, filled)
 
 

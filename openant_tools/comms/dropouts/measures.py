@@ -138,7 +138,7 @@ def _extent(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
 def _rhythm(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     if not episodes:
         return
-    runs = _lengths(reach.lost.any(axis=1))
+    runs = _lengths(np.asarray(reach.lost.any(axis=1), bool))
     single = float((runs <= 1).sum() / len(runs))
     yield "single", Measure(single, f"{single:.0%} of {len(runs)} losses last one read only"), ()
     longest = max(one.to_s - one.from_s for one in episodes) + log.period_s
@@ -184,7 +184,7 @@ def _dips(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     good = np.isfinite(volts)
     if not episodes or good.sum() < FEWEST:
         return
-    near = np.zeros(len(log.t), bool)
+    near: Flags = np.zeros(len(log.t), bool)
     for one in episodes:
         near[max(0, one.start - NEAR) : one.stop + NEAR] = True
     away = volts[good & ~near]
@@ -209,7 +209,8 @@ def _dips(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
 
 def _sag(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     with np.errstate(invalid="ignore"):
-        volts = np.where(np.isfinite(log.volt).any(axis=1), np.nanmean(np.where(np.isfinite(log.volt).any(axis=1)[:, None], log.volt, 0.0), axis=1), np.nan)  # fmt: skip
+        seen = np.isfinite(log.volt)
+        volts = np.where(seen, log.volt, 0.0).sum(axis=1) / seen.sum(axis=1)
     good = np.isfinite(volts) & np.isfinite(log.load)
     if good.sum() < FEWEST:
         return
@@ -263,7 +264,7 @@ def _resets(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
 
 def _explained(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     """How much of the timing of losses an angle, the load or shaking explains, beyond what chance does."""
-    lossy = reach.lost.any(axis=1)
+    lossy = np.asarray(reach.lost.any(axis=1), bool)
     if not episodes or lossy.mean() > 0.97:
         return
     # A long silence says what it began with; every row of it would say the same again.
@@ -312,7 +313,8 @@ def _around(values: Array) -> Array:
     """(n,) the least of each row and its neighbours, infinity where none of them knows."""
     known = np.where(np.isfinite(values), values, np.inf)
     padded = np.r_[np.inf, known, np.inf]
-    return np.minimum(np.minimum(padded[:-2], padded[2:]), known)
+    least: Array = np.minimum(np.minimum(padded[:-2], padded[2:]), known)
+    return least
 
 
 def _elsewhere(log: BusLog, episodes: Sequence[Episode]) -> NDArray[np.int64]:
