@@ -226,7 +226,7 @@ class TrueWalk:
         self.policies[b].begin()
 
 
-def play(out: Path, policies: Path, key: bytes | None, seconds: float, plays: int) -> None:
+def play(out: Path, policies: Path, key: bytes | None, seconds: float, plays: int, only: str | None) -> None:
     import tomllib
 
     import gymnasium
@@ -238,7 +238,7 @@ def play(out: Path, policies: Path, key: bytes | None, seconds: float, plays: in
     runs = find_policies(policies)
     for name, answer in answers.items():
         file = out / "models" / name / "real.json"
-        if file.exists():
+        if file.exists() or only not in (None, name):
             continue
         begun = time.monotonic()
         dts = {run: read_facts(folder)["trained_on"]["dt"] for run, folder in runs.items()}
@@ -286,16 +286,19 @@ def rank(out: Path, policies: Path, seconds: float, plays: int, docs: Path | Non
         if not nominal.exists():
             openant("policies", "play", "--policies", policies, "--on", "nominal", "--seconds", seconds, "--plays", plays,
                     "--json", nominal)  # fmt: skip
+        words: list[object] = []
         for name in ("calibrated", "diagnosed"):
-            openant("policies", "play", "--policies", policies, "--on", place / name, "--seconds", seconds, "--plays", plays,
-                    "--json", place / f"{name}.json")  # fmt: skip
+            if (place / name).exists():  # a diagnosis may still be to come
+                openant("policies", "play", "--policies", policies, "--on", place / name, "--seconds", seconds,
+                        "--plays", plays, "--json", place / f"{name}.json")  # fmt: skip
+                words += ["--sim", f"{name}={place / name}.json"]
         if openant(
-            "policies", "rank", "--policies", policies, "--real", real, "--sim", f"nominal={nominal}",
-            "--sim", f"calibrated={place / 'calibrated.json'}", "--sim", f"diagnosed={place / 'diagnosed.json'}",
+            "policies", "rank", "--policies", policies, "--real", real, "--sim", f"nominal={nominal}", *words,
             "--seconds", seconds, "--report", place / "ranking", "--json", answer,
         ):  # fmt: skip
             continue
-        verdict = json.loads((place / "diagnosis.json").read_text())["verdict"]
+        diagnosis = place / "diagnosis.json"
+        verdict = json.loads(diagnosis.read_text())["verdict"] if diagnosis.exists() else "not diagnosed"
         for name, one in json.loads(answer.read_text())["agreement"].items():
             s, k = one["spearman"], one["kendall"]
             sums.setdefault(name, []).append(s["value"])
@@ -323,6 +326,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--plays", type=int, default=3)
     parser.add_argument("--docs", type=Path)
+    parser.add_argument("--only", metavar="ROBOT", help="play on this one only, such as robot-000")
     chosen = parser.parse_args()
     key = None
     if chosen.key_file is not None:
@@ -334,7 +338,7 @@ def main() -> None:
     elif chosen.step == "models":
         models(chosen.out)
     elif chosen.step == "play":
-        play(chosen.out, chosen.policies, key, chosen.seconds, chosen.plays)
+        play(chosen.out, chosen.policies, key, chosen.seconds, chosen.plays, chosen.only)
     else:
         rank(chosen.out, chosen.policies, chosen.seconds, chosen.plays, chosen.docs)
 

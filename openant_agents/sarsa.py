@@ -164,7 +164,7 @@ class Sarsa:
         self._fading = discount * settings.trace**steps
         steps_by_trace = np.float32(settings.step_size * error) * strengths
         # add.at, because a box that the robot stayed in is there several times.
-        np.add.at(self._flat, np.concatenate(self._traces), np.repeat(steps_by_trace, [len(t) for t in self._traces]))
+        np.add.at(self._flat, np.concatenate(self._traces), np.repeat(steps_by_trace, len(at)))
         self.moved += abs(float(steps_by_trace.sum())) * len(at)
         self.decisions += 1
         return error

@@ -66,7 +66,9 @@ class TileCoder:
         self._scale = tiles * tilings / (self.high - self.low)
         inputs = np.arange(len(self.low))
         # Whole boxes of displacement change no box's extent; without them coordinates stay small.
-        self._shift = ((np.arange(tilings)[:, None] * (2 * inputs + 1)) % tilings).astype(np.int32)
+        shift = (np.arange(tilings)[:, None] * (2 * inputs + 1)) % tilings
+        # From how many n-ths on a point within its tile is pushed into the next.
+        self._next_from = (tilings - shift).astype(np.int32)
         # A box by name: its tiling and its coordinates.
         self._boxes = np.empty((tilings, 2 + len(inputs)), np.uint8)
         self._boxes[:, :2] = np.arange(tilings, dtype=np.uint16)[:, None].view(np.uint8)
@@ -107,7 +109,14 @@ class TileCoder:
     def _locate(self, observation: NDArray[np.floating]) -> list[bytes]:
         inside = np.minimum(np.maximum(observation, self.low), self.high)
         steps = ((inside - self.low) * self._scale).astype(np.int32)  # in n-ths of a tile, never below 0
-        self._boxes[:, 2:] = (steps + self._shift) // self.tilings
+        whole = steps // self.tilings
+        # (steps + shift) // n without dividing n times
+        np.add(
+            whole.astype(np.uint8),
+            steps - whole * self.tilings >= self._next_from,
+            out=self._boxes[:, 2:],
+            casting="unsafe",
+        )
         names: list[bytes] = self._names.tolist()
         return names
 
