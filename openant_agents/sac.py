@@ -37,7 +37,7 @@ from torch.nn import functional as F
 from openant_agents.runs import CurvePoint, Run, load_checkpoint, read_facts
 from openant_agents.training import CHECKPOINT_EVERY_S, REPORT_EVERY_S, Progress, event_writer, stop_on_signal
 from openant_env.metrics import AverageReward
-from openant_tools.errors import BadInput
+from openant_tools.errors import BadInput, HardwareFault
 
 __all__ = [
     "Actor", "Critics", "Progress", "Replay", "Sac", "Settings", "device_of", "finite_or_raise", "load_policy", "run_facts",
@@ -244,6 +244,7 @@ class Sac:
         self.entropy_optimiser = _adam([self.log_alpha], settings.entropy_step)
         self.replay = Replay(observations, actions, settings.buffer)
         self.updates = 0
+        self._critic_loss = torch.zeros(())
 
     def random_action(self) -> Array:
         """(actions,), uniform in −1…1."""
@@ -278,6 +279,7 @@ class Sac:
             target = settings.reward_scale * reward * dt + discount * value
         first, second = self.critics(observation_action)
         critic_loss = F.mse_loss(first, target) + F.mse_loss(second, target)
+        self._critic_loss = critic_loss.detach()
         self.critic_optimiser.zero_grad()
         critic_loss.backward()  # type: ignore[no-untyped-call]
         self.critic_optimiser.step()
@@ -305,16 +307,16 @@ class Sac:
         self.entropy_optimiser.step()
 
     def sound_or_raise(self, folder: Path) -> None:
-        """Refuse to go on with weights that are no numbers; the last checkpoint has others.
+        """Refuse to go on with what has come apart; the last checkpoint has not.
 
         Raises:
-            BadInput: something in it has come apart.
+            BadInput: weights or the critics' loss are no finite numbers any more.
         """
         with torch.no_grad():
             total = sum(weight.square().sum() for weight in self._actor_weights) + self.log_alpha.exp()
-        if not torch.isfinite(total):
+        if not torch.isfinite(total + self._critic_loss.to(self.device)):
             raise BadInput(
-                f"the agent's weights are no numbers any more after {self.updates} updates",
+                f"weights or losses are no finite numbers any more after {self.updates} updates",
                 where=folder,
                 remedy="the last checkpoint is sound; look at rewards and observations in transitions.f32",
             )
@@ -415,6 +417,7 @@ def train(
 
     Raises:
         BadInput: the folder holds another run, the environment does not suit, or a number that is none came up.
+        HardwareFault: the robot cannot go on; the run is saved.
         KeyboardInterrupt: asked for by SIGINT or SIGTERM; the run is saved and goes on with the same call.
     """
     settings = settings or Settings()
@@ -465,6 +468,7 @@ def _train(
 
     def save() -> None:
         nonlocal saved, last_save
+        agent.sound_or_raise(run.folder)
         get_state = getattr(env.unwrapped, "get_state", None)
         state = {
             "step": step, "seconds": seconds, "agent": agent.get_state(), "average": average.get_state(),
@@ -481,7 +485,11 @@ def _train(
     while step < steps and not stop.is_set():
         random = step < settings.learning_start
         action = agent.random_action() if random else agent.act(observation)
-        next_observation, reward, terminated, truncated, info = env.step(action)
+        try:
+            next_observation, reward, terminated, truncated, info = env.step(action)
+        except HardwareFault:
+            save()  # what was learned until the robot could not go on
+            raise
         reward = float(reward)
         finite_or_raise(next_observation, reward, step, run.folder)
         dt = float(info.get("dt", 1.0))
@@ -495,7 +503,11 @@ def _train(
             reason = str(info.get("reason", "the episode ended"))
             helped[reason] += 1
             run.add_intervention(step, seconds, reason)
-            observation, _ = env.reset()
+            try:
+                observation, _ = env.reset()
+            except HardwareFault:
+                save()
+                raise
         if step > settings.learning_start:
             agent.update()
         if step % CURVE_EVERY == 0:

@@ -1,0 +1,175 @@
+"""SAC that learns beside acting: what either half leaves behind when it is killed, and what a robot's troubles do to it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from openant_agents import beside  # noqa: E402
+from openant_agents.beside import train_beside  # noqa: E402
+from openant_agents.interventions import read_interventions  # noqa: E402
+from openant_agents.learner import SharedWeights  # noqa: E402
+from openant_agents.runs import load_checkpoint, read_curve  # noqa: E402
+from openant_agents.sac import Replay, Settings, load_policy, train  # noqa: E402
+from openant_tools.errors import BadInput, HardwareFault  # noqa: E402
+
+torch.set_num_threads(1)
+SMALL = Settings(learning_start=20, batch=16, hidden=16)
+WIDTH = Replay(1, 1, 1).width
+
+
+class Robot(gymnasium.Env):
+    """A point that takes its time, is stopped at some steps, and then needs help."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, step_s: float = 2e-3, stopped_at: tuple[int, ...] = (), nan_at: int = -1) -> None:
+        self.x, self.taken, self.step_s, self.stopped_at, self.nan_at = 0.0, 0, step_s, stopped_at, nan_at
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.array([self.x], np.float32), {}
+
+    def step(self, action):
+        time.sleep(self.step_s)
+        self.taken += 1
+        stopped = self.taken in self.stopped_at
+        before = abs(self.x - 0.5)
+        self.x = self.x if stopped else float(np.clip(self.x + 0.3 * action[0], -2.0, 2.0))
+        info = {"dt": 0.1, "overruns": 3} | ({"reason": "the cable came off", "void": True} if stopped else {})
+        seen = np.nan if self.taken == self.nan_at else self.x
+        return np.array([seen], np.float32), before - abs(self.x - 0.5), False, stopped, info
+
+
+def rows(folder: Path) -> np.ndarray:
+    return np.fromfile(folder / "transitions.f32", np.float32).reshape(-1, WIDTH)
+
+
+def test_it_learns_beside_acting_and_goes_on_with_every_transition(tmp_path):
+    said = []
+    done = train_beside(Robot(stopped_at=(31,)), folder=tmp_path, steps=120, seed=0, settings=SMALL, report=said.append)
+    assert done.step == 120
+    assert done.robot_seconds == pytest.approx(12.0)
+    assert done.helped == {"the cable came off": 1}
+    assert done.late == 3
+    assert done.updates is not None
+    assert done.updates > 0
+    assert said[-1] == done
+    assert len(rows(tmp_path)) == 120  # the step that was stopped is none of them
+    assert [(one.step, one.reason) for one in read_interventions(tmp_path)] == [(30, "the cable came off")]
+    assert [point.step for point in read_curve(tmp_path)] == [100]
+    checkpoint = load_checkpoint(tmp_path)
+    assert checkpoint["transitions"] == 120
+    assert checkpoint["agent"]["updates"] <= 100  # one for each transition after the start
+
+    before = rows(tmp_path)
+    with (tmp_path / "transitions.f32").open("ab") as stream:
+        stream.write(b"half a row")
+    more = train_beside(Robot(), folder=tmp_path, steps=150, seed=0, settings=SMALL)
+    assert more.step == 150
+    assert more.robot_seconds == pytest.approx(15.0)
+    assert more.helped == {"the cable came off": 1}
+    np.testing.assert_array_equal(rows(tmp_path)[:120], before)
+    assert more.updates >= checkpoint["agent"]["updates"]
+    agent, step = load_policy(tmp_path, Robot())
+    assert step == 150
+    assert np.isfinite(agent.act(np.zeros(1, np.float32))).all()
+    with pytest.raises(BadInput, match="this folder holds another run: it differs in learning"):
+        train(Robot(), folder=tmp_path, steps=200, seed=0, settings=SMALL)
+
+
+def test_kill_9_loses_no_transition(tmp_path):
+    code = f"""
+        import sys
+        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        from pathlib import Path
+        from test_beside import Robot, SMALL, train_beside
+        train_beside(Robot(5e-3), folder=Path({str(tmp_path)!r}), steps=100_000, seed=0, settings=SMALL)
+    """
+    with subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)]) as process:
+        give_up = time.monotonic() + 120
+        while not (tmp_path / "transitions.f32").is_file() or len(rows_so_far(tmp_path)) < 60:
+            assert process.poll() is None
+            assert time.monotonic() < give_up
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    made = len(rows_so_far(tmp_path))
+    wait_for_the_learner(tmp_path)  # it finds nobody there, saves and goes
+    assert load_checkpoint(tmp_path)["transitions"] == made
+    done = train_beside(Robot(), folder=tmp_path, steps=made + 5, seed=0, settings=SMALL)
+    assert done.step == made + 5
+    assert done.robot_seconds == pytest.approx(0.1 * (made + 5))
+
+
+def rows_so_far(folder: Path) -> np.ndarray:
+    data = (folder / "transitions.f32").read_bytes()
+    return np.frombuffer(data[: len(data) // (4 * WIDTH) * 4 * WIDTH], np.float32).reshape(-1, WIDTH)
+
+
+def wait_for_the_learner(folder: Path) -> None:
+    give_up = time.monotonic() + 60
+    while not (folder / "checkpoint.pt").is_file():
+        assert time.monotonic() < give_up
+        time.sleep(0.05)
+
+
+def test_a_learner_that_dies_is_told_and_the_same_call_goes_on(tmp_path, monkeypatch):
+    class Fatal(Robot):
+        def step(self, action):
+            if self.taken == 40:
+                [process] = started
+                os.kill(process.pid, signal.SIGKILL)
+                process.wait()
+            return super().step(action)
+
+    started = []
+    popen = subprocess.Popen
+
+    def remember(*arguments, **options):
+        started.append(popen(*arguments, **options))
+        return started[-1]
+
+    monkeypatch.setattr(beside.subprocess, "Popen", remember)
+    with pytest.raises(HardwareFault, match=r"the learner has died \(exit status -9\) → repeat the command"):
+        train_beside(Fatal(), folder=tmp_path, steps=200, seed=0, settings=SMALL)
+    assert len(rows(tmp_path)) >= 40
+    monkeypatch.undo()
+    assert train_beside(Robot(), folder=tmp_path, steps=60, seed=0, settings=SMALL).step == 60
+
+
+def test_nothing_is_learned_from_what_is_no_number(tmp_path):
+    with pytest.raises(BadInput, match="step 24 gave a reward or an observation that is no number"):
+        train_beside(Robot(nan_at=25), folder=tmp_path / "a", steps=60, seed=0, settings=SMALL)
+    assert np.isfinite(rows(tmp_path / "a")).all()
+    assert load_checkpoint(tmp_path / "a")["transitions"] == 24
+    huge = Settings(learning_start=20, batch=16, hidden=16, reward_scale=1e38)
+    with pytest.raises(BadInput, match="weights or losses are no finite numbers any more"):
+        train_beside(Robot(2e-2), folder=tmp_path / "b", steps=3000, seed=0, settings=huge)
+    with pytest.raises(BadInput, match="weights or losses are no finite numbers any more"):
+        train(Robot(0.0), folder=tmp_path / "c", steps=200, seed=0, settings=huge)
+
+
+def test_shared_weights_come_whole():
+    ours = SharedWeights(1000)
+    theirs = SharedWeights(1000, os.dup(ours.fd))
+    out = np.zeros(1000, np.float32)
+    for k in range(1, 5):
+        ours.publish(np.full(1000, k, np.float32), updates=10 * k)
+        assert theirs.take(out) == k
+        assert (out == k).all()
+        assert theirs.updates == 10 * k
+    ours.close()
+    theirs.close()
