@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from openant_tools.cli.learning import LearningBar, need_torch, robot_argument
+from openant_tools.cli.learning import LearningBar, need_torch, robot_argument, settings_of, settings_option
 from openant_tools.cli.options import json_option, robot_option
 from openant_tools.cli.train_sarsa import sarsa
 from openant_tools.cli.walking import (
@@ -52,13 +52,13 @@ def train() -> None:
 @click.option("--action-range", metavar="NAME", help="paper, platform, sac, sarsa or limits. Default: the robot's.")
 @click.option("--effects/--no-effects", default=True, help="Whether the robot's [[effect]] entries act.  [default: on]")
 @click.option(
-    "--learning-start", type=click.IntRange(min=1), default=2_000, show_default=True,
-    help="Steps with random actions before learning.",
-)  # fmt: skip
+    "--learning-start", type=click.IntRange(min=1), help="Steps with random actions before learning.  [default: 2000]"
+)
 @click.option(
-    "--entropy-start", type=click.FloatRange(min=0.0, min_open=True), default=1.0, show_default=True, metavar="ALPHA",
-    help="Weight of the entropy at first; 0.1 explores less and walks sooner.",
+    "--entropy-start", type=click.FloatRange(min=0.0, min_open=True), metavar="ALPHA",
+    help="Weight of the entropy at first; 0.1 explores less and walks sooner.  [default: 1]",
 )  # fmt: skip
+@settings_option
 @click.option(
     "--learn", "learn", type=click.Choice(["between", "beside"]),
     help="Updates between the steps, reproducibly, or beside them in a process of their own, so that acting never waits.  "
@@ -85,8 +85,9 @@ def sac(
     dt: float | None,
     action_range: str | None,
     effects: bool,
-    learning_start: int,
-    entropy_start: float,
+    learning_start: int | None,
+    entropy_start: float | None,
+    settings_file: Path | None,
     learn: str | None,
     updates_per_step: float,
     device: str,
@@ -125,11 +126,12 @@ def sac(
     if hardware:
         may_move(options, yes)
     name = HARDWARE_ID if hardware else SIMULATED_ID
-    settings = Settings(learning_start=learning_start, entropy_start=entropy_start)
+    given = {"learning_start": learning_start, "entropy_start": entropy_start}
+    settings = settings_of(Settings, settings_file, "sac", given)
     more: dict[str, Any] = {"updates_per_step": updates_per_step} if learn == "beside" else {}
     with environment(name, options, out / "recordings") as env:
         try:
-            with LearningBar(steps) as bar:
+            with LearningBar(steps, out) as bar:
                 result = (train_beside if learn == "beside" else train_sac)(
                     env,
                     folder=out,

@@ -1,0 +1,118 @@
+"""SAC on the virtual robot, through the bus, in real time: python benchmarks/robot_learning.py [--minutes 10]
+
+A third of the way the servos' bus is unplugged for five seconds; at two thirds training is killed (`kill -9`) and begun again
+with the same command. At the end every step's period, measured from command to command in the recordings' own stamps, is
+compared with what the run said of itself: a missed deadline that was not reported is a failure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from openant_tools.comms.clock import VirtualControl
+from openant_tools.recording.reader import read_recording
+from openant_tools.robot.config import Provenance
+from openant_tools.robot.folder import create_robot
+
+DT_S = 0.12
+UNPLUGGED_S = 5.0
+#: share of an engine's cycle of 10 ms by which a period may be too long (openant_env.hardware)
+LATE_S = 0.005
+
+
+def rows(run: Path) -> int:
+    log = run / "transitions.f32"
+    return log.stat().st_size // (59 * 4) if log.is_file() else 0
+
+
+def wait_for(run: Path, steps: int, process: subprocess.Popen[bytes]) -> None:
+    while rows(run) < steps:
+        if process.poll() is not None:
+            sys.exit(f"training ended with status {process.returncode} at step {rows(run)} of {steps}")
+        time.sleep(0.05)
+
+
+def periods(recordings: Path) -> np.ndarray:
+    """s between changes of the commands in every recording: each action of chance or policy is another command."""
+    found = []
+    for path in sorted(recordings.glob("*.mcap")):
+        run = read_recording(path).run
+        command, t = run.signal("cmd"), run.column("cmd_t")
+        known = np.isfinite(command).all(axis=1) & np.isfinite(t)
+        command, t = command[known], t[known]
+        changed = np.flatnonzero((np.diff(command, axis=0) != 0.0).any(axis=1)) + 1
+        found.append(np.diff(t[changed]))
+    gaps = np.concatenate(found)
+    return gaps[(gaps > 0.6 * DT_S) & (gaps < 3.0)]  # without ramps, and without waiting for help
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    steps = round(options.minutes * 60 / DT_S)
+    with tempfile.TemporaryDirectory(prefix="robot-learning-") as name:
+        folder = Path(name)
+        robot = create_robot(
+            folder / "ant",
+            values={"camera.body_tag_id": 12},
+            provenance={"motors": Provenance("measured", "benchmark")},
+        )
+        scenario, ready, run = folder / "floor.toml", folder / "ready.json", folder / "run"
+        scenario.write_text('[robot]\nsetup = "floor"\n[clock]\nmode = "real"\n')
+        start = [sys.executable, "-m", "openant_tools.cli"]
+        virtual = subprocess.Popen([*start, "virtual", "start", "--scenario", scenario, "--ready-file", ready])
+        try:
+            while not ready.is_file():
+                time.sleep(0.05)
+            control = VirtualControl(json.loads(ready.read_text())["control"])
+            train = [
+                *start, "train", "sac", "--env", "hardware", "--robot", robot.path, "--virtual", ready, "--yes",
+                "--steps", str(steps), "--learning-start", str(min(500, steps // 6)), "--out", run,
+                "--json", folder / "result.json",
+            ]  # fmt: skip
+            began = time.monotonic()
+            process = subprocess.Popen(train)
+            wait_for(run, steps // 3, process)
+            control.ask("fault", cause="usb_unplug", on=True)
+            time.sleep(UNPLUGGED_S)
+            control.ask("fault", cause="usb_unplug", on=False)
+            wait_for(run, 2 * steps // 3, process)
+            os.kill(process.pid, signal.SIGKILL)
+            process.wait()
+            kept = rows(run)
+            process = subprocess.Popen(train)
+            if process.wait() != 0:
+                sys.exit(f"training ended with status {process.returncode}")
+            took = time.monotonic() - began
+        finally:
+            virtual.terminate()
+            virtual.wait()
+        measured = periods(run / "recordings")
+        late = int((measured > DT_S + LATE_S).sum())
+        result = json.loads((folder / "result.json").read_text())
+        interventions = (run / "interventions.csv").read_text().splitlines()[1:]
+        answer = {
+            "steps": rows(run), "steps_at_kill": kept, "robot_minutes": result["seconds"] / 60, "wall_minutes": took / 60,
+            "updates": result["updates"], "late_steps_in_recordings": late, "late_steps_reported_since_kill": result["late"],
+            "period_median_s": float(np.median(measured)), "period_p99_s": float(np.quantile(measured, 0.99)),
+            "interventions": interventions, "load_average": os.getloadavg()[0],
+        }  # fmt: skip
+        print(json.dumps(answer, indent=2))
+        if options.json is not None:
+            options.json.write_text(json.dumps(answer, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
