@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
 from builder import robot
 from hypothesis import given
 from hypothesis import strategies as st
+from test_camera import TILTS, board_views
 
+from openant_tools.calib import arena as arena_step
 from openant_tools.calib.arena import LYING_M, STANDING_M, arena, judge_sizes
 from openant_tools.calib.bounds import Unwrapped
 from openant_tools.calib.centre import centre
@@ -24,10 +29,13 @@ from openant_tools.calib.legs import legs
 from openant_tools.calib.undo import undo
 from openant_tools.calib.zeros import straight, torso_answer, zeros
 from openant_tools.comms.body_imu import rotation
+from openant_tools.comms.camera import CameraInfo
+from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import Journal
-from openant_tools.procedure.step import Declined, Event, Hands, Intent, Progress, drive
+from openant_tools.procedure.step import Ask, Bench, Declined, Event, Hands, Intent, Progress, drive
 from openant_tools.robot.config import Camera
+from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
 
 LOOSE = {"robot": {"setup": "loose"}}
@@ -438,6 +446,50 @@ def test_without_a_camera_the_arena_says_what_is_missing(tmp_path):
         finding, _ = ant.do(arena(replace(ant.bench, camera=None)))
         assert finding.ok
         assert "no camera → floor experiments on the robot need one" in finding.problems
+
+
+class ShownBoard:
+    """A camera before which somebody turns a printed board, each view for several pictures."""
+
+    views: ClassVar[list[np.ndarray]] = []
+
+    def __init__(self, settings: object, clock: object) -> None:
+        self.shown = 0
+
+    def open(self) -> CameraInfo:
+        height, width = self.views[0].shape
+        return SimpleNamespace(width=width, height=height, notes=())  # type: ignore[return-value]
+
+    def wait(self, deadline: float) -> SimpleNamespace:
+        self.shown += 1
+        return SimpleNamespace(image=self.views[self.shown // 2 % len(self.views)])
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_board_before_the_camera_gives_the_lens_in_the_arena_step(tmp_path, monkeypatch):
+    truth, ticks = Intrinsics(800, 600, 780, 776, 405, 296), itertools.count()
+    monkeypatch.setattr(arena_step, "Camera", ShownBoard)
+    monkeypatch.setattr(arena_step, "_clock", lambda bench: SimpleNamespace(now=lambda: 0.1 * next(ticks)))
+    bench = Bench(create_robot(tmp_path / "ant"), camera="0")
+
+    class Shower:
+        """Calibrates, and has printed the board."""
+
+        def answer(self, event: Event):
+            return "yes" if isinstance(event, Ask) else True if isinstance(event, Hands) else None
+
+    ShownBoard.views = board_views(truth, CharucoBoard(), TILTS)
+    _, lens, _, odd = drive(arena_step._look(bench, bench.folder.config(), "0"), Shower())
+    assert odd == []
+    assert (lens.source, lens.fx) == ("ChArUco board", pytest.approx(780, rel=0.01))
+    assert (bench.folder.path / "charuco-board.png").is_file()
+    monkeypatch.setattr(arena_step, "VIEW_S", 1.0)
+    ShownBoard.views = board_views(truth, CharucoBoard(), [(0.0, 0.0)])
+    _, lens, _, odd = drive(arena_step._look(bench, bench.folder.config(), "0"), Shower())
+    assert "only 1 different views of the board were seen; the declared field of view is used" in odd[0]
+    assert lens.source != "ChArUco board"
 
 
 @pytest.mark.slow

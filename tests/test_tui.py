@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -609,12 +610,40 @@ def test_ctrl_c_leaves_with_130_and_nothing_running(robot: RobotFolder, loose: M
     assert not any(torques(loose))
 
 
+def test_training_on_the_robot_asks_before_it_moves_and_the_stop_key_reaches_it(
+    robot: RobotFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = list[str]()
+    monkeypatch.setattr(Training, "start", lambda self: told.append(f"start {self.where}"))
+    monkeypatch.setattr(Training, "running", property(lambda self: "stop" not in told))
+    monkeypatch.setattr(Training, "stop", lambda self: told.append("stop"))
+
+    async def look() -> None:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(120, 40)) as pilot:
+            await _go(pilot, "learn")
+            for answer in ("down", "enter"):
+                chooser = app.screen.query_one("#choices", Choices)
+                chooser.highlighted = next(k for k, line in enumerate(chooser.options) if line.id == "sac robot")
+                await pilot.press("enter")
+                assert "inside the circle, facing its reward" in screen_text(app)
+                await pilot.press(*(["down"] if answer == "down" else []), "enter")
+                assert told == ([] if answer == "down" else ["start robot"])
+            await pilot.press("space")
+            assert told == ["start robot", "stop"]
+
+    asyncio.run(look())
+
+
 def test_training_is_the_command_that_one_would_type(robot: RobotFolder) -> None:
     training = Training("sac", robot.path, 2000, 1, robot.runs / "sac-1")
     assert (
         training.command == f"openant train sac --robot {robot.path} --steps 2000 --seed 1 --out {robot.runs / 'sac-1'}"
     )
     assert read_curve(robot.runs / "sac-1") == []
+    real = replace(training, where="robot")
+    assert real.command == f"{training.command} --env hardware --yes"
+    assert replace(training, where="virtual").command == f"{real.command} --virtual"
     training.folder.mkdir(parents=True)
     (training.folder / "learning_curve.csv").write_text("step,seconds,average_reward_m_s\n100,12.0,0.01\n200,2")
     assert [point.step for point in read_curve(training.folder)] == [100]

@@ -69,10 +69,8 @@ def passport(folder: RobotFolder) -> Report:
         if after is not None:
             figures.append(KeyFigure("simulation is off by", f"{1e3 * after:.1f} mrad", "joint positions, 0.5 s ahead"))
     comms = states["comms"].finding
-    if comms is not None:
-        figures.append(
-            KeyFigure("bus", f"{comms.data.get('rate_hz', math.nan):.0f} cycles/s", "write and read of all servos")
-        )
+    if comms is not None and "rate_hz" in comms.data:
+        figures.append(KeyFigure("bus", f"{comms.data['rate_hz']:.0f} cycles/s", "write and read of all servos"))
     report.key_figures(*figures)
     report.table(
         ["step", "stands", "when (UTC)", "what was found"],

@@ -13,6 +13,7 @@ from collections.abc import Generator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,8 +29,9 @@ from openant_tools.comms.latency import camera_latency
 from openant_tools.comms.setup import camera_of_robot
 from openant_tools.comms.tags import TagDetector, tag_pose
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.files import write_bytes
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.step import Answer, Ask, Bench, Event, Hands, Intent, Procedure, Progress, Say
+from openant_tools.procedure.step import Answer, Ask, Bench, Event, Hands, Intent, Look, Procedure, Progress, Say
 from openant_tools.recording.reader import Recording, read_recording
 from openant_tools.recording.run import Facts
 from openant_tools.robot.config import Camera as CameraFacts
@@ -57,6 +59,8 @@ LATE_S = 0.008
 TURNED_SHARE = 0.3
 #: Views of a ChArUco board, and the longest wait for the next one that differs, s.
 VIEWS, VIEW_S = 10, 60.0
+#: Share of the picture's width by which a view must differ from all before it.
+NEW_VIEW = 0.03
 #: as `calibrate` calls its source
 BOARD = "ChArUco board"
 FOV_WORDS = "the declared field of view is good to a few mm near the picture's middle, 10 to 20 mm in height"
@@ -262,7 +266,7 @@ def _look(
     camera = Camera(CameraSettings(where, exposure=config.camera.exposure, focus=config.camera.focus), clock)
     try:
         info = camera.open()
-        lens, words = yield from _lens(camera, clock, config, where, info.width, info.height)
+        lens, words = yield from _lens(camera, clock, bench, config, where, info)
         detector, corners = TagDetector(config.camera.tag_family), dict[int, list[Array]]()
         for _ in range(PICTURES):
             frame = camera.wait(clock.now() + 2.0)
@@ -277,8 +281,10 @@ def _look(
 
 
 def _lens(
-    camera: Camera, clock: Clock, config: RobotConfig, where: str | int, width: int, height: int
+    camera: Camera, clock: Clock, bench: Bench, config: RobotConfig, where: str | int, info: CameraInfo
 ) -> Generator[Event, Answer, tuple[Intrinsics, list[str]]]:
+    """The lens: as robot.toml has it, from views of a board, or from the declared field of view; and what is odd."""
+    width, height = info.width, info.height
     known = camera_of_robot(
         replace(config, camera=replace(config.camera, body_tag_id=max(config.camera.body_tag_id, 1))), where
     )
@@ -290,25 +296,45 @@ def _lens(
     )
     if choice != "yes":
         return declared, []
-    board, pictures, last = CharucoBoard(), list[NDArray[np.uint8]](), None
-    yield Hands(
-        f"Show the board to the camera in {VIEWS} ways: tilted 30° and more, in every corner of the picture.",
-        "free",
-        while_watching=True,
+    board = CharucoBoard()
+    sheet = bench.folder.path / "charuco-board.png"
+    write_bytes(sheet, cv2.imencode(".png", board.image())[1].tobytes())
+    yield Look(
+        f"The board to print and glue to something flat: its squares must measure {1e3 * board.square_m:.0f} mm.",
+        picture=sheet,
     )
+    yield Hands("Have the printed board at hand.", "free")
+    yield Say(f"show the board in {VIEWS} ways: tilted 30° and more, in every corner of the picture", "info")
+    pictures = yield from _board_views(camera, clock, board)
+    try:
+        if len(pictures) < VIEWS:
+            raise BadInput(f"only {len(pictures)} different views of the board were seen")
+        return calibrate(pictures, board), []
+    except BadInput as error:
+        return declared, [f"lens: {error}; the declared field of view is used"]
+
+
+def _board_views(
+    camera: Camera, clock: Clock, board: CharucoBoard
+) -> Generator[Event, Answer, list[NDArray[np.uint8]]]:
+    """Pictures (h, w) of the board in `VIEWS` places and tilts; fewer where no new one comes for `VIEW_S`."""
+    pictures, seen = list[NDArray[np.uint8]](), list[Array]()
     give_up = clock.now() + VIEW_S
     while len(pictures) < VIEWS and clock.now() < give_up:
         frame = camera.wait(clock.now() + 2.0)
         gray = np.asarray(frame.image.mean(axis=2) if frame.image.ndim == 3 else frame.image, np.uint8)
         found = board.corners(gray)
-        if found is None or (last is not None and abs(found[0].mean(axis=0) - last).max() < 0.05 * width):
+        if found is None:
             continue
-        last, give_up = found[0].mean(axis=0), clock.now() + VIEW_S
+        # Where the board is in the picture, and how large it looks along both axes, which a tilt changes.
+        view = np.concatenate([found[1].mean(axis=0), 3 * found[1].std(axis=0)])
+        if any(np.abs(view - other).max() < NEW_VIEW * gray.shape[1] for other in seen):
+            continue
+        seen.append(view)
         pictures.append(gray)
+        give_up = clock.now() + VIEW_S
         yield Progress(len(pictures) / VIEWS, f"view {len(pictures)} of {VIEWS}")
-    if len(pictures) < VIEWS:
-        return declared, [f"only {len(pictures)} views of the board were seen → the declared field of view is used"]
-    return calibrate(pictures, board), []
+    return pictures
 
 
 def _path(bench: Bench) -> Path:

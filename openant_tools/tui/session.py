@@ -161,8 +161,15 @@ class Session:
         return replace(config, registers={})
 
     def release(self) -> int:
-        """The stop key: torque off everywhere, now, from any thread; how many were told."""
-        return release_all()
+        """The stop key: torque off everywhere, now, from any thread; how many were told.
+
+        Training on the robot has an engine in its own process: it is told as Ctrl-C tells it, and saves.
+        """
+        told = release_all()
+        if self.training is not None and self.training.where != "sim" and self.training.running:
+            self.training.stop()
+            told += 1
+        return told
 
     # ---- what the screens draw -----------------------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 __all__ = ["AGENTS", "CurvePoint", "Training", "read_curve"]
 
@@ -38,6 +39,7 @@ class Training:
         agent: as in `AGENTS`.
         robot: the robot's folder.
         folder: of the run; one that stands there goes on.
+        where: in the robot's simulation, on the robot itself, or on a virtual robot (started for it, on its floor).
     """
 
     agent: str
@@ -45,6 +47,7 @@ class Training:
     steps: int
     seed: int
     folder: Path
+    where: Literal["sim", "robot", "virtual"] = "sim"
 
     def __post_init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
@@ -56,6 +59,9 @@ class Training:
         return (
             *("train", self.agent, "--robot", str(self.robot), "--steps", str(self.steps)),
             *("--seed", str(self.seed), "--out", str(self.folder)),
+            # Who starts it on the screen has said there that the robot may move.
+            *(() if self.where == "sim" else ("--env", "hardware", "--yes")),
+            *(("--virtual",) if self.where == "virtual" else ()),
         )
 
     @property

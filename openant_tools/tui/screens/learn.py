@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from rich.text import Text
@@ -13,6 +14,7 @@ from textual.widgets.option_list import Option
 
 from openant_tools.tui.braille import trace
 from openant_tools.tui.choices import Choices
+from openant_tools.tui.dialogs import Question
 from openant_tools.tui.marks import BLUE, marked, plain
 from openant_tools.tui.page import Page
 from openant_tools.tui.training import AGENTS, Training, read_curve
@@ -20,6 +22,12 @@ from openant_tools.tui.training import AGENTS, Training, read_curve
 __all__ = ["LearnScreen"]
 
 REFRESH_S = 1.0
+ON_ROBOT = " robot"
+#: the paper's list for the start of an experiment
+BEFORE = (
+    "The robot moves, for as long as it trains. Is it on the floor, inside the circle, facing its reward, its cables outside "
+    "the circle and untangled?"
+)
 _WORDS = {"sac": "soft actor-critic, as in the paper", "sarsa": "SARSA(lambda) with tile coding, as in the paper"}
 
 
@@ -30,8 +38,10 @@ class LearnScreen(Page):
     HELP = """\
 # Learn
 
-Choose an agent: it trains in the simulation of this robot, in a process of its own, with the command that stands on the
-screen. You may leave this screen meanwhile. Stopping saves; the same command, or the same choice, goes on from there.
+Choose an agent and where it trains: in the simulation of this robot, or on the robot itself, on its floor under the camera
+(on a virtual robot where one is in use: one of its own, in stepped time). It is a process of its own, with the command that
+stands on the screen. You may leave this screen meanwhile. Stopping saves; the same choice goes on from there. `Space` stops
+training on the robot, too, with torque off.
 
 The curve is the average reward over the last 120 s of robot time, in cm/s: how fast it walks where it should.
 """
@@ -47,7 +57,8 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
                 yield Input("0", type="integer", id="seed")
                 yield Label("of its chance; each has a run of its own", classes="after")
             yield Choices(
-                *(Option(f"Train {name}: {_WORDS[name]}", id=name) for name in AGENTS),
+                *(Option(f"Train {name} in simulation: {_WORDS[name]}", id=name) for name in AGENTS),
+                *(Option(f"Train {name} on the robot: it moves", id=f"{name}{ON_ROBOT}") for name in AGENTS),
                 Option("Stop and save", id="stop"),
                 id="choices",
             )
@@ -68,12 +79,26 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
         if event.option_id == "stop":
             if self.session.training is not None:
                 self.session.training.stop()
+        elif event.option_id is not None and event.option_id.endswith(ON_ROBOT):
+            self._ask_robot(event.option_id.removesuffix(ON_ROBOT))
         elif event.option_id is not None:
             self.start(event.option_id)
         self.draw_progress()
 
-    def start(self, agent: str) -> None:
-        """Train, or go on with the run of the same agent and seed."""
+    def _ask_robot(self, agent: str) -> None:
+        """What moves the robot asks first; the bus has one master, so who watches gives it free."""
+        if self.session.virtual is not None:
+            self.start(agent, "virtual")
+            return
+
+        def answered(choice: int | None) -> None:
+            if choice == 0:
+                self.ant.free_bus(lambda: self.start(agent, "robot"))
+
+        self.app.push_screen(Question(BEFORE, "Yes, train", "No"), answered)
+
+    def start(self, agent: str, where: Literal["sim", "robot", "virtual"] = "sim") -> None:
+        """Train, or go on with the run of the same agent, place and seed."""
         folder = self.session.folder
         progress = self.query_one("#progress", Static)
         if folder is None:
@@ -86,10 +111,11 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
         if not steps.isdigit() or int(steps) < 1 or not seed.isdigit():
             progress.update(marked("fail", "steps and seed are whole numbers"))
             return
-        out = folder.runs / f"{agent}-{seed}"
-        training = Training(agent, folder.path, int(steps), int(seed), out)
+        out = folder.runs / (f"{agent}-{seed}" if where == "sim" else f"{agent}-{where}-{seed}")
+        training = Training(agent, folder.path, int(steps), int(seed), out, where)
         training.start()
         self.session.training = training
+        self.draw_progress()
 
     def draw_progress(self) -> None:
         """From the files of the run."""

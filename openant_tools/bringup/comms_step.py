@@ -1,0 +1,57 @@
+"""Comms health as a step: what the bus can, measured with torque off; then what it loses while the legs swing, and why."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from openant_tools.bringup.relay import relayed
+from openant_tools.calib.comms_health import comms_health
+from openant_tools.calib.wires import engine_config
+from openant_tools.comms.dropouts.diagnose import diagnose_dropouts
+from openant_tools.comms.dropouts.outcome import dropouts_finding
+from openant_tools.comms.soak import soak
+from openant_tools.procedure.step import Ask, Bench, Intent, Procedure
+from openant_tools.recording.tables import read_run
+
+__all__ = ["comms_step"]
+
+COMMAND = "openant calib comms"
+#: Long enough for every joint to swing to both sides and back, and to rest; an hour finds what is rare.
+DEFAULT_MIN, LONGEST_MIN = 1.0, 600.0
+
+
+def comms_step(bench: Bench) -> Procedure:
+    """Measure, soak, diagnose; one finding of both.
+
+    Raises:
+        HardwareFault: not all servos answer.
+    """
+    still = yield from comms_health(bench)
+    minutes = yield Ask(
+        "Now watch the bus while the legs swing. For how long? (0: not at all; an hour finds what is rare)",
+        unit="min", default=DEFAULT_MIN, low=0.0, high=LONGEST_MIN,
+    )  # fmt: skip
+    minutes = float(minutes) if isinstance(minutes, int | float) else DEFAULT_MIN
+    if minutes == 0.0:
+        return still
+    yield Intent(f"swing all legs gently on the stand for {minutes:g} min, and keep what the bus loses", moves=True)
+    path = bench.folder.recordings / "comms-soak.mcap"
+    path.unlink(missing_ok=True)
+    config, text = engine_config(bench), bench.folder.config_file.read_text(encoding="utf-8")
+    yield from relayed(
+        lambda progress, notice: soak(
+            config, path, 60 * minutes, robot_toml=text, notice=notice,
+            progress=lambda share, statistics: progress("the legs swing", share),
+        )
+    )  # fmt: skip
+    told = yield from relayed(lambda progress, notice: diagnose_dropouts([read_run(path, need=())]))
+    moving = dropouts_finding(told, [bench.folder.relative(path)], COMMAND)
+    return replace(
+        still,
+        ok=still.ok and moving.ok,
+        what=f"{still.what}; while it moved: {moving.what}",
+        evidence=(*still.evidence, *moving.evidence),
+        problems=(*still.problems, *moving.problems),
+        next_action="; ".join(words for words in (moving.next_action, still.next_action) if words),
+        data={**still.data, **moving.data},
+    )

@@ -1,0 +1,301 @@
+"""The walk by the screens of the terminal program, from loose motors; and the mistakes that builders make on the way."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from walker import AGAIN, BY_ITSELF, Reply, Walker
+
+from openant_tools.bringup import identification
+from openant_tools.bringup.walk import WALK, standing
+from openant_tools.calib import arena, legs, motions
+from openant_tools.comms.clock import VirtualControl
+from openant_tools.procedure.journal import Journal
+from openant_tools.robot.folder import RobotFolder, create_robot
+from openant_tools.robot.joints import JOINT_NAMES, JOINTS
+from openant_tools.tui.app import OpenAnt
+from openant_tools.tui.screens.walk import WalkScreen
+from openant_tools.virtual.process import virtual_robot
+
+WIDE = (120, 40)
+#: pictures small enough that a test need not wait for them
+CAMERA = "[camera]\nwidth = 640\nheight = 480\nfps = 15\n"
+BLIND = "[camera]\npresent = false\n"
+
+
+@dataclass
+class Robot:
+    """A virtual robot in stepped time, in a process of its own, and the folder that its builder keeps."""
+
+    folder: RobotFolder
+    addresses: Mapping[str, str | None]
+    memory: Path
+
+    def __post_init__(self) -> None:
+        self.remote = VirtualControl(str(self.addresses["control"]))
+
+    def torque(self) -> list[bool]:
+        return [bool(on) for on in self.remote.ask("state")["torque_enable"].values()]
+
+    def ids(self) -> dict[str, int]:
+        return dict(self.remote.ask("state")["id"])
+
+    def truth(self) -> object:
+        """What nobody may change unasked: torque, and the permanent memory of every servo."""
+        return self.torque(), self.memory.read_text() if self.memory.is_file() else ""
+
+    def walk(self, steps: Callable[[Walker], Awaitable[None]], replies: Mapping[str, Reply] | None = None) -> str:
+        """Let a builder walk with the terminal program; all that it said. Torque is off when it has been left."""
+        said = []
+
+        async def run() -> None:
+            app = OpenAnt(self.folder.path, ticking=False)
+            app.session.virtual = self.addresses
+            try:
+                async with app.run_test(size=WIDE) as pilot:
+                    walker = Walker(pilot, replies, self.truth)
+                    await steps(walker)
+                    said.append(walker.said)
+            finally:
+                app.session.close()
+
+        asyncio.run(run())
+        assert not any(self.torque())
+        return said[0]
+
+    def plug(self, *joints: str) -> Callable[[Walker], Awaitable[str | None]]:
+        """A builder's own hands, which plug these in and say that it is done."""
+
+        async def hands(walker: Walker) -> str | None:
+            for joint in joints:
+                self.remote.ask("plug", joint=joint)
+            return BY_ITSELF
+
+        return hands
+
+
+@contextlib.contextmanager
+def robot(folder: Path, scenario: str) -> Iterator[Robot]:
+    """The robot of a scenario; what its servos remember stands in a file."""
+    memory, path = folder / "memory.json", folder / "scenario.toml"
+    path.write_text(scenario.replace("[robot]\n", f"[robot]\neeprom = {json.dumps(str(memory))}\n", 1))
+    with virtual_robot(str(path), clock="stepped") as found:
+        one = Robot(create_robot(folder / "my-ant"), found, memory)
+        yield one
+        one.remote.close()
+
+
+def steps(*names: str) -> Callable[[Walker], Awaitable[None]]:
+    """Walk these steps, each from the first screen, and back to it."""
+
+    async def walk(walker: Walker) -> None:
+        for name in names:
+            await walker.do(name)
+            await walker.choose("Back to the walk")
+
+    return walk
+
+
+@pytest.fixture
+def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody waits for hands here: readings while a virtual hand moves something end with its motion, motions are short."""
+    monkeypatch.setattr(legs, "READ_S", 2.5)
+    monkeypatch.setattr(motions, "SECONDS", dict.fromkeys(motions.LIBRARY, 1.5))
+    monkeypatch.setattr(identification, "RECORD_S", 4.0)
+    monkeypatch.setattr(arena, "WIGGLE_S", 3.0)
+
+
+# ---- mistakes at the bench ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def loose(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+    """Eight motors in their boxes, one of which somebody has left at 4.5 Mbaud."""
+    servo = '[[servo]]\njoint = "hip_fl"\nbaud = 4500000\n'
+    with robot(tmp_path_factory.mktemp("loose"), f'[robot]\nsetup = "loose"\n{BLIND}{servo}') as ant:
+        yield ant
+
+
+@pytest.fixture
+def box(loose: Robot) -> Iterator[Robot]:
+    """The same; nothing is plugged in when a test begins."""
+    for joint in JOINT_NAMES:
+        loose.remote.ask("unplug", joint=joint)
+    return loose
+
+
+def only(*joints: str) -> Callable[[Walker], Awaitable[None]]:
+    """The step Motor IDs, which is left once it asks for a joint that is none of these."""
+
+    async def walk(walker: Walker) -> None:
+        last = JOINT_NAMES[JOINT_NAMES.index(joints[-1]) + 1]
+
+        async def leave(walker: Walker) -> None:
+            walker.press("space")
+
+        walker.replies[f"({last})"] = leave
+        await walker.do("ids")
+
+    return walk
+
+
+def test_two_motors_the_wrong_model_and_a_cable_that_comes_out(box: Robot) -> None:
+    tried = iter([box.plug("hip_rr", "hip_fr"), box.plug("knee_rr"), None, None])
+
+    async def plug(walker: Walker) -> str | None:
+        hands = next(tried)
+        return await hands(walker) if hands is not None else None
+
+    pulled = []
+
+    async def pull_the_cable(walker: Walker) -> str | None:
+        if not pulled:
+            pulled.append(box.remote.ask("unplug", joint="hip_rr"))
+        return None
+
+    async def walk(walker: Walker) -> None:
+        before = box.truth()
+        await walker.do("ids")
+        assert "hip_rr (id 1) does not answer at 57600 baud" in walker.said
+        assert box.truth() == before
+        assert not list(box.folder.findings.glob("ids-*"))
+        box.remote.ask("unplug", joint="hip_rr")
+        await walker.begin(AGAIN)
+
+    async def stop(walker: Walker) -> None:
+        walker.press("space")
+
+    replies = {
+        "(hip_rr)": plug,
+        "two servos answer at once": "try again",
+        "this is a XM430-W350-T": "try again",
+        "make this XC430-W240-T": pull_the_cable,
+        "(knee_rr)": stop,
+    }
+    said = box.walk(walk, replies)
+    assert "hip_rr: two servos answer at once under id 1 → unplug all but one" in said
+    assert "this is a XM430-W350-T, but the place is for a XC430-W240-T → it belongs into a knee" in said
+    assert box.ids()["hip_rr"] == 10
+    assert box.ids()["knee_rr"] == 1
+    assert {entry.write.joint for entry in Journal(box.folder.journal).open_entries()} == {"hip_rr"}
+
+
+def test_the_terminal_closed_in_mid_step_and_opened_again_goes_on_where_it_was(box: Robot) -> None:
+    """hip_rr has its id by now; what was written stands in the journal, and the step is still to be done."""
+
+    class Closed(Exception):
+        pass
+
+    async def close(walker: Walker) -> None:
+        raise Closed
+
+    with pytest.raises(Closed):
+        box.walk(steps("ids"), {"make this XM430-W350-T": close})
+    assert not any(box.torque())
+    assert box.ids()["knee_rr"] == 1
+
+    async def look(walker: Walker) -> None:
+        assert isinstance(walker.app.screen, WalkScreen)
+        assert standing(box.folder)["ids"].state == "todo"
+
+    box.walk(look)
+
+
+def test_a_motor_left_at_4_5_megabaud_is_found_and_the_rest_are_named(box: Robot) -> None:
+    said = box.walk(steps("connect", "estop", "ids"))
+    assert "id 1, 4500000 baud" in said
+    assert "8 of 8 servos have their id, read back" in said
+    assert list(box.ids().values()) == [joint.id for joint in JOINTS.values()]
+    assert standing(box.folder)["ids"].state == "ok"
+
+
+# ---- mistakes of building ------------------------------------------------------------------------------------------------
+
+
+def test_what_was_built_wrong_is_named_on_the_screen_and_taken_into_account(tmp_path: Path) -> None:
+    """A horn on the wrong spline, ids exchanged, a mirrored mount, and a cable that is out."""
+    built = """[robot]
+setup = "stand"
+[[servo]]
+joint = "knee_rr"
+spline_offset = 1
+[[servo]]
+joint = "hip_rr"
+id = 20
+[[servo]]
+joint = "hip_fr"
+id = 10
+reversed = true
+"""
+    with robot(tmp_path, built + BLIND) as ant:
+        ant.remote.ask("unplug", joint="knee_fl")
+
+        async def walk(walker: Walker) -> None:
+            await walker.do("inventory")
+            assert "look at the cable between hip_fl and knee_fl" in walker.said
+            ant.remote.ask("plug", joint="knee_fl")
+            ant.remote.ask("advance", to=ant.remote.ask("now")["t"] + 1.0)
+            await walker.begin(AGAIN)
+            await walker.choose("Next: Zeros and directions")
+            await walker.begin()
+
+        said = ant.walk(walk)
+        assert "hip_rr was moved, but the servo with the id of hip_fr turned" in said
+        assert "hip_fr and hip_rr are swapped" in said
+        assert "knee_rr: its horn is on the wrong spline, 1 × 45° beyond" in said
+        assert "hip_fr: reversed, its servo turns backwards" in said
+        motors = ant.folder.config().motors
+        assert (motors["hip_rr"].id, motors["hip_fr"].id, motors["hip_fr"].direction) == (20, 10, -1)
+        assert motors["knee_rr"].zero_offset_rad == pytest.approx(math.pi * 5 / 4, abs=0.01)
+        assert standing(ant.folder)["zeros"].state == "ok"
+
+
+@pytest.mark.slow
+def test_a_turned_board_a_wrong_scale_and_a_tag_of_another_size(tmp_path: Path, brisk: None) -> None:
+    built = f"""[robot]
+setup = "stand"
+[imu]
+mount_rpy = [0.0, 0.0, {math.pi / 2}]
+acc_scale = [1.15, 1.15, 1.15]
+{CAMERA}
+[camera.body]
+size = 0.03
+"""
+    with robot(tmp_path, built) as ant:
+        said = ant.walk(steps("imu", "arena"))
+        assert "the board is mounted rotated by 90° about z (up)" in said
+        assert "IMU scale: |acc| at rest is 11.28 m/s² instead of 9.81" in said
+        assert ant.folder.config().imu.acc_counts_per_g == 0.0, "nothing was written"
+        assert "tag is declared 45 mm, but everything fits only if its edge is about 30 mm" in said
+
+
+# ---- the whole walk ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_whole_walk_by_its_screens_from_loose_motors_to_the_passport(tmp_path: Path, brisk: None) -> None:
+    said = dict[str, str]()
+
+    async def walk(walker: Walker) -> None:
+        await walker.do("connect")
+        for name in list(WALK)[1:]:
+            said[name] = walker.log
+            await walker.choose(f"Next: {WALK[name].title}")
+            await walker.begin()
+        said["passport"] = walker.log
+
+    with robot(tmp_path, f'[robot]\nsetup = "loose"\n{CAMERA}') as ant:
+        ant.walk(walk, {"while the legs swing. For how long?": "0.2", "Soak for how long?": "1"})
+        states = {name: now.state for name, now in standing(ant.folder).items()}
+        assert set(states.values()) == {"ok"}, (states, said)
+        assert ant.folder.passport.is_file()
+        assert ant.folder.config().model == "calibrated.xml"
+        assert ant.folder.config().arena.centre_m == pytest.approx((0.75, -0.30), abs=0.03)
+        assert len(Journal(ant.folder.journal).open_entries()) >= 24
