@@ -105,7 +105,10 @@ def main() -> None:
         interventions = (run / "interventions.csv").read_text().splitlines()[1:]
         answer = {
             "steps": rows(run), "steps_at_kill": kept, "robot_minutes": result["seconds"] / 60, "wall_minutes": took / 60,
-            "updates": result["updates"], "late_steps_in_recordings": late, "late_steps_reported_since_kill": result["late"],
+            "updates": result["updates"], "late_steps_in_recordings": late,
+            # each transition carries the time that it took, those before the kill included
+            "late_steps_in_transitions": int((transitions[:, 33] > DT_S + LATE_S).sum()),
+            "late_steps_told_since_kill": result["late"],
             "period_median_s": float(np.median(measured)), "period_p99_s": float(np.quantile(measured, 0.99)),
             "interventions": interventions, "load_average": os.getloadavg()[0],
         }  # fmt: skip

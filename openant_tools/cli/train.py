@@ -51,6 +51,7 @@ def train() -> None:
 @click.option("--dt", type=float, metavar="S", help="Length of a step. Default: the robot's, 0.12 s.")
 @click.option("--action-range", metavar="NAME", help="paper, platform, sac, sarsa or limits. Default: the robot's.")
 @click.option("--effects/--no-effects", default=True, help="Whether the robot's [[effect]] entries act.  [default: on]")
+@click.option("--randomise", is_flag=True, help="Each reset another robot, from the intervals of the identification.")
 @click.option(
     "--learning-start", type=click.IntRange(min=1), help="Steps with random actions before learning.  [default: 2000]"
 )
@@ -85,6 +86,7 @@ def sac(
     dt: float | None,
     action_range: str | None,
     effects: bool,
+    randomise: bool,
     learning_start: int | None,
     entropy_start: float | None,
     settings_file: Path | None,
@@ -114,6 +116,10 @@ def sac(
         options["action_range"] = action_range
     if not effects and not hardware:
         options["effects"] = False
+    if randomise:
+        if hardware:
+            raise BadInput("--randomise is for the simulation", remedy="leave it out on a robot")
+        options["randomise"] = True
     if learn is None:
         learn = "beside" if hardware else "between"
 
