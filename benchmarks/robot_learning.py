@@ -102,6 +102,7 @@ def main() -> None:
         measured = periods(run / "recordings")
         late = int((measured > DT_S + LATE_S).sum())
         result = json.loads((folder / "result.json").read_text())
+        transitions = np.fromfile(run / "transitions.f32", np.float32).reshape(-1, 59)
         interventions = (run / "interventions.csv").read_text().splitlines()[1:]
         answer = {
             "steps": rows(run), "steps_at_kill": kept, "robot_minutes": result["seconds"] / 60, "wall_minutes": took / 60,
