@@ -178,7 +178,7 @@ def swinging_soak(
         if int(piece) not in pieces:
             pieces.clear()
             pieces[int(piece)] = soak_motion(joints, limits, fine, int(piece))
-        return pieces[int(piece)][0 if still else min(int(at * fine), len(pieces[int(piece)]) - 1)]
+        return np.asarray(pieces[int(piece)][0 if still else min(int(at * fine), len(pieces[int(piece)]) - 1)])
 
     run = record_transactions(Host(world, rate_hz), scenario, seconds, name, motion=motion, progress=progress)
     chain = [[joints[k] for k in cable] for cable in world.settings.bus.chains]

@@ -832,6 +832,8 @@ class Engine:
             return None
         recorder, self._recorder = self._recorder, None
         if self._thinning is not None:
+            for kept in self._thinning.flush():
+                recorder.cycle(kept)
             recorder.event("counts", **self._thinning.rest(self.clock.now()))
         recorder.close()
         return str(recorder.path), recorder.cycles

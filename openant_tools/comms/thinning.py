@@ -36,7 +36,7 @@ class Thinning:
 
     every_s: float
     joints: Sequence[str]
-    _waiting: deque[Cycle] = field(default_factory=deque)
+    _waiting: deque[tuple[Cycle, bool]] = field(default_factory=deque)
     _kept_t: float = -1e18
     _until: float = -1e18
     _volts: float | None = None
@@ -44,21 +44,28 @@ class Thinning:
     _counted_t: float | None = None
 
     def take(self, cycle: Cycle) -> list[Cycle]:
-        """Those to be recorded now, in order: none, this one, or those before it too."""
+        """Those to be recorded now, in order: healthy ones wait for AROUND_S whether something strange follows."""
         self._count(cycle)
         if self._strange(cycle):
             self._until = cycle.t + AROUND_S
-            kept = [one for one in self._waiting if one.t >= cycle.t - AROUND_S] + [cycle]
+            kept = [one for one, _ in self._waiting] + [cycle]
             self._waiting.clear()
-        elif cycle.t <= self._until or cycle.t - self._kept_t >= self.every_s - 1e-6:
-            kept = [cycle]
-            self._waiting.clear()
-        else:
-            self._waiting.append(cycle)
-            while self._waiting[0].t < cycle.t - AROUND_S:
-                self._waiting.popleft()
-            return []
-        self._kept_t = cycle.t
+            self._kept_t = cycle.t
+            return kept
+        keep = cycle.t <= self._until or cycle.t - self._kept_t >= self.every_s - 1e-6
+        if keep:
+            self._kept_t = cycle.t
+        self._waiting.append((cycle, keep))
+        kept = []
+        while self._waiting and self._waiting[0][0].t < cycle.t - AROUND_S:
+            one, wanted = self._waiting.popleft()
+            kept += [one] if wanted else []
+        return kept
+
+    def flush(self) -> list[Cycle]:
+        """Those that still wait and are wanted, at the end."""
+        kept = [one for one, wanted in self._waiting if wanted]
+        self._waiting.clear()
         return kept
 
     def counts(self, t: float) -> dict[str, Any] | None:

@@ -91,7 +91,7 @@ CAUSES: Mapping[str, Cause] = {
         _LOSES,
         {"all": 0.01, "behind": 0.04, "one": 0.91, "pair": 0.01, "scattered": 0.03},
         {
-            "crc": (1.0, 1.2), "rate": (0.6, 4.0), "single": (1.6, 0.9), "long": (0.7, 5.0), "reset": (0.35, 6.0),
+            "crc": (1.0, 1.2), "rate": (0.6, 4.0), "single": (1.2, 0.9), "long": (0.7, 5.0), "reset": (0.35, 6.0),
             "dip": (0.35, 8.0),
         },
     ),
@@ -113,7 +113,7 @@ CAUSES: Mapping[str, Cause] = {
         (0.0006, 0.06, 0.94),
         {"all": 0.86, "behind": 0.02, "one": 0.02, "pair": 0.02, "scattered": 0.08},
         {
-            "crc": (4.0, 1.3), "together": (1.2, 3.5), "rate": (0.6, 6.0), "single": (5.0, 0.8), "long": (0.4, 14.0),
+            "crc": (4.0, 1.3), "together": (1.2, 3.5), "rate": (0.6, 6.0), "single": (3.0, 0.8), "long": (0.4, 14.0),
             "baud": (3.0, 1.0),
         },
     ),

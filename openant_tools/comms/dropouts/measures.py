@@ -139,8 +139,9 @@ def _rhythm(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     if not episodes:
         return
     runs = _lengths(np.asarray(reach.lost.any(axis=1), bool))
-    single = float((runs <= 1).sum() / len(runs))
-    yield "single", Measure(single, f"{single:.0%} of {len(runs)} losses last one read only"), ()
+    # By reads, not by losses: a stray one or two must not outnumber an outage of a thousand reads.
+    single = float((runs <= 1).sum() / runs.sum())
+    yield "single", Measure(single, f"{single:.0%} of the reads that lose anything stand alone"), ()
     longest = max(one.to_s - one.from_s for one in episodes) + log.period_s
     rows = int(log.lossy.sum())
     # The length that holds half of all lossy rows, so that one stray loss does not hide an outage.
