@@ -1,0 +1,178 @@
+"""Soaks of the virtual robot's bus, by bytes through the engine and by transactions: the log, its resumption, its cause."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from openant_tools.blind.soak_virtual import swinging_soak
+from openant_tools.cli.comms import comms
+from openant_tools.comms.dropouts.diagnose import diagnose_dropouts
+from openant_tools.comms.dropouts.log import read_log
+from openant_tools.comms.step_timing import step_timing
+from openant_tools.comms.thinning import Thinning
+from openant_tools.errors import BadInput
+from openant_tools.recording.reader import read_recording
+from openant_tools.recording.run import Facts, Run
+from openant_tools.recording.tables import read_run, write_table
+from openant_tools.recording.telemetry import Answer, Cycle
+from openant_tools.virtual.scenario import parse_scenario
+
+#: cause → settings of the virtual robot's fault; each shows within seconds
+SHORT: dict[str, dict[str, Any]] = {
+    "bad_servo": {"where": ["hip_fr"], "fraction": 0.15},
+    "bad_cable": {"where": ["hip_fl"], "fraction": 0.15},
+    "line_noise": {"byte_error": 0.001},
+    "return_delay": {"delay_s": 0.0005},
+    "latency_timer": {"timer_s": 0.016},
+}
+
+
+def scenario_text(cause: str, **settings: Any) -> str:
+    lines = [f"{name} = {value!r}" for name, value in settings.items()]
+    return "\n".join(
+        ["[clock]", 'mode = "stepped"', "[camera]", "present = false", "[[fault]]", f'cause = "{cause}"', *lines]
+    )
+
+
+@pytest.mark.parametrize("cause", list(SHORT))
+def test_transactions_show_the_fault(cause: str) -> None:
+    scenario = parse_scenario({"camera": {"present": False}, "fault": [{"cause": cause, **SHORT[cause]}]})
+    run = swinging_soak(scenario, 24.0, 20.0, "soak")
+    assert len(run.t) == 480
+    found = diagnose_dropouts([run])
+    assert found.verdict == cause, found.as_json()["causes"][:2]
+
+
+def test_a_healthy_robot_shows_none() -> None:
+    found = diagnose_dropouts([swinging_soak(parse_scenario({"camera": {"present": False}}), 24.0, 20.0, "soak")])
+    assert found.verdict == "none"
+
+
+def test_bytes_show_the_fault_and_are_kept_around_each_loss(tmp_path: Path) -> None:
+    """The same through the engine, a pseudo-terminal and every packet."""
+    (tmp_path / "cable.toml").write_text(scenario_text("bad_cable", **SHORT["bad_cable"]))
+    out = tmp_path / "soak.mcap"
+    ask = ["soak", "--virtual", str(tmp_path / "cable.toml"), "--out", str(out), "--minutes", "0.15", "--yes"]
+    done = CliRunner().invoke(comms, ask)
+    assert done.exit_code == 0, done.output
+    recording = read_recording(out)
+    raw = [event for event in recording.events if event["kind"] == "bytes"]
+    assert raw
+    assert raw[0]["asked"].startswith("fffffd00fe")
+    counts = [event for event in recording.events if event["kind"] == "counts"]
+    assert sum(event["cycles"] for event in counts) > 800
+    found = diagnose_dropouts([recording.run])
+    assert found.verdict == "bad_cable", found.as_json()["causes"][:2]
+    # There already: not overwritten, but gone on with.
+    again = CliRunner().invoke(comms, ask)
+    assert isinstance(again.exception, BadInput)
+    assert "--resume" in str(again.exception)
+    longer = CliRunner().invoke(comms, [*ask[:-3], "--minutes", "0.2", "--yes", "--resume"])
+    assert longer.exit_code == 0, longer.output
+    assert read_recording(out).run.duration_s > recording.run.duration_s + 1.0
+
+
+def _cycle(t: float, err: str = "", wake: float = 0.0, volt: int = 120) -> Cycle:
+    return Cycle(t, [None], None, wake, [Answer(None if err else {"volt": volt}, not err, err)], [False])
+
+
+def test_thinning_keeps_what_is_strange_with_what_was_around_it() -> None:
+    thinning, kept = Thinning(1.0, ("knee",)), list[float]()
+    for k in range(1000):
+        t = k * 0.01
+        err = "crc" if k == 450 else ""
+        kept += [one.t for one in thinning.take(_cycle(t, err, 0.05 if k == 700 else 0.0, 100 if k == 850 else 120))]
+    assert kept == sorted(kept)
+    for strange in (4.5, 7.0, 8.5):
+        around = [t for t in kept if abs(t - strange) <= 0.29]
+        assert len(around) >= 55
+    assert len([t for t in kept if t < 4.0]) == 4
+    assert thinning.rest(10.0)["lost"] == {"knee crc": 1}
+
+
+def test_a_thinned_log_counts_what_was_left_out() -> None:
+    t = np.arange(0, 60, 0.1)
+    ok = np.ones(len(t))
+    ok[300] = 0
+    run = Run(
+        "thin", Facts(("knee",), extra={"rate_hz": 100.0, "thinned_s": 0.1}), t, {"ok.knee": ok, "rtt.knee": t * 0}
+    )
+    log = read_log([run])
+    assert log.answers[0] == pytest.approx(5991, abs=2)
+    assert log.period_s == 0.01
+
+
+def test_no_table_is_overwritten_and_no_port_is_asked_without_bytes(tmp_path: Path) -> None:
+    def refused(*options: str) -> str:
+        return str(CliRunner().invoke(comms, ["soak", "--transactions", *options]).exception)
+
+    assert "name it soak.parquet" in refused("--virtual", "default", "--out", str(tmp_path / "soak.mcap"))
+    assert "only a virtual robot" in refused("--out", str(tmp_path / "soak.parquet"))
+    (tmp_path / "there.parquet").write_text("")
+    assert "name another file" in refused("--virtual", "default", "--out", str(tmp_path / "there.parquet"))
+
+
+# ---- step timing ----
+
+
+def steps(*, apart: bool) -> Run:
+    """Forty steps of 120 ms: command, 100 ms of waiting, 3 ms of reading, 2 of observing, the rest deciding."""
+    begin = 1.0 + 0.12 * np.arange(41)
+    t = begin - 0.02
+    columns = {
+        "cmd.knee": np.sin(np.arange(41.0)), "pos.knee": np.zeros(41), "rtt.knee": np.full(41, 3e-3), "cmd_t": begin,
+    }  # fmt: skip
+    if apart:
+        columns |= {"obs_t": t + 5e-3, "act_t": begin - 1e-3}
+    return Run("steps", Facts(("knee",), extra={"baud": 1_000_000}), t, columns)
+
+
+def test_a_step_is_taken_apart() -> None:
+    found = step_timing(steps(apart=True))
+    mean = {part.name: part.mean for part in found.parts}
+    assert found.steps == 40
+    assert mean["wait"] == pytest.approx(0.1)
+    assert mean["read"] == pytest.approx(3e-3)
+    assert mean["observe"] == pytest.approx(2e-3)
+    assert mean["decide"] == pytest.approx(14e-3)
+    assert sum(mean.values()) == pytest.approx(found.step.mean) == pytest.approx(0.12)
+    assert found.action_to_observation.mean == pytest.approx(0.103)
+    assert found.computing_share == pytest.approx(16 / 120)
+
+
+def test_without_the_agents_times_observing_and_deciding_are_one() -> None:
+    found = step_timing(steps(apart=False))
+    assert [part.name for part in found.parts] == ["command", "wait", "read", "observe and decide"]
+    assert not found.told_apart
+
+
+def test_a_loop_faster_than_the_agent_repeats_its_command() -> None:
+    """Twelve cycles of the engine to a step: the read that counts is the last one before the next command."""
+    n = 12 * 20
+    t = 0.01 * np.arange(n) + 0.8e-3
+    cmd = np.repeat(np.arange(20.0), 12) / 20
+    run = Run("loop", Facts(("knee",)), t, {"cmd.knee": cmd, "rtt.knee": np.full(n, 3e-3), "cmd_t": t - 0.2e-3})
+    found = step_timing(run)
+    assert found.step.mean == pytest.approx(0.12)
+    assert found.action_to_observation.mean == pytest.approx(0.1132, abs=1e-4)
+
+
+def test_timing_says_what_it_cannot_use(tmp_path: Path) -> None:
+    still = steps(apart=False)
+    still.columns["cmd.knee"][:] = 0.0  # type: ignore[index]
+    with pytest.raises(BadInput, match="only 1 different commands"):
+        step_timing(still)
+    write_table(steps(apart=True), tmp_path / "walk.parquet")
+    picture = tmp_path / "timing.png"
+    done = CliRunner().invoke(
+        comms, ["timing", str(tmp_path / "walk.parquet"), "--json", str(tmp_path / "t.json"), "--picture", str(picture)]
+    )
+    assert done.exit_code == 0, done.output
+    assert "13.3% of the step" in done.output
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert read_run(tmp_path / "walk.parquet").name == "walk"
