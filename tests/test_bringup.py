@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -266,6 +267,23 @@ def write_id(folder: Path, id: int) -> None:
     EepromFile(folder / "virtual-eeprom.json").write(world)
 
 
+def test_a_virtual_robot_does_not_outlive_who_started_it(tmp_path):
+    code = (
+        "import time\nfrom openant_tools.virtual.process import virtual_robot\n"
+        f"with virtual_robot({str(scenario(tmp_path))!r}) as found:\n    print(found['control'], flush=True)\n    time.sleep(600)\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    control = Path(parent.stdout.readline().strip())
+    assert control.exists()
+    parent.kill()
+    parent.wait()
+    give_up = time.monotonic() + 60.0
+    while control.exists():  # it takes its folder away when it ends
+        assert time.monotonic() < give_up
+        time.sleep(0.05)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_from_loose_motors_to_a_passport_and_on_to_learning(tmp_path):
@@ -285,6 +303,8 @@ def test_from_loose_motors_to_a_passport_and_on_to_learning(tmp_path):
     assert again.returncode == 0
     assert "1/15" not in again.stdout  # what stands is not done again
     pytest.importorskip("torch")
-    trained = openant("train", "sac", "--robot", ant, "--env", "sim", "--steps", "2000", "--out", ant / "runs" / "sac")
-    assert trained.returncode == 0, trained.stderr[-2000:]
-    assert (ant / "runs" / "sac" / "learning_curve.csv").is_file()
+    train = ("train", "sac", "--robot", ant, "--steps", "2000")
+    for run, where in (("sim", ("--env", "sim")), ("virtual", ("--env", "hardware", "--virtual", "--yes"))):
+        trained = openant(*train, *where, "--out", ant / "runs" / run)
+        assert trained.returncode == 0, trained.stderr[-2000:]
+        assert (ant / "runs" / run / "learning_curve.csv").is_file()

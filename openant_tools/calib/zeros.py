@@ -359,9 +359,9 @@ def _nudge_all(bench: Bench, joints: tuple[str, ...]) -> Generator[Event, Answer
                 )
             )
         if board_known and answer.verdict in ("contradicted", "another"):
-            went = "the leg went the other way" if answer.verdict == "contradicted" else "another leg moved"
+            otherwise = "the leg went the other way" if answer.verdict == "contradicted" else "another leg moved"
             problems.append(
-                f"{joint}: the gyro says that {went} → look which leg moves, and which way; then `openant calib imu`"
+                f"{joint}: the gyro says that {otherwise} → look which leg moves, and which way; then `openant calib imu`"
             )
     yield Say(*_seen_words(answers, board_known))
     return _Nudged(not problems, tuple(problems), tuple(evidence))

@@ -91,6 +91,8 @@ TAIL = """\
 | `F8` | a fault has been seen; it stays on every screen until then, even if it is over |
 | `p` `,` `.` `[` `]` `<` `>` `x` | replay: pause, step, 5 s, speed, end |
 
+In tmux an `Esc` waits for half a second for what may follow it; `set -sg escape-time 10` in `~/.tmux.conf` ends that.
+
 A state is a glyph, a word and a colour at once: `✓` ok, `✗` no, `▲` look, `…` running, `↻` again, `·` to do.
 """
 
