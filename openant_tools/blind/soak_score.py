@@ -136,15 +136,15 @@ class SoakScore:
         }  # fmt: skip
 
 
-def score_soaks(folder: Path, key: bytes | None) -> SoakScore:
-    """Open the answers of a set and compare.
+def score_soaks(folder: Path, key: bytes | None, *, so_far: bool = False) -> SoakScore:
+    """Open the answers of a set and compare; with `so_far` of the soaks alone that have a verdict.
 
     Raises:
         BadInput: no set, no verdicts, or a seal that does not open.
     """
     answers = read_soak_answers(folder, key)
-    said = read_verdicts(folder, list(answers))
-    cases = tuple(SoakCase(name, answer, said[name]) for name, answer in answers.items())
+    said = read_verdicts(folder, list(answers), so_far=so_far)
+    cases = tuple(SoakCase(name, answers[name], one) for name, one in said.items())
     return SoakScore(soak_facts(folder), cases)
 
 
@@ -183,6 +183,11 @@ def _failures(found: SoakScore) -> list[str]:
             f"| {case.name} | {truth} | {case.said.get('error') or case.verdict} | {', '.join(said)} | {log} |"
         )
     return lines
+
+
+def _how_many(found: SoakScore) -> str:
+    n, all_of = len(found.cases), int(found.facts["soaks"])
+    return f"{n} soaks" if n == all_of else f"**Not the whole set:** {n} of its {all_of} soaks, those judged so far"
 
 
 def reliability_figure(found: SoakScore) -> Figure:
@@ -245,7 +250,7 @@ def write_soak_docs(found: SoakScore, path: Path) -> None:
         "openant comms blind run SET",
         "openant comms blind score SET --key-file KEY --docs docs/comms-blind.md",
         "```", "", *_HOW, "", "## Result", "",
-        f"{len(found.cases)} soaks, {len(found.healthy)} of them healthy, {seed}, commitment of the answers "
+        f"{_how_many(found)}, {len(found.healthy)} of them healthy, {seed}, commitment of the answers "
         f"`{facts['commitment']}`. {virtual} came from the virtual robot's bus. The slowest diagnosis took {longest:.1f} s.", "",
         *table_lines(found), "", *_by_cause(found), "",
         f"![Stated probability against share right]({os.path.relpath(pictures, path.parent)}/comms-blind-reliability.png)", "",

@@ -22,7 +22,7 @@ from openant_tools.files import write_text
 from openant_tools.recording.tables import read_run, write_table
 from openant_tools.virtual.seal import commitment_of, open_sealed, seal
 
-__all__ = ["SCHEMA", "make_soaks", "read_soak_answers", "run_soaks", "soak_facts"]
+__all__ = ["SCHEMA", "make_soaks", "read_soak_answers", "read_verdicts", "run_soaks", "soak_facts"]
 
 SCHEMA = "openant.blind-comms/1"
 SEALED, OPEN = "answers.sealed.toml", "truth.toml"
@@ -164,14 +164,16 @@ def _diagnose(folder: Path, path: Path) -> str:
     return path.stem
 
 
-def read_verdicts(folder: Path, names: Sequence[str]) -> Mapping[str, Mapping[str, Any]]:
-    """Soak → diagnosis as JSON.
+def read_verdicts(folder: Path, names: Sequence[str], *, so_far: bool = False) -> Mapping[str, Mapping[str, Any]]:
+    """Soak → diagnosis as JSON; with `so_far` of those alone that have one.
 
     Raises:
         BadInput: a soak has none.
     """
     missing = [name for name in names if not _verdict(folder, name).exists()]
-    if missing:
+    if so_far:
+        names = [name for name in names if name not in missing]
+    if missing and (not so_far or not names):
         raise BadInput(
             f"{len(missing)} soaks have no verdict, such as {missing[0]}",
             where=folder,

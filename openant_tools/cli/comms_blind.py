@@ -77,9 +77,7 @@ def make(
     usual = SoakMix()
     mix = SoakMix(usual.healthy if healthy is None else healthy, usual.virtual if virtual is None else virtual)
     with shown_progress() as progress:
-        commitment = make_soaks(
-            out, count, seed, mix=mix, commit=full, key=key, jobs=jobs, progress=progress
-        )
+        commitment = make_soaks(out, count, seed, mix=mix, commit=full, key=key, jobs=jobs, progress=progress)
     click.echo(f"{count} soaks in {out}")
     click.echo(f"commitment of their answers: {commitment}")
 
@@ -102,14 +100,15 @@ def run(folder: Path, jobs: int) -> None:
 @click.option(
     "--docs", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Write the page of the docs."
 )
+@click.option("--so-far", is_flag=True, help="Only soaks that have a verdict; the page says so.")
 @json_option
-def score(folder: Path, key_file: Path | None, docs: Path | None, json_file: Path | None) -> None:
+def score(folder: Path, key_file: Path | None, docs: Path | None, so_far: bool, json_file: Path | None) -> None:
     """Open the answers of SET and compare: exit code 1 where a figure lies below what is asked for."""
     from openant_tools.blind.soak_score import score_soaks, table_lines, write_soak_docs
     from openant_tools.files import write_text
     from openant_tools.virtual.seal import read_key
 
-    found = score_soaks(folder, None if key_file is None else read_key(key_file))
+    found = score_soaks(folder, None if key_file is None else read_key(key_file), so_far=so_far)
     for line in table_lines(found):
         click.echo(line)
     click.echo(f"{len(found.failures)} of {len(found.cases)} soaks went wrong")
