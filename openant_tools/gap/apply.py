@@ -86,7 +86,7 @@ def apply(found: Diagnosis, model: Path, out: Path, *, robot: Path | None = None
     ]
     if not selected:
         carried.append("no effect was selected: the model is the given one, calibrated as far as the diagnosis went")
-    return Applied(tuple(written), tuple(carried), edited.notes)
+    return Applied(tuple(written), tuple(carried), tuple(edited.notes))
 
 
 def robot_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import pkgutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -55,6 +56,7 @@ class Quantity:
         signed: x may be negative.
         scale: what an x of 1 means on this robot.
         shape: it says how an effect acts, not how much: never absent, drawn between small and large.
+        levels: from how many values of a shape it is sought, because what it makes has many valleys.
     """
 
     name: str
@@ -66,6 +68,11 @@ class Quantity:
     signed: bool
     scale: Scale
     shape: bool = False
+    levels: int = 1
+
+    def sought(self) -> list[float]:
+        """The values of a shape from which it is sought, evenly by their logarithms."""
+        return [float(self.small * (self.large / self.small) ** ((k + 0.5) / self.levels)) for k in range(self.levels)]
 
 
 def _one(reference: Reference, joints: Ints) -> float:
@@ -89,9 +96,9 @@ def rate(name: str, unit: str, small: float, large: float, scale: Scale) -> Quan
     )
 
 
-def shape(name: str, unit: str, low: float, high: float) -> Quantity:
+def shape(name: str, unit: str, low: float, high: float, *, levels: int = 1) -> Quantity:
     """A parameter of how it acts."""
-    return Quantity(name, unit, lambda x, s: x, lambda v, s: v, low, high, False, _one, shape=True)
+    return Quantity(name, unit, lambda x, s: x, lambda v, s: v, low, high, False, _one, shape=True, levels=levels)
 
 
 def usual_torque(reference: Reference, joints: Ints) -> float:
@@ -150,22 +157,34 @@ class Cause:
         """The parameters at a point of the coordinates."""
         return {q.name: q.value(x[q.name], q.scale(reference, joints)) for q in self.quantities}
 
-    def starts(self, strength: float) -> list[dict[str, float]]:
-        """Coordinates of one size in every direction that matters: either sign, each part of a vector by itself."""
+    def starts(self, strength: float, turn: int = 0, turns: int = 1) -> list[dict[str, float]]:
+        """Coordinates of one size in every direction that matters: either sign, each part of a vector by itself.
+
+        Args:
+            turn, turns: of the levels of shapes, every `turns`-th is taken, from this one on.
+        """
+        out = []
+        levels = [
+            [(q.name, level) for level in q.sought()[turn::turns] or q.sought()] for q in self.quantities if q.shape
+        ]
+        for shapes in itertools.product(*levels):
+            out += [{**one, **dict(shapes)} for one in self._directions(strength)]
+        return out
+
+    def _directions(self, strength: float) -> list[dict[str, float]]:
         sizes = [q for q in self.quantities if not q.shape]
         size = {q.name: q.small * (q.large / q.small) ** strength for q in sizes}
-        shapes = {q.name: float(np.sqrt(q.small * q.large)) for q in self.quantities if q.shape}
         out = []
         if self.together:
             for one in sizes:
                 for sign in (1.0, -1.0) if one.signed else (1.0,):
-                    out.append({q.name: sign * size[q.name] if q is one else 0.0 for q in sizes} | shapes)
+                    out.append({q.name: sign * size[q.name] if q is one else 0.0 for q in sizes})
             return out
         first = sizes[0]
         for sign in (1.0, -1.0) if first.signed else (1.0,):
             # What comes beside the first is nothing where it may have either sign.
             rest = {q.name: 0.0 if q.signed else size[q.name] for q in sizes[1:]}
-            out.append({first.name: sign * size[first.name], **rest, **shapes})
+            out.append({first.name: sign * size[first.name], **rest})
         return out
 
     def draw(self, rng: np.random.Generator, strength: float) -> dict[str, float]:
@@ -175,7 +194,8 @@ class Cause:
             strength: 0 just beyond tolerance … 1 clearly ill.
         """
         sizes = [q for q in self.quantities if not q.shape]
-        direction = rng.normal(size=len(sizes))
+        # Of a vector often only some parts are there: one signal of several is late, a board turned about one axis.
+        direction = rng.normal(size=len(sizes)) * _some(rng, len(sizes))
         direction /= np.linalg.norm(direction)
         out = {}
         for k, q in enumerate(sizes):
@@ -190,6 +210,13 @@ class Cause:
             if q.shape:
                 out[q.name] = float(q.small * (q.large / q.small) ** rng.random())
         return out
+
+
+def _some(rng: np.random.Generator, n: int) -> NDArray[np.bool_]:
+    """(n,) of which at least one is true."""
+    chosen: NDArray[np.bool_] = rng.random(n) < rng.choice([0.5, 1.0])
+    chosen[int(rng.integers(n))] = True
+    return chosen
 
 
 def enter(robot: Robot, reference: Reference, causes: Iterable[tuple[str, Sequence[int], Mapping[str, float]]]) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.cause import enter
+from openant_tools.gap.cause import Quantity, enter
 from openant_tools.gap.explain import Hypothesis
 from openant_tools.gap.protocol import Played, Protocol
 from openant_tools.gap.robot import Robot
@@ -33,6 +33,8 @@ SPREAD, END = 0.6, 1.3
 INDEPENDENT_S = 0.5
 #: standard deviation that sizes of causes keep from where they were found, as a share
 POLISH = 0.3
+#: times what it was found to be that a size may become
+FARTHEST = 2.5
 ITERATIONS = 2
 #: rad, the least that a position is known to
 LEAST_SIGMA_RAD = 2e-4
@@ -139,20 +141,20 @@ class Windows:
         for _ in range(ITERATIONS):
             at = u
             blocks = {k: self._normal(k, start, at) for k in fitted}
-            u = self._solve(at, prior, scale, blocks.values())
+            u = self._solve(start, at, prior, scale, blocks.values())
         folds = [[block for k, block in blocks.items() if k != out] for out in leave_out]
-        return _from(start, u), [_from(start, self._solve(at, prior, scale, fold)) for fold in folds]
+        return _from(start, u), [_from(start, self._solve(start, at, prior, scale, fold)) for fold in folds]
 
-    def _solve(self, u: Array, prior: Array, scale: Array, blocks: Iterable[tuple[Array, Array]]) -> Array:
+    def _solve(
+        self, start: Refit, u: Array, prior: Array, scale: Array, blocks: Iterable[tuple[Array, Array]]
+    ) -> Array:
         """Where the runs' blocks, made at u, lead."""
         normal, gradient = np.diag(1 / scale**2), (u - prior) / scale**2
         for more, slope in blocks:
             normal, gradient = normal + more, gradient + slope
         found = u - np.linalg.solve(normal, gradient)
-        low, high = np.full(len(u), -END), np.full(len(u), END)
-        n = len(u) - len(self.names)
-        low[:n] = np.where(prior[:n] >= 0, 0.0, 2.5 * prior[:n])
-        high[:n] = np.where(prior[:n] >= 0, 2.5 * prior[:n], 0.0)
+        ends = [_limits(q, float(at)) for q, at in zip(_quantities(start), prior, strict=False)]
+        low, high = np.array([*ends, *[(-END, END)] * len(self.names)]).T
         clipped: Array = np.clip(found, low, high)
         return clipped
 
@@ -290,6 +292,17 @@ def calibration_of(windows: Windows, refit: Refit) -> dict[str, dict[str, float]
 def nothing(windows: Windows) -> Refit:
     """No cause at all, only what tolerances let move."""
     return Refit((), (), np.zeros(len(windows.names)))
+
+
+def _limits(quantity: Quantity, at: float) -> tuple[float, float]:
+    """Between which a size may be polished that was found somewhere: it keeps its sign, and a shape its reason."""
+    if quantity.shape:
+        return quantity.small / 2, quantity.large * 2
+    return (0.0, FARTHEST * at) if at >= 0 else (FARTHEST * at, 0.0)
+
+
+def _quantities(refit: Refit) -> list[Quantity]:
+    return [q for part in refit.hypothesis for q in part.definition.quantities]
 
 
 def _vector(refit: Refit) -> Array:

@@ -44,8 +44,8 @@ Progress = Callable[[float, str], None]
 DOUBT, SUSPECT, FINDING = 0.12, 0.07, 0.5
 #: probability of a cause that little closure on the held-out runs does not overrule: a stop, say, shows in few of them
 CERTAIN = 0.8
-#: how many causes are looked at, at most and at least
-SUSPECTS, LIKELIEST = 5, 3
+#: how many causes are looked at, at most and at least; and at least where the log is strange and no cause likely
+SUSPECTS, LIKELIEST, PUZZLED = 5, 3, 7
 #: probability of a second cause, once the first is taken into account
 SECOND = 0.35
 #: places at which each of them is tried
@@ -55,13 +55,13 @@ PLACES = 2
 ADDS, ADDS_ALONE, EXPLAINS = 0.02, 0.2, 0.35
 #: gaps that are so many floors, of robots whose energy is so many gates, ask for an explanation; beyond ODD gates no robot of
 #: the build is healthy, whatever the judge says
-LARGE, STRANGE, ODD = 3.0, 5.0, 20.0
+LARGE, STRANGE, ODD = 3.0, 3.0, 20.0
 #: sets whose closures differ by less are not told apart
 APART = 0.01
 #: s that a diagnosis gives to simulated robots where the protocol was never seen; `prepare` by itself takes what it needs
 PREPARE_S = 900.0
 #: how what is left of the gap counts beside the judge's probability
-LEFT_COUNTS = 3.0
+LEFT_COUNTS = 5.0
 
 
 def diagnose(
@@ -108,7 +108,10 @@ def diagnose(
         return _healthy(case, judgement, first)
     scenes = _scenes(prepared, coarse, found, training)
     # Where nothing is likely and yet the log is strange, the likeliest few have to answer.
+    puzzled = first[0][1] < FINDING and judgement.energy > STRANGE
     suspects = [name for n, (name, chance) in enumerate(first) if chance > SUSPECT or n < LIKELIEST][:SUSPECTS]
+    if puzzled:
+        suspects = [name for name, _ in first[: max(PUZZLED, len(suspects))]]
     explained = _explain(scenes, suspects, judgement)
     tell(0.85, "held-out runs")
     return _decide(case, judgement, first, explained, scenes)

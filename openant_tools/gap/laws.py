@@ -58,7 +58,9 @@ def first_laws(robots: Sequence[Robot], fields: Fields) -> list[Law]:
     if steps.any():
         laws.append(_rounding(steps, _table(robots, "zero")))
     if derating.any():
-        laws.append(_heating(derating, np.array([[robot.derating_s] for robot in robots])))
+        laws.append(
+            _heating(derating, *(np.array([[getattr(r, name)] for r in robots]) for name in ("derating_s", "heat_c")))
+        )
     if np.isfinite(no_load).any():
         laws.append(_fading(no_load))
     return laws
@@ -115,8 +117,8 @@ def _rounding(steps: Array, zero: Array) -> Law:
     return act
 
 
-def _heating(loss: Array, seconds: Array) -> Law:
-    heat = np.zeros(loss.shape)
+def _heating(loss: Array, seconds: Array, start: Array) -> Law:
+    heat = np.broadcast_to(start, loss.shape).copy()
 
     def act(step: Step) -> None:
         share = np.minimum(np.abs(step.motor_torque) / np.maximum(step.limit, TINY), 1.0)

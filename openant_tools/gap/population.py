@@ -28,6 +28,8 @@ COUNTS = (0.24, 0.52, 0.18, 0.04, 0.02)
 COUNTS_ONE_JOINT = (0.15, 0.30, 0.2, 0.15, 0.1, 0.06, 0.04)
 #: what tolerances are drawn wider by
 WIDTH = 1.15
+#: °C by which servos warm up at most from one run to the next
+WARMING_C = 4.0
 #: how unequal the joints are that share a cause
 UNEQUAL = 0.1
 #: strengths of templates
@@ -107,6 +109,9 @@ def robot_of(protocol: Protocol, case: Case) -> Robot:
             }
             # Sized by all joints that share it, it sits at each of them.
             cause.enter(robot, np.array([j]), cause.values(own, reference, np.array(joints)))
+    if robot.shared_dropout:
+        robot.shared_dropout = bool(rng.random() < 0.5)
+    robot.warming_c = float(rng.uniform(0, WARMING_C))
     robot.form = random_form(rng, reference.seen.encoder_rad)
     robot.start = resting(robot, reference, rng)
     return robot
@@ -125,8 +130,9 @@ def templates(protocol: Protocol) -> list[Case]:
         if {Scope.ALL, Scope.BODY} & set(cause.scopes) and everything not in where:
             where.append(everything)
         for joints in where or [everything]:
-            for strength in TEMPLATES:
-                out += [Case({cause.name: (joints, x)}, -1) for x in cause.starts(strength)]
+            for turn, strength in enumerate(TEMPLATES):
+                starts = cause.starts(strength, turn, len(TEMPLATES))
+                out += [Case({cause.name: (joints, x)}, -1) for x in starts]
     return out
 
 
@@ -147,5 +153,7 @@ def play(protocol: Protocol, cases: Sequence[Case], seed: int) -> list[Floats]:
         noisy = with_noise({name: values[1:] for name, values in signals.items()}, robots[1:], steps, rng)
         # A robot that no step can hold together shows as very ill, not as infinite.
         found = played.layout.features(differences(noisy, nominal, played.signals))
+        for robot in robots:
+            robot.heat_c += robot.warming_c
         out.append(np.clip(np.nan_to_num(found, nan=0.0, posinf=LARGEST, neginf=-LARGEST), -LARGEST, LARGEST))
     return out

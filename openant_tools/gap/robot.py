@@ -146,7 +146,8 @@ class Robot:
         electrical: share of the damping that goes with the torque.
         stop_low, stop_high: rad, where a stop stands that should not be there; ∓inf for none.
         play: rad. compliance: rad per N·m.
-        derating: share of the torque lost per °C·A² of heat, see `laws`; derating_s: s, how fast it comes.
+        derating: share of the torque lost per °C of heat, see `laws`; derating_s: s, how fast it comes; heat_c: °C as a run
+            begins; warming_c: more from run to run.
         laws: (effect, parameter) → values of the effects that act between steps (`openant_tools.effects`).
         payload_kg, payload_m: (3,) in the torso's frame. torso_kg: added to it.
         floor_friction, softness: factors. adhesion_n: force of each foot. tilt: (2,) rad, how far downhill
@@ -178,6 +179,8 @@ class Robot:
     compliance: Array = field(init=False)
     derating: Array = field(init=False)
     derating_s: float = 20.0
+    heat_c: float = 0.0
+    warming_c: float = 0.0
     laws: dict[tuple[str, str], Array] = field(default_factory=dict)
     payload_kg: float = 0.0
     payload_m: Array = field(default_factory=lambda: np.zeros(3))

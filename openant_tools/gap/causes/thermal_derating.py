@@ -10,7 +10,7 @@ __all__ = ["CAUSE"]
 
 def _enter(robot: Robot, joints: Ints, values: Values) -> None:
     robot.derating[joints] += values["loss_per_c"]
-    robot.derating_s = values["time_constant_s"]
+    robot.derating_s, robot.heat_c = values["time_constant_s"], values["start_c"]
 
 
 CAUSE = Cause(
@@ -21,7 +21,11 @@ CAUSE = Cause(
     quantities=(
         amount("loss_per_c", "1/°C", 0.005, 0.06),
         shape("time_constant_s", "s", 5.0, 40.0),
+        shape("start_c", "°C", 2.0, 30.0),
     ),
     enter=_enter,
     native=False,
+    # How warm it was as a recording began is the recording's, not the robot's.
+    stated=lambda values, reference, joints: {name: values[name] for name in ("loss_per_c", "time_constant_s")},
+    restored=lambda given, x, reference, joints: {**given, "start_c": x.get("start_c", 0.0)},
 )
