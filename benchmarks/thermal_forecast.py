@@ -2,6 +2,7 @@
 
     python benchmarks/thermal_forecast.py --rooms 20                   the table for docs/thermal.md
     python benchmarks/thermal_forecast.py --rooms 20 --json table.json
+    python benchmarks/thermal_forecast.py --stress                     the paper's stress test, an hour, four robots
 
 Each case is a robot with its own thermal sizes in its own room, under its own load, with the virtual robot's heat and none
 of its mechanics (a stalled joint has none), so that an hour takes a second. The forecast sees what a servo reports, once a
@@ -24,13 +25,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.recording.run import Facts, Run
+from openant_tools.report import plots
 from openant_tools.robot.control_table import AMPERE_PER_COUNT
 from openant_tools.robot.kit import KITS
 from openant_tools.robot.registers import PWM_FULL
 from openant_tools.thermal.fit import fit
 from openant_tools.thermal.forecast import HORIZON_S, forecast
 from openant_tools.thermal.inputs import inputs_of
+from openant_tools.thermal.report import forecast_picture
 from openant_tools.virtual.motor import MotorSettings
+from openant_tools.virtual.scenario import load_scenario
 from openant_tools.virtual.world import World, WorldSettings, standard_servos
 
 Array = NDArray[np.float64]
@@ -97,17 +101,24 @@ def drawn_world(seed: int) -> tuple[World, dict[str, object], np.random.Generato
     return World(settings), drawn, random
 
 
-def soaked(world: World, effort: float, load: str, random: np.random.Generator) -> tuple[Run, float | None, int | None]:
-    """What the servos report until the first of them shuts down or time is over: the run, when and who."""
+def soaked(
+    world: World, effort: float, load: str, random: np.random.Generator | None, longest_s: float = LONGEST_S
+) -> tuple[Run, float | None, int | None]:
+    """What the servos report until the first of them shuts down or time is over: the run, when and who.
+
+    Args:
+        random: of the joints' efforts and their noise; None for equal ones and a fixed seed.
+    """
+    equal, random = random is None, random or np.random.default_rng(0)
     drives, n = world.drives, len(world.joints)
     knee = np.array([joint.startswith("knee") for joint in world.joints])
-    base = np.where(knee, effort * np.exp(random.normal(0.0, 0.05, n)), 0.05)
+    base = np.where(knee, effort * np.exp((0.0 if equal else 0.05) * random.standard_normal(n)), 0.0 if equal else 0.05)
     limit = np.array([servo.model.temperature_limit_c for servo in world.servos])
     settings = world.settings
     rows: list[list[Array]] = []
     wander = np.zeros(n)
     fade = math.exp(-STEP_S / 45.0)
-    steps = int(LONGEST_S / STEP_S)
+    steps = int(longest_s / STEP_S)
     for i in range(steps):
         t = i * STEP_S
         duty = base
@@ -166,6 +177,34 @@ def case(seed: int) -> Case | None:
     return Case(seed, **drawn, shutdown_s=when, joint=joint, forecast_s=interval, probability=of.probability, held=held)  # type: ignore[arg-type]
 
 
+#: the paper's stress test: scenario → what the paper tells
+STRESS = {
+    "lite": "a knee shuts down at 72 °C after about 30 min",
+    "lite_sinks": "helps little: plastic case",
+    "standard": "touches the 80 °C limit",
+    "standard_sinks": "stays below",
+}
+
+
+def stress(picture: Path | None) -> str:
+    """The four scenarios of benchmarks/thermal, an hour with the knees at half duty, and the forecasts after 10 min."""
+    lines = ["| scenario | paper | warmest knee | shutdown | forecast after 10 min |", "|---|---|---|---|---|"]
+    for name, paper in STRESS.items():
+        script = load_scenario(Path(__file__).parent / "thermal" / f"{name}.toml")
+        run, when, _ = soaked(World(script.world), 442 / PWM_FULL, "stall", None, 3600.0)
+        peaks = {joint: float(run.column(f"temp.{joint}").max()) for joint in run.joints}
+        warmest = max(peaks, key=lambda joint: peaks[joint])
+        found = fit([inputs_of(run).until(AT_S)])
+        told = forecast(found, torques=False)
+        words = next(one.words for one in told.joints if one.joint == warmest)
+        down = "–" if when is None else f"after {when / 60:.1f} min"
+        lines.append(f"| `{name}` | {paper} | {warmest} {peaks[warmest]:.0f} °C | {down} | from then on, {words} |")
+        if picture is not None and name == "lite":
+            shown = forecast_picture(found, told, run=inputs_of(run), joints=["knee_fl", "knee_rr", "hip_fl"])
+            picture.write_bytes(plots.as_png(shown, 100))
+    return "\n".join(lines) + "\n"
+
+
 def table(cases: list[Case]) -> str:
     """Markdown: the cases with a shutdown, the count, and those without."""
     lines = [
@@ -208,7 +247,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rooms", type=int, default=20, help="cases with a shutdown, from seed 0 on")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--stress", action="store_true", help="the paper's stress test instead")
+    parser.add_argument("--picture", type=Path, help="of the Lite's forecast, with --stress")
     options = parser.parse_args()
+    if options.stress:
+        print(stress(options.picture), end="")
+        return 0
     cases: list[Case] = []
     seed = 0
     while sum(one.shutdown_s is not None for one in cases) < options.rooms:

@@ -102,7 +102,7 @@ def main() -> int:
                 panel.set_xlabel(plots.axis_label("time", "min"))
             for panel in axes[:, 0]:
                 panel.set_ylabel(plots.axis_label("case", "°C"))
-            plots.legend(axes[0, 1], ncols=4, fontsize=7)
+            plots.legend(axes[0, 0], loc="lower right", bbox_to_anchor=(1.0, 0.0), ncols=2, fontsize=7)
         options.picture.write_bytes(plots.as_png(figure, 100))
     return 0
 

@@ -96,7 +96,7 @@ def fit(
 
         then = found.at(inputs[-1].loaded_s)
         finding = thermal_finding(
-            then, look_ahead(then), command=_command(), recording=folder.relative(runs[-1]), held=held,
+            then, look_ahead(then, from_cold=True), command=_command(), recording=folder.relative(runs[-1]), held=held,
             rest=rest_advice(then), warning=_warning(folder),
         )  # fmt: skip
         click.echo(f"wrote {keep(finding, folder, folder.relative(runs[-1]))}", err=True)

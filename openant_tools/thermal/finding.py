@@ -28,6 +28,7 @@ def thermal_finding(
 
     Args:
         recording: its path, relative to the robot's folder.
+        told: from a cold start, so that it says the same of a robot whenever it was looked at.
         held: how the fit of the first part met the rest. rest: advice. warning: of the torque table.
     """
     evidence, problems = list[Evidence](), list[str]()
@@ -63,7 +64,7 @@ def thermal_finding(
         problems.append(warning)
     first = told.first
     what = (
-        f"under {told.load.words} {first.words}"
+        f"under {told.load.words}, from cold, {first.words}"
         if first is not None
         else f"under {told.load.words} no servo comes to its limit"
     )

@@ -187,6 +187,8 @@ def present_load(found: Fit, *, whole: bool = False) -> Load:
     duty = by_duty(run.source)
     push = np.where(duty, run.drive, run.drive * ohm**2)
     current = np.where(duty, run.drive / ohm**2, run.drive)
+    # Heat of unknown cause is a number of each draw; the load is one of it.
+    current = np.where(np.array([source == "unknown" for source in run.source]), 1.0, current)
     return Load(
         np.array([current[block].mean(axis=0) for block in rows[:count]]),
         np.array([push[block].mean(axis=0) for block in rows[:count]]),
@@ -366,8 +368,7 @@ def _going_on(found: Fit, variants: Variants, load: Load, random: np.random.Gene
     unknown = np.array([source == "unknown" for source in found.inputs.source])
     keeps = (random.random(variants.state.case.shape) < load.by_duty) & ~unknown
     current = np.where(servos.by_duty, 1 / ratio**2, np.ones((b, 1)))
-    # Heat of unknown cause is its own drive, in W, in the place of the nothing that was recorded.
-    current = np.where(unknown, variants.held / np.maximum(load.current.mean(axis=0), 1e-12), current)
+    current = np.where(unknown, variants.held, current)
     return replace(servos, by_duty=keeps), current, np.where(servos.by_duty, 1.0, ratio**2)
 
 

@@ -62,7 +62,7 @@ def thermal_soak(bench: Bench) -> Procedure:
     run = inputs_of(read_run(path, need=()))
     # What is forecast is the load, not the cooling after it.
     found = fit([run]).at(run.loaded_s)
-    told = forecast(found)
+    told = forecast(found, from_cold=True)
     held = held_out(run) if run.duration_s > 300 else None
     finding: Finding = thermal_finding(
         found, told, command=COMMAND, recording=bench.folder.relative(path), held=held, rest=rest_advice(found), warning=warning,
