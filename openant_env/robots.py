@@ -48,6 +48,7 @@ class SimulatedRobot:
         dt_s: s, the length of a step unless someone asks for another.
         measured_bounds: name of an observation → (low, high), as far as they were measured.
         folder: the robot's folder, None for the nominal one.
+        identified: whether its model is one that was fitted to it; the nominal robot is what it is.
         effects: what acts beside the model, between its steps; commands: on the way to the servos; sensing: in sensors.
     """
 
@@ -58,6 +59,7 @@ class SimulatedRobot:
     dt_s: float
     measured_bounds: Mapping[str, tuple[float, float]]
     folder: Path | None
+    identified: bool = True
     effects: EffectValues = field(default_factory=dict)
     commands: CommandEffects | None = None
     sensing: SensingEffects | None = None
@@ -140,6 +142,7 @@ def simulated_robot(
         dt_s=config.timing.dt_s,
         measured_bounds=config.observation,
         folder=folder.path,
+        identified=(source := config.provenance_of("model")) is not None and source.how != "nominal",
         effects=values_of(acting, tuple(JOINTS), folder.config_file),
         commands=commands_of(acting, tuple(JOINTS), folder.config_file),
         sensing=sensing_of(acting, folder.config_file),

@@ -289,6 +289,7 @@ def test_train_and_eval_from_the_command_line(trained, tmp_path, capsys):
     assert measured["average_reward_m_s"] == pytest.approx(measured["progress_m"] / 3.0)
     printed = capsys.readouterr()
     assert re.search(r"cm/s over 3 s: .*policy of step 220", printed.out)
+    assert "was never identified: this is the kit's nominal model" in printed.err
     # The same robot under another name: the policy's model is a file in it, its folder can move.
     assert run_command("eval", out, "--seconds", 1, "--robot", robot.path) == 0
 

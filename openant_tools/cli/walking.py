@@ -92,6 +92,11 @@ def environment(name: str, options: Mapping[str, Any], recordings: Path, **more:
 
     if name != HARDWARE_ID:
         env = gymnasium.make(name, **options, **more)
+        if not env.unwrapped.robot.identified:
+            _notice(
+                f"{options['robot']} was never identified: this is the kit's nominal model, not that robot "
+                "(`openant sysid fit … --robot DIR` makes it one)"
+            )
         try:
             yield env
         finally:
