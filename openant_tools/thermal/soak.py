@@ -433,8 +433,8 @@ def _press(
     here = np.asarray(engine.ask(messages.Hold(0.5)), float)
     for _ in range(PRESSES):
         was = here
-        here = np.asarray(engine.ask(messages.Ramp(_within(was - error, config))), float)
-        engine.ask(messages.Hold(0.5))
+        engine.ask(messages.Ramp(_within(was - error, config)))
+        here = np.asarray(engine.ask(messages.Hold(0.5)), float)
         log.take(engine.telemetry())
         if float(np.abs(here - was).max()) < STILL_RAD:
             break
