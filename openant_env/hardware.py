@@ -500,6 +500,9 @@ def _virtual(source: str, clock: str | None) -> Any:
     """What the ready file of the virtual robot says; one started here is put on the floor where that is possible."""
     from openant_tools.virtual.process import clock_of_its_own, placeable, placed, virtual_robot
 
+    if source.endswith(".toml") and not Path(source).is_file():
+        remedy = "name a scenario (NAME.toml) or a ready file, or 'default' for a healthy robot"
+        raise BadInput("there is no such scenario", where=source, remedy=remedy)
     with contextlib.ExitStack() as stack:
         if placeable(source):
             given = clock_of_its_own(source) if clock is None else clock
