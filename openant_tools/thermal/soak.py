@@ -27,7 +27,7 @@ from openant_tools.recording.tables import read_run
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import HOME_RAD
 from openant_tools.robot.registers import PULSES_PER_TURN, PWM_FULL
-from openant_tools.thermal.thermometer import Thermometer
+from openant_tools.thermal.thermometer import Thermometer, clean
 
 __all__ = [
     "COOL_DOWN_S", "POSES", "Load", "Phase", "Plan", "Sample", "Soaked", "pose_angles", "resume_plan", "soak", "soak_config",
@@ -553,6 +553,5 @@ def _so_far(path: Path) -> _SoFar:
     phase: Phase = "load" if not len(on) or on[-1] or loaded == 0.0 else "cool-down"
     if loaded >= plan.seconds - 1.0:
         phase = "cool-down"
-    temperature = run.signal("temp")
-    peak = {joint: float(np.nanmax(temperature[:, k])) for k, joint in enumerate(run.joints)}
+    peak = {joint: float(np.nanmax(clean(run.t, run.column(f"temp.{joint}")).values)) for joint in run.joints}
     return _SoFar(phase, loaded, cooled if phase == "cool-down" else 0.0, peak)
