@@ -359,10 +359,10 @@ def test_an_argument_that_cannot_be_is_refused_in_one_line(options, words):
 
 
 def test_effects_that_the_model_carries_are_refused_by_name_unless_left_out(robot):
-    robot.update(
-        effects=[Effect("action_delay", ("knee_fl",), {"delay_s": 0.1}), Effect("voltage_sag", enabled=False)]
-    )
-    with pytest.raises(BadInput, match=r"robot\.toml: the effect action_delay does not act as an entry.* `--no-effects`"):
+    robot.update(effects=[Effect("action_delay", ("knee_fl",), {"delay_s": 0.1}), Effect("voltage_sag", enabled=False)])
+    with pytest.raises(
+        BadInput, match=r"robot\.toml: the effect action_delay does not act as an entry.* `--no-effects`"
+    ):
         make(robot=robot.path)
     with pytest.raises(BadInput, match="the effect action_delay does not act as an entry"):
         make(robot=robot.path, effects=["action_delay"])
