@@ -303,8 +303,9 @@ def test_from_loose_motors_to_a_passport_and_on_to_learning(tmp_path):
     assert again.returncode == 0
     assert "1/15" not in again.stdout  # what stands is not done again
     pytest.importorskip("torch")
-    train = ("train", "sac", "--robot", ant, "--steps", "2000")
-    for run, where in (("sim", ("--env", "sim")), ("virtual", ("--env", "hardware", "--virtual", "--yes"))):
-        trained = openant(*train, *where, "--out", ant / "runs" / run)
+    # On the bus a step takes the bus's time: enough of them to see that it walks, records and learns from this folder.
+    runs = {"sim": ("--steps", "2000"), "virtual": ("--steps", "40", "--env", "hardware", "--virtual", "--yes")}
+    for run, how in runs.items():
+        trained = openant("train", "sac", "--robot", ant, *how, "--out", ant / "runs" / run)
         assert trained.returncode == 0, trained.stderr[-2000:]
         assert (ant / "runs" / run / "learning_curve.csv").is_file()

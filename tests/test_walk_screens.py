@@ -108,7 +108,7 @@ def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody waits for hands here: readings while a virtual hand moves something end with its motion, motions are short."""
     monkeypatch.setattr(legs, "READ_S", 2.5)
     monkeypatch.setattr(motions, "SECONDS", dict.fromkeys(motions.LIBRARY, 1.5))
-    monkeypatch.setattr(identification, "RECORD_S", 4.0)
+    monkeypatch.setattr(identification, "RECORD_S", 5.0)
     monkeypatch.setattr(arena, "WIGGLE_S", 3.0)
 
 

@@ -22,7 +22,7 @@ __all__ = ["LearningBar", "need_torch", "robot_argument", "settings_of", "settin
 Settings = TypeVar("Settings")
 
 settings_option = click.option(
-    "--settings", "settings_file", type=click.Path(path_type=Path, dir_okay=False, exists=True), metavar="FILE",
+    "--settings", "settings_file", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
     help="Settings that `openant tune --json` found. Options given here count more.",
 )  # fmt: skip
 
@@ -46,6 +46,10 @@ def read_settings(file: Path | None, agent: str) -> dict[str, Any]:
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
         settings, of = dict(found["settings"]), found["agent"]
+    except OSError as error:
+        raise BadInput(
+            f"there is nothing to read ({error.strerror})", where=file, remedy="name what `openant tune --json` wrote"
+        ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise BadInput(
             "it holds no settings of an agent", where=file, remedy="name what `openant tune --json` wrote"

@@ -307,7 +307,8 @@ class Around(Segment):
         shares, inside = self._shares(space), self._inside(t)
         there = smooth(t / MOVE_S) * smooth((self.seconds - t) / MOVE_S)
         out: Array = there[:, None] * shares * space.half
-        if inside.any():
+        # In one sample nothing moves: a short pose in a slow protocol may have no more.
+        if np.count_nonzero(inside) > 1:
             out[inside] += self._inner().offsets(t[inside] - t[inside][0], space.around(shares), chance)
         return out
 
