@@ -63,6 +63,7 @@ class Robot:
                     walker = Walker(pilot, replies, self.truth)
                     await steps(walker)
                     said.append(walker.said)
+                    await walker.leave()
             finally:
                 app.session.close()
 

@@ -69,6 +69,12 @@ class Walker:
         for key in keys:
             self.app.simulate_key(key)
 
+    async def leave(self) -> None:
+        """Let what was pressed be answered, before the screens are taken away."""
+        answered = asyncio.Event()
+        self.app.call_later(answered.set)
+        await asyncio.wait_for(answered.wait(), PATIENCE_S)
+
     async def until(self, what: Callable[[], bool]) -> None:
         give_up = time.monotonic() + PATIENCE_S
         while not what():
