@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import gymnasium
@@ -89,10 +90,9 @@ class Walker:
         self._control.close()
 
 
-@pytest.fixture(scope="module")
-def ready(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+@contextmanager
+def started(scenario: Path, path: Path) -> Iterator[Path]:
     """The ready file of a virtual robot in stepped time."""
-    path = tmp_path_factory.mktemp("ready") / "ready.json"
     with subprocess.Popen(
         [sys.executable, "-m", "openant_tools.cli", "virtual", "start", "--scenario", scenario, "--ready-file", path]
     ) as process:
@@ -105,6 +105,12 @@ def ready(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
             yield path
         finally:
             process.terminate()
+
+
+@pytest.fixture(scope="module")
+def ready(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    with started(scenario, tmp_path_factory.mktemp("ready") / "ready.json") as path:
+        yield path
 
 
 @pytest.fixture(scope="module")
@@ -295,17 +301,14 @@ def test_sac_learns_on_the_robot_beside_acting_with_a_cable_that_comes_off_in_th
     assert rows[:, 33] == pytest.approx(np.full(24, 0.12), abs=0.03)
 
 
-def test_what_walks_is_recorded_and_the_gap_reads_it(
-    on_the_floor: Walker, ready: Path, folder: RobotFolder, tmp_path: Path
-) -> None:
-    """Last, since it needs the robot for itself, and lays it down."""
-    on_the_floor.env.close()
-    one = Walker(ready, folder, recordings=tmp_path)
-    one.env.reset(seed=0)
-    commands = np.random.default_rng(0).uniform(-1, 1, (6, 8)).astype(np.float32)
-    for action in commands:
-        one.env.step(action)
-    one.close()
+def test_what_walks_is_recorded_and_the_gap_reads_it(scenario: Path, folder: RobotFolder, tmp_path: Path) -> None:
+    with started(scenario, tmp_path / "ready.json") as ready:
+        one = Walker(ready, folder, recordings=tmp_path)
+        one.env.reset(seed=0)
+        commands = np.random.default_rng(0).uniform(-1, 1, (6, 8)).astype(np.float32)
+        for action in commands:
+            one.env.step(action)
+        one.close()
     [path] = one.env.link.recorded
     run = read_recording(path).run
     assert run.facts.setup == "floor"
