@@ -9,7 +9,9 @@ process was trying is tried again by another.
 from __future__ import annotations
 
 import json
+import random
 import tempfile
+import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -19,6 +21,7 @@ from typing import Any
 
 import gymnasium
 import optuna
+import sqlalchemy
 
 from openant_agents import sac, sarsa
 from openant_agents.training import Progress
@@ -32,6 +35,9 @@ Agent = str
 HEARTBEAT_S, GIVEN_UP_S = 60, 240
 #: how often a trial is tried again whose process was killed
 RETRIES = 3
+#: Processes that begin a study together make its tables together, and all but one of them fail: they look again, so often.
+OPENINGS = 6
+RACES = (sqlalchemy.exc.OperationalError, sqlalchemy.exc.IntegrityError, sqlalchemy.exc.ProgrammingError)
 
 
 def _sarsa(trial: optuna.Trial) -> sarsa.Settings:
@@ -82,6 +88,20 @@ class _Sum(gymnasium.Wrapper):  # type: ignore[misc]
         return result
 
 
+def _storage(url: str) -> Any:
+    if url.startswith("redis"):
+        return optuna.storages.get_storage(url)
+    with warnings.catch_warnings():
+        # Signs of life have been called experimental since 2021.
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        return optuna.storages.RDBStorage(
+            url,
+            heartbeat_interval=HEARTBEAT_S,
+            grace_period=GIVEN_UP_S,
+            heartbeat_stale_trial_callback=optuna.storages.RetryHeartbeatStaleTrialCallback(max_retry=RETRIES),
+        )
+
+
 def open_study(url: str, name: str, facts: Mapping[str, Any]) -> optuna.Study:
     """A study in a storage, begun or gone on with.
 
@@ -94,26 +114,20 @@ def open_study(url: str, name: str, facts: Mapping[str, Any]) -> optuna.Study:
         BadInput: the storage cannot be opened, or the study is another.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    try:
-        storage: Any
-        if url.startswith("redis"):
-            storage = optuna.storages.get_storage(url)
-        else:
-            with warnings.catch_warnings():
-                # Signs of life have been called experimental since 2021.
-                warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-                storage = optuna.storages.RDBStorage(
-                    url,
-                    heartbeat_interval=HEARTBEAT_S,
-                    grace_period=GIVEN_UP_S,
-                    heartbeat_stale_trial_callback=optuna.storages.RetryHeartbeatStaleTrialCallback(max_retry=RETRIES),
-                )
-        study = optuna.create_study(storage=storage, study_name=name, direction="maximize", load_if_exists=True)
-    except Exception as error:  # of SQLAlchemy, its drivers, redis: a dozen kinds without a common parent
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
-        raise BadInput(
-            f"the storage cannot be opened: {reason}", where=url, remedy="give a URL such as sqlite:///tune.db"
-        ) from error
+    for attempt in range(OPENINGS):
+        try:
+            study = optuna.create_study(
+                storage=_storage(url), study_name=name, direction="maximize", load_if_exists=True
+            )
+            break
+        except Exception as error:  # of SQLAlchemy, its drivers, redis: a dozen kinds without a common parent
+            if attempt + 1 < OPENINGS and any(isinstance(one, RACES) for one in (error, error.__cause__)):
+                time.sleep(random.uniform(0.1, 0.5))
+                continue
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
+            raise BadInput(
+                f"the storage cannot be opened: {reason}", where=url, remedy="give a URL such as sqlite:///tune.db"
+            ) from error
     asked = json.loads(json.dumps(facts))
     there = study.user_attrs.get("openant")
     if there is None:
