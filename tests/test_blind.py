@@ -29,13 +29,14 @@ from openant_tools.blind.log import logged
 from openant_tools.blind.make import make_set, seed_of_commit
 from openant_tools.blind.robot import true_robot
 from openant_tools.blind.run import run_set, verdict_path
-from openant_tools.blind.score import Case, read, score, wilson
+from openant_tools.blind.score import Case, read, score
 from openant_tools.blind.score_report import score_report, write_docs
 from openant_tools.blind.simulate import simulate
 from openant_tools.blind.sizes import KINDS, SIZES, STANDARD, size_table
 from openant_tools.blind.through_bus import record_through_bus, scenario_of
 from openant_tools.cli.gap import gap
 from openant_tools.errors import BadInput
+from openant_tools.procedure.intervals import wilson
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.joints import JOINTS
 from openant_tools.virtual.scenario import parse_scenario

@@ -1,7 +1,6 @@
 """Verdicts against answers: the table of the benchmark, with intervals, and everything that went wrong.
 
-Of a proportion k of n the 95 % interval is Wilson's (J. Am. Stat. Assoc. 22, 1927). Only `read` opens the answers, and only once
-every robot has its verdict.
+Only `read` opens the answers, and only once every robot has its verdict.
 """
 
 from __future__ import annotations
@@ -20,24 +19,14 @@ from openant_tools.blind.draw import OUTSIDE, Answer
 from openant_tools.blind.run import folders_of, verdict_path
 from openant_tools.blind.sizes import KINDS
 from openant_tools.errors import BadInput
+from openant_tools.procedure.intervals import wilson
 
-__all__ = ["Case", "Row", "Score", "read", "score", "wilson"]
+__all__ = ["Case", "Row", "Score", "read", "score"]
 
 #: verdicts that give no name
 UNNAMED = ("none", "unexplained", "ambiguous")
 #: what joint positions do not show, so that no closure of their gap can be asked for
 _OFF_POSITION = frozenset({"imu_misalignment", "imu_bias", "tracker_scale"})
-Z_95 = 1.959964
-
-
-def wilson(k: int, n: int) -> tuple[float, float]:
-    """The 95 % interval of a proportion of which k of n were seen."""
-    if not n:
-        return 0.0, 1.0
-    share, z2 = k / n, Z_95**2
-    middle = (share + z2 / (2 * n)) / (1 + z2 / n)
-    half = Z_95 / (1 + z2 / n) * math.sqrt(share * (1 - share) / n + z2 / (4 * n * n))
-    return max(0.0, middle - half), min(1.0, middle + half)
 
 
 @dataclass(frozen=True)

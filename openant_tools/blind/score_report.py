@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from openant_tools.blind.score import Row, Score, truth_in_words, wilson
+from openant_tools.blind.score import Row, Score, truth_in_words
 from openant_tools.blind.sizes import size_table
 from openant_tools.files import write_bytes, write_text
+from openant_tools.procedure.intervals import wilson
 from openant_tools.report import KeyFigure, Report, plots
 
 if TYPE_CHECKING:

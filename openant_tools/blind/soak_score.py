@@ -15,6 +15,7 @@ import numpy as np
 from openant_tools.blind.soak_set import read_soak_answers, read_verdicts, soak_facts
 from openant_tools.blind.soaks import CAUSES, SoakAnswer
 from openant_tools.files import write_bytes, write_text
+from openant_tools.procedure.intervals import wilson
 from openant_tools.report import plots
 
 if TYPE_CHECKING:
@@ -22,21 +23,10 @@ if TYPE_CHECKING:
 
 __all__ = ["SoakCase", "SoakScore", "score_soaks", "write_soak_docs"]
 
-Z_95 = 1.959964
 #: what the issue asks for
 FIRST, FIRST_TWO, FALSE_ALARMS = 0.90, 0.95, 0.02
 #: s that one soak of 15 minutes may take
 SECONDS = 60.0
-
-
-def wilson(k: int, n: int) -> tuple[float, float]:
-    """The 95 % interval of a proportion of which k of n were seen."""
-    if not n:
-        return 0.0, 1.0
-    share, z2 = k / n, Z_95**2
-    middle = (share + z2 / (2 * n)) / (1 + z2 / n)
-    half = Z_95 / (1 + z2 / n) * float(np.sqrt(share * (1 - share) / n + z2 / (4 * n * n)))
-    return max(0.0, middle - half), min(1.0, middle + half)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 
 from openant_tools.comms.dropouts.diagnose import DropoutDiagnosis
 from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.intervals import wilson
 
 __all__ = ["dropout_effects", "dropouts_finding", "effects_toml"]
 
@@ -39,7 +40,7 @@ def dropouts_finding(
     log = found.measures.log
     source = ", ".join(recordings)
     asked, lost = int(log.answers.sum()), int(log.lost.sum())
-    low, high = _wilson(lost, asked)
+    low, high = wilson(lost, asked)
     evidence = [
         Evidence("time watched", round(log.seconds, 3), "s", source),
         Evidence("answers asked for", float(asked), "", source),
@@ -109,13 +110,3 @@ def effects_toml(found: DropoutDiagnosis) -> str:
     import tomlkit
 
     return tomlkit.dumps({"effect": dropout_effects(found)})
-
-
-def _wilson(k: int, n: int) -> tuple[float, float]:
-    """95 % interval of a share."""
-    if not n:
-        return 0.0, 1.0
-    z2, share = 1.959964**2, k / n
-    middle = (share + z2 / (2 * n)) / (1 + z2 / n)
-    half = (z2 * (share * (1 - share) / n + z2 / (4 * n * n))) ** 0.5 / (1 + z2 / n)
-    return max(0.0, middle - half), min(1.0, middle + half)
