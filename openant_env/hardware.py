@@ -5,7 +5,8 @@ cycles; the observation returned is what the last of them measured. Who answers 
 action leave exactly `dt` after the last one. Who takes longer makes the period longer: that is measured from command to
 command (`info["period_s"]`), counted (`info["overruns"]`) and told, and `info["dt"]` is the time that really passed.
 
-What a robot cannot do is a truncation with a reason; `reset` then waits until it can, and says what for.
+What a robot cannot do is a truncation with a reason; `reset` then waits until it can, and says what for. A virtual robot
+has nobody beside it: one that walked out of the camera's view, fell or wound up its cable is put back after a while.
 """
 
 from __future__ import annotations
@@ -51,6 +52,8 @@ LATE_SHARE = 0.5
 COOLED_K = 15.0
 #: s of one look at a robot that is waited for, and between two words about the same trouble
 LOOK_S, REPEAT_S = 0.25, 30.0
+#: s after which someone is there who puts a virtual robot back
+HELP_S = 5.0
 #: servos that shut down so often within so many seconds are not started again without someone looking
 REBOOTS, REBOOTS_S = 3, 600.0
 
@@ -340,7 +343,6 @@ class AntHardware(AntBase):
         up = self._observation[self.layout.slices["acc"]][2]
         self._fallen_s = self._fallen_s + elapsed if up < 0.0 else 0.0
         lost, silent = self._t - self._pose_t, self._t - self._imu_t
-        turns = self._wound_rad / (2.0 * math.pi)
         if self._fallen_s >= FALLEN_S and self._on_fall != "ignore":
             info["reason"] = "the robot lies on its back"
             return self._on_fall == "terminate", self._on_fall == "truncate"
@@ -348,10 +350,9 @@ class AntHardware(AntBase):
             info["reason"] = f"the camera has not seen the robot for {lost:.1f} s"
         elif silent > IMU_PATIENCE_S:
             info["reason"] = f"the IMU has sent nothing for {silent:.1f} s"
-        elif abs(turns) > CABLE_TURNS:
-            info["reason"] = (
-                f"the cable is wound up by {abs(turns):.1f} turns to the {'left' if turns > 0 else 'right'}"
-            )
+        elif self._wound:
+            turns, side = abs(self._wound_rad) / (2.0 * math.pi), "left" if self._wound_rad > 0 else "right"
+            info["reason"] = f"the cable is wound up by {turns:.1f} turns to the {side}"
         elif self._paused.is_set():
             info["reason"] = self._why_paused
         elif self._seconds >= self._time_limit_s - 0.5 * self.dt:
@@ -384,7 +385,7 @@ class AntHardware(AntBase):
 
     def _stand_up(self) -> None:
         """Wait until nothing is in the way, saying what it is, and stand."""
-        said, said_at, waited = "", -math.inf, 0.0
+        said, said_at, waited, helped_at = "", -math.inf, 0.0, 0.0
         while True:
             why = self._in_the_way()
             if why is None:
@@ -394,6 +395,7 @@ class AntHardware(AntBase):
                     why = self._unseen()
                     if why is None:
                         break
+                    self.link.let_down()  # it may wait for long
                 except HardwareFault as fault:
                     why = str(fault)
                     self.link.drop()
@@ -403,6 +405,9 @@ class AntHardware(AntBase):
             if kind != said or waited - said_at > REPEAT_S:
                 self._notice(f"waiting: {why}")
                 said, said_at = kind, waited
+            if waited - helped_at > HELP_S and self._out_of_place and self.link.put_back():
+                self._notice("the virtual robot is put back where it began")
+                self._wound_rad, helped_at = 0.0, waited
             began = time.monotonic()
             self.link.look(LOOK_S)
             waited += LOOK_S if self.link.stepped else time.monotonic() - began
@@ -431,6 +436,23 @@ class AntHardware(AntBase):
             self.link.drop()
             return str(fault)
 
+    @property
+    def _out_of_place(self) -> bool:
+        """Whether it takes hands to go on: the robot lies on its back or side, is wound up, or stands out of view."""
+        return not self._paused.is_set() and (self._lying or self._wound or not self._seen)
+
+    @property
+    def _lying(self) -> bool:
+        return bool(self._observation[self.layout.slices["acc"]][2] < UPRIGHT_M_S2) and self._on_fall != "ignore"
+
+    @property
+    def _wound(self) -> bool:
+        return abs(self._wound_rad) > 2.0 * math.pi * CABLE_TURNS
+
+    @property
+    def _seen(self) -> bool:
+        return self._t - self._pose_t < self._tag_patience_s
+
     def _trouble(self) -> str | None:
         """What the servos and sensors of a robot have to say against its standing up."""
         hot = self._hot()
@@ -445,11 +467,11 @@ class AntHardware(AntBase):
             self._reboots.append(time.monotonic())
             self.link.reboot(list(errors))
             return f"{', '.join(errors)} had shut down, and are started again"
-        turns = self._wound_rad / (2.0 * math.pi)
-        if abs(turns) > CABLE_TURNS:
+        if self._wound:
             self.link.let_down()
-            return f"the cable is wound up by {abs(turns):.1f} turns: turn the robot back by hand, in the camera's view"
-        if self._observation[self.layout.slices["acc"]][2] < UPRIGHT_M_S2 and self._on_fall != "ignore":
+            turns = abs(self._wound_rad) / (2.0 * math.pi)
+            return f"the cable is wound up by {turns:.1f} turns: turn the robot back by hand, in the camera's view"
+        if self._lying:
             self.link.let_down()
             return "the robot lies on its back or side: put it on its feet"
         why = self._unseen()
@@ -472,7 +494,7 @@ class AntHardware(AntBase):
 
     def _unseen(self) -> str | None:
         """Which reading is missing, so that there is nothing to learn from."""
-        if not self._t - self._pose_t < self._tag_patience_s:
+        if not self._seen:
             return "the camera does not see the robot: look at light, focus, and both tags in view"
         if not self._t - self._imu_t < IMU_PATIENCE_S:
             return "the IMU sends nothing: look at its cable"

@@ -261,6 +261,16 @@ class RobotLink:
             bus.close()
         self.wait(BOOT_S)
 
+    def put_back(self) -> bool:
+        """Have a virtual robot on its floor set where it began, as a person would; False where there is none."""
+        if self._control is None:
+            return False
+        try:
+            self._control.ask("put")
+        except HardwareFault:
+            return False
+        return True
+
     # ---- inside --------------------------------------------------------------------------------------------------
 
     def _need_engine(self) -> EngineProcess:

@@ -236,6 +236,25 @@ def test_a_cable_wound_up_and_a_fall_need_someone(walker: Walker) -> None:
     assert info["reason"] == "the robot lies on its back"
 
 
+@pytest.mark.parametrize(
+    ("where", "why"),
+    [
+        ({"position_m": [1.5, 0.0]}, "the camera does not see the robot"),
+        ({"rotation_rad": [math.pi, 0.0, 0.0]}, "the robot lies on its back or side"),
+    ],
+)
+def test_a_virtual_robot_that_needs_hands_is_put_back(walker: Walker, where: dict[str, object], why: str) -> None:
+    """Nobody else could: a run on a virtual robot would wait for ever."""
+    walker.env.link.let_down()
+    walker._control.ask("put", **where)
+    walker.env.link.look(1.0)
+    walker.env.reset(seed=0)
+    assert walker.said[0].startswith(f"waiting: {why}")
+    assert "the virtual robot is put back where it began" in walker.said
+    assert not walker.env.step(STILL)[3]
+    assert np.hypot(*walker._control.ask("state")["base"]["position"][:2]) < 0.05
+
+
 # ---------------------------------------------------------------------------------------------------- what is refused
 
 

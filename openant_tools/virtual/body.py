@@ -137,6 +137,16 @@ class Body:
             self.data.qpos[:7] = (*s.position_m, LYING_HEIGHT, math.cos(half), 0.0, 0.0, math.sin(half))
         mujoco.mj_forward(self.model, self.data)
 
+    def put(self, position_m: Sequence[float], rotation_rad: Sequence[float]) -> None:
+        """Hands set the robot on the floor, still, its legs as they are: torso at (2,) m, turned by (3,) rad."""
+        self.data.qpos[:7] = (*position_m, 0.0, 1.0, 0.0, 0.0, 0.0)
+        mujoco.mju_quatIntegrate(self.data.qpos[3:7], np.array(rotation_rad, float), 1.0)
+        self.data.qvel[:6] = 0.0
+        mujoco.mj_forward(self.model, self.data)
+        lowest = min(min(az, bz) - radius for _, _, az, _, _, bz, radius in self.limbs())
+        self.data.qpos[2] = max(LYING_HEIGHT, -lowest)
+        mujoco.mj_forward(self.model, self.data)
+
     def set_gear(self, frictionloss: Array, viscous: Array, armature: Array) -> None:
         """Friction and rotor inertia at the joints, (n,) N·m, N·m·s/rad, kg·m²."""
         self.frictionloss[:] = frictionloss

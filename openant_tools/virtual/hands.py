@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -64,10 +63,8 @@ class Tilting:
     @classmethod
     def to(cls, start_s: float, start: Array, rotation_rad: Sequence[float], seconds: float) -> Tilting:
         """From attitude `start` to the one that a rotation vector (rad, in the world) makes of a level torso."""
-        goal, back, between, turn = np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(3)
-        angle = math.sqrt(sum(x * x for x in rotation_rad))
-        axis = np.array(rotation_rad, float) / angle if angle else np.array([0.0, 0.0, 1.0])
-        mujoco.mju_axisAngle2Quat(goal, axis, angle)
+        goal, back, between, turn = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(4), np.zeros(4), np.zeros(3)
+        mujoco.mju_quatIntegrate(goal, np.array(rotation_rad, float), 1.0)
         mujoco.mju_negQuat(back, start)
         mujoco.mju_mulQuat(between, back, goal)
         mujoco.mju_quat2Vel(turn, between, 1.0)

@@ -26,6 +26,8 @@ The control socket (Unix stream, one JSON object a line, one line of answer each
 | `{"do": "turn", "joint": …, "to": [rad, …], "leg_s": s}` | a hand leads a joint through these angles and holds it |
 | `{"do": "let_go"}` | hands off all joints |
 | `{"do": "tilt", "rotation_rad": [x, y, z], "seconds": s}` | hands turn the torso on its stand to this attitude |
+| `{"do": "put", "position_m": [x, y], "rotation_rad": [x, y, z]}` | hands put the robot on the floor; without these on |
+| | its feet where it began |
 
 What fails answers `{"error": "…"}`. Counts of bytes run from the opening of this control connection or the last `open`.
 """
@@ -514,9 +516,17 @@ class Server:
                 raise _Failed("only a robot on its stand is tilted by hand")
             self.world.tilt_by_hand(_numbers(request, "rotation_rad", 3), _number(request, "seconds", 1.0))
             return {"t": self.now}
+        if do == "put":
+            if self.world.settings.body.setup != "floor":
+                raise _Failed("only a robot on the floor can be put elsewhere")
+            self.world.put(
+                _numbers(request, "position_m", 2) if "position_m" in request else None,
+                _numbers(request, "rotation_rad", 3) if "rotation_rad" in request else None,
+            )
+            return {"t": self.now}
         raise _Failed(
             f"no such request: {do!r} (now, open, advance, settle, wait, state, wiring, fault, plug, unplug, assemble, turn, "
-            "let_go, tilt)"
+            "let_go, tilt, put)"
         )
 
     def _arrive(self, control: _Control, request: dict[str, Any]) -> None:

@@ -308,6 +308,13 @@ class World:
         self.drives.grips.clear()
         self.drives.touched += 1
 
+    def put(self, position_m: Sequence[float] | None, rotation_rad: Sequence[float] | None) -> None:
+        """Pick the robot up and put it on the floor, by default on its feet where it began; (2,) m and (3,) rad."""
+        body = self.settings.body
+        here = body.position_m if position_m is None else position_m
+        self.body.put(here, (0.0, 0.0, body.heading_rad) if rotation_rad is None else rotation_rad)
+        self.drives.touched += 1
+
     def tilt_by_hand(self, rotation_rad: Sequence[float], seconds: float) -> None:
         """Turn the torso on its stand to an attitude, as a rotation vector in the world, rad."""
         self._tilting = Tilting.to(self.now, self.body.quaternion, rotation_rad, seconds)
