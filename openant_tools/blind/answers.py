@@ -17,7 +17,7 @@ from openant_tools.errors import BadInput
 from openant_tools.files import write_text
 from openant_tools.virtual.seal import commitment_of, open_sealed, seal
 
-__all__ = ["SEALED", "read_answers", "write_answers"]
+__all__ = ["OPEN", "SEALED", "open_answers", "read_answers", "write_answers"]
 
 SEALED, OPEN = "answers.sealed.toml", "truth.toml"
 
@@ -36,7 +36,7 @@ def read_answers(folder: Path, key: bytes | None, commitment: str) -> Mapping[st
     """Robot → answer.
 
     Raises:
-        BadInput: the seal needs a key, does not open, or is not the one that was committed to.
+        BadInput: there are none, or they do not open (`open_answers`).
     """
     path = folder / SEALED
     if not path.exists():
@@ -46,6 +46,15 @@ def read_answers(folder: Path, key: bytes | None, commitment: str) -> Mapping[st
                 "there are no answers here", where=folder, remedy="name a set that `openant gap blind make` made"
             )
         return {file.parent.name: Answer.of(tomllib.loads(file.read_text(encoding="utf-8"))) for file in found}
+    return {name: Answer.of(one) for name, one in tomllib.loads(open_answers(path, key, commitment))["answer"].items()}
+
+
+def open_answers(path: Path, key: bytes | None, commitment: str) -> str:
+    """The plain text of a set's sealed answers.
+
+    Raises:
+        BadInput: the seal needs a key, does not open, or is not the one that was committed to.
+    """
     if key is None:
         raise BadInput("the answers are sealed", where=path, remedy="name the key by --key-file")
     table = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -53,5 +62,4 @@ def read_answers(folder: Path, key: bytes | None, commitment: str) -> Mapping[st
         raise BadInput(
             "the answers are not those that the set committed to", where=path, remedy="take the set's own file"
         )
-    opened = tomllib.loads(open_sealed(table, key, path))
-    return {name: Answer.of(one) for name, one in opened["answer"].items()}
+    return open_sealed(table, key, path)

@@ -13,6 +13,7 @@ from typing import Any
 import tomlkit
 from joblib import Parallel, delayed
 
+from openant_tools.blind.answers import OPEN, SEALED, open_answers
 from openant_tools.blind.soak_tables import soak_table
 from openant_tools.blind.soak_virtual import soak_virtual
 from openant_tools.blind.soaks import SoakAnswer, SoakMix, draw_soaks
@@ -20,12 +21,11 @@ from openant_tools.comms.dropouts.diagnose import diagnose_dropouts
 from openant_tools.errors import BadInput, OpenAntError
 from openant_tools.files import write_text
 from openant_tools.recording.tables import read_run, write_table
-from openant_tools.virtual.seal import commitment_of, open_sealed, seal
+from openant_tools.virtual.seal import commitment_of, seal
 
 __all__ = ["SCHEMA", "make_soaks", "read_soak_answers", "read_verdicts", "run_soaks", "soak_facts"]
 
 SCHEMA = "openant.blind-comms/1"
-SEALED, OPEN = "answers.sealed.toml", "truth.toml"
 
 Progress = Callable[[str, float], None]
 
@@ -114,19 +114,11 @@ def read_soak_answers(folder: Path, key: bytes | None) -> Mapping[str, SoakAnswe
     """Soak → answer.
 
     Raises:
-        BadInput: the seal needs a key, does not open, or is not the one that was committed to.
+        BadInput: there are none, or they do not open (`open_answers`).
     """
     commitment = str(soak_facts(folder)["commitment"])
     if (folder / SEALED).exists():
-        path = folder / SEALED
-        if key is None:
-            raise BadInput("the answers are sealed", where=path, remedy="name the key by --key-file")
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-        if table["sealed"]["commitment"] != commitment:
-            raise BadInput(
-                "the answers are not those that the set committed to", where=path, remedy="take the set's own file"
-            )
-        plain = open_sealed(table, key, path)
+        plain = open_answers(folder / SEALED, key, commitment)
     else:
         path = folder / OPEN
         if not path.is_file():
