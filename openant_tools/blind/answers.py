@@ -9,6 +9,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import tomlkit
 
@@ -17,9 +18,26 @@ from openant_tools.errors import BadInput
 from openant_tools.files import write_text
 from openant_tools.virtual.seal import commitment_of, open_sealed, seal
 
-__all__ = ["OPEN", "SEALED", "open_answers", "read_answers", "write_answers"]
+__all__ = ["OPEN", "SEALED", "committed", "open_answers", "read_answers", "write_answers"]
 
 SEALED, OPEN = "answers.sealed.toml", "truth.toml"
+
+
+def committed(out: Path, facts: Mapping[str, Any]) -> str | None:
+    """What the set of these facts committed to, where it stands there already; None in a new or empty folder.
+
+    Raises:
+        BadInput: `out` holds something else.
+    """
+    path = out / "set.toml"
+    if path.exists():
+        there = tomllib.loads(path.read_text(encoding="utf-8"))
+        if {name: there.get(name) for name in facts} != facts:
+            raise BadInput("another set is here already", where=out, remedy="name another folder")
+        return str(there["commitment"])
+    if out.exists() and any(out.iterdir()):
+        raise BadInput("the folder is not empty", where=out, remedy="name a new one")
+    return None
 
 
 def write_answers(out: Path, names: Sequence[str], answers: Sequence[Answer], key: bytes | None) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import tomlkit
 from joblib import Parallel, delayed
 
-from openant_tools.blind.answers import read_answers, write_answers
+from openant_tools.blind.answers import committed, read_answers, write_answers
 from openant_tools.blind.commands import Motion, motions
 from openant_tools.blind.draw import Answer, Mix, draw_answers
 from openant_tools.blind.log import logged
@@ -114,21 +114,16 @@ def _claim(
     out: Path, answers: list[Answer], drawn: dict[str, int], commit: str | None, mix: Mix, key: bytes | None
 ) -> tuple[str, list[Answer]]:
     """Write the set's facts and its answers, or see that it is the same set and take those that it has; their commitment."""
-    path = out / "set.toml"
     facts: dict[str, Any] = {"schema": SCHEMA, **drawn}
     if commit:
         facts["seed_from_commit"] = commit
     facts["mix"] = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(mix).items()}
-    if path.exists():
-        there = tomlkit.parse(path.read_text(encoding="utf-8")).unwrap()
-        if {name: there.get(name) for name in facts} != facts:
-            raise BadInput("another set is here already", where=out, remedy="name another folder")
+    commitment = committed(out, facts)
+    if commitment is not None:
         # What was sealed stays true, however a later version of this code would draw.
-        return str(there["commitment"]), list(read_answers(out, key, str(there["commitment"])).values())
-    if out.exists() and any(out.iterdir()):
-        raise BadInput("the folder is not empty", where=out, remedy="name a new one")
+        return commitment, list(read_answers(out, key, commitment).values())
     facts["commitment"] = write_answers(out, [_name(k) for k in range(len(answers))], answers, key)
-    write_text(path, tomlkit.dumps(facts))
+    write_text(out / "set.toml", tomlkit.dumps(facts))
     return str(facts["commitment"]), answers
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import tomlkit
 from joblib import Parallel, delayed
 
-from openant_tools.blind.answers import OPEN, SEALED, open_answers
+from openant_tools.blind.answers import OPEN, SEALED, committed, open_answers
 from openant_tools.blind.soak_tables import soak_table
 from openant_tools.blind.soak_virtual import soak_virtual
 from openant_tools.blind.soaks import SoakAnswer, SoakMix, draw_soaks
@@ -67,23 +67,17 @@ def make_soaks(
     if commit:
         facts["seed_from_commit"] = commit
     facts["mix"] = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(mix).items()}
-    path = out / "set.toml"
-    if path.exists():
-        there = tomllib.loads(path.read_text(encoding="utf-8"))
-        if {name: there.get(name) for name in facts} != facts:
-            raise BadInput("another set is here already", where=out, remedy="name another folder")
-        commitment = str(there["commitment"])
+    commitment = committed(out, facts)
+    if commitment is not None:
         answers = list(read_soak_answers(out, key).values())
     else:
-        if out.exists() and any(out.iterdir()):
-            raise BadInput("the folder is not empty", where=out, remedy="name a new one")
         plain = tomlkit.dumps({"answer": {_name(k): answer.as_table() for k, answer in enumerate(answers)}})
         if key is None:
             commitment = commitment_of(b"", plain)
             write_text(out / OPEN, plain)
         else:
             commitment = seal(plain, key, out / SEALED)
-        write_text(path, tomlkit.dumps({**facts, "commitment": commitment}))
+        write_text(out / "set.toml", tomlkit.dumps({**facts, "commitment": commitment}))
     todo = [k for k in range(count) if not (out / f"{_name(k)}.parquet").exists()]
     work = (delayed(_make)(out, _name(k), answers[k]) for k in todo)
     for done, name in enumerate(Parallel(n_jobs=jobs, return_as="generator_unordered")(work), 1):
