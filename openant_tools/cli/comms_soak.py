@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,10 +10,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from openant_tools.cli.options import finite, json_option, rate_option, robot_option
+from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, clock_of_its_own, virtual_option, virtual_robot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
+
+    from rich.console import Console
 
 __all__ = ["soak"]
 
@@ -84,7 +88,6 @@ def _on_the_bus(
     out: Path, seconds: float, still: bool, resume: bool, every_cycle: bool, yes: bool, port: str | None,
     virtual_source: str | None, robot: Path | None, rate_hz: float, json_file: Path | None,
 ) -> None:  # fmt: skip
-    import contextlib
     import json
 
     from rich.console import Console
@@ -148,25 +151,16 @@ def _on_the_bus(
         raise SystemExit(1)
 
 
-def _bar(console: Any) -> Any:
-    import contextlib
+@contextlib.contextmanager
+def _bar(console: Console) -> Iterator[Callable[[float, Mapping[str, Any]], None]]:
+    with progress_bar("soaking", console=console) as tell:
 
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        def update(share: float, statistics: Mapping[str, Any]) -> None:
+            asked = sum(servo["asked"] for servo in statistics["servos"])
+            answered = sum(servo["answered"] for servo in statistics["servos"])
+            tell(f"{asked - answered} of {asked} answers lost", share)
 
-    @contextlib.contextmanager
-    def shown() -> Any:
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=console, transient=True) as bar:
-            task = bar.add_task("soaking", total=1.0)
-
-            def update(share: float, statistics: Mapping[str, Any]) -> None:
-                asked = sum(servo["asked"] for servo in statistics["servos"])
-                answered = sum(servo["answered"] for servo in statistics["servos"])
-                bar.update(task, completed=share, description=f"{asked - answered} of {asked} answers lost")
-
-            yield update
-
-    return shown()
+        yield update
 
 
 def _transactions(source: str, out: Path, seconds: float, rate_hz: float, still: bool) -> None:
@@ -186,7 +180,6 @@ def _transactions(source: str, out: Path, seconds: float, rate_hz: float, still:
             "a running robot has ports only", where=source, remedy="name a scenario, or leave out --transactions"
         )
     scenario = Scenario() if source == VIRTUAL_DEFAULT else load_scenario(Path(source))
-    progress: Callable[[float, Mapping[str, Any]], None]
     with _bar(Console(stderr=True)) as progress:
         run = swinging_soak(
             scenario, seconds, rate_hz, out.stem, still=still, progress=lambda share: progress(share, {"servos": []})

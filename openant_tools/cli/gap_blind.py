@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
 import click
 
+from openant_tools.cli.blind_sets import (
+    docs_option,
+    jobs_option,
+    key_of_set,
+    key_option,
+    seed_from_option,
+    seed_of_set,
+    seed_option,
+    set_argument,
+)
 from openant_tools.cli.options import json_option, out_option, report_option
-from openant_tools.errors import BadInput
+from openant_tools.cli.progress import progress_bar
 
-__all__ = ["blind", "shown_progress"]
+__all__ = ["blind"]
 
 
 @click.group()
 def blind() -> None:
     """Judge the diagnosis on robots whose answers are sealed."""
-
-
-_set_argument = click.argument("folder", type=click.Path(path_type=Path), metavar="SET")
-_key_option = click.option(
-    "--key-file", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="The key of the answers."
-)
-_jobs_option = click.option(
-    "--jobs", type=click.IntRange(1), default=1, show_default=True, metavar="N", help="Robots at the same time."
-)
 
 
 def _share(name: str, words: str) -> Callable[[click.decorators.FC], click.decorators.FC]:
@@ -37,8 +37,8 @@ def _share(name: str, words: str) -> Callable[[click.decorators.FC], click.decor
 @blind.command()
 @out_option
 @click.option("--robots", "count", type=click.IntRange(1, 10_000), default=240, show_default=True, metavar="N")
-@click.option("--seed", type=click.IntRange(0), metavar="S", help="Of everything that is drawn.")
-@click.option("--seed-from", "commit", metavar="COMMIT", help="Take the seed from a commit's hash: nobody chose it.")
+@seed_option
+@seed_from_option
 @click.option(
     "--motions",
     "motion_seed",
@@ -50,9 +50,9 @@ def _share(name: str, words: str) -> Callable[[click.decorators.FC], click.decor
 @_share("--two", "Robots with two effects. Default 0.15.")
 @_share("--outside", "Robots outside the catalogue. Default 0.12.")
 @_share("--virtual", "Robots from the virtual robot's bus, where it can have the effect; a minute each. Default 0.5.")
-@_key_option
+@key_option
 @click.option("--open", "unsealed", is_flag=True, help="Leave the answers open, beside the runs: for development.")
-@_jobs_option
+@jobs_option("Robots")
 def make(
     out: Path,
     count: int,
@@ -71,29 +71,16 @@ def make(
       openant gap blind make --out dev --robots 60 --seed 1 --open
     """
     from openant_tools.blind.draw import Mix
-    from openant_tools.blind.make import make_set, seed_of_commit
-    from openant_tools.virtual.seal import make_key, read_key
+    from openant_tools.blind.make import make_set
 
-    full = None
-    if commit is not None:
-        if seed is not None:
-            raise BadInput("a set has one seed", remedy="give --seed or --seed-from, not both")
-        seed, full = seed_of_commit(commit)
-    if seed is None:
-        raise BadInput("a set needs a seed", remedy="give --seed-from COMMIT, or --seed S")
-    if unsealed == (key_file is not None):
-        raise BadInput("the answers are to be sealed or open", remedy="give --key-file FILE or --open")
-    key = None
-    if key_file is not None:
-        if key_file.resolve().is_relative_to(out.resolve()):
-            raise BadInput("the key would lie beside what it seals", where=key_file, remedy="keep it outside the set")
-        key = read_key(key_file) if key_file.exists() else make_key(key_file)
+    drawn_from, full = seed_of_set(seed, commit)
+    key = key_of_set(out, key_file, unsealed)
     given: dict[str, Any] = {name: value for name, value in shares.items() if value is not None}
-    with shown_progress() as progress:
+    with progress_bar() as progress:
         commitment = make_set(
             out,
             count,
-            seed,
+            drawn_from,
             mix=Mix(**given),
             commit=full,
             key=key,
@@ -106,8 +93,8 @@ def make(
 
 
 @blind.command()
-@_set_argument
-@_jobs_option
+@set_argument
+@jobs_option("Robots")
 @click.option("--backend", type=click.Choice(["loky", "dask", "ray"]), default="loky", show_default=True)
 @click.option("--scheduler", metavar="ADDRESS", help="Of a Dask cluster that runs already; else one starts here.")
 def run(folder: Path, jobs: int, backend: str, scheduler: str | None) -> None:
@@ -119,7 +106,7 @@ def run(folder: Path, jobs: int, backend: str, scheduler: str | None) -> None:
     """
     from openant_tools.blind.run import Backend, run_set
 
-    with shown_progress() as progress:
+    with progress_bar() as progress:
         done = run_set(
             folder, jobs=jobs, backend=cast("Backend", backend), scheduler=scheduler, progress=progress
         )  # fmt: skip
@@ -127,11 +114,9 @@ def run(folder: Path, jobs: int, backend: str, scheduler: str | None) -> None:
 
 
 @blind.command()
-@_set_argument
-@_key_option
-@click.option(
-    "--docs", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Write the page of the docs."
-)
+@set_argument
+@key_option
+@docs_option
 @json_option
 @report_option
 def score(folder: Path, key_file: Path | None, docs: Path | None, json_file: Path | None, report: Path | None) -> None:
@@ -160,15 +145,3 @@ def score(folder: Path, key_file: Path | None, docs: Path | None, json_file: Pat
         click.echo(f"wrote {docs}", err=True)
     if any(row.reached == "below" for row in found.rows):
         click.get_current_context().exit(1)
-
-
-@contextlib.contextmanager
-def shown_progress() -> Iterator[Callable[[str, float], None]]:
-    """A bar on stderr."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=1.0)
-        yield lambda words, share: bar.update(task, description=words, completed=share)

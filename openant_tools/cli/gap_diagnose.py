@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from openant_tools.cli.options import json_option, report_option, robot_option
+from openant_tools.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from openant_tools.gap.diagnosis import Diagnosis
@@ -170,13 +171,8 @@ def next_experiment(diagnosis: Path, model: Path | None, json_file: Path | None)
 @contextlib.contextmanager
 def progress() -> Iterator[Callable[[float, str], None]]:
     """A bar on stderr, told a share and words."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("reading", total=1.0)
-        yield lambda share, words: bar.update(task, description=words, completed=share)
+    with progress_bar("reading") as tell:
+        yield lambda share, words: tell(words, share)
 
 
 def _model(model: Path | None, robot: Path | None, runs: tuple[Path, ...]) -> Path:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from openant_tools.cli.options import robot_folder, robot_option, tie_option
+from openant_tools.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
@@ -67,9 +68,6 @@ def fit(
     voltage_sag …), which is written to calibrated.effects.toml and into robot.toml, and acts in the environment. Anything else in an MJCF with --parameters (docs/identify.md). Exit code 1: nothing beats
     the given model.
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
     from openant_tools.recording.tables import read_run
     from openant_tools.robot.folder import RobotFolder
     from openant_tools.sysid.declared import read_declarations
@@ -83,10 +81,7 @@ def fit(
         model = described.model_path()
     recordings = [read_run(path) for path in runs]
     held_out = [read_run(path) for path in hold_out]
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("fitting", total=1.0)
+    with progress_bar("fitting", remaining=False) as tell:
         result = identify(
             recordings,
             model,
@@ -98,9 +93,9 @@ def fit(
             tie=tie,
             declared=None if declared is None else read_declarations(declared),
             effects=() if described is None else described.config().effects,
-            progress=lambda what, done: bar.update(task, description=what, completed=done),
+            progress=tell,
         )
-        bar.update(task, description="writing the report", completed=1.0)
+        tell("writing the report", 1.0)
         written = write_fit(result, out)
     if folder is not None and result.accepted:
         write_robot(result, folder)

@@ -16,6 +16,7 @@ from openant_tools.cli.options import (
     seconds_option,
     tie_option,
 )
+from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, robot_of
 
 if TYPE_CHECKING:
@@ -109,9 +110,6 @@ def plan(
     """
     import json
 
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
     from openant_tools.errors import BadInput
     from openant_tools.files import write_text
     from openant_tools.sysid.design import design
@@ -155,15 +153,8 @@ def plan(
             memory_s=assumed.memory_s if memory_s is None else memory_s,
         ),
     )
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     notes = []
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("planning", total=1.0)
-
-        def step(what: str, done: float) -> None:
-            bar.update(task, description=what, completed=done)
-
+    with progress_bar("planning", remaining=False) as step:
         result = make_plan(asked, played, step)
         if optimise:
             found = design(asked, sum(one.seconds for one in stand), step)
