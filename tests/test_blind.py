@@ -286,6 +286,27 @@ def test_the_score_counts_what_is_right_and_shows_what_is_not(
     assert (docs.parent / "pictures" / "blind-confusion.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_set_that_is_judged_in_part_can_be_scored_so_far(
+    sealed_set: tuple[Path, Path, bytes], tmp_path: Path
+) -> None:
+    folder, key_file, key = sealed_set
+    with pytest.raises(BadInput, match="3 of 3 robots have no verdict"):
+        read(folder, key, so_far=True)
+    run_set(folder, diagnose=says)
+    verdict_path(folder, "robot-001").unlink()
+    asked = ["blind", "score", str(folder), "--key-file", str(key_file)]
+    refused = CliRunner().invoke(gap, asked)
+    assert isinstance(refused.exception, BadInput)
+    assert "1 of 3 robots have no verdict" in str(refused.exception)
+    out, docs = tmp_path / "score.json", tmp_path / "blind.md"
+    done = CliRunner().invoke(gap, [*asked, "--so-far", "--json", str(out), "--docs", str(docs)])
+    assert done.exit_code == 0, done.output
+    assert "| robots that have no verdict yet, left out | 1 |  | 3 |" in done.output
+    assert "| right name first, medium and large, joint, servo, bus | – |  | 0 |" in done.output
+    assert {name: json.loads(out.read_text())[name] for name in ("robots", "missing")} == {"robots": 2, "missing": 1}
+    assert "2 robots, those judged so far of 3, seed 3" in docs.read_text()
+
+
 def test_a_false_alarm_and_a_wrong_name_are_shown() -> None:
     wrong = {"verdict": "actuator_lag", "effects": [{"effect": "actuator_lag", "probability": 0.8, "joints": "all"}]}
     cases = [

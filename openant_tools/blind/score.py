@@ -1,6 +1,6 @@
 """Verdicts against answers: the table of the benchmark, with intervals, and everything that went wrong.
 
-Only `read` opens the answers, and only once every robot has its verdict.
+Only `read` opens the answers, and unless asked for less only once every robot has its verdict.
 """
 
 from __future__ import annotations
@@ -132,11 +132,17 @@ class Score:
     def failures(self) -> list[Case]:
         return [case for case in self.cases if not _good(case)]
 
+    @property
+    def missing(self) -> int:
+        """Robots of the set without a verdict, which were left out."""
+        return int(self.facts.get("robots", len(self.cases))) - len(self.cases)
+
     def as_json(self) -> dict[str, Any]:
         return {
             "schema": "openant.blind-score/1",
             "set": dict(self.facts),
             "robots": len(self.cases),
+            "missing": self.missing,
             "rows": [row.as_json() for row in self.rows],
             "confusions": [
                 {"truth": truth, "verdict": verdict, "count": count}
@@ -153,23 +159,24 @@ class Score:
         }
 
 
-def read(folder: Path, key: bytes | None) -> tuple[dict[str, Any], list[Case]]:
-    """The set's facts, and its robots with verdicts and answers.
+def read(folder: Path, key: bytes | None, *, so_far: bool = False) -> tuple[dict[str, Any], list[Case]]:
+    """The set's facts, and its robots with verdicts and answers; with `so_far` those alone that have a verdict.
 
     Raises:
-        BadInput: no set, a robot without a verdict, or answers that do not open.
+        BadInput: no set, a robot without a verdict (with `so_far`: all of them), or answers that do not open.
     """
     robots = [path.name for path in folders_of(folder)]
     facts = tomllib.loads((folder / "set.toml").read_text(encoding="utf-8"))
     missing = [name for name in robots if not verdict_path(folder, name).exists()]
-    if missing:
+    judged = [name for name in robots if name not in missing]
+    if missing and not (so_far and judged):
         raise BadInput(
             f"{len(missing)} of {len(robots)} robots have no verdict yet", where=folder,
             remedy="`openant gap blind run` first: answers are opened when all verdicts are written",
         )  # fmt: skip
     answers = read_answers(folder, key, facts["commitment"])
-    said = {name: json.loads(verdict_path(folder, name).read_text(encoding="utf-8")) for name in robots}
-    return facts, [Case(name, answers[name], said[name]) for name in robots]
+    said = {name: json.loads(verdict_path(folder, name).read_text(encoding="utf-8")) for name in judged}
+    return facts, [Case(name, answers[name], said[name]) for name in judged]
 
 
 def score(facts: Mapping[str, Any], cases: Sequence[Case]) -> Score:

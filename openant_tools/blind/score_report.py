@@ -35,10 +35,27 @@ def _cells(row: Row) -> list[str]:
     return [row.words, result, interval, str(row.n), sign + shown(row.first), sign + shown(row.then), row.reached]
 
 
+def _table(found: Score) -> list[list[str]]:
+    rows = [_cells(row) for row in found.rows]
+    if found.missing:
+        rows.append(
+            [
+                "robots that have no verdict yet, left out",
+                str(found.missing),
+                "",
+                str(found.facts["robots"]),
+                "",
+                "",
+                "",
+            ]
+        )
+    return rows
+
+
 def table_lines(found: Score) -> list[str]:
     """The table as Markdown."""
     lines = [f"| {' | '.join(_COLUMNS)} |", "|" + "---|" * len(_COLUMNS)]
-    return lines + [f"| {' | '.join(_cells(row))} |" for row in found.rows]
+    return lines + [f"| {' | '.join(row)} |" for row in _table(found)]
 
 
 def _worst(found: Score) -> list[tuple[str, str, int]]:
@@ -132,7 +149,8 @@ def _origin(found: Score) -> str:
         seed += f" (the first 8 digits of commit `{facts['seed_from_commit']}`)"
     makers = {case.answer.maker for case in found.cases}
     virtual = sum(case.answer.maker == "virtual" for case in found.cases)
-    words = f"{len(found.cases)} robots, {seed}, commitment of the answers `{facts['commitment']}`."
+    whole = f", those judged so far of {facts['robots']}" if found.missing else ""
+    words = f"{len(found.cases)} robots{whole}, {seed}, commitment of the answers `{facts['commitment']}`."
     return words + (f" {virtual} came from the virtual robot's bus." if "virtual" in makers else "")
 
 
@@ -143,7 +161,7 @@ def score_report(found: Score) -> Report:
     report.key_figures(
         *(KeyFigure(row.words, _cells(row)[1], f"asked: {_cells(row)[4]}") for row in marks[:3]),
     )
-    report.section("Table").table(_COLUMNS, [_cells(row) for row in found.rows])
+    report.section("Table").table(_COLUMNS, _table(found))
     report.section("Confusions").figure(confusion(found), "How often which verdict was given, by what was true.")
     report.section("Probabilities").figure(
         reliability(found), "Every effect of every diagnosis; figures are counts, lines 95 % intervals."

@@ -117,9 +117,12 @@ def run(folder: Path, jobs: int, backend: str, scheduler: str | None) -> None:
 @set_argument
 @key_option
 @docs_option
+@click.option("--so-far", is_flag=True, help="Only robots that have a verdict; the table says so.")
 @json_option
 @report_option
-def score(folder: Path, key_file: Path | None, docs: Path | None, json_file: Path | None, report: Path | None) -> None:
+def score(
+    folder: Path, key_file: Path | None, docs: Path | None, so_far: bool, json_file: Path | None, report: Path | None
+) -> None:
     """Open the answers of SET and compare: exit code 1 where a figure lies below what is asked for first.
 
     \b
@@ -131,7 +134,7 @@ def score(folder: Path, key_file: Path | None, docs: Path | None, json_file: Pat
     from openant_tools.files import write_text
     from openant_tools.virtual.seal import read_key
 
-    facts, cases = read(folder, None if key_file is None else read_key(key_file))
+    facts, cases = read(folder, None if key_file is None else read_key(key_file), so_far=so_far)
     found = scored(facts, cases)
     for line in table_lines(found):
         click.echo(line)
