@@ -190,6 +190,8 @@ class AntHardware(AntBase):
         self._volts = math.nan
         #: s, the robot's clock: of the last row, of its command, of the last pose and sample
         self._t = self._cmd_t = self._pose_t = self._imu_t = math.nan
+        #: s, the host's clock: when the newest observation was made
+        self._observed_at = time.monotonic()
         self._fallen_s = self._wound_rad = 0.0
         self._overruns = 0
         self._told_late = -math.inf
@@ -262,10 +264,11 @@ class AntHardware(AntBase):
         """
         if not self._ready:
             raise BadInput("the robot does not stand yet", remedy="reset the environment first")
+        chosen_at = time.monotonic()
         self._set_command(action)
         before = self._t
         try:
-            rows, number = self.link.go(self._command, self.dt)
+            rows, number = self.link.go(self._command, self.dt, (self._observed_at, chosen_at))
         except HardwareFault as fault:
             return self._stopped(str(fault))
         mine = rows[rows[:, self.link.columns["goal"]] == number]
@@ -362,6 +365,7 @@ class AntHardware(AntBase):
     def _observe(self, hx: float, hy: float) -> Observation:
         at = self._direction_at
         self._observation[at], self._observation[at + 1] = self.task.observed_direction(hx, hy)
+        self._observed_at = time.monotonic()
         return self._observation.astype(np.float32)
 
     def _more(self, period: float, missed: int) -> dict[str, Any]:

@@ -191,8 +191,11 @@ class RobotLink:
             engine.ask(messages.Hold(settle_s))
         return self._rows()
 
-    def go(self, target: Array, seconds: float) -> tuple[Array, int]:
+    def go(self, target: Array, seconds: float, agent: tuple[float, float] | None = None) -> tuple[Array, int]:
         """Command a goal (joints,) rad for `seconds`; it stays in force until the next one.
+
+        Args:
+            agent: s on the host's monotonic clock, when the observation was made and the action chosen, for the recording.
 
         Returns:
             Telemetry rows since the last call, oldest first, and the number that those of this goal bear.
@@ -202,7 +205,9 @@ class RobotLink:
         """
         engine = self._need_engine()
         with self._noticing_stops():
-            number = engine.start(messages.Goal(target, seconds, measured=False))
+            # A stepped robot's time stands still while an agent computes: there is nothing to keep.
+            goal = messages.Goal(target, seconds, measured=False, agent=None if self.stepped else agent)
+            number = engine.start(goal)
             engine.wait(number)
         return self._rows(), number
 

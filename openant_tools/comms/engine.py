@@ -407,10 +407,12 @@ class Engine:
             return
         cmd_t: float | None = None
         ended: Motion | None = None
+        agent: tuple[float, float] | None = None
         self._playing = 0
         if self._torque and self._motions:
             motion = self._motions[0]
             self._playing = motion.number
+            agent = motion.agent if motion.done == 0 else None
             self._goal = motion.step(cycles)
             if (motion.limp_now != self._limp).any():
                 self._goal = self._release_and_catch(motion)
@@ -432,7 +434,7 @@ class Engine:
         self._cycles += 1
         self._worst_wake = max(self._worst_wake, wake)
         if self._recorder is not None:
-            self._record(t, cmd_t, wake, answers)
+            self._record(t, cmd_t, wake, answers, agent)
         self._telemetry(t, cmd_t, wake, answers)
         if self._torque:
             trip = self._watch.check(t, answers) or self._stood_still(t - before)
@@ -576,7 +578,10 @@ class Engine:
 
     # ---- what a cycle leaves behind ------------------------------------------------------------------------------
 
-    def _record(self, t: float, cmd_t: float | None, wake: float, answers: list[tuple[Answer, Block | None]]) -> None:
+    def _record(
+        self, t: float, cmd_t: float | None, wake: float, answers: list[tuple[Answer, Block | None]],
+        agent: tuple[float, float] | None,
+    ) -> None:  # fmt: skip
         assert self._recorder is not None
         recorded = [
             RecordedAnswer(
@@ -594,7 +599,7 @@ class Engine:
         goals: list[int | None] = [None] * n if self._counts is None else list(self._counts)
         try:
             torque = [self._torque and not limp for limp in self._limp.tolist()]
-            cycle = Cycle(t, goals, cmd_t, wake, recorded, torque)
+            cycle = Cycle(t, goals, cmd_t, wake, recorded, torque, *(agent or (None, None)))
             if self._thinning is None:
                 self._recorder.cycle(cycle)
             else:
@@ -762,6 +767,7 @@ class Engine:
         cycles = max(1, round(command.seconds * self.config.rate_hz))
         row = np.clip(command.target, low, high)
         motion = Motion("goal", np.repeat(row[None, :], cycles, axis=0), number=number, measured=command.measured)
+        motion.agent = command.agent
         self._motions.clear()
         self._motions.append(motion)
         self._waiting.append((number, motion))

@@ -132,11 +132,14 @@ class Goal:
 
     Attributes:
         measured: whether the reply is where the joints are, which is read after the last cycle; else telemetry tells.
+        agent: when the observation was made that this answers, and when it was chosen (s, the host's monotonic clock): for
+            recordings, which keep them as `obs_t` and `act_t`.
     """
 
     target: NDArray[np.float64]
     seconds: float
     measured: bool = True
+    agent: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

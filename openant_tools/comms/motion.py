@@ -29,6 +29,7 @@ class Motion:
         limp: (n, joints), where torque is off; None where it is on throughout.
         number: of the command that it came with, for those that telemetry is to tell apart.
         measured: whether where the joints are is to be read once more when it has ended.
+        agent: s, when the observation was made and the action chosen that this carries out; None where nobody said.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Motion:
     limp: NDArray[np.bool_] | None = None
     number: int = 0
     measured: bool = True
+    agent: tuple[float, float] | None = None
 
     @property
     def ended(self) -> bool:

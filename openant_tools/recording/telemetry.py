@@ -19,7 +19,16 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from openant_tools.recording.run import Array
 
-__all__ = ["IMU_FIELDS", "POSE_FIELDS", "Answer", "Cycle", "ServoChannel", "Telemetry", "message_classes"]
+__all__ = [
+    "AGENT_TIMES",
+    "IMU_FIELDS",
+    "POSE_FIELDS",
+    "Answer",
+    "Cycle",
+    "ServoChannel",
+    "Telemetry",
+    "message_classes",
+]
 
 #: fields of `Servo` that are not registers
 _OF_THE_BUS = ("goal", "torque", "ok", "err", "rtt")
@@ -103,6 +112,8 @@ class Cycle:
         wake: s, how late the loop began this cycle.
         answers: one a servo.
         torque: whether torque is enabled.
+        obs_t, act_t: s, when the observation was made, and the action chosen from it, that this cycle's command carries out
+            first; None where nobody said.
     """
 
     t: float
@@ -111,6 +122,12 @@ class Cycle:
     wake: float | None
     answers: Sequence[Answer]
     torque: Sequence[bool]
+    obs_t: float | None = None
+    act_t: float | None = None
+
+
+#: further columns of a recording of the bus: an agent's own times
+AGENT_TIMES: Mapping[str, type] = {"obs_t": float, "act_t": float}
 
 
 _Field = descriptor_pb2.FieldDescriptorProto
@@ -157,6 +174,9 @@ class Telemetry:
             fields["cmd_t"] = cycle.cmd_t
         if cycle.wake is not None:
             fields["wake"] = cycle.wake
+        for name, at in (("obs_t", cycle.obs_t), ("act_t", cycle.act_t)):
+            if at is not None:
+                fields[self.extra_fields[name]] = at
         rows = zip(self.joint_fields.values(), cycle.goals, cycle.answers, cycle.torque, strict=True)
         for name, goal, answer, torque in rows:
             servo: dict[str, Any] = {"ok": answer.ok, "torque": torque}

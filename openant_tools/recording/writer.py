@@ -28,7 +28,7 @@ from mcap.writer import CompressionType, Writer
 from openant_tools.errors import BadInput, OpenAntError
 from openant_tools.recording.facts import facts_to_json
 from openant_tools.recording.run import Facts
-from openant_tools.recording.telemetry import Cycle, ServoChannel, Telemetry
+from openant_tools.recording.telemetry import AGENT_TIMES, Cycle, ServoChannel, Telemetry
 
 __all__ = ["METADATA", "PROFILE", "SCHEMA", "Continued", "RecordingStopped", "RecordingWriter", "recording_path"]
 
@@ -114,7 +114,7 @@ class RecordingWriter:
         self.path = recording_path(path)
         self.cycles = 0
         self._clock = clock
-        self._telemetry = telemetry or Telemetry(channels)
+        self._telemetry = telemetry or Telemetry(channels, extra=AGENT_TIMES)
         self._queue: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         self._stopped: OpenAntError | None = None
         self._reported = False
@@ -143,8 +143,9 @@ class RecordingWriter:
     def cycle(self, cycle: Cycle) -> None:
         """Record one turn of the bus loop. Costs a microsecond: encoding and disk are another thread's."""
         if self._shift:
-            cmd_t = None if cycle.cmd_t is None else cycle.cmd_t + self._shift
-            cycle = replace(cycle, t=cycle.t + self._shift, cmd_t=cmd_t)
+            times = {"cmd_t": cycle.cmd_t, "obs_t": cycle.obs_t, "act_t": cycle.act_t}
+            moved = {name: None if at is None else at + self._shift for name, at in times.items()}
+            cycle = replace(cycle, t=cycle.t + self._shift, **moved)
         self._put((_CYCLE, cycle.t, cycle))
         self.cycles += 1
 
