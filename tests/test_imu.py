@@ -66,6 +66,9 @@ class Bench:
     def arrivals(self, line: Cable) -> list[tuple[int, float]]:
         return [self.marks[-1]] if self.stepped and self.marks else [(line.received, self.t)]
 
+    def in_time(self, at: float, deadline: float) -> bool:
+        return at <= deadline
+
     def step(self, limit: float) -> None:
         self.t = min(limit, max(self.t + 1e-5, self.fc.next_event(self.t)))
         if self.motion is not None:

@@ -99,6 +99,9 @@ class WireLine:
     def arrivals(self, line: object) -> list[tuple[int, float]]:
         return self._arrivals
 
+    def in_time(self, at: float, deadline: float) -> bool:
+        return at <= deadline
+
 
 def ant(
     timing: Timing | None = None, *, firmware: int = 46, settings: BusSettings | None = None, seed: int = 0

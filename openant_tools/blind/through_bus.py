@@ -198,6 +198,9 @@ class _Wire:
     def arrivals(self, line: object) -> list[tuple[int, float]]:
         return self._arrivals
 
+    def in_time(self, at: float, deadline: float) -> bool:
+        return at <= deadline
+
 
 class _Host:
     """A robot in its place, its bus, and what its IMU has seen last."""

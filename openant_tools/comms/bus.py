@@ -475,8 +475,7 @@ class Bus:
                 continue
             data += self._readable()
             for total, at in self.clock.arrivals(line):
-                # In real time a portion that was read late may have arrived in time: only waiting in vain tells.
-                edges.append((total - before, at, in_time and (at <= deadline or not self.clock.stepped)))
+                edges.append((total - before, at, in_time and self.clock.in_time(at, deadline)))
             if len(data) == expected:
                 break
             while (

@@ -7,6 +7,7 @@ and a virtual one as fast as it can be computed.
 from __future__ import annotations
 
 import json
+import math
 import select
 import socket
 import time
@@ -47,6 +48,11 @@ class Clock(Protocol):
         """(bytes received in all, when) of each portion that the last `line.read()` brought."""
         ...
 
+    def in_time(self, at: float, deadline: float) -> bool:
+        """Whether a portion that came at `at` (s, see `arrivals`) lay there by a deadline: this process may have come late
+        to it."""
+        ...
+
 
 class RealClock:
     """The host's monotonic clock, the same one for all processes."""
@@ -69,6 +75,9 @@ class RealClock:
 
     def arrivals(self, line: Line) -> list[tuple[int, float]]:
         return [(line.received, time.monotonic())]
+
+    def in_time(self, at: float, deadline: float) -> bool:
+        return True  # only waiting in vain tells otherwise
 
 
 class VirtualControl:
@@ -128,6 +137,8 @@ class SteppedClock:
         self._sent: dict[str, int] = {"bus": 0, "imu": 0}
         self._settled: dict[str, int] = {}
         self._marks: dict[str, list[tuple[int, float]]] = {}
+        #: s, from when to when the host last stood still
+        self._stood = (-math.inf, -math.inf)
         answer = control.ask("now")
         if not answer["stepped"]:
             raise HardwareFault(
@@ -153,7 +164,7 @@ class SteppedClock:
         if any(line.written != self._settled[name] for name, line in self._lines.items()):
             self._ask("settle")
         if t > self._t:
-            self._t = float(self._control.ask("advance", to=t)["t"])
+            self._take(self._control.ask("advance", to=t))
 
     def wait_readable(self, line: Line, deadline: float) -> bool:
         name = self._name(line)
@@ -166,7 +177,7 @@ class SteppedClock:
         if line.received >= self._sent[name]:
             return False
         first = next((t for count, t in self._marks[name] if count > line.received), self._t)
-        if first > deadline:
+        if not self.in_time(first, deadline):
             return False
         ready, _, _ = select.select([line], [], [], CONTROL_TIMEOUT_S)
         if not ready:
@@ -179,7 +190,12 @@ class SteppedClock:
         self._marks[name] = self._marks[name][len(here) :]
         if not here or here[-1][0] < line.received:
             here.append((line.received, self._t))
-        return here
+        # Who stood still finds all that came meanwhile when it goes on.
+        fell_asleep, woke = self._stood
+        return [(count, woke if fell_asleep <= t < woke else t) for count, t in here]
+
+    def in_time(self, at: float, deadline: float) -> bool:
+        return at <= deadline or (self._stood[0] <= deadline and at <= self._stood[1])
 
     def _name(self, line: Line) -> str:
         return next(name for name, known in self._lines.items() if known is line)
@@ -189,8 +205,15 @@ class SteppedClock:
         self._settled = {name: line.written for name, line in self._lines.items()}
         written = {f"{name}_written": count - self._base[name][0] for name, count in self._settled.items()}
         answer = self._control.ask(do, **written, **fields)
-        self._t = max(self._t, float(answer["t"]))
+        self._take(answer)
         for name in self._lines:
             base = self._base[name][1]
             self._sent[name] = int(answer[f"{name}_sent"]) + base
             self._marks[name] += [(int(count) + base, float(t)) for count, t in answer.get(f"{name}_arrivals", ())]
+
+    def _take(self, answer: dict[str, Any]) -> None:
+        """How far time has come."""
+        self._t = max(self._t, float(answer["t"]))
+        if "stood" in answer:
+            fell_asleep, woke = answer["stood"]
+            self._stood = float(fell_asleep), float(woke)

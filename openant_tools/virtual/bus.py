@@ -62,7 +62,9 @@ class BusSettings:
         waits_for_silent: in a sync or bulk read a servo waits for the answer before its own; unpublished for
             silent ones. True: those behind a silent servo stay silent. False: they answer after a pause.
         silent_pause_s: that pause.
-        stalled_until: the host hands nothing over, either way, before this time (s).
+        stalled_until: the host stands still until this time (s).
+        holds_back: the line hands nothing over meanwhile, either way. False where whoever keeps the host's clock lets the
+            host itself stand still.
     """
 
     chains: Sequence[Sequence[int]] = ()
@@ -73,6 +75,7 @@ class BusSettings:
     broken: dict[int, float] = field(default_factory=dict)
     cut: set[int] = field(default_factory=set)
     stalled_until: float = -math.inf
+    holds_back: bool = True
     response_s: float = 0.0
     waits_for_silent: bool = True
     silent_pause_s: float = 1e-3
@@ -150,6 +153,11 @@ class Line:
         """When the wire falls silent, s."""
         return max(self._host_end, self._answer_end)
 
+    @property
+    def _held_until(self) -> float:
+        """When the line hands anything over again, s."""
+        return self.settings.stalled_until if self.settings.holds_back else -math.inf
+
     # ---- host → servos ----
 
     def receive(self, data: bytes, t: float, baud: int, *, late_s: float = 0.0) -> list[Reply]:
@@ -161,7 +169,7 @@ class Line:
                 have heard if it was so.
         """
         byte_s = BITS_PER_BYTE / baud
-        start = max(t, self._host_end, self.settings.stalled_until)
+        start = max(t, self._host_end, self._held_until)
         if baud != self._baud:
             self._parser, self._baud = Parser(), baud
         elif self._parser.pending and start - late_s - self._host_end > INTER_BYTE_S:
@@ -335,7 +343,7 @@ class Line:
         self._late_s = 0.0
         self._baud = self._baud or max((self.servos[k].baud for k in self.plugged), default=57_600)
         byte_s, noise = BITS_PER_BYTE / self._baud, self.settings.byte_error
-        began = max(t, self.free_at, self.settings.stalled_until)
+        began = max(t, self.free_at, self._held_until)
         length = _wire_length(packet)
         ended = self._host_end = began + length * byte_s
         if noise and self._random.random() < 1 - (1 - noise) ** length:
@@ -372,9 +380,9 @@ class Line:
         """When the adapter hands over what has arrived at t."""
         period = self.settings.latency_timer_s
         if period < SHORTEST_TIMER_S:
-            return max(t, self.settings.stalled_until)
+            return max(t, self._held_until)
         tick = (math.floor(t / period - self._phase) + 1 + self._phase) * period
-        return max(tick, self.settings.stalled_until)
+        return max(tick, self._held_until)
 
     def _deliver(self, bursts: list[_Burst], byte_s: float) -> list[Reply]:
         """What the host gets: the line's bytes, cut at the ticks of the latency timer."""
@@ -382,7 +390,7 @@ class Line:
             return []
         bursts.sort(key=lambda burst: burst.start)
         data = b"".join(burst.data for burst in bursts)
-        stalled, period = self.settings.stalled_until, self.settings.latency_timer_s
+        stalled, period = self._held_until, self.settings.latency_timer_s
         spaced = all(b.start >= a.end(byte_s) - byte_s / 2 for a, b in itertools.pairwise(bursts))
         if spaced and period < SHORTEST_TIMER_S and self.settings.byte_error == 0 and len(data) < ADAPTER_BUFFER:
             return self._pieces(bursts, byte_s)
@@ -417,11 +425,11 @@ class Line:
         piece, until = bursts[0].data, bursts[0].end(byte_s)
         for burst in bursts[1:]:
             if burst.start > until + byte_s / 2:
-                replies.append(Reply(max(until, self.settings.stalled_until), piece))
+                replies.append(Reply(max(until, self._held_until), piece))
                 piece = b""
             piece += burst.data
             until = burst.end(byte_s)
-        replies.append(Reply(max(until, self.settings.stalled_until), piece))
+        replies.append(Reply(max(until, self._held_until), piece))
         return replies
 
 

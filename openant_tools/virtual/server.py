@@ -18,6 +18,8 @@ The control socket (Unix stream, one JSON object a line, one line of answer each
 | | answer reached the host |
 | `{"do": "wait", "port": "bus", "to": s, "bus_written": n, "imu_written": m}` | as `settle`, but time runs only until |
 | | the next bytes leave for that port, or to `to` (stepped only) |
+| | `advance`, `settle` and `wait` add `"stood": [s, s]` where the host stood still (a `host_stall`): from when it was |
+| | to go on, to when it does, which is `t` |
 | `{"do": "state"}` | the truth: angles, torques, temperatures, torque enables, supply, body; not where it is sealed |
 | `{"do": "wiring"}` | `{"chain": [[joint, …], …]}`, each cable from the adapter outwards |
 | `{"do": "fault", "cause": …, "where": …, "on": bool, …}` | switches a fault; `{"t": s}` |
@@ -150,6 +152,8 @@ class Server:
         folder: Path | None = None,
     ) -> None:
         self.world, self.stepped = world, stepped
+        # In stepped time it is the host's clock that stands still (`_sleep_through`); in real time nobody can stop it.
+        world.line.settings.holds_back = not stepped
         self._camera = camera
         if camera is not None:
             world.events.append(self._expose)
@@ -476,7 +480,8 @@ class Server:
             if not self.stepped:
                 raise _Failed("time runs by itself: the robot was not started with --clock stepped")
             self.advance(_number(request, "to"))
-            return {"t": self.now}
+            stood = self._sleep_through()
+            return {"t": self.now, **stood}
         if do == "settle":
             return self._settle(control, request)
         if do == "wait":
@@ -554,18 +559,28 @@ class Server:
         self._arrive(control, request)
         before = self.sent[name]
         self.advance(_number(request, "to"), until=lambda: self.sent[name] > before)
-        return self._counts(control)
+        stood = self._sleep_through()
+        return self._counts(control) | stood
 
     def _settle(self, control: _Control, request: dict[str, Any]) -> dict[str, Any]:
         self._arrive(control, request)
+        stood: dict[str, Any] = {}
         if self.stepped:
             reached = max(self._act(), self.now)
             self.advance(reached)
+            stood = self._sleep_through()
         else:
             while self._outbox:
                 time.sleep(max(0.0, self._outbox[0][0] - self.now))
                 self._keep_time()
-        return self._counts(control)
+        return self._counts(control) | stood
+
+    def _sleep_through(self) -> dict[str, Any]:
+        """Stepped: let a host that stands still now wake up where it goes on; `stood` of the answer."""
+        settings, began = self.world.line.settings, self.now
+        while settings.stalled_until > self.now:
+            self.advance(settings.stalled_until)
+        return {"stood": [began, self.now]} if self.now > began else {}
 
     def _await(self, name: str, deadline: float) -> None:
         """Wait for more bytes at one port, the pseudo-terminal's delivery being asynchronous."""
