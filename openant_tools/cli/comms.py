@@ -15,17 +15,15 @@ import click
 from openant_tools.cli.comms_blind import blind
 from openant_tools.cli.comms_diagnose import diagnose, timing
 from openant_tools.cli.comms_soak import soak
+from openant_tools.cli.hardware import engine_config, port_option, robot_of
 from openant_tools.cli.options import json_option, robot_option
 from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_option, virtual_robot
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from openant_tools.comms.messages import EngineConfig
 
 __all__ = ["comms"]
-
-port_option = click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one plugged in.")
 
 
 @click.group()
@@ -153,8 +151,7 @@ def bench(
 
     console = Console(stderr=True)
     # Stepped, a virtual robot shows its bus and nothing of what else this machine does.
-    clock = None if virtual_source is None else clock_of_its_own(virtual_source)
-    with _engine_config(port, virtual_source, robot, clock=clock) as config:
+    with engine_config(robot_of(robot, needed=False), port, virtual_source) as config:
         bus = open_bus(config.port, config.baud, config.control)
         try:
             servos = Servos(bus, config.servos)
@@ -201,7 +198,8 @@ def watch(
 
     console = Console()
     statistics: dict[str, Any] = {}
-    with _engine_config(port, virtual_source, robot, clock="real") as config, EngineProcess(config) as engine:
+    folder = robot_of(robot, needed=False)
+    with engine_config(folder, port, virtual_source, clock="real") as config, EngineProcess(config) as engine:
         end = None if seconds is None else time.monotonic() + seconds
         with contextlib.suppress(KeyboardInterrupt), Live(console=console, auto_refresh=False) as live:
             while end is None or time.monotonic() < end:
@@ -241,28 +239,6 @@ def _table(columns: Sequence[str], row: Sequence[float], statistics: Mapping[str
             causes + (f", retries {servo['retries']}" if servo["retries"] else ""),
         )
     return table
-
-
-@contextlib.contextmanager
-def _engine_config(
-    port: str | None, virtual_source: str | None, robot: Path | None, *, clock: str | None = None
-) -> Any:
-    """The robot meant by the options, as the engine wants it."""
-    from openant_tools.cli.sysid_record import robot_of
-    from openant_tools.comms.setup import config_of_robot, config_of_unknown_robot, find_bus
-
-    folder = robot_of(robot, needed=False)
-    with contextlib.ExitStack() as stack:
-        control = None
-        if virtual_source is not None:
-            found = stack.enter_context(virtual_robot(virtual_source, clock=clock))
-            port, control = port or found["bus"], found["control"]
-        config: EngineConfig
-        if folder is not None:
-            config = config_of_robot(folder.config(), port, control=control)
-        else:
-            config = config_of_unknown_robot(find_bus(port), control)
-        yield config
 
 
 def _write_json(path: Path, content: object) -> None:

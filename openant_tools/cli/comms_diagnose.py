@@ -71,7 +71,7 @@ def diagnose(
     if report:
         click.echo(f"wrote {dropouts_report(found).write_folder(report)}", err=True)
     if keep:
-        from openant_tools.cli.sysid_record import robot_of
+        from openant_tools.cli.hardware import robot_of
 
         folder = robot_of(robot, needed=True)
         assert folder is not None

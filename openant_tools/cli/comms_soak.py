@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from openant_tools.cli.hardware import engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import finite, json_option, rate_option, robot_option
 from openant_tools.cli.progress import progress_bar
-from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, clock_of_its_own, virtual_option, virtual_robot
+from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -41,8 +41,8 @@ TRANSACTIONS_HZ = 10.0
     is_flag=True,
     help="With --virtual: without bytes and ports, many times faster than real time, 10 cycles a second; RUN is a .parquet.",
 )
-@click.option("--yes", is_flag=True, help="The robot may move: do not ask. Needed where no terminal is attached.")
-@click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one plugged in.")
+@yes_option
+@port_option
 @virtual_option
 @robot_option
 @rate_option
@@ -92,8 +92,6 @@ def _on_the_bus(
 
     from rich.console import Console
 
-    from openant_tools.cli.sysid_record import robot_of
-    from openant_tools.comms.setup import config_of_robot, config_of_unknown_robot, find_bus
     from openant_tools.comms.soak import THIN_S
     from openant_tools.comms.soak import soak as soak_bus
     from openant_tools.errors import BadInput
@@ -108,24 +106,12 @@ def _on_the_bus(
     console = Console(stderr=True)
     folder = robot_of(robot, needed=False)
     with contextlib.ExitStack() as stack:
-        control = None
-        if virtual_source is not None:
-            found = stack.enter_context(virtual_robot(virtual_source, clock=clock_of_its_own(virtual_source)))
-            port, control = port or found["bus"], found["control"]
-        if folder is not None:
-            config = config_of_robot(folder.config(), port, control=control, rate_hz=rate_hz)
-        else:
-            config = config_of_unknown_robot(find_bus(port), control, rate_hz=rate_hz)
+        config = stack.enter_context(engine_config(folder, port, virtual_source, rate_hz=rate_hz))
         if not still:
             console.print(
                 f"all {len(config.servos)} joints swing by up to 0.25 rad; the robot must be on its stand, legs free"
             )
-            if not yes:
-                if not sys.stdin.isatty():
-                    raise BadInput(
-                        "the robot would move and nobody is there to ask", remedy="add --yes if it may, or --still"
-                    )
-                click.confirm("May it move?", abort=True, err=True)
+            may_move(yes, remedy="add --yes if it may, or --still")
         shown = stack.enter_context(_bar(console))
         try:
             done = soak_bus(

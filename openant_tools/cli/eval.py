@@ -15,7 +15,7 @@ from openant_tools.cli.walking import (
     environment,
     hardware_options,
     hardware_robot,
-    may_move,
+    may_walk,
 )
 from openant_tools.errors import BadInput
 
@@ -88,7 +88,7 @@ def eval_(
             raise BadInput(
                 "a robot paints no pictures of itself", remedy="leave --strip out; its recording can be replayed"
             )
-        may_move(options, yes)
+        may_walk(options, yes)
     elif virtual_source is not None:
         raise BadInput("--virtual is a robot behind its ports", remedy="add --env hardware")
     else:

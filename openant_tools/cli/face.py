@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.prompt import Confirm, FloatPrompt, Prompt
 
+from openant_tools.cli.hardware import need_terminal
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.step import Answer, Ask, Event, Hands, Intent, Live, Look, Progress, Say
@@ -89,7 +90,7 @@ class CommandFace:
             self._line(f"    {escape(str(change))}")
         if self._yes:
             return True
-        self._need_terminal("it would write or move")
+        need_terminal("it would write or move")
         return Confirm.ask("Do it?", console=self.console, default=True)
 
     def _by_hand(self, hands: Hands) -> bool:
@@ -97,7 +98,7 @@ class CommandFace:
         if self._hands is not None:
             self._hands(hands)
         elif not self._yes and not hands.while_watching:
-            self._need_terminal("it needs your hands")
+            need_terminal("it needs your hands")
             Prompt.ask("Enter when done", console=self.console, default="", show_default=False)
         elif self._yes and not hands.while_watching:
             raise BadInput(
@@ -113,7 +114,7 @@ class CommandFace:
                 )
             self._line(f"[dim]? {escape(ask.question)} {escape(str(ask.default))}[/dim]")
             return ask.default
-        self._need_terminal("it has a question")
+        need_terminal("it has a question")
         question = escape(ask.question)
         if ask.choices:
             default = ask.default if isinstance(ask.default, str) else ask.choices[0]
@@ -145,10 +146,6 @@ class CommandFace:
 
     def _end_live(self) -> None:
         self._live = 0
-
-    def _need_terminal(self, why: str) -> None:
-        if not sys.stdin.isatty():
-            raise BadInput(f"{why} and nobody is there to ask", remedy="add --yes if it may")
 
 
 def echo_finding(finding: Finding) -> None:

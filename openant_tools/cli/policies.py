@@ -252,7 +252,7 @@ def _maker(place: str, yes: bool) -> Callable[[Mapping[str, Any]], Any]:
     import gymnasium
 
     import openant_env  # noqa: F401  (registers the environments)
-    from openant_tools.cli.walking import HARDWARE_ID, SIMULATED_ID, may_move
+    from openant_tools.cli.walking import HARDWARE_ID, SIMULATED_ID, may_walk
 
     kind, _, rest = place.partition(":")
     name, chosen = SIMULATED_ID, {}
@@ -264,7 +264,7 @@ def _maker(place: str, yes: bool) -> Callable[[Mapping[str, Any]], Any]:
             chosen = {"virtual": rest if rest == "default" else os.path.abspath(rest)}
         else:
             chosen = {"robot": os.path.abspath(rest)}
-            may_move(chosen, yes)
+            may_walk(chosen, yes)
     elif os.path.exists(place):
         chosen = {"robot": os.path.abspath(place)}
     else:

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import re
 import select
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from openant_tools.cli.hardware import engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import json_option, report_option, robot_option
-from openant_tools.cli.sysid_record import robot_of
-from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_option, virtual_robot
+from openant_tools.cli.virtual_for_command import virtual_option
 
 if TYPE_CHECKING:
-    from openant_tools.comms.messages import EngineConfig
     from openant_tools.procedure.finding import Finding
     from openant_tools.robot.folder import RobotFolder
 
@@ -130,10 +128,6 @@ def torque(
             f"{load.torque_nm:6.2f} N·m  {load.nominal_nm:4.2f} N·m   {load.limit_nm:10.2f} N·m{mark}"
         )
     return _conclude(finding, folder if robot is not None else None, json_file)
-
-
-port_option = click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one plugged in.")
-yes_option = click.option("--yes", is_flag=True, help="The robot may move: do not ask. Needed without a terminal.")
 
 
 @click.command()
@@ -263,15 +257,15 @@ def scale(
         return _ask_grams(deflection) if talk else None
 
     pressing = Pressing(joint, touch, step_rad, steps, 1 if up or kind == "hip" else -1)
-    with _engine_config(folder, virtual_source, port) as engine_config:
-        own = pressing.check(engine_config).model
+    with engine_config(folder, port, virtual_source) as engine:
+        own = pressing.check(engine).model
         words = (
             f"{joint} goes to {touch:.2f} rad and presses {steps} × {step_rad:g} rad beyond; the others stand at home."
         )
         click.echo(f"{words} Fix the torso on its stand, feet free.", err=True)
-        _may_move(yes)
+        may_move(yes)
         result = press(
-            engine_config,
+            engine,
             pressing,
             ready=_place_scale if talk else lambda: None,
             grams=grams,
@@ -387,11 +381,11 @@ def tilt(
 
         source = "accelerometer"
         talk = sys.stdin.isatty()
-        with _engine_config(folder, virtual_source, port, imu=True) as engine_config:
+        with engine_config(folder, port, virtual_source, imu=True) as engine:
             click.echo("The robot stands up at home on the plate and holds itself there.", err=True)
-            _may_move(yes)
+            may_move(yes)
             angles = tilt_trials(
-                engine_config,
+                engine,
                 trials,
                 level=lambda: talk and _enter("Hold the plate level and still"),
                 begin=lambda trial: _begin(trial, trials) if talk else None,
@@ -407,37 +401,6 @@ def tilt(
         interval = "" if evidence.low is None else f"  [{evidence.low:.3f}, {evidence.high:.3f}]"
         click.echo(f"{evidence.name:20} {evidence.value:.3f}{interval}")
     return _conclude(finding, folder if robot is not None else None, json_file)
-
-
-@contextlib.contextmanager
-def _engine_config(
-    folder: RobotFolder | None, virtual_source: str | None, port: str | None, *, imu: bool = False
-) -> Iterator[EngineConfig]:
-    """The engine's config for the robot meant; a virtual one that was started for this command ends with the block."""
-    from openant_tools.comms.setup import config_of_robot, config_of_unknown_robot, imu_of_robot
-
-    with contextlib.ExitStack() as stack:
-        control = imu_port = None
-        if virtual_source is not None:
-            found = stack.enter_context(virtual_robot(virtual_source, clock=clock_of_its_own(virtual_source)))
-            port, control, imu_port = port or found["bus"], found["control"], found["imu"]
-        described = None if folder is None else folder.config()
-        more = {"imu": imu_of_robot(described, imu_port) if imu else None}
-        if described is not None:
-            yield config_of_robot(described, port, control=control, **more)
-        else:
-            assert port is not None
-            yield config_of_unknown_robot(port, control, **more)
-
-
-def _may_move(yes: bool) -> None:
-    from openant_tools.errors import BadInput
-
-    if yes:
-        return
-    if not sys.stdin.isatty():
-        raise BadInput("the robot would move and nobody is there to ask", remedy="add --yes if it may")
-    click.confirm("May it move?", abort=True, err=True)
 
 
 def _enter(words: str) -> bool:

@@ -32,7 +32,7 @@ def compare(a: str, b: str, robot: Path | None, json_file: Path | None, report: 
     So many parameters differ a little by chance; Holm's procedure holds the probability that any is wrongly called changed
     at 5 %. Exit code 1: something changed.
     """
-    from openant_tools.cli.sysid_record import robot_of
+    from openant_tools.cli.hardware import robot_of
     from openant_tools.files import write_text
     from openant_tools.sysid.compare import compare as compared
     from openant_tools.sysid.compare_sources import snapshot

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from openant_tools.cli.hardware import robot_of
 from openant_tools.cli.options import (
     finite,
     json_option,
@@ -17,7 +18,7 @@ from openant_tools.cli.options import (
     tie_option,
 )
 from openant_tools.cli.progress import progress_bar
-from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, robot_of
+from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL
 
 if TYPE_CHECKING:
     from openant_tools.sysid.plan import Plan

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from openant_tools.cli.hardware import engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import finite, rate_option, robot_option, seconds_option
-from openant_tools.cli.virtual_for_command import clock_of_its_own, placeable, placed, virtual_option, virtual_robot
+from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from openant_tools.sysid.protocols import Protocol
     from openant_tools.sysid.record import Recorded, Take
 
-__all__ = ["record", "robot_of"]
+__all__ = ["DEFAULT_PROTOCOL", "record"]
 
 #: `protocols.FULL`, without loading it for every --help
 DEFAULT_PROTOCOL = "full"
@@ -38,7 +38,7 @@ DEFAULT_PROTOCOL = "full"
 @click.option("--list", "listing", is_flag=True, is_eager=True, help="List the protocols and how far each joint goes.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="RUN.mcap", help="What to make.")
 @virtual_option
-@click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one U2D2 that is plugged in.")
+@port_option
 @robot_option
 @rate_option
 @click.option(
@@ -67,7 +67,7 @@ DEFAULT_PROTOCOL = "full"
 @click.option("--setup", type=click.Choice(["stand", "floor"]), help="Only what is played there. Default: all of it.")
 @click.option("--imu/--no-imu", default=None, help="Record the IMU too. Default: on the floor.")
 @click.option("--camera/--no-camera", default=None, help="Record the pose too. Default: on the floor, if there is one.")
-@click.option("--yes", is_flag=True, help="The robot may move: do not ask. Needed where no terminal is attached.")
+@yes_option
 def record(
     name: str | None,
     plan_file: Path | None,
@@ -190,34 +190,27 @@ def _record_here(
     """Connect to the robot where it is, and record."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from openant_tools.comms.setup import camera_of_robot, config_of_robot, config_of_unknown_robot, imu_of_robot
     from openant_tools.errors import HardwareFault
     from openant_tools.sysid.record import record_takes
 
-    control = imu_port = camera_source = None
-    if virtual_source is not None:
-        found = stack.enter_context(virtual_robot(virtual_source, clock=clock_of_its_own(virtual_source)))
-        port, control, imu_port = port or found["bus"], found["control"], found["imu"]
-        camera_source = found["camera"]
-    described = None if folder is None else folder.config()
     floor = wanted[0].protocol.setup == "floor"
-    more = {
-        "rate_hz": rate_hz,
-        "imu": imu_of_robot(described, imu_port) if (floor if imu is None else imu) else None,
-        "camera": camera_of_robot(described, camera_source) if (floor if camera is None else camera) else None,
-    }
-    if described is not None:
-        config = config_of_robot(described, port, control=control, **more)
-    else:
-        assert port is not None
-        config = config_of_unknown_robot(port, control, **more)
+    config = stack.enter_context(
+        engine_config(
+            folder,
+            port,
+            virtual_source,
+            imu=floor if imu is None else imu,
+            camera=floor if camera is None else camera,
+            rate_hz=rate_hz,
+        )
+    )
     first = wanted[0].protocol
     console.print(
         f"{first.name}: {first.words}; {sum(take.protocol.seconds for take in wanted):.0f} s"
         + (f" in {len(wanted)} recordings" if len(wanted) > 1 else "")
         + f". All {len(config.servos)} joints move on {config.port}; the robot must be {_where(first)}."
     )
-    _ask(yes)
+    may_move(yes)
     columns = TextColumn("{task.description:18}"), BarColumn(), TextColumn("{task.percentage:3.0f} %")
     bar = stack.enter_context(Progress(*columns, TimeElapsedColumn(), console=console, transient=True))
     task = bar.add_task("connecting", total=1.0)
@@ -259,23 +252,3 @@ def _list(robot: Path | None) -> None:
                 f"{'':17} {where:13} {one.seconds:4.0f} s   from home: "
                 + "   ".join(f"{kind} {low:+.2f} … {high:+.2f} rad" for kind, (low, high) in reach.items())
             )
-
-
-def robot_of(robot: Path | None, *, needed: bool) -> RobotFolder | None:
-    """The robot's folder by `--robot`, $OPENANT_ROBOT or the working directory; None where none is meant nor needed."""
-    from openant_tools.robot.config import CONFIG_NAME
-    from openant_tools.robot.folder import RobotFolder
-
-    path = robot or Path(os.environ.get("OPENANT_ROBOT", "."))
-    meant = robot is not None or "OPENANT_ROBOT" in os.environ or (path / CONFIG_NAME).is_file()
-    return RobotFolder.at(path) if meant or needed else None
-
-
-def _ask(yes: bool) -> None:
-    from openant_tools.errors import BadInput
-
-    if yes:
-        return
-    if not sys.stdin.isatty():
-        raise BadInput("the robot would move and nobody is there to ask", remedy="add --yes if it may")
-    click.confirm("May it move?", abort=True, err=True)

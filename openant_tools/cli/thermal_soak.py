@@ -5,16 +5,15 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from openant_tools.cli.hardware import engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import finite, json_option, robot_option
-from openant_tools.cli.sysid_record import robot_of
-from openant_tools.cli.virtual_for_command import clock_of_its_own, placeable, placed, virtual_option, virtual_robot
+from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -82,9 +81,9 @@ DRAW_S, LINE_S = 0.25, 20.0
     help="Reads a second.  [default: 5, or 50 where motions are played]",
 )  # fmt: skip
 @virtual_option
-@click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one U2D2 that is plugged in.")
+@port_option
 @robot_option
-@click.option("--yes", is_flag=True, help="The robot may move: do not ask. Needed where no terminal is attached.")
+@yes_option
 @json_option
 def soak(
     out: Path,
@@ -162,7 +161,7 @@ def soak(
             f"{'going on with ' if resume else ''}{_words(plan)}, {plan.seconds / 60:g} min, then {plan.cool_down_s / 60:g} "
             f"min of cooling. {'The knees press' if plan.load == 'stall' else 'All joints move'} on {config.port}."
         )
-        _ask(yes)
+        may_move(yes)
         made = _run(console, config, plan, out, folder, resume)
     for joint, peak in made.peak_c.items():
         click.echo(
@@ -185,21 +184,12 @@ def _connected(
     folder: RobotFolder | None,
     rate_hz: float,
 ) -> EngineConfig:
-    from openant_tools.comms.setup import config_of_robot, config_of_unknown_robot
     from openant_tools.thermal.soak import soak_config
 
-    control = None
-    if virtual_source is not None:
-        source = virtual_source
-        if placeable(source):
-            source = stack.enter_context(placed(source, plan.setup, doze=True))
-        found = stack.enter_context(virtual_robot(source, clock=clock_of_its_own(source)))
-        port, control = port or found["bus"], found["control"]
-    if folder is not None:
-        config = config_of_robot(folder.config(), port, control=control)
-    else:
-        assert port is not None
-        config = config_of_unknown_robot(port, control)
+    source = virtual_source
+    if source is not None and placeable(source):
+        source = stack.enter_context(placed(source, plan.setup, doze=True))
+    config = stack.enter_context(engine_config(folder, port, source))
     return soak_config(config, rate_hz)
 
 
@@ -318,13 +308,3 @@ def _words(plan: Plan) -> str:
         return f"the commands of {plan.commands} over and over"
     where = "standing on its feet" if plan.load == "stand" else "hanging on its stand"
     return f"{where}, {' then '.join(plan.poses)}"
-
-
-def _ask(yes: bool) -> None:
-    from openant_tools.errors import BadInput
-
-    if yes:
-        return
-    if not sys.stdin.isatty():
-        raise BadInput("the robot would move and nobody is there to ask", remedy="add --yes if it may")
-    click.confirm("May it move?", abort=True, err=True)

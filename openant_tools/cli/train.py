@@ -17,7 +17,7 @@ from openant_tools.cli.walking import (
     environment,
     hardware_options,
     hardware_robot,
-    may_move,
+    may_walk,
 )
 from openant_tools.errors import BadInput
 
@@ -130,7 +130,7 @@ def sac(
     from openant_agents.sac import train as train_sac
 
     if hardware:
-        may_move(options, yes)
+        may_walk(options, yes)
     name = HARDWARE_ID if hardware else SIMULATED_ID
     given = {"learning_start": learning_start, "entropy_start": entropy_start}
     settings = settings_of(Settings, settings_file, "sac", given)

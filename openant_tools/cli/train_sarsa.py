@@ -16,7 +16,7 @@ from openant_tools.cli.walking import (
     environment,
     hardware_options,
     hardware_robot,
-    may_move,
+    may_walk,
 )
 from openant_tools.errors import BadInput
 
@@ -99,7 +99,7 @@ def sarsa(
     from openant_agents.sarsa import train as train_sarsa
 
     if hardware:
-        may_move(options, yes)
+        may_walk(options, yes)
     name = HARDWARE_ID if hardware else SIMULATED_ID
     given = {"epsilon": epsilon, "step_size": step_size, "reward_scale": reward_scale}
     settings = settings_of(Settings, settings_file, "sarsa", given)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from openant_tools.cli.hardware import may_move
 from openant_tools.cli.learning import robot_argument
 from openant_tools.cli.virtual_for_command import virtual_option
 from openant_tools.errors import BadInput
@@ -19,7 +20,7 @@ from openant_tools.errors import BadInput
 if TYPE_CHECKING:
     from openant_env.hardware import AntHardware
 
-__all__ = ["HARDWARE_ID", "SIMULATED_ID", "environment", "hardware_options", "hardware_robot", "may_move"]
+__all__ = ["HARDWARE_ID", "SIMULATED_ID", "environment", "hardware_options", "hardware_robot", "may_walk"]
 
 SIMULATED_ID, HARDWARE_ID = "openant/Ant-v0", "openant/AntHardware-v0"
 
@@ -56,21 +57,15 @@ def hardware_robot(
     return options
 
 
-def may_move(options: Mapping[str, Any], yes: bool) -> None:
+def may_walk(options: Mapping[str, Any], yes: bool) -> None:
     """Ask whether the robot may walk.
 
     Raises:
         BadInput: nobody is there to ask.
     """
-    if yes:
-        return
-    if not sys.stdin.isatty():
-        raise BadInput("the robot would walk and nobody is there to ask", remedy="add --yes if it may")
     which = "The virtual robot" if "virtual" in options else f"The robot of {options['robot']}"
-    click.echo(
-        f"{which} will stand up and walk: it must be on the floor, in the camera's view, with room around it.", err=True
-    )
-    click.confirm("May it?", abort=True, err=True)
+    place = "it must be on the floor, in the camera's view, with room around it."
+    may_move(yes, move="walk", question=f"{which} will stand up and walk: {place}\nMay it?")
 
 
 def _notice(words: str) -> None:

@@ -1,0 +1,105 @@
+"""What commands share that reach a robot over its bus: which robot, which port, and whether it may move."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_robot
+from openant_tools.errors import BadInput
+
+if TYPE_CHECKING:
+    from openant_tools.comms.messages import EngineConfig
+    from openant_tools.robot.folder import RobotFolder
+
+__all__ = ["engine_config", "may_move", "need_terminal", "port_option", "robot_of", "yes_option"]
+
+port_option = click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one plugged in.")
+yes_option = click.option(
+    "--yes", is_flag=True, help="The robot may move: do not ask. Needed where no terminal is attached."
+)
+
+
+def robot_of(robot: Path | None, *, needed: bool) -> RobotFolder | None:
+    """The robot's folder by `--robot`, $OPENANT_ROBOT or the working directory; None where none is meant nor needed."""
+    from openant_tools.robot.config import CONFIG_NAME
+    from openant_tools.robot.folder import RobotFolder
+
+    path = robot or Path(os.environ.get("OPENANT_ROBOT", "."))
+    meant = robot is not None or "OPENANT_ROBOT" in os.environ or (path / CONFIG_NAME).is_file()
+    return RobotFolder.at(path) if meant or needed else None
+
+
+@contextlib.contextmanager
+def engine_config(
+    folder: RobotFolder | None,
+    port: str | None,
+    virtual_source: str | None,
+    *,
+    clock: str | None = None,
+    imu: bool = False,
+    camera: bool = False,
+    **more: object,
+) -> Iterator[EngineConfig]:
+    """The robot meant, as the engine wants it; a virtual one that is started for this command ends with the block.
+
+    Args:
+        folder: None for an Ant that nobody has described.
+        port: of the bus, where it is not the virtual robot's or robot.toml's.
+        clock: "real" or "stepped" for a virtual robot; None for its own.
+        imu, camera: whether they are to be read, where there are any.
+        more: to `EngineConfig`.
+    """
+    from openant_tools.comms.setup import (
+        camera_of_robot,
+        config_of_robot,
+        config_of_unknown_robot,
+        find_bus,
+        imu_of_robot,
+    )
+
+    with contextlib.ExitStack() as stack:
+        found: Mapping[str, str | None] = {}
+        if virtual_source is not None:
+            clock = clock or clock_of_its_own(virtual_source)
+            found = stack.enter_context(virtual_robot(virtual_source, clock=clock))
+        port, control = port or found.get("bus"), found.get("control")
+        described = None if folder is None else folder.config()
+        if imu:
+            more["imu"] = imu_of_robot(described, found.get("imu"))
+        if camera:
+            more["camera"] = camera_of_robot(described, found.get("camera"))
+        if described is not None:
+            yield config_of_robot(described, port, control=control, **more)
+        else:
+            yield config_of_unknown_robot(find_bus(port), control, **more)
+
+
+def need_terminal(why: str, remedy: str = "add --yes if it may") -> None:
+    """Go on only where somebody can be asked; raises BadInput."""
+    if not sys.stdin.isatty():
+        raise BadInput(f"{why} and nobody is there to ask", remedy=remedy)
+
+
+def may_move(
+    yes: bool, *, move: str = "move", question: str = "May it move?", remedy: str = "add --yes if it may"
+) -> None:
+    """Go on only where the robot may move: `yes` says so, or whoever sits at the terminal.
+
+    Args:
+        move: what it would do, in a word. question: in the terminal.
+
+    Raises:
+        BadInput: nobody is there to ask.
+        click.Abort: it may not.
+    """
+    if yes:
+        return
+    need_terminal(f"the robot would {move}", remedy)
+    click.confirm(question, abort=True, err=True)
