@@ -240,7 +240,7 @@ def _part(run: Run, joints: Sequence[str]) -> dict[str, Any]:
         if np.isfinite(vel).any():
             speeds.append(np.abs(_filled(t, vel, np.full(n, np.nan))))
         elif np.isfinite(angle[:, k]).all() and n > 2:
-            speeds.append(np.abs(np.gradient(angle[:, k], t)))
+            speeds.append(np.abs(_speed(t, angle[:, k])))
         for name in ("cur", "load", "pwm"):
             effort = _numbers(run, name, joint)
             if np.isfinite(effort).mean() > 1 - _SPARSE:
@@ -270,6 +270,13 @@ def _part(run: Run, joints: Sequence[str]) -> dict[str, Any]:
         "wake": run.column("wake"),
         "cmd_t": run.column("cmd_t"),
     }
+
+
+def _speed(t: Array, angle: Array) -> Array:
+    """(n,) rad/s. Rows that a late loop catches up with follow each other at once: they count as half a period apart."""
+    step = np.gradient(t)
+    speed: Array = np.gradient(angle) / np.maximum(step, 0.5 * float(np.median(step)))
+    return speed
 
 
 def _shaking(t: Array, body: Array) -> Array:
