@@ -8,14 +8,13 @@ was made. What chance decides (exploration, batches) differs from run to run: `s
 from __future__ import annotations
 
 import contextlib
-import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -29,7 +28,7 @@ from numpy.typing import NDArray
 from openant_agents.learner import Job, SharedWeights
 from openant_agents.runs import CurvePoint, Run
 from openant_agents.sac import CURVE_EVERY, Sac, Settings, device_of, finite_or_raise, run_facts, sizes
-from openant_agents.training import REPORT_EVERY_S, Progress, event_writer, stop_on_signal
+from openant_agents.training import REPORT_EVERY_S, Progress, event_writer, reset_or_stop, stop_on_signal
 from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput, HardwareFault
 
@@ -249,7 +248,7 @@ class _Walk:
     def go(self, seed: int) -> None:
         """Until the run is long enough, or someone wants it to stop."""
         env, agent, learner, settings = self._env, self._agent, self._learner, self._settings
-        observation = self._reset(seed)
+        observation: Array | None = reset_or_stop(env, seed, self._stop)
         told = reported = time.monotonic()
         while observation is not None and self.step < self._steps and not self._stop.is_set():
             learner.follow()
@@ -266,7 +265,7 @@ class _Walk:
                 self._helped[reason] += 1
                 self._run.add_intervention(self.step, self._seconds, reason)
                 learner.tell(self.state)
-                observation = self._reset(None)
+                observation = reset_or_stop(env, None, self._stop)
             now = time.monotonic()
             if now - told > STATE_EVERY_S:
                 told = now
@@ -288,33 +287,3 @@ class _Walk:
             if self._events is not None:
                 self._events.add_scalar("average_reward_m_s", self._average.value, self.step)
                 self._events.add_scalar("updates", self._learner.updates, self.step)
-
-    def _reset(self, seed: int | None) -> Array | None:
-        """The first observation; a robot that needs help may keep us waiting, and Ctrl-C ends that at once."""
-        if self._stop.is_set():
-            return None
-        with _interruptible():
-            try:
-                observation: Array = self._env.reset(seed=seed)[0]
-            except KeyboardInterrupt:
-                self._stop.set()
-                return None
-        return observation
-
-
-@contextlib.contextmanager
-def _interruptible() -> Iterator[None]:
-    """Signals raise here, as nothing can be cut in half."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -32,6 +32,7 @@ class Evaluation:
         progress_m: m, the sum of rewards: displacement along the reward direction.
         path_m: m, the length of the way that the torso went, from step to step.
         turns: how often the reward direction changed.
+        late: steps that began later than they should, of a robot in real time.
         helped: why and how often the robot had to be set up again.
         seed: of the resets.
     """
@@ -42,6 +43,7 @@ class Evaluation:
     progress_m: float
     path_m: float
     turns: int
+    late: int
     helped: dict[str, int]
     seed: int
 
@@ -85,16 +87,18 @@ def evaluate(
     helped: Counter[str] = Counter()
     pictures: list[Frame] = []
     progress = path = 0.0
-    steps = turns = since_picture = 0
+    steps = turns = late = since_picture = 0
     observation, info = env.reset(seed=seed)
     if begin is not None:
         begin()
     while average.seconds < seconds - 1e-9:
         before = info
         observation, reward, terminated, truncated, info = env.step(policy(observation))
-        average.add(float(reward), float(info["dt"]))
-        progress += float(reward)
-        steps += 1
+        late = int(info.get("overruns", 0))
+        if not info.get("void", False):  # a stop came in the way of this step: nothing was done
+            average.add(float(reward), float(info["dt"]))
+            progress += float(reward)
+            steps += 1
         path += float(np.linalg.norm(np.nan_to_num(info["position"] - before["position"])))
         turns += bool((info["reward_direction"] != before["reward_direction"]).any())
         if len(pictures) < frames and average.seconds > frames_from_s:
@@ -108,4 +112,5 @@ def evaluate(
             observation, info = env.reset()
             if begin is not None:
                 begin()
-    return Evaluation(average.value, average.seconds, steps, progress, path, turns, dict(helped), seed), pictures
+    result = Evaluation(average.value, average.seconds, steps, progress, path, turns, late, dict(helped), seed)
+    return result, pictures

@@ -35,7 +35,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from openant_agents.runs import CurvePoint, Run, load_checkpoint, read_facts
-from openant_agents.training import CHECKPOINT_EVERY_S, REPORT_EVERY_S, Progress, event_writer, stop_on_signal
+from openant_agents.training import (
+    CHECKPOINT_EVERY_S,
+    REPORT_EVERY_S,
+    Progress,
+    event_writer,
+    reset_or_stop,
+    stop_on_signal,
+)
 from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput, HardwareFault
 
@@ -450,8 +457,10 @@ def _train(
     settings, replay = agent.settings, agent.replay
     average = AverageReward()
     helped: Counter[str] = Counter()
-    step, seconds = 0, 0.0
-    observation, _ = env.reset(seed=seed)
+    step, seconds, late = 0, 0.0, 0
+    observation: Array | None = reset_or_stop(env, seed, stop)
+    if observation is None:
+        raise KeyboardInterrupt
     checkpoint = run.resume()
     if checkpoint is not None:
         step, seconds = int(checkpoint["step"]), float(checkpoint["seconds"])
@@ -480,7 +489,7 @@ def _train(
 
     def progress() -> Progress:
         learning = step > settings.learning_start
-        return Progress(step, steps, seconds, average.value, learning, dict(helped))
+        return Progress(step, steps, seconds, average.value, learning, dict(helped), late)
 
     while step < steps and not stop.is_set():
         random = step < settings.learning_start
@@ -493,24 +502,27 @@ def _train(
         reward = float(reward)
         finite_or_raise(next_observation, reward, step, run.folder)
         dt = float(info.get("dt", 1.0))
-        if not info.get("void", False):  # of a robot that was stopped: nothing was done in that step
+        void = bool(info.get("void", False))
+        if not void:
             replay.add(observation, action, reward, dt, terminated, next_observation)
             average.add(reward, dt)
+            step += 1
+            seconds += dt
+        late = int(info.get("overruns", 0))
         observation = next_observation
-        step += 1
-        seconds += dt
         if terminated or truncated:
             reason = str(info.get("reason", "the episode ended"))
             helped[reason] += 1
             run.add_intervention(step, seconds, reason)
             try:
-                observation, _ = env.reset()
+                begun: Array | None = reset_or_stop(env, None, stop)
             except HardwareFault:
                 save()
                 raise
-        if step > settings.learning_start:
+            observation = observation if begun is None else begun
+        if not void and step > settings.learning_start:
             agent.update()
-        if step % CURVE_EVERY == 0:
+        if not void and step % CURVE_EVERY == 0:
             agent.sound_or_raise(run.folder)
             run.add_curve_point(CurvePoint(step, seconds, average.value))
             if events is not None:

@@ -36,7 +36,14 @@ from numpy.typing import NDArray
 from openant_agents.primitives import Gait
 from openant_agents.runs import CurvePoint, Run, load_checkpoint, read_facts
 from openant_agents.tile_coding import Rows, TileCoder
-from openant_agents.training import CHECKPOINT_EVERY_S, REPORT_EVERY_S, Progress, event_writer, stop_on_signal
+from openant_agents.training import (
+    CHECKPOINT_EVERY_S,
+    REPORT_EVERY_S,
+    Progress,
+    event_writer,
+    reset_or_stop,
+    stop_on_signal,
+)
 from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput, HardwareFault
 
@@ -361,7 +368,9 @@ def _train(
     step, seconds, late = 0, 0.0, 0
     random = np.random.default_rng(seed)
     agent = _agent(bounds, len(gait), settings, seed) if bounds.complete else None
-    observation, _ = env.reset(seed=seed)
+    observation: Array | None = reset_or_stop(env, seed, stop)
+    if observation is None:
+        raise KeyboardInterrupt
     action: int | None = None
     checkpoint = run.resume()
     log: list[Array] = []  # decisions not yet handed to the scribe
@@ -415,7 +424,6 @@ def _train(
                         where=run.folder,
                         remedy="look at the environment; what was saved until then is sound",
                     )
-                # Of a robot that was stopped: nothing was done in that step.
                 void = bool(info.get("void", False))
                 late = int(info.get("overruns", 0))
                 if void:
@@ -456,9 +464,11 @@ def _train(
                 reason = str(info.get("reason", "the episode ended"))
                 helped[reason] += 1
                 scribe.write(run.add_intervention, step, seconds, reason)
-                observation, _ = env.reset()
-                gait.rest()
-                action = choose(observation)
+                begun: Array | None = reset_or_stop(env, None, stop)
+                if begun is not None:
+                    observation = begun
+                    gait.rest()
+                    action = choose(observation)
             now = time.monotonic()
             if now - last_save > CHECKPOINT_EVERY_S:
                 save()

@@ -1,4 +1,8 @@
-"""What training loops share: how far they are, how they stop, where their events go."""
+"""What training loops share: how far they are, how they wait and stop, where their events go.
+
+A step that a stop came in the way of (`info["void"]`) counts for nothing in all of them: nobody learns from it, and it is
+neither a step nor time.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +15,11 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import gymnasium
+
 from openant_tools.errors import BadInput
 
-__all__ = ["CHECKPOINT_EVERY_S", "REPORT_EVERY_S", "Progress", "event_writer", "stop_on_signal"]
+__all__ = ["CHECKPOINT_EVERY_S", "REPORT_EVERY_S", "Progress", "event_writer", "reset_or_stop", "stop_on_signal"]
 
 #: s of wall-clock time between checkpoints: a crash loses at most this much.
 CHECKPOINT_EVERY_S = 30.0
@@ -76,6 +82,42 @@ def stop_on_signal() -> Iterator[threading.Event]:
     before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def reset_or_stop(env: gymnasium.Env[Any, Any], seed: int | None, stop: threading.Event) -> Any | None:
+    """The first observation, or None where someone wants to stop.
+
+    A robot that needs help keeps a reset waiting, and one wish ends that. A simulation is reset whole: half of it could not
+    be saved.
+    """
+    if stop.is_set():
+        return None
+    if hasattr(env.unwrapped, "get_state"):
+        return env.reset(seed=seed)[0]
+    with _interruptible():
+        try:
+            return env.reset(seed=seed)[0]
+        except KeyboardInterrupt:
+            stop.set()
+            return None
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Signals raise here, as nothing can be cut in half."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(signum: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -114,6 +114,36 @@ def test_kill_9_loses_no_transition(tmp_path):
     assert done.robot_seconds == pytest.approx(0.1 * (made + 5))
 
 
+def test_a_step_that_was_not_carried_out_counts_for_nothing_between_actions_too(tmp_path):
+    done = train(Robot(0.0, stopped_at=(31, 101)), folder=tmp_path, steps=120, seed=0, settings=SMALL)
+    assert done.step == 120
+    assert done.robot_seconds == pytest.approx(12.0)
+    assert done.helped == {"the cable came off": 2}
+    assert done.late == 3
+    assert len(rows(tmp_path)) == 120
+    assert [one.step for one in read_interventions(tmp_path)] == [30, 99]
+    assert [point.step for point in read_curve(tmp_path)] == [100]
+    checkpoint = load_checkpoint(tmp_path)
+    assert checkpoint["seconds"] == pytest.approx(12.0)
+    assert checkpoint["agent"]["updates"] == 120 - SMALL.learning_start
+
+
+@pytest.mark.parametrize("learn", [train, train_beside])
+def test_one_wish_to_stop_ends_waiting_for_a_robot(tmp_path, learn):
+    class Lost(Robot):
+        def reset(self, *, seed=None, options=None):
+            if self.taken:
+                signal.raise_signal(signal.SIGINT)
+                raise AssertionError("it waits for ever")
+            return super().reset(seed=seed)
+
+    with pytest.raises(KeyboardInterrupt):
+        learn(Lost(0.0, stopped_at=(31,)), folder=tmp_path, steps=120, seed=0, settings=SMALL)
+    assert len(rows(tmp_path)) == 30
+    assert load_checkpoint(tmp_path)["transitions"] == 30
+    assert learn(Robot(0.0), folder=tmp_path, steps=60, seed=0, settings=SMALL).step == 60
+
+
 def rows_so_far(folder: Path) -> np.ndarray:
     data = (folder / "transitions.f32").read_bytes()
     return np.frombuffer(data[: len(data) // (4 * WIDTH) * 4 * WIDTH], np.float32).reshape(-1, WIDTH)
