@@ -17,10 +17,13 @@ if TYPE_CHECKING:
     from openant_agents.drops import DropWatch
     from openant_agents.training import Progress
 
-__all__ = ["LearningBar", "need_torch", "robot_argument", "settings_of", "settings_option"]
+__all__ = ["LearningBar", "kit_option", "need_torch", "robot_argument", "settings_of", "settings_option"]
 
 Settings = TypeVar("Settings")
 
+kit_option = click.option(
+    "--kit", type=click.Choice(["standard", "lite"]), help="The bundled nominal robot, instead of --robot."
+)
 settings_option = click.option(
     "--settings", "settings_file", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
     help="Settings that `openant tune --json` found. Options given here count more.",

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from openant_tools.cli.learning import LearningBar, need_torch, robot_argument
+from openant_tools.cli.learning import LearningBar, kit_option, need_torch, robot_argument
 from openant_tools.cli.options import json_option, robot_option
 from openant_tools.errors import BadInput
 
@@ -24,7 +24,7 @@ DEFAULTS: dict[str, tuple[dict[str, Any], int]] = {
 @click.command()
 @click.argument("agent", type=click.Choice(sorted(DEFAULTS)))
 @robot_option
-@click.option("--kit", type=click.Choice(["standard", "lite"]), help="The bundled nominal robot, instead of --robot.")
+@kit_option
 @click.option(
     "--storage", default="sqlite:///tune.db", show_default=True, metavar="URL",
     help="Any storage of Optuna's. Processes and machines that name the same share the work.",

@@ -1,0 +1,157 @@
+"""What `openant train sac` and `openant train sarsa` share: where they train, how they stop, and what they show."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from openant_tools.cli.learning import LearningBar, kit_option, robot_argument
+from openant_tools.cli.options import robot_option
+from openant_tools.cli.walking import (
+    HARDWARE_ID,
+    SIMULATED_ID,
+    environment,
+    hardware_options,
+    hardware_robot,
+    may_walk,
+)
+from openant_tools.errors import BadInput
+
+if TYPE_CHECKING:
+    from openant_agents.training import Progress
+
+__all__ = ["effects_option", "place_of", "show_result", "tensorboard_option", "training", "training_options"]
+
+effects_option = click.option(
+    "--effects/--no-effects", default=True, help="Whether the robot's [[effect]] entries act.  [default: on]"
+)
+tensorboard_option = click.option(
+    "--tensorboard", is_flag=True, help="Also write TensorBoard events into the run's folder."
+)
+
+
+def training_options(hour: int, step_s: float, leaves: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """The robot and where it trains, `--steps`, `--seed`, `--out`, `--task`.
+
+    Args:
+        hour: so many steps are an hour of robot time. step_s: s, of each.
+        leaves: what is in a run's folder, in words.
+    """
+    options = (
+        robot_option,
+        kit_option,
+        click.option(
+            "--env", "where", type=click.Choice(["sim", "hardware"]), default="sim", show_default=True,
+            help="Where to train: in the simulation, or on the robot itself (with --virtual on a virtual one).",
+        ),
+        hardware_options,
+        click.option(
+            "--steps", type=click.IntRange(min=1), default=hour, show_default=True,
+            help=f"Train until the run is this long; {hour:,} steps of {step_s:g} s are an hour.",
+        ),
+        click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True),
+        click.option(
+            "--out", type=click.Path(path_type=Path, file_okay=False), required=True, metavar="DIR",
+            help=f"The run's folder: {leaves}. A run that stands there goes on.",
+        ),
+        click.option(
+            "--task", type=click.Choice(["back-and-forth", "forward"]), default="back-and-forth", show_default=True
+        ),
+    )  # fmt: skip
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return add
+
+
+def place_of(
+    where: str,
+    robot: Path | None,
+    kit: str | None,
+    virtual_source: str | None,
+    clock: str | None,
+    task: str,
+    effects: bool,
+) -> tuple[str, dict[str, Any]]:
+    """The environment's id and options.
+
+    Raises:
+        BadInput: options that do not go together, or no such robot.
+    """
+    hardware = where == "hardware"
+    if virtual_source is not None and not hardware:
+        raise BadInput("--virtual is a robot behind its ports", remedy="add --env hardware")
+    chosen = hardware_robot(robot, kit, virtual_source, clock) if hardware else robot_argument(robot, kit)
+    options: dict[str, Any] = {**chosen, "task": task}
+    if not effects and not hardware:
+        options["effects"] = False
+    return HARDWARE_ID if hardware else SIMULATED_ID, options
+
+
+@contextlib.contextmanager
+def training(
+    name: str, options: Mapping[str, Any], *, yes: bool, steps: int, out: Path
+) -> Iterator[tuple[Any, LearningBar]]:
+    """An environment by its id, once a robot may move, and the bar; Ctrl-C says how to go on."""
+    if name == HARDWARE_ID:
+        may_walk(options, yes)
+    with environment(name, options, out / "recordings") as env:
+        try:
+            with LearningBar(steps, out) as bar:
+                yield env, bar
+        except KeyboardInterrupt:
+            click.echo(f"saved in {out}; the same command goes on from there", err=True)
+            raise
+
+
+def show_result(
+    agent: str,
+    result: Progress,
+    out: Path,
+    json_file: Path | None,
+    *,
+    words: Sequence[str] = (),
+    more: Mapping[str, Any] | None = None,
+    learning_from_s: float | None = None,
+) -> None:
+    """Print how far a run came, draw its curve, and write the JSON that was asked for.
+
+    Args:
+        words: lines of this agent. more: its part of the JSON.
+        learning_from_s: s of robot time at which updates began.
+    """
+    from openant_agents.curves import plot_curves
+    from openant_agents.runs import read_curve
+
+    curve = read_curve(out)
+    picture = out / "learning_curve.png"
+    if curve:
+        plot_curves({agent: curve}, picture, learning_from_s=learning_from_s)
+    helped = ", ".join(f"{count}× {reason}" for reason, count in result.helped.items())
+    click.echo(
+        f"{result.step} steps, {result.robot_seconds / 60:.1f} min of robot time: "
+        f"{100 * result.average_reward_m_s:+.1f} cm/s over the last 120 s"
+        + (f" (set up again: {helped})" if helped else "")
+        + (f", {result.late} steps began late" if result.late else "")
+        + ("" if result.updates is None else f", {result.updates} updates")
+    )
+    for line in words:
+        click.echo(line)
+    click.echo(f"run: {out}" + (f"   curve: {picture}" if curve else ""))
+    click.echo(f"next: openant eval {out} --seconds 120")
+    if json_file is not None:
+        from openant_tools.files import write_text
+
+        answer = {
+            "steps": result.step, "seconds": result.robot_seconds, "average_reward_m_s": result.average_reward_m_s,
+            "helped": dict(result.helped), "late": result.late, "run": str(out), **(more or {}),
+        }  # fmt: skip
+        write_text(json_file, json.dumps(answer, indent=2) + "\n")
