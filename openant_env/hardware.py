@@ -488,7 +488,7 @@ class AntHardware(AntBase):
         if guards.temperature_margin_k is None:
             return None
         for servo, temperature in zip(self.link.config.servos, self._temps.tolist(), strict=True):
-            limit = servo.model.temperature_limit_c - guards.temperature_margin_k
+            limit = self.link.limits_c[servo.joint] - guards.temperature_margin_k
             cooled = limit - COOLED_K
             tripped = self._cooling.get(servo.joint, False)
             self._cooling[servo.joint] = temperature >= (cooled if tripped else limit - 1.0)

@@ -102,6 +102,7 @@ class RobotLink:
 
     Attributes:
         columns: name → place in a row of telemetry.
+        limits_c: joint → °C at which its servo would shut down.
     """
 
     def __init__(
@@ -143,6 +144,8 @@ class RobotLink:
         self.drop()
         self._engine = engine = EngineProcess(self.config)
         self.columns = {name: k for k, name in enumerate(engine.columns)}
+        registers = engine.description["registers"]
+        self.limits_c = {joint: float(table["temperature_limit"]) for joint, table in registers.items()}
         if self._found is None:
             self._found = np.asarray(engine.description["position"], float)
         self._tell()

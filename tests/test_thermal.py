@@ -18,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openant_tools.cli import openant as manual
+from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.setup import config_of_unknown_robot
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
@@ -354,7 +355,7 @@ def test_a_finding_says_it_all_and_the_table_warns_while_cold(lite: Inputs) -> N
 
 def run_soak(plan: Plan, out: Path, robot_: object, *, resume: bool = False, rate_hz: float = 4.0):  # type: ignore[no-untyped-def]
     bench = robot_.bench  # type: ignore[attr-defined]
-    config = soak_config(config_of_unknown_robot(bench.bus, bench.control), rate_hz)
+    config = soak_config(config_of_unknown_robot(bench.bus, bench.control), rate_hz, plan.margin_k)
     return soak(config, plan, out, resume=resume)
 
 
@@ -424,6 +425,22 @@ def test_a_soak_ends_below_the_limit_that_the_servo_has(tmp_path: Path) -> None:
     assert made.joint == "hip_fl"
     assert made.loaded_s < 300
     assert "37 °C, 3 K below its limit" in made.words
+
+
+def test_the_engine_stops_a_hot_robot_that_nobody_watches(tmp_path: Path) -> None:
+    """Half way between the margin and the servo's own limit, and not for one wrong answer."""
+    servo = {"joint": "hip_fl", "temperature_limit": 40}
+    glitch = {"cause": "temperature_glitch", "where": "knee_rr", "fraction": 0.05}
+    with robot(
+        tmp_path / "ant", servo=[servo], fault=[glitch], room={"ambient_c": 29.6}, **DOZING,
+        **motor(case_j_k=4.0, standby_a=0.1),
+    ) as there:  # fmt: skip
+        config = soak_config(config_of_unknown_robot(there.bench.bus, there.bench.control), 4.0, 4.0)
+        with EngineProcess(config) as engine:
+            engine.ask(messages.Torque(True))
+            with pytest.raises(HardwareFault, match=r"hip_fl .* is at 38 °C, 40 °C is its limit"):
+                engine.ask(messages.Hold(600.0))
+            assert not any(there.torque())
 
 
 def test_a_hot_robot_is_left_to_cool(tmp_path: Path) -> None:

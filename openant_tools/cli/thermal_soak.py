@@ -190,7 +190,7 @@ def _connected(
     if source is not None and placeable(source):
         source = stack.enter_context(placed(source, plan.setup, doze=True))
     config = stack.enter_context(engine_config(folder, port, source))
-    return soak_config(config, rate_hz)
+    return soak_config(config, rate_hz, plan.margin_k)
 
 
 def _run(

@@ -178,8 +178,9 @@ class Engine:
         for write in servos.journal:
             self._notice(f"{write.joint} (id {write.id}): {write.register} changed from {write.old} to {write.new}")
         self._servos = self._on_this_turn()
-        self._watch = Watch(config.guards, self._servos.servos, config.limits_rad)
         self._registers = self._read_registers()
+        hottest = {joint: float(table["temperature_limit"]) for joint, table in self._registers.items()}
+        self._watch = Watch(config.guards, self._servos.servos, config.limits_rad, hottest)
         self._period = 1.0 / config.rate_hz
         if config.imu is not None:
             try:

@@ -22,6 +22,7 @@ class Guards:
         angle_margin_rad: how far beyond its limits a joint may be measured: overshoot, not a wrong way.
         current_share, load_share: of the servo's stall current, or of its full load, over `effort_s`.
         temperature_margin_k: below the servo's own limit, at which it would shut down.
+        temperature_s: for how long it must read so: whoever soaks for hours meets answers with a wrong byte.
         silent_s: a servo that does not answer for so long is lost, once it has been asked `silent_cycles` times in
             vain, too: a noisy line loses answers by chance, a busy host asks seldom.
         lost_s: a servo that does not answer for so long is lost, however often it was asked.
@@ -32,6 +33,7 @@ class Guards:
     load_share: float | None = 0.95
     effort_s: float = 0.5
     temperature_margin_k: float | None = 5.0
+    temperature_s: float = 0.0
     voltage: bool = True
     silent_s: float | None = 0.25
     silent_cycles: int = 20
@@ -58,18 +60,22 @@ class Watch:
 
     Attributes:
         limits_rad: joint → (low, high), joint angle.
+        limits_c: joint → temperature limit, as the servo has it; the maker's where it is not known.
     """
 
     guards: Guards
     servos: Sequence[Servo]
     limits_rad: Mapping[str, tuple[float, float]]
+    limits_c: Mapping[str, float] = field(default_factory=dict)
     _strained_since: dict[int, float] = field(default_factory=dict)
+    _hot_since: dict[int, float] = field(default_factory=dict)
     _heard: dict[int, float] = field(default_factory=dict)
     _missed: dict[int, Counter[Cause]] = field(default_factory=dict)
 
     def reset(self, t: float) -> None:
         """Torque comes on at `t`: what was before does not count."""
         self._strained_since.clear()
+        self._hot_since.clear()
         self._missed.clear()
         self._heard = {servo.id: t for servo in self.servos}
 
@@ -147,10 +153,12 @@ class Watch:
         else:
             self._strained_since.pop(servo.id, None)
         if guards.temperature_margin_k is not None:
-            limit = model.temperature_limit_c - guards.temperature_margin_k
-            if block.temperature >= limit:
+            limit = self.limits_c.get(servo.joint, model.temperature_limit_c)
+            if block.temperature < limit - guards.temperature_margin_k:
+                self._hot_since.pop(servo.id, None)
+            elif t - self._hot_since.setdefault(servo.id, t) >= guards.temperature_s:
                 return Trip(
-                    f"{place} is at {block.temperature} °C, {model.temperature_limit_c:.0f} °C is its limit",
+                    f"{place} is at {block.temperature} °C, {limit:.0f} °C is its limit",
                     "let it cool for 20 minutes and take load off this joint",
                     servo.joint,
                 )

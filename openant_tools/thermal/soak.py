@@ -47,6 +47,8 @@ STALL_S, STALLED = 3.0, 0.7
 PRESSES, STILL_RAD = 20, 0.01
 #: K below a limit from which no soak begins: what is hot already is to cool first.
 BEGIN_K = 10.0
+#: s that a servo must read too hot until the engine believes it: longer than any telemetry error
+HOT_S = 3.0
 #: A soak must outlive a noisy bus: s without an answer until a servo is given up.
 SILENT_S = 3.0
 
@@ -169,11 +171,19 @@ def pose_angles(pose: str, joints: Sequence[str]) -> Array:
     return angles
 
 
-def soak_config(config: EngineConfig, rate_hz: float) -> EngineConfig:
-    """The engine's config for hours at a few cycles a second: heat is watched here, silence is borne longer."""
+def soak_config(config: EngineConfig, rate_hz: float, margin_k: float = Plan.margin_k) -> EngineConfig:
+    """The engine's config for hours at a few cycles a second: silence is borne longer.
+
+    Heat is watched here, by one who knows telemetry errors; half way from there to the limit the engine stops by itself,
+    whatever becomes of us.
+
+    Args:
+        margin_k: of the plan; below zero the servos are to shut down by themselves.
+    """
     guards = replace(
         config.guards or Guards(),
-        temperature_margin_k=None,
+        temperature_margin_k=None if margin_k < 0 else margin_k / 2,
+        temperature_s=HOT_S,
         silent_s=max(0.25, SILENT_S),
         silent_cycles=5,
         lost_s=max(0.4, 2 * SILENT_S),
@@ -391,7 +401,7 @@ def _under_load(
 def _why_stopped(
     engine: EngineProcess, log: _Log, limits: Array, loaded: float, fault: HardwareFault
 ) -> tuple[float, str, str | None, str]:
-    """A servo's own shutdown is what the test was for; anything else is not."""
+    """A servo's own shutdown is what the test was for, its limit what the margin is for; anything else is neither."""
     joint = next((e.joint for e in engine.events() if isinstance(e, messages.Stopped) and e.joint), None)
     if engine.ended or joint is None:
         raise fault
@@ -399,6 +409,8 @@ def _why_stopped(
     if "overheating" in fault.what:
         words = f"{joint} shut itself down at {log.temperature[k]:.0f} °C, its limit is {limits[k]:.0f} °C"
         return loaded, "shutdown", joint, words
+    if "is its limit" in fault.what:
+        return loaded, "margin", joint, fault.what
     return loaded, "guard", joint, fault.what
 
 
