@@ -40,6 +40,7 @@ from openant_agents.training import (
     REPORT_EVERY_S,
     Progress,
     event_writer,
+    finite_or_raise,
     reset_or_stop,
     stop_on_signal,
 )
@@ -47,8 +48,7 @@ from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput, HardwareFault
 
 __all__ = [
-    "Actor", "Critics", "Progress", "Replay", "Sac", "Settings", "device_of", "finite_or_raise", "load_policy", "run_facts",
-    "sizes", "train",
+    "Actor", "Critics", "Progress", "Replay", "Sac", "Settings", "device_of", "load_policy", "run_facts", "sizes", "train",
 ]  # fmt: skip
 
 Array = NDArray[np.float32]
@@ -380,20 +380,6 @@ def run_facts(
         "trained_on": {} if describe is None else dict(describe()), "observations": observations, "actions": actions,
         "versions": {"torch": torch.__version__, "numpy": np.__version__, "gymnasium": gymnasium.__version__},
     }  # fmt: skip
-
-
-def finite_or_raise(observation: NDArray[Any], reward: float, step: int, folder: Path) -> None:
-    """Refuse what nothing can be learned from.
-
-    Raises:
-        BadInput: the reward or a number of the observation is none.
-    """
-    if not math.isfinite(reward + float(observation.sum())):
-        raise BadInput(
-            f"step {step} gave a reward or an observation that is no number",
-            where=folder,
-            remedy="look at the environment; the last checkpoint is sound",
-        )
 
 
 def train(

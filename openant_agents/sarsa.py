@@ -41,6 +41,7 @@ from openant_agents.training import (
     REPORT_EVERY_S,
     Progress,
     event_writer,
+    finite_or_raise,
     reset_or_stop,
     stop_on_signal,
 )
@@ -418,12 +419,7 @@ def _train(
             for command in gait.actions(action):
                 seen, r, terminated, truncated, info = env.step(command.astype(np.float32))
                 r = float(r)
-                if not math.isfinite(r + float(seen.sum())):
-                    raise BadInput(
-                        f"step {step} gave a reward or an observation that is no number",
-                        where=run.folder,
-                        remedy="look at the environment; what was saved until then is sound",
-                    )
+                finite_or_raise(seen, r, step, run.folder)
                 void = bool(info.get("void", False))
                 late = int(info.get("overruns", 0))
                 if void:

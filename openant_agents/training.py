@@ -6,6 +6,7 @@ neither a step nor time.
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 from collections.abc import Iterator, Mapping
@@ -16,10 +17,13 @@ from types import FrameType
 from typing import Any
 
 import gymnasium
+from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 
-__all__ = ["CHECKPOINT_EVERY_S", "REPORT_EVERY_S", "Progress", "event_writer", "reset_or_stop", "stop_on_signal"]
+__all__ = [
+    "CHECKPOINT_EVERY_S", "REPORT_EVERY_S", "Progress", "event_writer", "finite_or_raise", "reset_or_stop", "stop_on_signal",
+]  # fmt: skip
 
 #: s of wall-clock time between checkpoints: a crash loses at most this much.
 CHECKPOINT_EVERY_S = 30.0
@@ -49,6 +53,20 @@ class Progress:
     helped: Mapping[str, int]
     late: int = 0
     updates: int | None = None
+
+
+def finite_or_raise(observation: NDArray[Any], reward: float, step: int, folder: Path) -> None:
+    """Refuse what nothing can be learned from.
+
+    Raises:
+        BadInput: the reward or a number of the observation is none.
+    """
+    if not math.isfinite(reward + float(observation.sum())):
+        raise BadInput(
+            f"step {step} gave a reward or an observation that is no number",
+            where=folder,
+            remedy="look at the environment; what was saved until then is sound",
+        )
 
 
 def event_writer(folder: Path) -> Any:
