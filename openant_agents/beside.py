@@ -28,7 +28,14 @@ from numpy.typing import NDArray
 from openant_agents.learner import Job, SharedWeights
 from openant_agents.runs import CurvePoint, Run
 from openant_agents.sac import CURVE_EVERY, Sac, Settings, device_of, run_facts, sizes
-from openant_agents.training import REPORT_EVERY_S, Progress, event_writer, finite_or_raise, reset_or_stop, stop_on_signal
+from openant_agents.training import (
+    REPORT_EVERY_S,
+    Progress,
+    event_writer,
+    finite_or_raise,
+    reset_or_stop,
+    stop_on_signal,
+)
 from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput, HardwareFault
 
