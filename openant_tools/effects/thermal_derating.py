@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from openant_tools.effects.effect import Effect, Quantity, Values
 from openant_tools.effects.step import Step
 
-__all__ = ["EFFECT"]
+__all__ = ["EFFECT", "Heating"]
 
 #: °C by which a winding that gives all its torque warms up in the end
 FULL_HEAT_C = 60.0
@@ -24,18 +24,22 @@ USUAL_S = 20.0
 TINY = 1e-9
 
 
-class _Heating:
+class Heating:
     """heat' = (FULL_HEAT_C (torque/limit)² − heat) / time constant, explicitly; share left = 1 − loss · heat.
+
+    Args:
+        values: (n, joints) or (n, 1) of each quantity.
+        start_c: (n, 1) °C, how warm it is at the first step already.
 
     Attributes:
         state: (n, joints) °C above where it began.
     """
 
-    def __init__(self, values: Values) -> None:
+    def __init__(self, values: Values, start_c: NDArray[np.float64] | float = 0.0) -> None:
         self._loss = values["loss_per_c"]
         seconds = values["time_constant_s"]
         self._seconds = np.where(seconds > 0.0, seconds, USUAL_S)
-        self.state: NDArray[np.float64] = np.zeros(self._loss.shape)
+        self.state: NDArray[np.float64] = np.broadcast_to(start_c, self._loss.shape).copy()
 
     def __call__(self, step: Step) -> None:
         share = np.minimum(np.abs(step.motor_torque) / np.maximum(step.limit, TINY), 1.0)
@@ -55,5 +59,5 @@ EFFECT = Effect(
         Quantity("time_constant_s", "s", 10.0, high=3600.0),
     ),
     order=5,
-    law=_Heating,
+    law=Heating,
 )

@@ -13,16 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.effects.step import Law, Step
+from openant_tools.effects.thermal_derating import Heating
 from openant_tools.gap.robot import Robot
 
 __all__ = ["Fields", "first_laws", "last_laws"]
 
 Array = NDArray[np.float64]
 
-#: °C by which a winding that gives all its torque warms up in the end; sizes of derating are per °C of it
-FULL_HEAT_C = 60.0
-#: least share of the torque that heat leaves
-COLDEST = 0.2
 #: share of the stiffest spring that a step can integrate, for what is to be hard
 HARD = 0.15
 #: share of critical damping in a spring
@@ -58,9 +55,9 @@ def first_laws(robots: Sequence[Robot], fields: Fields) -> list[Law]:
     if steps.any():
         laws.append(_rounding(steps, _table(robots, "zero")))
     if derating.any():
-        laws.append(
-            _heating(derating, *(np.array([[getattr(r, name)] for r in robots]) for name in ("derating_s", "heat_c")))
-        )
+        seconds = np.array([[robot.derating_s] for robot in robots])
+        heat_c = np.array([[robot.heat_c] for robot in robots])
+        laws.append(Heating({"loss_per_c": derating, "time_constant_s": seconds}, heat_c))
     if np.isfinite(no_load).any():
         laws.append(_fading(no_load))
     return laws
@@ -113,20 +110,6 @@ def _rounding(steps: Array, zero: Array) -> Law:
     def act(step: Step) -> None:
         read = step.position + zero
         step.setpoint = step.setpoint + np.where(steps > 0, read - np.round(read / size) * size, 0.0)
-
-    return act
-
-
-def _heating(loss: Array, seconds: Array, start: Array) -> Law:
-    heat = np.broadcast_to(start, loss.shape).copy()
-
-    def act(step: Step) -> None:
-        share = np.minimum(np.abs(step.motor_torque) / np.maximum(step.limit, TINY), 1.0)
-        heat[:] += step.dt / seconds * (FULL_HEAT_C * share**2 - heat)
-        left = np.maximum(1 - loss * heat, COLDEST)
-        step.stiffness *= left
-        step.velocity_gain *= left
-        step.limit *= left
 
     return act
 
