@@ -9,11 +9,9 @@ and nothing is lost.
 from __future__ import annotations
 
 import contextlib
-import mmap
 import os
 import signal
 import sys
-import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,6 +27,7 @@ from openant_agents.runs import load_checkpoint, save_checkpoint
 from openant_agents.sac import Sac, Settings
 from openant_agents.training import CHECKPOINT_EVERY_S
 from openant_tools.errors import OpenAntError
+from openant_tools.files import shared_memory
 
 __all__ = ["Job", "SharedWeights", "main"]
 
@@ -71,13 +70,7 @@ class SharedWeights:
     """
 
     def __init__(self, count: int, fd: int | None = None) -> None:
-        size = _HEADER + 2 * 4 * count
-        if fd is None:
-            with tempfile.TemporaryFile() as file:
-                fd = os.dup(file.fileno())
-            os.ftruncate(fd, size)
-        self.fd = fd
-        self._map = mmap.mmap(fd, size)
+        self.fd, self._map = shared_memory(_HEADER + 2 * 4 * count, fd)
         self._numbers = np.frombuffer(self._map, np.uint64, 2)  # version, updates
         self._places = np.frombuffer(self._map, np.float32, 2 * count, _HEADER).reshape(2, count)
 

@@ -1,7 +1,8 @@
-"""Writing files so that whoever looks sees the old one or the whole new one, never a part."""
+"""Writing files so that whoever looks sees the old one or the whole new one, never a part; and memory shared as a file."""
 
 from __future__ import annotations
 
+import mmap
 import os
 import tempfile
 from collections.abc import Iterator
@@ -9,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-__all__ = ["atomic_writer", "write_bytes", "write_text"]
+__all__ = ["atomic_writer", "shared_memory", "write_bytes", "write_text"]
 
 
 @contextmanager
@@ -62,3 +63,20 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 def write_text(path: str | Path, text: str) -> None:
     """Write `text` as UTF-8 to `path` by `atomic_writer`."""
     write_bytes(path, text.encode())
+
+
+def shared_memory(size: int, fd: int | None = None) -> tuple[int, mmap.mmap]:
+    """Memory that other processes can open by its file descriptor, which is theirs and ours to close.
+
+    Args:
+        size: bytes.
+        fd: of memory that another process made; None makes it, of zeros and without a name.
+
+    Returns:
+        The file descriptor, and the memory.
+    """
+    if fd is None:
+        with tempfile.TemporaryFile() as file:
+            fd = os.dup(file.fileno())
+        os.ftruncate(fd, size)
+    return fd, mmap.mmap(fd, size)

@@ -6,13 +6,13 @@ joints, named by `columns`.
 
 from __future__ import annotations
 
-import mmap
 import os
-import tempfile
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+
+from openant_tools.files import shared_memory
 
 __all__ = ["ERR_CODES", "SIGNALS", "Ring", "columns"]
 
@@ -44,13 +44,7 @@ class Ring:
     """
 
     def __init__(self, width: int, fd: int | None = None) -> None:
-        size = _HEADER + SLOTS * width * 8
-        if fd is None:
-            with tempfile.TemporaryFile() as file:
-                fd = os.dup(file.fileno())
-            os.ftruncate(fd, size)
-        self.fd = fd
-        self._map = mmap.mmap(fd, size)
+        self.fd, self._map = shared_memory(_HEADER + SLOTS * width * 8, fd)
         self._count = np.frombuffer(self._map, np.uint64, 1)
         self._rows = np.frombuffer(self._map, np.float64, SLOTS * width, _HEADER).reshape(SLOTS, width)
 
