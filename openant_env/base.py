@@ -100,6 +100,11 @@ class AntBase(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         """Name of an observation → (low, high), of those alone whose bounds were measured on the robot."""
         return self.robot.measured_bounds
 
+    @property
+    def command(self) -> NDArray[np.float64]:
+        """(joints,) rad, what the last action commanded."""
+        return self._command.copy()
+
     def describe(self) -> dict[str, Any]:
         """What a policy trained here depends on, as plain values: to be kept beside it and compared before it plays."""
         return {

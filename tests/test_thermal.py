@@ -577,6 +577,36 @@ def test_fit_forecast_and_compare_from_tables(tmp_path: Path, lite: Inputs) -> N
     assert command("thermal", "compare", tmp_path / "bare", "--paper")[1].startswith("Paper: a Lite's knee")
 
 
+def test_a_trained_policy_is_a_load(tmp_path: Path) -> None:
+    """It walks in the simulation; what it commanded stands beside the recording, so that --resume finds it."""
+    pytest.importorskip("torch")
+    import gymnasium
+
+    import openant_env  # noqa: F401  (registers the environments)
+    from openant_agents.sac import Settings, train
+
+    env = gymnasium.make("openant/Ant-v0", kit="lite")
+    facts = {"id": "openant/Ant-v0", "options": {"kit": "lite"}}
+    small = Settings(learning_start=60, batch=16, hidden=16)
+    train(env, folder=tmp_path / "policy", steps=30, seed=0, settings=small, env_facts=facts)
+    out = tmp_path / "walked.mcap"
+    code, said = command(
+        "thermal", "soak", "--virtual", "--play", tmp_path / "policy", "--minutes", 0.05, "--cool-down", 0, "--rate", 25,
+        "--out", out, "--yes",
+    )  # fmt: skip
+    assert code == 0, said
+    played = read_run(tmp_path / "walked-policy.parquet", need=("cmd",))
+    assert played.duration_s == pytest.approx(60.0, abs=0.3)
+    walked = read_run(out, need=())
+    assert 2.9 < walked.duration_s < 8.0, "three seconds, and lying down"
+    seen, asked = walked.column("cmd.knee_fl"), played.column("cmd.knee_fl")[5:20]
+    assert all(np.abs(seen - angle).min() < 2e-3 for angle in asked)
+    assert resume_plan(out).commands == str(tmp_path / "walked-policy.parquet")
+    code, said = command("thermal", "soak", "--virtual", "--play", tmp_path, "--out", tmp_path / "no.mcap", "--yes")
+    assert code == 2
+    assert "there is no training run here" in said
+
+
 def test_mistakes_on_the_command_line_are_named(tmp_path: Path) -> None:
     write_table(stalled(seconds=120), tmp_path / "run.parquet")
     (tmp_path / "bad.json").write_text("{}")

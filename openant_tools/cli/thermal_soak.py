@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,8 +41,9 @@ DRAW_S, LINE_S = 0.25, 20.0
     help="Stand on its feet; hang on its stand, legs free; or lie under a weight that stalls the pressing knees.",
 )  # fmt: skip
 @click.option(
-    "--play", "commands", type=click.Path(path_type=Path), metavar="RUN", help="Play a recording's commands instead."
-)
+    "--play", "commands", type=click.Path(path_type=Path), metavar="RUN|DIR",
+    help="Play a recording's commands instead, or those of a trained policy by its folder, over and over.",
+)  # fmt: skip
 @click.option(
     "--pose", "poses", multiple=True, metavar="POSE",
     help="home, low, tall, straight, or knee=-0.32,hip=0; repeat it to hold several in turn.  [default: home]",
@@ -116,6 +118,7 @@ def soak(
       openant thermal soak --robot my-ant --minutes 30 --out soak.mcap
       openant thermal soak --robot my-ant --load stall --to-shutdown --heat-sink knee --out stress.mcap
       openant thermal soak --robot my-ant --play walk.mcap --minutes 20 --out walking.mcap
+      openant thermal soak --robot my-ant --play my-ant/runs/sac-1 --minutes 20 --out walking.mcap
       openant thermal soak --virtual --minutes 30 --out soak.mcap --yes
 
     Exit code 1: a servo came so near its limit that the load ended early.
@@ -153,6 +156,10 @@ def soak(
             pose_angles(pose, JOINT_NAMES)
     console = Console(stderr=True, highlight=False)
     folder = robot_of(robot, needed=virtual_source is None)
+    if not resume and commands is not None and commands.is_dir():
+        from openant_tools.cli.policy_commands import policy_commands
+
+        plan = replace(plan, commands=str(policy_commands(commands, out, folder)))
     with contextlib.ExitStack() as stack:
         config = _connected(
             stack, plan, virtual_source, port, folder, rate_hz or (50.0 if plan.load == "play" else 5.0)
