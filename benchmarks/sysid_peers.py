@@ -342,8 +342,10 @@ def known(cases: Sequence[Case]) -> None:
         cells = [f"{rms(of_kind):.2f}" for of_kind in errors.values()]
         cells += [f"{rms([e for of_kind in errors.values() for e in of_kind]):.2f}"]
         cells += [f"{1e3 * rms([outcome.held_out for outcome in outcomes]):.3f}"]
-        cells += [f"{seconds:.2f}" + (f" ({whole:.2f})" if whole != seconds else "")]
+        cells += [f"{seconds:.3f}" + (f" ({whole:.3f})" if whole != seconds else "")]
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
+    ratio = np.median([ours.seconds / theirs.seconds for ours, theirs in both])
+    print(f"\nTime beside mujoco.sysid's, median of the robots' ratios: {ratio:.2f}", flush=True)
 
 
 def rms(values: Sequence[float]) -> float:

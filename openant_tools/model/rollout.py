@@ -29,7 +29,7 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -103,7 +103,6 @@ class Rollouts:
     """
 
     def __init__(self, plant: Plant, runs: Sequence[Run], horizon: float | None = None, nthread: int = 0) -> None:
-        self.plant = plant
         self.runs = tuple(runs)
         self.horizon = horizon
         self.nthread = nthread
@@ -119,6 +118,8 @@ class Rollouts:
         if plant.setup is Setup.STAND and not any(_comes_close(plant, run) for run in runs):
             # Without contacts a few joints' dry friction is solved sooner than it is sorted into islands.
             self._disable |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+        #: whoever makes variants of this one's model saves a copy of each
+        self.plant = replace(plant, model=self.lean(plant.model))
 
     @property
     def steps(self) -> int:
@@ -214,7 +215,9 @@ class Rollouts:
         return self._segments
 
     def lean(self, model: mujoco.MjModel) -> mujoco.MjModel:
-        """A copy of a variant that computes nothing that nobody reads."""
+        """A variant that computes nothing that nobody reads: a copy, unless it is so already."""
+        if model.opt.disableflags & self._disable == self._disable:
+            return model
         lean = copy.copy(model)
         lean.opt.disableflags |= self._disable
         return lean

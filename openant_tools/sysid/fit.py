@@ -168,7 +168,7 @@ class Dataset:
     ) -> Trajectories:
         """What the model would have done with the parameters at each u, (parameters,), by default as the fit compares."""
         rollouts = rollouts or self.fitted
-        models, late = self._variants(parameters, us)
+        models, late = self._variants(parameters, us, rollouts)
         effects = [effect_values(self.plant, parameters, u, self.acting) for u in us]
         if self.measured_supply or any(effects):
             return rollout(rollouts, models, effects, late, measured_supply=self.measured_supply)
@@ -182,12 +182,12 @@ class Dataset:
         if self.measured_supply or any(effect_values(self.plant, parameters, u, self.acting) for u in us):
             whole = self.simulate(parameters, us, rollouts)  # effects act step by step on all runs at once
             return iter([(slice(0, whole.pos.shape[1]), whole.pos, whole.vel)])
-        return rollouts.stream(*self._variants(parameters, us))
+        return rollouts.stream(*self._variants(parameters, us, rollouts))
 
     def _variants(
-        self, parameters: Sequence[Parameter], us: Sequence[Array]
+        self, parameters: Sequence[Parameter], us: Sequence[Array], rollouts: Rollouts
     ) -> tuple[list[mujoco.MjModel], Array | None]:
-        models = [apply(self.plant, parameters, u) for u in us]
+        models = [apply(rollouts.plant, parameters, u) for u in us]
         late = np.array([delays(self.plant, parameters, u) for u in us])
         return models, late if late.any() else None
 
