@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+from openant_tools.cli.hardware import adapter_option, camera_option, imu_option
 from openant_tools.cli.options import json_option
 from openant_tools.cli.virtual_for_command import virtual_option
 
@@ -27,9 +28,9 @@ __all__ = ["bringup"]
 @click.option(
     "--kit", type=click.Choice(["standard", "lite"]), help="Of a new robot. Default: standard, or the scenario's."
 )
-@click.option("--port", metavar="PATH", help="The servos' adapter. Default: robot.toml's, else the one plugged in.")
-@click.option("--imu", metavar="PATH", help="The flight controller. Default: robot.toml's.")
-@click.option("--camera", metavar="SOURCE", help="The overhead camera. Default: robot.toml's.")
+@adapter_option
+@imu_option
+@camera_option
 @virtual_option
 @click.option("--yes", is_flag=True, help="No questions: grant everything, take every default.")
 @click.option("--again", is_flag=True, help="Do every step, also those that stand.")

@@ -6,16 +6,21 @@ import contextlib
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from openant_tools.bringup.walk import WALK
-from openant_tools.cli.options import json_option, robot_option
+from openant_tools.cli.hardware import adapter_option, camera_option, imu_option
+from openant_tools.cli.options import joint_option, json_option, robot_option
 from openant_tools.cli.virtual_for_command import virtual_option
-from openant_tools.procedure.step import Bench, Step
+from openant_tools.procedure.step import Bench, Procedure, Step
 
-__all__ = ["bench_of", "calib", "robot_of", "run_step", "step_options"]
+if TYPE_CHECKING:
+    from openant_tools.procedure.finding import Finding
+    from openant_tools.robot.folder import RobotFolder
+
+__all__ = ["bench_of", "calib", "run_and_keep", "show_finding", "step_options"]
 
 
 class _InOrder(click.Group):
@@ -39,11 +44,9 @@ def step_options(function: Callable[..., Any]) -> Callable[..., Any]:
     for option in reversed(
         (
             robot_option,
-            click.option(
-                "--port", metavar="PATH", help="The servos' adapter. Default: robot.toml's, else the one plugged in."
-            ),
-            click.option("--imu", metavar="PATH", help="The flight controller. Default: robot.toml's."),
-            click.option("--camera", metavar="SOURCE", help="The overhead camera. Default: robot.toml's."),
+            adapter_option,
+            imu_option,
+            camera_option,
             virtual_option,
             click.option(
                 "--yes", is_flag=True, help="Grant everything and take every default; hands are the virtual robot's."
@@ -55,7 +58,7 @@ def step_options(function: Callable[..., Any]) -> Callable[..., Any]:
     return function
 
 
-def robot_of(robot: Path | None) -> Any:
+def _folder_of(robot: Path | None) -> RobotFolder:
     """The robot's folder; made, with the standard kit's nominal values, where it is named and empty."""
     from openant_tools.cli.options import robot_folder
     from openant_tools.robot.folder import RobotFolder, create_robot
@@ -75,7 +78,7 @@ def bench_of(
     from openant_tools.cli.face import CommandFace
     from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_robot
 
-    folder = robot_of(robot)
+    folder = _folder_of(robot)
     with contextlib.ExitStack() as stack:
         if virtual_source is None:
             yield Bench(folder, port, imu, camera, None, joints), CommandFace(yes=yes)
@@ -88,19 +91,30 @@ def bench_of(
         yield bench, CommandFace(yes=yes, hands=hands.do)
 
 
-def run_step(step: Step, bench: Bench, face: Any) -> Any:
-    """Run a step and keep its finding; a name that stands for "not this robot" is the caller's to refuse."""
+def run_and_keep(procedure: Procedure, bench: Bench, face: Any) -> Finding:
+    """Run a procedure and keep its finding in the robot's folder."""
     from openant_tools.procedure.finding import keep
     from openant_tools.procedure.step import drive
 
-    finding = drive(step.start(bench), face)
+    finding = drive(procedure, face)
     keep(finding, bench.folder)
     return finding
 
 
+def show_finding(finding: Finding, json_file: Path | None) -> int:
+    """Print a finding, write its JSON where it was asked for; the exit code."""
+    from openant_tools.cli.face import echo_finding
+    from openant_tools.files import write_text
+
+    echo_finding(finding)
+    if json_file is not None:
+        write_text(json_file, json.dumps(finding.as_json(), indent=1, ensure_ascii=False) + "\n")
+    return 0 if finding.ok else 1
+
+
 def _command(step: Step) -> click.Command:
     @click.command(step.name, help=_help(step), short_help=step.does)
-    @click.option("--joint", "joints", multiple=True, metavar="NAME", help="Only this joint. Repeatable.")
+    @joint_option
     @step_options
     def command(
         robot: Path | None,
@@ -112,20 +126,15 @@ def _command(step: Step) -> click.Command:
         json_file: Path | None,
         joints: tuple[str, ...],
     ) -> int:
-        from openant_tools.cli.face import echo_finding
         from openant_tools.errors import BadInput
-        from openant_tools.files import write_text
         from openant_tools.robot.joints import JOINT_NAMES
 
         for joint in joints:
             if joint not in JOINT_NAMES:
                 raise BadInput(f"there is no joint {joint!r}", remedy=f"the joints are {', '.join(JOINT_NAMES)}")
         with bench_of(robot, port, imu, camera, virtual_source, yes, joints, sees=step.sees) as (bench, face):
-            finding = run_step(step, bench, face)
-        echo_finding(finding)
-        if json_file is not None:
-            write_text(json_file, json.dumps(finding.as_json(), indent=1, ensure_ascii=False) + "\n")
-        return 0 if finding.ok else 1
+            finding = run_and_keep(step.start(bench), bench, face)
+        return show_finding(finding, json_file)
 
     return command
 
@@ -166,15 +175,7 @@ def undo(
     A servo that has lost its id and baud rate again must be alone on the cable, as it was when they were given.
     """
     from openant_tools.calib.undo import undo as undoing
-    from openant_tools.cli.face import echo_finding
-    from openant_tools.files import write_text
-    from openant_tools.procedure.finding import keep
-    from openant_tools.procedure.step import drive
 
     with bench_of(robot, port, imu, camera, virtual_source, yes) as (bench, face):
-        finding = drive(undoing(bench, everything=everything), face)
-        keep(finding, bench.folder)
-    echo_finding(finding)
-    if json_file is not None:
-        write_text(json_file, json.dumps(finding.as_json(), indent=1, ensure_ascii=False) + "\n")
-    return 0 if finding.ok else 1
+        finding = run_and_keep(undoing(bench, everything=everything), bench, face)
+    return show_finding(finding, json_file)

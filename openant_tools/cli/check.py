@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
 
-from openant_tools.cli.calib import bench_of, step_options
+from openant_tools.cli.calib import bench_of, run_and_keep, show_finding, step_options
 
 __all__ = ["check"]
 
@@ -29,15 +28,7 @@ def check(
     calibrated model. Exit code 1 names the joint and the likely part: screw, gear, foot, cable.
     """
     from openant_tools.bringup.check import check as checking
-    from openant_tools.cli.face import echo_finding
-    from openant_tools.files import write_text
-    from openant_tools.procedure.finding import keep
-    from openant_tools.procedure.step import drive
 
     with bench_of(robot, port, imu, camera, virtual_source, yes) as (bench, face):
-        finding = drive(checking(bench), face)
-        keep(finding, bench.folder)
-    echo_finding(finding)
-    if json_file is not None:
-        write_text(json_file, json.dumps(finding.as_json(), indent=1, ensure_ascii=False) + "\n")
-    return 0 if finding.ok else 1
+        finding = run_and_keep(checking(bench), bench, face)
+    return show_finding(finding, json_file)

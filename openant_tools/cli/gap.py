@@ -9,7 +9,7 @@ import click
 
 from openant_tools.cli.gap_blind import blind
 from openant_tools.cli.gap_diagnose import apply, diagnose, next_experiment, prepare
-from openant_tools.cli.options import json_option, report_option, robot_option
+from openant_tools.cli.options import joint_option, json_option, model_option, report_option, robot_option
 
 __all__ = ["gap"]
 
@@ -25,10 +25,8 @@ for _command in (apply, blind, diagnose, next_experiment, prepare):
 
 @gap.command()
 @click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN…")
-@click.option(
-    "--model", type=click.Path(path_type=Path), metavar="M.xml", help="Default: the model of the robot's folder."
-)
-@click.option("--joint", "joints", multiple=True, metavar="NAME", help="Only this joint. Repeatable.")
+@model_option
+@joint_option
 @click.option(
     "--horizon", default="0.5", show_default=True, metavar="S", help="Seconds between re-initialisations, or `full`."
 )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.options import json_option, report_option, robot_option
+from openant_tools.cli.options import joint_option, json_option, report_option, robot_option
 from openant_tools.cli.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ model_option = click.option(
     metavar="M.xml",
     help="Default: the model that every run names, else that of the robot's folder.",
 )
-joint_option = click.option("--joint", "joints", multiple=True, metavar="NAME", help="Only this joint. Repeatable.")
 robots_option = click.option(
     "--robots",
     type=click.IntRange(min=64),

@@ -18,9 +18,17 @@ if TYPE_CHECKING:
     from openant_tools.comms.messages import EngineConfig
     from openant_tools.robot.folder import RobotFolder
 
-__all__ = ["engine_config", "may_move", "need_terminal", "port_option", "robot_of", "yes_option"]
+__all__ = [
+    "adapter_option", "camera_option", "engine_config", "imu_option", "may_move", "need_terminal", "port_option", "robot_of",
+    "yes_option",
+]  # fmt: skip
 
 port_option = click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one plugged in.")
+adapter_option = click.option(
+    "--port", metavar="PATH", help="The servos' adapter. Default: robot.toml's, else the one plugged in."
+)
+imu_option = click.option("--imu", metavar="PATH", help="The flight controller. Default: robot.toml's.")
+camera_option = click.option("--camera", metavar="SOURCE", help="The overhead camera. Default: robot.toml's.")
 yes_option = click.option(
     "--yes", is_flag=True, help="The robot may move: do not ask. Needed where no terminal is attached."
 )

@@ -11,8 +11,8 @@ import click
 from openant_tools.errors import BadInput
 
 __all__ = [
-    "finite", "json_option", "out_option", "rate_option", "report_option", "robot_folder", "robot_option", "seconds_option",
-    "tie_option",
+    "finite", "joint_option", "json_option", "model_option", "out_option", "rate_option", "report_option", "robot_folder",
+    "robot_option", "seconds_option", "tie_option",
 ]  # fmt: skip
 
 
@@ -30,6 +30,10 @@ robot_option = click.option(
     metavar="DIR",
     help="The robot's folder (or its robot.toml). Default: $OPENANT_ROBOT, else the working directory.",
 )
+model_option = click.option(
+    "--model", type=click.Path(path_type=Path), metavar="M.xml", help="Default: the model of the robot's folder."
+)
+joint_option = click.option("--joint", "joints", multiple=True, metavar="NAME", help="Only this joint. Repeatable.")
 json_option = click.option(
     "--json",
     "json_file",

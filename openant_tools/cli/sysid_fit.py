@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.options import robot_folder, robot_option, tie_option
+from openant_tools.cli.options import model_option, robot_folder, robot_option, tie_option
 from openant_tools.cli.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -18,9 +18,7 @@ __all__ = ["fit"]
 
 @click.command()
 @click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN…")
-@click.option(
-    "--model", type=click.Path(path_type=Path), metavar="M.xml", help="Default: the model of the robot's folder."
-)
+@model_option
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), required=True, metavar="DIR")
 @click.option(
     "--hold-out", multiple=True, type=click.Path(path_type=Path), metavar="RUN", help="Judge on this run. Repeatable."

@@ -7,15 +7,13 @@ from pathlib import Path
 
 import click
 
-from openant_tools.cli.options import json_option, robot_option
+from openant_tools.cli.options import json_option, model_option, robot_option
 
 __all__ = ["twitch"]
 
 
 @click.command()
-@click.option(
-    "--model", type=click.Path(path_type=Path), metavar="M.xml", help="Default: the model of the robot's folder."
-)
+@model_option
 @robot_option
 @click.option("--seconds", type=click.FloatRange(1.0, 600.0), default=6.0, show_default=True, help="Of twitching.")
 @json_option
