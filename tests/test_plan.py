@@ -198,7 +198,7 @@ def test_the_command_writes_plan_json_and_report(tmp_path: Path, monkeypatch: py
         (["--seconds", "inf"], "--seconds is inf → give it a number"),
         (["--protocol", "chirp", "--seconds", "9999"], "9999 s is too long for chirp"),
         (["--plan", "none.toml"], "No such file or directory"),
-        (["--plan", "p.toml", "--protocol", "chirp"], "a plan file says what to play"),
+        (["--plan", "p.toml", "--protocol", "chirp"], "a plan says what to play"),
         (["--protocol", "gait", "--optimise", "--kinds", "damping"], "there is nothing on the stand to optimise"),
     ],
 )

@@ -18,7 +18,7 @@ from openant_tools.cli.options import (
     tie_option,
 )
 from openant_tools.cli.progress import progress_bar
-from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL
+from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, protocols_of, setup_option
 
 if TYPE_CHECKING:
     from openant_tools.sysid.plan import Plan
@@ -42,7 +42,7 @@ __all__ = ["plan"]
     "--kinds", multiple=True, metavar="KIND", help="Parameters of interest. Repeatable. Default: a fit's own."
 )
 @tie_option
-@click.option("--setup", type=click.Choice(["stand", "floor"]), help="Only what is played there. Default: all of it.")
+@setup_option
 @seconds_option
 @rate_option
 @click.option(
@@ -115,9 +115,9 @@ def plan(
     from openant_tools.files import write_text
     from openant_tools.sysid.design import design
     from openant_tools.sysid.plan import Planned, Residual, make_plan
-    from openant_tools.sysid.plan_file import read_plan, write_plan
+    from openant_tools.sysid.plan_file import write_plan
     from openant_tools.sysid.plan_report import plan_report
-    from openant_tools.sysid.protocols import CommandSpace, protocols
+    from openant_tools.sysid.protocols import CommandSpace
 
     folder = robot_of(robot, needed=False)
     described = None if folder is None else folder.config()
@@ -129,14 +129,7 @@ def plan(
             model = nominal_model_path()
         else:
             model = folder.model_path(described)
-    if plan_file is not None:
-        if name is not None or seconds is not None:
-            raise BadInput("a plan file says what to play", remedy="leave out --protocol and --seconds")
-        played = tuple(one for one in read_plan(plan_file) if setup in (None, one.setup))
-        if not played:
-            raise BadInput(f"the plan has nothing for the {setup}", where=plan_file, remedy="leave out --setup")
-    else:
-        played = protocols(name or DEFAULT_PROTOCOL, seconds, setup)
+    played = protocols_of(name, plan_file, seconds, setup)
     stand = [one for one in played if one.setup == "stand"]
     if optimise and not stand:
         raise BadInput("there is nothing on the stand to optimise", remedy="leave out --optimise, or --setup floor")

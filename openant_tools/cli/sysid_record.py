@@ -20,10 +20,14 @@ if TYPE_CHECKING:
     from openant_tools.sysid.protocols import Protocol
     from openant_tools.sysid.record import Recorded, Take
 
-__all__ = ["DEFAULT_PROTOCOL", "record"]
+__all__ = ["DEFAULT_PROTOCOL", "protocols_of", "record", "setup_option"]
 
 #: `protocols.FULL`, without loading it for every --help
 DEFAULT_PROTOCOL = "full"
+
+setup_option = click.option(
+    "--setup", type=click.Choice(["stand", "floor"]), help="Only what is played there. Default: all of it."
+)
 
 
 @click.command()
@@ -64,7 +68,7 @@ DEFAULT_PROTOCOL = "full"
     metavar="[S]",
     help="Work for S (60) seconds or until a servo is 10 K warmer, and repeat it hot.",
 )
-@click.option("--setup", type=click.Choice(["stand", "floor"]), help="Only what is played there. Default: all of it.")
+@setup_option
 @click.option("--imu/--no-imu", default=None, help="Record the IMU too. Default: on the floor.")
 @click.option("--camera/--no-camera", default=None, help="Record the pose too. Default: on the floor, if there is one.")
 @yes_option
@@ -101,7 +105,6 @@ def record(
 
     from openant_tools.errors import BadInput
     from openant_tools.recording.writer import recording_path
-    from openant_tools.sysid.protocols import protocols
     from openant_tools.sysid.record import takes
 
     if listing:
@@ -109,16 +112,7 @@ def record(
         return
     if out is None:
         raise BadInput("no name for the recording", remedy="name it with --out RUN.mcap")
-    if plan_file is not None:
-        from openant_tools.sysid.plan_file import read_plan
-
-        if name is not None or seconds is not None:
-            raise BadInput("a plan says what to play", remedy="leave out --protocol and --seconds")
-        played = tuple(one for one in read_plan(plan_file) if setup in (None, one.setup))
-        if not played:
-            raise BadInput(f"the plan has nothing for the {setup}", where=plan_file, remedy="leave out --setup")
-    else:
-        played = protocols(name or DEFAULT_PROTOCOL, seconds, setup)
+    played = protocols_of(name, plan_file, seconds, setup)
     wanted = takes(recording_path(out), played, seed, repeats=repeats, hold_out_seed=hold_out_seed, hot_s=hot_s)
     for take in wanted:
         if take.path.exists():
@@ -149,6 +143,28 @@ def record(
         for recorded in done:
             click.echo(f"{recorded.path}  {recorded.cycles} cycles")
             _print_tracking(recorded.path)
+
+
+def protocols_of(
+    name: str | None, plan_file: Path | None, seconds: float | None, setup: str | None
+) -> tuple[Protocol, ...]:
+    """What is to be played: the protocols of a name, else those of a plan's file.
+
+    Raises:
+        BadInput: both are given, or there is nothing for the setup.
+    """
+    from openant_tools.errors import BadInput
+    from openant_tools.sysid.plan_file import read_plan
+    from openant_tools.sysid.protocols import protocols
+
+    if plan_file is None:
+        return protocols(name or DEFAULT_PROTOCOL, seconds, setup)
+    if name is not None or seconds is not None:
+        raise BadInput("a plan says what to play", remedy="leave out --protocol and --seconds")
+    played = tuple(one for one in read_plan(plan_file) if setup in (None, one.setup))
+    if not played:
+        raise BadInput(f"the plan has nothing for the {setup}", where=plan_file, remedy="leave out --setup")
+    return played
 
 
 def _print_tracking(path: Path) -> None:
