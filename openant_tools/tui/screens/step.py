@@ -240,8 +240,10 @@ and can be begun again: what it found or wrote before stays, and every write to 
             self.say(marked("ok", "granted with the rest"))
             self._reply_later(True)
             return
-        count = f" It writes {len(event.registers)} registers." if event.registers else ""
-        motion = f" {mark('warn')} The robot moves." if event.moves else ""
+        written = len(event.registers)
+        count = f" It writes {written} register{'s' if written > 1 else ''}." if written else ""
+        # Torque alone is asked for like a motion.
+        motion = f" {mark('warn')} {'The robot moves' if self.step.moves else 'Torque goes on'}." if event.moves else ""
         choices = [
             Choice("Yes, do it", lambda: self.reply(True, "granted")),
             Choice("No, leave everything as it is", lambda: self.reply(False, "not granted")),
