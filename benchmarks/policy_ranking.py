@@ -1,13 +1,14 @@
 """Do simulations rank policies as a robot does? Three robots with sealed faults, three simulations of each.
 
-    python benchmarks/policy_ranking.py make   --out SET [--robots 3] [--seed-from COMMIT] --key-file KEY
+    python benchmarks/policy_ranking.py make   --out SET [--robots 3] [--seed-from COMMIT] [--motions N] --key-file KEY
     python benchmarks/policy_ranking.py models --out SET
     python benchmarks/policy_ranking.py play   --out SET --policies DIR --key-file KEY
     python benchmarks/policy_ranking.py rank   --out SET --policies DIR [--docs docs/policies-result.md]
 
 `make` draws robots with one medium or large effect each, whose answers are sealed, and lets each play the blind benchmark's
-runs. `models` makes three simulations of each robot from these runs alone: the nominal model, `sysid fit`'s, and that with
-what `gap diagnose` finds. `play` lets policies walk on the true robots, simulated by the blind benchmark's own code at half a
+runs. `models` makes three simulations of each robot from these runs alone: the nominal model, `sysid fit`'s, and that of
+`gap diagnose`, which calibrates the nominal model and adds the effects that it finds: all robots are then compared with the
+same simulated ones, made once (of `--motions`, where a set of those motions was prepared before). `play` lets policies walk on the true robots, simulated by the blind benchmark's own code at half a
 millisecond: no line of it is the environments'. `rank` plays them in the simulations (`openant policies rank`).
 Each step goes on where it was stopped.
 """
@@ -49,9 +50,9 @@ RUNS = ("stand-1", "stand-2", "floor-1", "floor-2", "floor-3")
 HELD_OUT = ("stand-3", "floor-4")
 
 
-def make(out: Path, count: int, commit: str, key: bytes | None) -> None:
+def make(out: Path, count: int, commit: str, motions: int | None, key: bytes | None) -> None:
     seed, full = seed_of_commit(commit)
-    print("commitment", make_set(out, count, seed, mix=MIX, commit=full, key=key))
+    print("commitment", make_set(out, count, seed, mix=MIX, commit=full, motion_seed=motions, key=key))
 
 
 # ------------------------------------------------------------------------------------------------------- simulations
@@ -82,13 +83,13 @@ def models(out: Path) -> None:
         diagnosis = place / "diagnosis.json"
         if not diagnosis.exists():
             words = [word for run in held_out for word in ("--hold-out", run)]
-            openant("gap", "diagnose", *runs, *words, "--model", calibrated, "--json", diagnosis)
+            openant("gap", "diagnose", *runs, *words, "--model", out / "model.xml", "--json", diagnosis)
         verdict = json.loads(diagnosis.read_text())["verdict"]
         print(f"{folder.name}: diagnosed as {verdict} in {time.monotonic() - begun:.0f} s", flush=True)
         if not (place / "diagnosed").exists():
-            _robot(place / "diagnosed", calibrated)
+            _robot(place / "diagnosed", out / "model.xml")
             openant(
-                "gap", "apply", diagnosis, "--model", calibrated, "--out", place / "diagnosed" / "improved.xml",
+                "gap", "apply", diagnosis, "--model", out / "model.xml", "--out", place / "diagnosed" / "improved.xml",
                 "--robot", place / "diagnosed",
             )  # fmt: skip
             from openant_tools.robot.folder import RobotFolder
@@ -321,6 +322,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--robots", type=int, default=3)
     parser.add_argument("--seed-from", default="HEAD")
+    parser.add_argument(
+        "--motions", type=int, metavar="N", help="seed of the motions that robots play; default: the set's"
+    )
     parser.add_argument("--key-file", type=Path)
     parser.add_argument("--policies", type=Path)
     parser.add_argument("--seconds", type=float, default=60.0)
@@ -334,7 +338,7 @@ def main() -> None:
 
         key = read_key(chosen.key_file) if chosen.key_file.exists() else make_key(chosen.key_file)
     if chosen.step == "make":
-        make(chosen.out, chosen.robots, chosen.seed_from, key)
+        make(chosen.out, chosen.robots, chosen.seed_from, chosen.motions, key)
     elif chosen.step == "models":
         models(chosen.out)
     elif chosen.step == "play":

@@ -11,9 +11,11 @@ this form, reward times Δt included, is that of the platform's published agent.
 
 The task has no episodes. A termination cuts the bootstrap, a truncation (someone had to help the robot) does not.
 
-Updates are plain torch on one thread: the matrices are too small for two. What makes them quick: fused Adam, one call
-for all target weights, no gradients for the critics' weights while the actor learns, log π computed once for actor and
-entropy, and transitions kept as rows of one array, so that a batch is one gather.
+Updates are plain torch on one thread: the matrices are too small for two. What makes them quick: all weights of a network
+in one vector, so that Adam (fused) and the targets take one call each; no gradients for the critics' weights while the actor
+learns; log π computed once for actor and entropy; and transitions kept as rows of one array, so that a batch is one gather.
+The losses stand here as autograd takes them (`Autograd`); on a processor `openant_agents.by_hand` has the same derivatives
+written out, a tenth quicker.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from openant_agents.by_hand import Gradients, acting, flatten
 from openant_agents.runs import CurvePoint, Run, load_checkpoint, read_facts
 from openant_agents.training import (
     CHECKPOINT_EVERY_S,
@@ -208,11 +211,50 @@ class Replay:
 # ------------------------------------------------------------------------------------------------------------ agent
 
 
-def _adam(weights: list[Tensor], step: float) -> torch.optim.Adam:
+class Autograd:
+    """The gradients of both losses, by torch; `by_hand.Gradients` has the same derivatives written out."""
+
+    def __init__(self, actor: Actor, critics: Critics, targets: Critics) -> None:
+        self._actor, self._critics, self._targets = actor, critics, targets
+        self._actor_weights: list[Tensor] = list(actor.parameters())
+
+    def sample(self, observation: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions (batch, actions) and their log π (batch,)."""
+        sampled: tuple[Tensor, Tensor] = self._actor(observation, noise)
+        return sampled
+
+    def value(self, observation: Tensor, action: Tensor) -> Tensor:
+        """(batch,), the smaller of the targets' values."""
+        return torch.minimum(*self._targets(torch.cat((observation, action), dim=1)))
+
+    @torch.enable_grad()
+    def critics(self, observation_action: Tensor, target: Tensor) -> Tensor:
+        """Gradients of the mean squared errors of both critics; their sum."""
+        first, second = self._critics(observation_action)
+        loss = F.mse_loss(first, target) + F.mse_loss(second, target)
+        self._critics.zero_grad(set_to_none=False)
+        loss.backward()  # type: ignore[no-untyped-call]
+        return loss.detach()
+
+    @torch.enable_grad()
+    def actor(self, observation: Tensor, noise: Tensor, alpha: Tensor) -> Tensor:
+        """Gradients of the mean of α log π − min Q; log π (batch,)."""
+        action, log_pi = self._actor(observation, noise)
+        value = torch.minimum(*self._critics(torch.cat((observation, action), dim=1)))
+        loss: Tensor = (alpha * log_pi - value).mean()
+        self._actor.zero_grad(set_to_none=False)
+        # Only the actor's weights: the critics' would cost a third more and be thrown away.
+        loss.backward(inputs=self._actor_weights)  # type: ignore[no-untyped-call]
+        result: Tensor = log_pi.detach()
+        return result
+
+
+def _adam(*weights_and_steps: tuple[Tensor, float]) -> torch.optim.Adam:
+    groups = [{"params": [weights], "lr": step} for weights, step in weights_and_steps]
     try:
-        return torch.optim.Adam(weights, lr=step, fused=True)
+        return torch.optim.Adam(groups, fused=True)
     except RuntimeError:  # torch before 2.4 has the fused form on graphics cards only
-        return torch.optim.Adam(weights, lr=step)
+        return torch.optim.Adam(groups)
 
 
 class Sac:
@@ -223,10 +265,18 @@ class Sac:
         settings: parameters of the algorithm.
         seed: of initial weights, random actions, exploration noise and batches.
         device: where networks live.
+        by_hand: whether gradients are computed as written out, where networks live on a processor, or by autograd.
     """
 
     def __init__(
-        self, observations: int, actions: int, settings: Settings, *, seed: int, device: str | torch.device = "cpu"
+        self,
+        observations: int,
+        actions: int,
+        settings: Settings,
+        *,
+        seed: int,
+        device: str | torch.device = "cpu",
+        by_hand: bool = True,
     ) -> None:
         self.settings = settings
         self.device = torch.device(device)
@@ -243,15 +293,17 @@ class Sac:
         self.targets.requires_grad_(False)
         self.log_alpha = torch.tensor(math.log(settings.entropy_start), device=self.device, requires_grad=True)
         self.target_entropy = -float(actions)
-        self._actor_weights: list[Tensor] = list(self.actor.parameters())
-        self._critic_weights: list[Tensor] = list(self.critics.parameters())
-        self._target_weights: list[Tensor] = list(self.targets.parameters())
-        self.actor_optimiser = _adam(self._actor_weights, settings.actor_step)
-        self.critic_optimiser = _adam(self._critic_weights, settings.critic_step)
-        self.entropy_optimiser = _adam([self.log_alpha], settings.entropy_step)
+        actor_weights, self._critic_weights = flatten(self.actor), flatten(self.critics)
+        self._target_weights = flatten(self.targets)
+        self.critic_optimiser = _adam((self._critic_weights, settings.critic_step))
+        self.actor_optimiser = _adam((actor_weights, settings.actor_step), (self.log_alpha, settings.entropy_step))
         self.replay = Replay(observations, actions, settings.buffer)
         self.updates = 0
         self._critic_loss = torch.zeros(())
+        on_processor = self.device.type == "cpu"
+        self._by_hand = by_hand and on_processor
+        self._gradients: Autograd | Gradients | None = None  # their memory is for those who learn
+        self._think = acting(self.actor.network) if on_processor else None
 
     def random_action(self) -> Array:
         """(actions,), uniform in −1…1."""
@@ -260,58 +312,53 @@ class Sac:
     @torch.inference_mode()
     def act(self, observation: Array, *, explore: bool = True) -> Array:
         """(actions,): a sample of the policy, or its mode."""
+        if self._think is not None:
+            mean, spread = np.split(self._think(np.asarray(observation, np.float32)), 2)
+            if explore:
+                log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (np.tanh(spread) + 1.0)
+                mean += np.exp(log_std) * self._normal(1)[0].numpy()
+            result: Array = np.tanh(mean)
+            return result
         seen = torch.from_numpy(observation).to(self.device).unsqueeze(0)
-        if explore:
-            mean, log_std = self.actor._gaussian(seen)
-            action = torch.tanh(mean + log_std.exp() * self._normal(1))
-        else:
-            action = self.actor.mode(seen)
-        result: Array = action.squeeze(0).cpu().numpy()
+        action = self.actor(seen, self._normal(1))[0] if explore else self.actor.mode(seen)
+        result = action.squeeze(0).cpu().numpy()
         return result
 
+    @torch.no_grad()
     def update(self) -> None:
         """One update of the critics and their targets; every `policy_every` times as many of actor and entropy."""
         settings, replay = self.settings, self.replay
         o, a = replay.observations, replay.actions
         batch = replay.sample(settings.batch, self.random).to(self.device)
-        observation_action = batch[:, : o + a]
         observation, next_observation = batch[:, :o], batch[:, o + a + 3 :]
         reward, dt, terminated = batch[:, o + a], batch[:, o + a + 1], batch[:, o + a + 2]
+        gradients = self._gradients = self._gradients or self._make_gradients()
 
-        with torch.no_grad():
-            next_action, next_log_pi = self.actor(next_observation, self._normal(settings.batch))
-            value = torch.minimum(*self.targets(torch.cat((next_observation, next_action), dim=1)))
-            value = value - self.log_alpha.exp() * next_log_pi
-            discount = torch.pow(settings.gamma_per_s, dt) * (1.0 - terminated)
-            target = settings.reward_scale * reward * dt + discount * value
-        first, second = self.critics(observation_action)
-        critic_loss = F.mse_loss(first, target) + F.mse_loss(second, target)
-        self._critic_loss = critic_loss.detach()
-        self.critic_optimiser.zero_grad()
-        critic_loss.backward()  # type: ignore[no-untyped-call]
+        next_action, next_log_pi = gradients.sample(next_observation, self._normal(settings.batch))
+        value = gradients.value(next_observation, next_action) - self.log_alpha.exp() * next_log_pi
+        discount = torch.pow(settings.gamma_per_s, dt) * (1.0 - terminated)
+        target = settings.reward_scale * reward * dt + discount * value
+        self._critic_loss = gradients.critics(batch[:, : o + a], target)
         self.critic_optimiser.step()
         self.updates += 1
 
         if self.updates % settings.policy_every == 0:
             for _ in range(settings.policy_every):
-                self._update_actor(observation)
+                alpha = self.log_alpha.exp()
+                log_pi = gradients.actor(observation, self._normal(settings.batch), alpha)
+                # The entropy's loss is −α (log π + H) on average, α = exp(log α).
+                self.log_alpha.grad = -alpha * (log_pi.mean() + self.target_entropy)
+                self.actor_optimiser.step()
 
-        with torch.no_grad():
-            torch._foreach_lerp_(self._target_weights, self._critic_weights, settings.tau)
+        self._target_weights.lerp_(self._critic_weights, settings.tau)
 
-    def _update_actor(self, observation: Tensor) -> None:
-        action, log_pi = self.actor(observation, self._normal(self.settings.batch))
-        value = torch.minimum(*self.critics(torch.cat((observation, action), dim=1)))
-        actor_loss = (self.log_alpha.detach().exp() * log_pi - value).mean()
-        self.actor_optimiser.zero_grad()
-        # Only the actor's weights: the critics' would cost a third more and be thrown away.
-        actor_loss.backward(inputs=self._actor_weights)
-        self.actor_optimiser.step()
-
-        entropy_loss = -self.log_alpha.exp() * (log_pi.detach().mean() + self.target_entropy)
-        self.entropy_optimiser.zero_grad()
-        entropy_loss.backward()
-        self.entropy_optimiser.step()
+    def _make_gradients(self) -> Autograd | Gradients:
+        if not self._by_hand:
+            return Autograd(self.actor, self.critics, self.targets)
+        return Gradients(
+            self.actor.network, (self.critics.first, self.critics.second), (self.targets.first, self.targets.second),
+            batch=self.settings.batch, observations=self.replay.observations, log_std=(LOG_STD_MIN, LOG_STD_MAX),
+        )  # fmt: skip
 
     def sound_or_raise(self, folder: Path) -> None:
         """Refuse to go on with what has come apart; the last checkpoint has not.
@@ -320,7 +367,7 @@ class Sac:
             BadInput: weights or the critics' loss are no finite numbers any more.
         """
         with torch.no_grad():
-            total = sum(weight.square().sum() for weight in self._actor_weights) + self.log_alpha.exp()
+            total = sum(weight.square().sum() for weight in self.actor.parameters()) + self.log_alpha.exp()
         if not torch.isfinite(total + self._critic_loss.to(self.device)):
             raise BadInput(
                 f"weights or losses are no finite numbers any more after {self.updates} updates",
@@ -342,22 +389,27 @@ class Sac:
             "log_alpha": self.log_alpha.detach(),
             "actor_optimiser": self.actor_optimiser.state_dict(),
             "critic_optimiser": self.critic_optimiser.state_dict(),
-            "entropy_optimiser": self.entropy_optimiser.state_dict(),
             "noise": self.noise.get_state(),
             "random": self.random.bit_generator.state,
             "updates": self.updates,
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on where `get_state` was called; the replay is restored apart from this."""
-        self.actor.load_state_dict(state["actor"])
-        self.critics.load_state_dict(state["critics"])
-        self.targets.load_state_dict(state["targets"])
+        """Go on where `get_state` was called; the replay is restored apart from this.
+
+        Raises:
+            BadInput: it is of other networks, or of an earlier version of this software.
+        """
+        try:
+            for name in ("actor", "critics", "targets", "actor_optimiser", "critic_optimiser"):
+                getattr(self, name).load_state_dict(state[name])
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise BadInput(
+                "the checkpoint does not fit the agent that run.json describes; an earlier version may have written it",
+                remedy="train into another folder",
+            ) from error
         with torch.no_grad():
             self.log_alpha.copy_(state["log_alpha"])
-        self.actor_optimiser.load_state_dict(state["actor_optimiser"])
-        self.critic_optimiser.load_state_dict(state["critic_optimiser"])
-        self.entropy_optimiser.load_state_dict(state["entropy_optimiser"])
         self.noise.set_state(state["noise"].cpu())
         self.random.bit_generator.state = state["random"]
         self.updates = int(state["updates"])

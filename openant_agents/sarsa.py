@@ -112,12 +112,26 @@ class Sarsa:
         self._traces: deque[Rows] = deque()  # places in the flat weights, newest first
         self._strengths = np.empty(0, np.float32)
         self._fading = 0.0  # γλ over the transition that the newest trace began
+        self._seen: deque[tuple[bytes, Rows]] = deque(maxlen=2)  # where a transition began and ended
         self.decisions = 0
         self.moved = 0.0  # sum of how far the weights were ever moved
 
+    def rows_of(self, observation: Array) -> Rows:
+        """The coder's rows of an observation (float32); those of the last two are remembered.
+
+        A decision needs them three times: to choose, and as the end of one transition and the beginning of the next.
+        """
+        name = observation.tobytes()
+        for known, rows in self._seen:
+            if known == name:
+                return rows
+        rows = self.coder.rows_of(observation)
+        self._seen.append((name, rows))
+        return rows
+
     def values(self, rows: Rows) -> Array:
         """(actions,): Q of each primitive where the tiles have these rows."""
-        values: Array = self.weights[rows].sum(axis=0)
+        values: Array = np.add.reduce(self.weights.take(rows, axis=0), axis=0)
         return values
 
     def choose(self, rows: Rows) -> int:
@@ -213,7 +227,7 @@ class _Columns:
         """Learn from a row; the same row gives the same update, now and when the log is read again."""
         o = self.observations
         action, reward, seconds, terminated = row[o : o + 4].tolist()
-        rows, next_rows = agent.coder.rows_of(row[:o]), agent.coder.rows_of(row[o + 4 : -1])
+        rows, next_rows = agent.rows_of(row[:o]), agent.rows_of(row[o + 4 : -1])
         return agent.learn(
             rows, int(action), reward, seconds, next_rows, int(row[-1]), terminated=bool(terminated)
         )  # fmt: skip
@@ -390,7 +404,7 @@ def _train(
     def choose(observed: Array) -> int:
         if agent is None:
             return int(random.integers(len(gait)))
-        return agent.choose(agent.coder.rows_of(observed))
+        return agent.choose(agent.rows_of(np.asarray(observed, np.float32)))
 
     def save() -> None:
         nonlocal last_save
