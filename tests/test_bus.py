@@ -331,12 +331,13 @@ def test_torque_after_a_shutdown_says_why() -> None:
 def test_a_tripped_watchdog_is_found() -> None:
     servos, line = robot()
     servos.set_torque(True)
-    servos.set_watchdogs(10)
+    for joint in JOINTS:
+        servos.write_counts("bus_watchdog", joint, 10)
     line.sleep_until(line.now() + 1.0)  # type: ignore[attr-defined]
     assert servos.tripped_watchdogs() == list(JOINTS)
     with pytest.raises(Refused, match="Bus Watchdog has tripped"):
         servos.write_counts("goal_position", "hip_rr", 2000)
-    servos.set_watchdogs(0)
+    servos.write_counts("bus_watchdog", "hip_rr", 0)
     servos.write_counts("goal_position", "hip_rr", 2000)
 
 

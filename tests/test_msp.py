@@ -63,7 +63,7 @@ def test_every_frame_survives_any_portions(sent: list[Frame], sizes: list[int]) 
     parser = Parser()
     stream = b"".join(msp.encode(frame) for frame in sent)
     assert [frame for part in cut(stream, sizes) for frame in parser.feed(part)] == sent
-    assert not parser.in_frame
+    assert parser.clean
     assert parser.broken == 0
 
 
@@ -124,11 +124,11 @@ def test_a_host_finds_the_frame_behind_a_broken_one_and_a_device_drops_it_whole(
     assert host.broken == device.broken == 1
 
 
-def test_bytes_outside_frames_are_kept_for_whoever_asks() -> None:
+def test_bytes_outside_frames_are_counted() -> None:
     parser = Parser()
     parser.feed(b"# " + bytes.fromhex(VECTORS[0][0]) + b"R")
-    assert parser.take_outside() == b"# R"
-    assert parser.take_outside() == b""
+    assert parser.stray == 3
+    assert not parser.clean
 
 
 def test_a_device_believes_no_request_longer_than_its_buffer() -> None:

@@ -25,8 +25,6 @@ __all__ = ["SoakCase", "SoakScore", "score_soaks", "write_soak_docs"]
 
 #: what the issue asks for
 FIRST, FIRST_TWO, FALSE_ALARMS = 0.90, 0.95, 0.02
-#: s that one soak of 15 minutes may take
-SECONDS = 60.0
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from openant_tools.recording.run import Facts, Run
 __all__ = ["soak_table"]
 
 Array = NDArray[np.float64]
-_ANSWER_BYTES, _REQUEST_BYTES, _WRITE_BYTES = 38, 22, 54
+_ANSWER_BYTES, _REQUEST_BYTES = 38, 22
 
 
 def soak_table(answer: SoakAnswer, name: str) -> Run:

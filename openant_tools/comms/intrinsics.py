@@ -70,12 +70,6 @@ class Intrinsics:
         """Distortion for OpenCV, shape (5,)."""
         return np.array(self.distortion)
 
-    @property
-    def diagonal_fov_deg(self) -> float:
-        """Of the centred pinhole with the same focal length, degrees."""
-        diagonal = math.hypot(self.width, self.height)
-        return math.degrees(2.0 * math.atan(diagonal / (self.fx + self.fy)))
-
     def scaled(self, width: int, height: int) -> Intrinsics:
         """The same lens at another picture size of the same shape.
 

@@ -59,9 +59,7 @@ class Motion:
         return row
 
 
-def ramp(
-    start: Array, end: Array, rate_hz: float, *, speed_rad_s: float = RAMP_SPEED_RAD_S, name: str = "ramp"
-) -> Motion:
+def ramp(start: Array, end: Array, rate_hz: float, *, speed_rad_s: float = RAMP_SPEED_RAD_S) -> Motion:
     """Minimum jerk from `start` to `end` (joints,), all joints arriving together, none faster than `speed_rad_s`."""
     distance = float(np.abs(end - start).max())
     seconds = max(_PEAK_OVER_MEAN * distance / speed_rad_s, SHORTEST_RAMP_S)

@@ -209,12 +209,6 @@ class Parser:
         self._limit = limit
         self._rescan = rescan
         self._buffer = bytearray()
-        self._outside = bytearray()
-
-    @property
-    def in_frame(self) -> bool:
-        """Whether a frame has begun and not ended."""
-        return bool(self._buffer)
 
     @property
     def clean(self) -> bool:
@@ -230,12 +224,6 @@ class Parser:
         self._buffer.clear()
         self._flaws = self.broken + self.stray
 
-    def take_outside(self) -> bytes:
-        """The last bytes (at most 512) that stood outside every frame since the last call."""
-        outside = bytes(self._outside[-512:])
-        self._outside.clear()
-        return outside
-
     def feed(self, data: bytes | bytearray) -> list[Frame]:
         """Frames completed by these bytes, in order."""
         self._buffer += data
@@ -245,7 +233,7 @@ class Parser:
             start = self._buffer.find(b"$", at)
             if start != at:
                 end = len(self._buffer) if start < 0 else start
-                self._drop(at, end)
+                self.stray += end - at
                 at = end
                 continue
             length = self._length(at)
@@ -260,16 +248,10 @@ class Parser:
                 at += length
             else:
                 self.broken += length > 0
-                self._drop(at, at + 1)
+                self.stray += 1
                 at += 1
         del self._buffer[:at]
         return frames
-
-    def _drop(self, start: int, end: int) -> None:
-        self.stray += end - start
-        self._outside += self._buffer[start:end]
-        if len(self._outside) > 4096:
-            del self._outside[:-512]
 
     def _length(self, at: int) -> int | None:
         """Whole length of the frame that begins at `at`: None while the header is incomplete, 0 if it is no frame."""

@@ -315,11 +315,6 @@ class Servos:
         able = [servo.joint for servo in self.servos if (servo.firmware or 99) >= 38]
         return [joint for joint, value in self.read_all("bus_watchdog", able).items() if value == WATCHDOG_TRIPPED]
 
-    def set_watchdogs(self, counts: int) -> None:
-        """Arm the Bus Watchdog of every servo (units of 20 ms), or clear it with 0."""
-        for joint in self.joints:
-            self.write_counts("bus_watchdog", joint, counts)
-
 
 def _model_name(number: int) -> str:
     try:

@@ -53,11 +53,6 @@ class TagFamily:
     bits: tuple[tuple[int, int], ...]
     hamming: int
 
-    @property
-    def print_scale(self) -> float:
-        """Side of the whole bitmap over the edge length."""
-        return self.cells / self.edge_cells
-
     def bitmap(self, tag_id: int) -> NDArray[np.uint8]:
         """The tag as printed: (cells, cells), 0 black and 255 white, row 0 at the top.
 

@@ -205,13 +205,7 @@ class BodyTracker:
         self._seen: deque[Array] = deque(maxlen=ORIGIN_MEMORY)
         self._elsewhere: list[Array] = []
         self._origin: _Origin | None = None
-        self._origin_t: float | None = None
         self._misfits: deque[float] = deque(maxlen=CORNER_MEMORY)
-
-    @property
-    def origin_age(self) -> float | None:
-        """Time stamp of the last picture that showed the origin tag where it is believed to be."""
-        return self._origin_t
 
     @property
     def origin(self) -> tuple[Array, Array] | None:
@@ -280,7 +274,6 @@ class BodyTracker:
                 return
         self._elsewhere = []
         self._seen.append(seen.corners)
-        self._origin_t = t
         # The average settles: solved anew only while it still gains.
         if self._origin is None or len(self._seen) < ORIGIN_MEMORY:
             self._solve_origin(lens)

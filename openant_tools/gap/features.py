@@ -33,10 +33,9 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
 #: what a servo says of its torque, best first; none in N·m, so that all are brought to the model's own scale
 TORQUES = ("cur", "load", "pwm")
 #: s: at the start of a run that is left out (where the robot really began is not known well), and of blocks
-SKIP_S, STAND_BLOCK_S, ONE_JOINT_BLOCK_S, FLOOR_BLOCK_S, SCATTER_BLOCK_S = 0.5, 0.1, 0.05, 0.2, 0.4
+SKIP_S, STAND_BLOCK_S, ONE_JOINT_BLOCK_S, FLOOR_BLOCK_S = 0.5, 0.1, 0.05, 0.2
 #: least size of a scatter, as a share of the signal's noise
 LEAST = 0.3
-SCATTERING = ("vel", "gyro", "acc")
 
 
 @dataclass(frozen=True)

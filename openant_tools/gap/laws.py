@@ -44,7 +44,7 @@ class Fields:
     link: Array
 
 
-def first_laws(robots: Sequence[Robot], fields: Fields) -> list[Law]:
+def first_laws(robots: Sequence[Robot]) -> list[Law]:
     """The laws on what the servo is asked and may give."""
     laws: list[Law] = []
     slew, no_load = _table(robots, "slew"), _table(robots, "no_load")

@@ -125,7 +125,7 @@ class _Batch:
             friction=_column(self._batch, "dof_frictionloss", plant.dof),
             link=np.maximum(plant.model.dof_M0[plant.dof] - plant.model.dof_armature[plant.dof], 1e-6)[None].repeat(len(robots), 0),
         )  # fmt: skip
-        first, last = first_laws(robots, fields), last_laws(robots, fields)
+        first, last = first_laws(robots), last_laws(robots, fields)
         for name, values in (("dof_armature", fields.armature), ("dof_damping", fields.damping)):
             self._batch.expand(name)[:, plant.dof] = values
         return [*first, *laws_of([robot.laws for robot in robots], len(plant.joints)), self._note, *last]

@@ -79,10 +79,6 @@ class ServoChannel:
         values = counts * self.scales[name]
         return self.direction * values if name in _SIGNED else values
 
-    def to_goal(self, angle: float) -> int:
-        """The goal, in counts, nearest to a joint angle in rad: the inverse of `to_si`."""
-        return round((self.direction * angle + self.zero_offset_rad) / self.scales["pos"])
-
 
 @dataclass(frozen=True, slots=True)
 class Answer:

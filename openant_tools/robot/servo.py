@@ -6,16 +6,14 @@ import difflib
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 
 from openant_tools.errors import BadInput
 from openant_tools.robot.control_table import control_table
 from openant_tools.robot.registers import PULSES_PER_TURN, PWM_FULL, RAD_PER_PULSE, RAD_S_PER_COUNT, Register
 
 __all__ = [
-    "BAUD_CODES", "HARDWARE_ERRORS", "OPERATING_MODES", "PULSES_PER_TURN", "PWM_FULL", "RAD_PER_PULSE",
-    "RAD_S_PER_COUNT", "SERVO_MODELS", "HardwareError", "MovingStatus", "Rating", "Register", "ServoModel",
-    "baud_code", "hardware_errors", "moving_status", "servo_model",
+    "BAUD_CODES", "HARDWARE_ERRORS", "PULSES_PER_TURN", "PWM_FULL", "RAD_PER_PULSE", "RAD_S_PER_COUNT", "SERVO_MODELS",
+    "HardwareError", "Rating", "Register", "ServoModel", "baud_code", "hardware_errors", "servo_model",
 ]  # fmt: skip
 
 _RPM = 2 * math.pi / 60
@@ -23,11 +21,6 @@ _RPM = 2 * math.pi / 60
 #: Code of the register `baud_rate` → bits per second.
 BAUD_CODES: Mapping[int, int] = {
     0: 9_600, 1: 57_600, 2: 115_200, 3: 1_000_000, 4: 2_000_000, 5: 3_000_000, 6: 4_000_000, 7: 4_500_000,
-}  # fmt: skip
-
-#: Value of the register `operating_mode` → what it is called.
-OPERATING_MODES: Mapping[int, str] = {
-    0: "current", 1: "velocity", 3: "position", 4: "extended position", 5: "current-based position", 16: "PWM",
 }  # fmt: skip
 
 
@@ -85,22 +78,6 @@ HARDWARE_ERRORS: tuple[HardwareError, ...] = (
 def hardware_errors(status: int) -> tuple[HardwareError, ...]:
     """The errors that stand in a value of `hardware_error_status` or of the mask `shutdown`."""
     return tuple(error for error in HARDWARE_ERRORS if status & error.mask)
-
-
-@dataclass(frozen=True)
-class MovingStatus:
-    """The register `moving_status` (123), taken apart."""
-
-    in_position: bool
-    profile_ongoing: bool
-    following_error: bool
-    profile: str
-
-
-def moving_status(value: int) -> MovingStatus:
-    """The bits of `moving_status`."""
-    profile = ("none", "rectangle", "triangle", "trapezoid")[value >> 4 & 3]
-    return MovingStatus(bool(value & 1), bool(value & 2), bool(value & 8), profile)
 
 
 def baud_code(baud: int) -> int:
@@ -204,11 +181,6 @@ class ServoModel:
         supply = self.nominal_voltage_v if supply_v is None else supply_v
         return self.stall_torque_nm * duty * supply / self.nominal_voltage_v
 
-    def no_load_at(self, supply_v: float | None = None, duty: float = 1.0) -> float:
-        """rad/s without load, in proportion to duty and supply like the torque."""
-        supply = self.nominal_voltage_v if supply_v is None else supply_v
-        return self.no_load_rad_s * duty * supply / self.nominal_voltage_v
-
     def stiffness_nm_rad(self, p_gain: float | None = None, supply_v: float | None = None) -> float:
         """N·m of torque per rad of position error.
 
@@ -221,10 +193,6 @@ class ServoModel:
         gain = self.register("position_p_gain").default if p_gain is None else p_gain
         assert gain is not None
         return gain / self.position_p_divisor / PWM_FULL / RAD_PER_PULSE * self.stall_torque_at(supply_v)
-
-    def p_gain_for(self, stiffness_nm_rad: float, supply_v: float | None = None) -> int:
-        """The register `position_p_gain` nearest to a stiffness in N·m/rad; raises BadInput beyond its range."""
-        return self.register("position_p_gain").to_counts(stiffness_nm_rad / self.stiffness_nm_rad(1, supply_v))
 
     def derivative_damping_nm_s_rad(self, d_gain: float | None = None, supply_v: float | None = None) -> float:
         """N·m·s/rad that the D gain adds: duty = D / divisor · Δe / 885 once per control period.
@@ -244,18 +212,6 @@ class ServoModel:
             raise BadInput(
                 f"{self.name} has no register {name!r}", remedy=_nearest(name, self.registers, "its registers")
             ) from None
-
-    @cached_property
-    def _by_address(self) -> Mapping[int, Register]:
-        return {
-            address: register
-            for register in self.registers.values()
-            for address in range(register.address, register.end)
-        }
-
-    def register_at(self, address: int) -> Register | None:
-        """The register that owns the byte at an address, or None where the table has a hole."""
-        return self._by_address.get(address)
 
     @property
     def effort(self) -> Register:

@@ -55,7 +55,7 @@ def fit_report(result: Identification) -> Report:
     report = Report(
         "System identification", f"{result.model.name} · {', '.join(_names(result))}", made_by="openant sysid fit"
     )
-    report.text(_sentence(result, closed))
+    report.text(_sentence(result))
     report.key_figures(
         KeyFigure("held-out error, full run", _change(result.before.full, result.after.full), "given → calibrated"),
         KeyFigure(
@@ -142,7 +142,7 @@ def _names(result: Identification) -> list[str]:
     return [run.name for data in result.datasets for run in data.runs]
 
 
-def _sentence(result: Identification, closed: float) -> str:
+def _sentence(result: Identification) -> str:
     if not result.accepted:
         return "**Nothing that was fitted beats the given model on held-out runs, so the model is returned as it was.**"
     kinds = dict.fromkeys(name.partition(".")[0].replace("_", " ") for name in result.accepted)

@@ -33,7 +33,6 @@ __all__ = ["StepScreen"]
 #: the answer that the stop key gives where a procedure asks for the stop key
 STOP = "stop"
 _LEVELS: Mapping[str, Name] = {"info": "info", "ok": "ok", "warn": "warn", "fail": "fail"}
-PATIENCE_S = 0.05
 
 
 @dataclass(frozen=True)
