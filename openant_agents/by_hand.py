@@ -60,10 +60,9 @@ class _Layer:
     def forward(self, x: Tensor) -> Tensor:
         self.x = x
         torch.addmm(self.bias, x, self.weight.t(), out=self.sums)
-        self.out = self.sums
+        self.out = self.sums  # before the norm, whose last answer makes room for the next in the processor's memory
         if self.norm is not None:
             norm = self.norm
-            self.out = self.sums
             self.out, self.mean, self.scale = torch.native_layer_norm(
                 self.sums, list(norm.normalized_shape), norm.weight, norm.bias, norm.eps
             )
@@ -90,9 +89,10 @@ class _Layer:
             torch.sum(slope, 0, out=_grad(self.linear.bias))
         if inputs is None:
             return slope
+        weight, out = self.weight[:, inputs], self.slopes[:, : inputs.stop - inputs.start]
         if slope.shape[1] == 1:  # an outer product, for which a matrix product takes twice as long
-            return torch.mul(slope, self.weight, out=self.slopes)
-        return torch.mm(slope, self.weight[:, inputs], out=self.slopes[:, : inputs.stop - inputs.start])
+            return torch.mul(slope, weight, out=out)
+        return torch.mm(slope, weight, out=out)
 
 
 def _grad(weight: Tensor) -> Tensor:

@@ -324,9 +324,13 @@ class Sac:
         result = action.squeeze(0).cpu().numpy()
         return result
 
-    @torch.no_grad()
     def update(self) -> None:
         """One update of the critics and their targets; every `policy_every` times as many of actor and entropy."""
+        # Inference mode spares torch keeping count of changes; autograd cannot work within it.
+        with torch.inference_mode() if self._by_hand else torch.no_grad():
+            self._update()
+
+    def _update(self) -> None:
         settings, replay = self.settings, self.replay
         o, a = replay.observations, replay.actions
         batch = replay.sample(settings.batch, self.random).to(self.device)

@@ -129,6 +129,18 @@ def test_a_restored_replay_holds_every_row_where_it_was(capacity, count):
     assert kept[:, 0].tolist() == list(range(max(0, count - capacity), count))
 
 
+def test_a_checkpoint_of_other_networks_or_versions_is_refused():
+    agent = Sac(2, 1, SMALL, seed=0)
+    state = agent.get_state()
+    for broken in (
+        {name: value for name, value in state.items() if name != "critics"},
+        {**state, "actor_optimiser": {"state": {}, "param_groups": []}},
+        Sac(3, 1, SMALL, seed=0).get_state(),
+    ):
+        with pytest.raises(BadInput, match=r"the checkpoint does not fit the agent .* → train into another folder"):
+            agent.set_state(broken)
+
+
 def test_it_learns_to_reach(tmp_path):
     chosen = Settings(learning_start=100, batch=64, hidden=32, entropy_start=0.1, actor_step=3e-3, gamma_per_s=0.01)
     train(Reach(), folder=tmp_path, steps=600, seed=0, settings=chosen)
