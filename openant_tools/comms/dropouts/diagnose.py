@@ -35,7 +35,11 @@ TIE = 0.4
 #: marks that do not come from losses
 _OF_TIME = frozenset({"stall", "comb", "stairs"})
 #: marks that stand for themselves: no other repeats what they say
-_DECISIVE = frozenset({"stall", "comb", "stairs", "port", "late"})
+_DECISIVE = frozenset({"stall", "comb", "stairs", "port", "late", "reset", "empty"})
+#: marks of what was going on when losses began, of which a robot that is hardly ever heard tells little
+_OF_MOMENTS = frozenset({"dip", "sag", "angle", "load", "low", "motion"})
+#: lossy reads that say whom losses concern
+ENOUGH = 6
 
 _HEALTHY = Cause(
     "nothing wrong", "", "", (0.78, 0.2197, 0.0003),
@@ -205,13 +209,14 @@ def _terms(cause: Cause, measures: Measures) -> dict[str, float]:
     kinds = ("no", "stray", "yes")
     terms = {"losses": math.log(cause.losses[kinds.index(measures.losses)])}
     lossy = measures.losses == "yes"
+    silent = float(measures.log.lost.all(axis=1).mean())
     if lossy:
         reach = measures.reach
         share = cause.reach[reach.kind]
         if reach.tied is not None:
             share = 0.75 * share + 0.25 * cause.reach[reach.tied]
-        # A few losses say little of whom they concern.
-        few = min(1.0, len(measures.episodes) / 6)
+        # A few losses say little of whom they concern; one that goes on says it again and again.
+        few = min(1.0, sum(min(one.stop - one.start, ENOUGH) for one in measures.episodes) / ENOUGH)
         terms["reach"] = TEMPER * few * math.log(share)
     for name, seen in measures.marks.items():
         if not lossy and name not in _OF_TIME:
@@ -221,6 +226,8 @@ def _terms(cause: Cause, measures: Measures) -> dict[str, float]:
             terms[name] *= 0.4  # the supply says the same, and better
         if name in _DECISIVE:
             terms[name] *= TEMPER
+        if name in _OF_MOMENTS:
+            terms[name] *= 1 - silent
         if name in ("angle", "load", "low", "motion", "single", "together", "dip", "crc"):
             terms[name] *= len(measures.episodes) / (len(measures.episodes) + 4)
     return terms

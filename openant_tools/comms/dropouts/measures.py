@@ -29,8 +29,19 @@ STALL_S = 0.02
 RESET_MS = 120.0
 #: s, of waiting beyond the wire where a latency timer is felt
 COMB_WAIT_S = 2.5e-3
+#: share of a comb from which on answers count as handed over by its timer
+BEATS = 0.5
+#: s, USB hands over in frames of it, timers count in it; share of steps that are whole ones where answers come so
+TICK_S, IN_TICKS = 1e-3, 0.6
+#: parts of a timer's period, of which each has so much of its share where reads begin at all phases alike
+PHASES, EVEN = 12, 0.6
 #: bytes that the longest block read of ours is long on the wire, with its frame
 LONGEST_ANSWER = 38
+#: episodes a minute where `often` begins; a thousand times as many are as often as can be
+SELDOM = 0.1
+#: V, servos for a nominal 12 V need so much (facts/dynamixel: XM430 and XC430 10.0 V); a robot that ever reads more than
+#: the other has such
+NEEDED_V, TWELVE_VOLT = 10.0, 9.0
 #: times that losses are moved elsewhere, to see what chance does; closer together than this (s) they move as one
 SHIFTS, CLUSTER_S = 30, 0.25
 #: loops tell nothing of a mark in fewer rows
@@ -69,7 +80,7 @@ def measure(log: BusLog) -> Measures:
     marks: dict[str, Measure] = {}
     at: dict[str, tuple[int, ...]] = {}
     looks: Sequence[Callable[..., Iterator[tuple[str, Measure, tuple[int, ...]]]]] = (
-        _words, _extent, _rhythm, _dips, _sag, _resets, _explained, _host, _comb, _staircase, _gap, _baud,
+        _words, _extent, _rhythm, _dips, _empty, _sag, _resets, _explained, _host, _comb, _staircase, _gap, _baud,
     )  # fmt: skip
     for look in looks:
         for name, seen, joints in look(log, episodes, reach):
@@ -142,6 +153,9 @@ def _rhythm(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     # By reads, not by losses: a stray one or two must not outnumber an outage of a thousand reads.
     single = float((runs <= 1).sum() / runs.sum())
     yield "single", Measure(single, f"{single:.0%} of the reads that lose anything stand alone"), ()
+    a_minute = len(episodes) / max(log.seconds / 60, 1e-3)
+    often = math.log10(max(a_minute, SELDOM) / SELDOM) / 3
+    yield "often", Measure(often, f"it happens {len(episodes)} times, {a_minute:.2g} times a minute"), ()
     longest = max(one.to_s - one.from_s for one in episodes) + log.period_s
     rows = int(log.lossy.sum())
     # The length that holds half of all lossy rows, so that one stray loss does not hide an outage.
@@ -206,6 +220,17 @@ def _dips(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     joints = tuple(np.flatnonzero(low.any(axis=0)).tolist())
     words = f"the supply dips at {share:.0%} of the losses, by {deep:.1f} V at most (usual {usual:.1f} V)"
     yield "dip", Measure(max(0.0, share - chance), words), joints
+
+
+def _empty(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+    """Whether the supply, with next to no load on it, is below what servos need: they begin anew again and again."""
+    volts = _supply(log)
+    known = volts[np.isfinite(volts)]
+    if len(known) < FEWEST or float(known.max()) < TWELVE_VOLT:
+        return
+    usual = float(np.median(known))
+    value = 1 / (1 + math.exp(min((usual - NEEDED_V) / 0.15, 50.0)))
+    yield "empty", Measure(value, f"the supply stands at {usual:.1f} V, servos need {NEEDED_V:.0f} V"), ()
 
 
 def _sag(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
@@ -428,34 +453,44 @@ def _host(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
 
 def _waits(log: BusLog) -> tuple[Array, float, bool]:
     """(J,) s from one answer's end to the next one's, NaN where unknown; s that an answer takes on the wire; whether
-    answers are handed over in portions."""
+    answers are handed over at the ticks of a timer, in whole ms of each other."""
     rtt, j = log.rtt, log.rtt.shape[1]
     known = np.isfinite(rtt)
-    steps, together, portion = np.full(j, np.nan), [], []
+    steps, whole = np.full(j, np.nan), []
     for k in range(1, j):
         both = known[:, k] & known[:, k - 1]
         if both.sum() >= FEWEST:
             between = rtt[both, k] - rtt[both, k - 1]
             low, high = np.quantile(between, [0.02, 0.98])
             steps[k] = float(np.clip(between, low, high).mean())
-            apart = between[between > 0.1e-3]
-            together.append(float((np.abs(between) < 0.03e-3).mean()))
-            portion.append(float(np.median(apart)) if len(apart) else 0.0)
+            whole.append(float((np.abs(between / TICK_S - np.round(between / TICK_S)) < 0.1).mean()))
     known_baud = log.baud[np.isfinite(log.baud) & (log.baud > 0)]
     wire = LONGEST_ANSWER * 10 / (float(np.median(known_baud)) if len(known_baud) else 1e6)
-    if not together or max(together) < 0.15:
-        return steps, wire, False
-    # Requests at all phases of the timer scatter each answer over a whole portion, and the mean of each step is about
-    # what the servo took; at one phase it is not.
-    with np.errstate(invalid="ignore"):
-        spread = [
-            float(np.ptp(np.quantile(one[np.isfinite(one)], [0.05, 0.95]))) for one in rtt.T if np.isfinite(one).any()
-        ]
-    return steps, wire, float(np.median(spread)) < 0.8 * max(max(portion), 0.25e-3)
+    return steps, wire, bool(whole) and float(np.median(whole)) > IN_TICKS
 
 
-def _comb(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
-    """Whether answers wait for the beat of a latency timer."""
+@dataclass(frozen=True)
+class _Beat:
+    """How first answers keep time.
+
+    Attributes:
+        wait_s: what they wait besides their time on the wire, median. period_s: of the beat that they keep best, 0 for none.
+        strength: 0…1, of that.
+    """
+
+    wait_s: float
+    period_s: float
+    strength: float
+
+    @property
+    def share(self) -> float:
+        """0…1, how much this is a timer: answers that wait for nothing keep any beat."""
+        slow = 1 / (1 + (COMB_WAIT_S / max(self.wait_s, 1e-6)) ** 5)
+        return slow * (0.3 + 0.7 / (1 + math.exp(-14 * (self.strength - 0.6))))
+
+
+def _beat(log: BusLog) -> _Beat | None:
+    """The beat of first answers; None where too few are known."""
     steps, wire, _ = _waits(log)
     if not np.isfinite(log.baud).any() and np.isfinite(steps).any():
         # Nobody said how fast the line is: its answers cannot follow each other faster than the wire lets them.
@@ -463,7 +498,7 @@ def _comb(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     first = np.nanmin(np.where(np.isfinite(log.rtt), log.rtt, np.inf), axis=1)
     good = np.isfinite(first) & (first < 0.3)
     if good.sum() < FEWEST:
-        return
+        return None
     rows = np.flatnonzero(good)
     rtt = first[rows]
     # A request of 14 bytes and one for each servo, then the first answer: from there on it waits.
@@ -481,17 +516,61 @@ def _comb(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
         strength = max(beats)
         if strength > best + 0.05:
             best, period = strength, float(candidate)
-    slow = 1 / (1 + (COMB_WAIT_S / max(wait, 1e-6)) ** 5)
-    value = slow * (0.3 + 0.7 / (1 + math.exp(-14 * (best - 0.6))))
+    return _Beat(wait, period, best)
+
+
+def _comb(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+    """Whether answers wait for the beat of a latency timer."""
+    beat = _beat(log)
+    if beat is None:
+        return
+    wait, best, value = beat.wait_s, beat.strength, beat.share
     told = [float(one["latency_timer_ms"]) for one in log.facts if "latency_timer_ms" in one]
     if told and min(told) >= 4 and wait > 0.25e-3 * min(told):
         value = max(value, 0.9)
     words = f"answers wait {max(wait, 0.0) * 1e3:.1f} ms besides their time on the wire"
     if best > 0.5:
-        words += f", in a beat of {period * 1e3:.0f} ms (strength {best:.2f})"
+        words += f", in a beat of {beat.period_s * 1e3:.0f} ms (strength {best:.2f})"
     if told:
         words += f"; the adapter's timer is said to be {min(told):.0f} ms"
     yield "comb", Measure(value, words), ()
+
+
+def _least_waits(rtt: Array, wire: float, period_s: float) -> Array:
+    """(J,) s that each servo waits at least before it answers, where a timer of this period hands answers over.
+
+    An answer ends within the period before the tick that brings it. Reads begin at several phases of the timer, so that its
+    end is known better than to a period: after the latest tick less a period, and before the earliest one; and not
+    before the end of the answer before it and its own time on the wire. What USB adds now and then blurs that by some tenths
+    of a ms, too much for single servos where the timer is long: then only the whole staircase counts.
+    """
+    j = rtt.shape[1]
+    low, high = np.full(j, -np.inf), np.full(j, np.inf)
+    for k in range(j):
+        known = rtt[np.isfinite(rtt[:, k]), k]
+        if len(known) >= FEWEST:
+            # All but a few: a host that was late once must not say when an answer ended.
+            earliest, latest = np.quantile(known, [0.02, 0.98])
+            low[k], high[k] = min(earliest, latest - period_s), max(earliest, latest - period_s)
+    seen = np.flatnonzero(np.isfinite(low))
+    if len(seen) < 2:
+        return np.zeros(j)
+    first, last = seen[0], seen[-1]
+    waits = np.full(j, max(0.0, (low[last] - high[first]) / (last - first) - wire))
+    if period_s <= TICK_S:
+        for k in range(1, j):
+            low[k] = max(low[k], low[k - 1] + wire)
+        for k in range(j - 2, -1, -1):
+            high[k] = min(high[k], high[k + 1] - wire)
+        waits[1:] = np.maximum(waits[1:], low[1:] - high[:-1] - wire)
+    return waits
+
+
+def _at_all_phases(rtt: Array, period_s: float) -> bool:
+    """Whether reads begin at all phases of a timer alike."""
+    first = rtt[np.isfinite(rtt[:, 0]), 0]
+    count = np.histogram(first / period_s % 1.0, PHASES, (0.0, 1.0))[0]
+    return bool(count.min() > EVEN * count.mean())
 
 
 def _staircase(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
@@ -499,11 +578,13 @@ def _staircase(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     steps, wire, portions = _waits(log)
     if not np.isfinite(steps).any():
         return
-    j = len(steps)
-    if portions:
-        # Handed over together, single steps mean nothing; the whole staircase still does, to a portion (1 ms).
-        excess = np.full(j, max(0.0, float(np.nanmean(steps)) - wire - 1e-3 / j))
+    j, beat = len(steps), _beat(log)
+    period = beat.period_s if beat is not None and beat.share > BEATS else TICK_S
+    if portions and not _at_all_phases(log.rtt, period):
+        # Whose answer just misses the tick comes a whole period later: that is no servo's waiting.
+        excess = _least_waits(log.rtt, wire, period)
     else:
+        # Asked at all phases of the timer, or handed over at once, what each took is the mean of its steps.
         excess = np.maximum(steps - wire, 0.0)
     worst, typical = float(np.nanmax(excess)), float(np.nanmedian(excess))
     joints = tuple(range(j)) if typical > 0.5 * worst else tuple(np.flatnonzero(np.nan_to_num(excess) > 0.5 * worst))
