@@ -452,3 +452,20 @@ def test_body_and_joints_stand_in_one_recording(tmp_path: Path) -> None:
     assert [row["base.x"], row["base.y"], row["base.z"]] == pytest.approx([x + 0.75, y - 0.30, z], abs=0.02)
     assert row["base.yaw"] == pytest.approx(2 * truth["quaternion"][3], abs=0.03)
     assert np.nanmedian(recording.run.columns["base.x"]) == pytest.approx(row["base.x"], abs=5e-3)
+
+
+def test_a_virtual_robot_that_ends_is_told_in_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    ready, scenario = tmp_path / "ready.json", tmp_path / "blind.toml"
+    scenario.write_text('[camera]\npresent = false\n[clock]\nmode = "stepped"\n')
+    words = ["virtual", "start", "--scenario", str(scenario), "--ready-file", str(ready)]
+    with subprocess.Popen([sys.executable, "-m", "openant_tools.cli", *words]) as robot:
+        while not ready.is_file():
+            assert robot.poll() is None
+            time.sleep(0.02)
+        with EngineProcess(config(json.loads(ready.read_text()))) as engine:
+            engine.ask(messages.Torque(True))
+            robot.kill()
+            with pytest.raises(HardwareFault, match="the engine has ended|the port is gone"):
+                while True:
+                    engine.ask(messages.Hold(0.1))
+    assert "Traceback" not in capfd.readouterr().err

@@ -139,6 +139,8 @@ class Engine:
             self._loop()
         except _ParentGone:
             pass
+        except HardwareFault as error:  # a virtual robot that ended
+            self._outbox.append(messages.Notice(str(error)))
         finally:
             self._release()
             self._flush(patience_s=0.5)
@@ -303,7 +305,12 @@ class Engine:
     def _release(self) -> None:
         """Torque off, the recording closed, the guardian sent home; none of them prevents the next."""
         if hasattr(self, "_servos"):
-            self._torque_off()
+            try:
+                self._torque_off()
+            except HardwareFault as error:
+                # The guardian, who is not sent home then, tries once more as this process ends.
+                self._outbox.append(messages.Notice(str(error)))
+                self._guardian = None
         try:
             self._close_recording()
         except RecordingStopped as error:
