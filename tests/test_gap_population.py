@@ -72,6 +72,31 @@ def test_every_cause_of_the_catalogue_shows(protocol: Protocol) -> None:
     assert set(silent) <= {"thermal_derating", "blocked_joint"}
 
 
+def test_a_run_that_was_warmer_begins_warmer() -> None:
+    cool, warm = commanded("stand", 1.0), commanded("stand", 1.0, seed=1)
+    columns = dict(warm.columns)
+    for joint in JOINT_NAMES:
+        cool.columns[f"temp.{joint}"] = np.full(len(cool.t), 28.0)
+        columns[f"temp.{joint}"] = np.full(len(warm.t), 40.0 if joint == "knee_fl" else 28.0)
+    columns["temp.hip_rr"][3] = 127.0  # a glitch
+    warm = dataclasses.replace(warm, columns=columns)
+    protocol = Protocol.of([cool, warm, commanded("stand", 1.0, seed=2)], MODEL, JOINT_NAMES, [None] * 3)
+    knee = JOINT_NAMES.index("knee_fl")
+    assert [one.warm_c.tolist() for one in protocol.runs] == [
+        [0.0] * 8,
+        [12.0 * (j == knee) for j in range(8)],
+        [0.0] * 8,
+    ]
+    weakening = Robot(8)
+    weakening.derating[:] = 0.03
+    heated = weakening.copy()
+    heated.heat_c = 12.0
+    rollouts = Rollouts(protocol.runs[1].plant, [warm])
+    known = simulate(rollouts, [weakening], signals=("pos",), warm_c=[protocol.runs[1].warm_c]).signals["pos"][0]
+    cold, hot = simulate(rollouts, [weakening, heated], signals=("pos",)).signals["pos"]
+    assert np.abs(known[:, knee] - hot[:, knee]).max() < 1e-3 < np.abs(known[:, knee] - cold[:, knee]).max()
+
+
 def test_the_same_seed_draws_the_same_robot(protocol: Protocol) -> None:
     assert draw(protocol, 5) == draw(protocol, 5)
     one, other = robot_of(protocol, draw(protocol, 5)), robot_of(protocol, draw(protocol, 5))

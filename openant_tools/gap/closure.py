@@ -120,7 +120,8 @@ class Windows:
     def errors(self, k: int, refits: Sequence[Refit | None], *, quick: bool = False) -> Array:
         """(refits, rows, joints) rad, measured minus simulated on run k."""
         rollouts = (self._quick if quick else self._rollouts)[k]
-        found = simulate(rollouts, [self.robot(refit) for refit in refits], signals=("pos",)).signals["pos"]
+        robots = [self.robot(refit) for refit in refits]
+        found = simulate(rollouts, robots, signals=("pos",), warm_c=[self.protocol.runs[k].warm_c]).signals["pos"]
         out: Array = self._measured[k][None] - found.astype(np.float64)
         return out
 

@@ -53,6 +53,8 @@ PLACES = 2
 #: held-out closure that an addition must bring; that one cause must bring beyond what tolerances do, where the judge doubts;
 #: and below which a set explains nothing
 ADDS, ADDS_ALONE, EXPLAINS = 0.02, 0.2, 0.35
+#: °C between runs from which heat is asked about, and its cause
+WARMED_C, HEAT = 2.5, "thermal_derating"
 #: gaps that are so many floors, of robots whose energy is so many gates, ask for an explanation; beyond ODD gates no robot of
 #: the build is healthy, whatever the judge says
 LARGE, STRANGE, ODD = 3.0, 3.0, 20.0
@@ -114,7 +116,10 @@ def diagnose(
     suspects = [name for n, (name, chance) in enumerate(first) if chance > SUSPECT or n < LIKELIEST][:SUSPECTS]
     if puzzled:
         suspects = [name for name, _ in first[: max(PUZZLED, len(suspects))]]
-    explained = _explain(scenes, suspects, judgement)
+    # No template was as warm as this robot was in each run: what a thermometer shows is asked about wherever it may sit.
+    warmed = [HEAT] if max(float(one.warm_c.max()) for one in protocol.runs) > WARMED_C else []
+    suspects += [name for name in warmed if name not in suspects and name in judgement.places]
+    explained = _explain(scenes, suspects, judgement, thorough=warmed)
     tell(0.85, "held-out runs")
     return _decide(case, judgement, first, explained, scenes)
 
@@ -232,15 +237,17 @@ def _scene_of(cause: str, scenes: dict[Setup, Scene]) -> Scene:
     return scenes.get(first) or next(iter(scenes.values()))
 
 
-def _explain(scenes: dict[Setup, Scene], suspects: Sequence[str], judgement: Judgement) -> dict[str, Explained]:
-    """The best place and size of each suspect by itself."""
+def _explain(
+    scenes: dict[Setup, Scene], suspects: Sequence[str], judgement: Judgement, thorough: Sequence[str] = ()
+) -> dict[str, Explained]:
+    """The best place and size of each suspect by itself, of those to be `thorough` about of all places."""
     out: dict[str, Explained] = {}
     for scene in {id(s): s for s in scenes.values()}.values():
         known = {
             Part(name, where): x
             for name in suspects
             if _scene_of(name, scenes) is scene
-            for where, x in judgement.places[name][:PLACES]
+            for where, x in judgement.places[name][: None if name in thorough else PLACES]
         }
         if known:
             for one in fit(scene, known):
@@ -264,7 +271,10 @@ def _without(case: _Case, explained: Explained) -> Judgement:
             continue
         rollouts = Rollouts(plant, [coarse.runs[k].run for k in mine])
         both = simulate(
-            rollouts, [Robot(len(case.protocol.joints)), scene], signals=coarse.runs[mine[0]].signals
+            rollouts,
+            [Robot(len(case.protocol.joints)), scene],
+            signals=coarse.runs[mine[0]].signals,
+            warm_c=[coarse.runs[k].warm_c for k in mine],
         ).signals
         for k, rows in zip(mine, rollouts.rows, strict=True):
             one = coarse.runs[k]
@@ -310,6 +320,11 @@ def _decide(
     best = names[0]
     chosen, whole = [best], alone[best]
     beyond = {best: whole.closed - refit.closed}
+    if beyond[best] > ADDS_ALONE:
+        # What none of the others closes speaks for a cause whatever the judge thought of it.
+        scores = np.array([_score(probability[name], alone[name]) for name in names])
+        share = float(1 / np.exp(scores - scores[0]).sum())
+        probability[best] = max(probability[best], share * min(beyond[best], 1.0))
     if probability[best] > FINDING or beyond[best] > ADDS_ALONE:
         left = _without(case, explained[best])
         for name, chance in _shown(left, case.protocol)[:2]:

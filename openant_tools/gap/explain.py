@@ -98,7 +98,7 @@ class Scene:
         """(robots, features) whitened differences between the robot at hand and these."""
         parts = []
         for one, rollouts, nominal in zip(self.runs, self._rollouts, self._nominal, strict=True):
-            found = simulate(rollouts, robots, signals=one.signals).signals
+            found = simulate(rollouts, robots, signals=one.signals, warm_c=[one.warm_c]).signals
             parts.append(one.layout.features(differences(found, nominal, one.signals)))
         x = np.concatenate(parts, axis=1)[:, self.columns]
         out: Floats = np.nan_to_num(self.whitening(x) - self._target)

@@ -44,8 +44,12 @@ class Fields:
     link: Array
 
 
-def first_laws(robots: Sequence[Robot]) -> list[Law]:
-    """The laws on what the servo is asked and may give."""
+def first_laws(robots: Sequence[Robot], warm_c: Array) -> list[Law]:
+    """The laws on what the servo is asked and may give.
+
+    Args:
+        warm_c: (robots, joints) °C, by which servos are known to be warmer as the run begins.
+    """
     laws: list[Law] = []
     slew, no_load = _table(robots, "slew"), _table(robots, "no_load")
     derating = _table(robots, "derating")
@@ -56,7 +60,7 @@ def first_laws(robots: Sequence[Robot]) -> list[Law]:
         laws.append(_rounding(steps, _table(robots, "zero")))
     if derating.any():
         seconds = np.array([[robot.derating_s] for robot in robots])
-        heat_c = np.array([[robot.heat_c] for robot in robots])
+        heat_c = np.array([[robot.heat_c] for robot in robots]) + warm_c
         laws.append(Heating({"loss_per_c": derating, "time_constant_s": seconds}, heat_c))
     if np.isfinite(no_load).any():
         laws.append(_fading(no_load))

@@ -7,6 +7,7 @@ import dataclasses
 import hashlib
 import json
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,21 +48,23 @@ class Played:
             every other robot that plays these commands does.
         plant: how it is simulated. signals: those that a robot on it can have.
         seen: what its log has of them.
+        warm_c: (joints,) °C, by which its servos were warmer than in the coolest run beside it, as far as that was logged.
     """
 
     run: Run
     plant: Plant
     signals: tuple[str, ...]
     seen: Mapping[str, Floats]
+    warm_c: Array
 
     @classmethod
-    def of(cls, run: Run, plant: Plant) -> Played:
+    def of(cls, run: Run, plant: Plant, warm_c: Array) -> Played:
         """A run on a plant."""
         free = plant.setup is Setup.FLOOR and plant.free_joint is not None
         signals = ("pos", "vel", "torque", "volt", *(COLUMNS if free else ()))
         seen = {name: values for name, values in logged(run, plant.joints).items() if name in signals}
         columns = {name: values for name, values in run.columns.items() if not name.startswith("base.")}
-        return cls(dataclasses.replace(run, columns=columns), plant, signals, seen)
+        return cls(dataclasses.replace(run, columns=columns), plant, signals, seen, warm_c)
 
     @property
     def layout(self) -> Layout:
@@ -100,11 +103,11 @@ class Protocol:
         """
         plants: dict[tuple[Path, Setup], Plant] = {}
         played = []
-        for run, own in zip(runs, models, strict=True):
+        for run, own, warm_c in zip(runs, models, _warmer(runs, joints), strict=True):
             key = (own or model, setup_of(run.facts.setup))
             if key not in plants:
                 plants[key] = load_plant(key[0], joints, key[1])
-            played.append(Played.of(run, plants[key]))
+            played.append(Played.of(run, plants[key], warm_c))
         seen = {name for one in played for name in one.seen}
         first = next((one.plant for one in played if one.plant.setup is Setup.FLOOR), played[0].plant)
         reference = Reference.of(
@@ -226,6 +229,15 @@ def _on_grid(run: Run, joints: Sequence[str]) -> Array:
 def _resolution(runs: Sequence[Run], signal: str, joints: Sequence[str]) -> float:
     steps = [resolution(run, signal, joint) for run in runs for joint in joints]
     return float(np.median([step for step in steps if step > 0] or [0.0]))
+
+
+def _warmer(runs: Sequence[Run], joints: Sequence[str]) -> Array:
+    """(runs, joints) °C above the coolest run; 0 where nothing was logged. Medians: single samples may be glitches."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are empty
+        temperature = np.array([np.nanmedian(run.signal("temp", joints), axis=0) for run in runs])
+        warmer: Array = np.nan_to_num(temperature - np.nanmin(temperature, axis=0))
+    return warmer
 
 
 def _begun(run: Run, other: Run, joints: Sequence[str]) -> Run:

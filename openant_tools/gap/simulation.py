@@ -49,7 +49,13 @@ class Log:
     signals: dict[str, NDArray[np.float32]]
 
 
-def simulate(rollouts: Rollouts, robots: Sequence[Robot], seed: int = 0, signals: Sequence[str] | None = None) -> Log:
+def simulate(
+    rollouts: Rollouts,
+    robots: Sequence[Robot],
+    seed: int = 0,
+    signals: Sequence[str] | None = None,
+    warm_c: Sequence[Array] | None = None,
+) -> Log:
     """Let robots do what runs command.
 
     Args:
@@ -57,6 +63,7 @@ def simulate(rollouts: Rollouts, robots: Sequence[Robot], seed: int = 0, signals
         robots: any number; those with an integrator or cone of their own are simulated in it.
         seed: of what is random in time (jitter, lost commands).
         signals: those wanted; default all that there are.
+        warm_c: of each run (joints,) °C, by which servos are known to be warmer than in the coolest one; default none.
     """
     plant, rows = rollouts.plant, rollouts.rows[-1].stop
     floor = plant.setup is Setup.FLOOR and plant.free_joint is not None
@@ -69,7 +76,7 @@ def simulate(rollouts: Rollouts, robots: Sequence[Robot], seed: int = 0, signals
     at_once = max(1, int(CHUNK_BYTES // (state * longest * len(rollouts.segments))))
     for first in range(0, len(robots), at_once):
         some = robots[first : first + at_once]
-        _Batch(rollouts, some, np.random.default_rng((seed, first))).play(
+        _Batch(rollouts, some, np.random.default_rng((seed, first)), warm_c).play(
             {name: values[first : first + len(some)] for name, values in out.items()}
         )
     return Log(out)
@@ -78,7 +85,13 @@ def simulate(rollouts: Rollouts, robots: Sequence[Robot], seed: int = 0, signals
 class _Batch:
     """Robots × segments side by side: simulation s · robots + r."""
 
-    def __init__(self, rollouts: Rollouts, robots: Sequence[Robot], rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        rollouts: Rollouts,
+        robots: Sequence[Robot],
+        rng: np.random.Generator,
+        warm_c: Sequence[Array] | None,
+    ) -> None:
         self._rollouts, self._robots, self._rng = rollouts, robots, rng
         self._plant, self._segments = rollouts.plant, rollouts.segments
         self._n = len(robots)
@@ -93,7 +106,8 @@ class _Batch:
         state[:, 1 + plant.qpos] += np.tile(np.array([robot.start for robot in robots]), (copies, 1)) - self._zero
         self._batch.state[:] = state
         self._batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
-        self._laws = self._make_laws()
+        warm = np.zeros((len(rollouts.runs), len(plant.joints))) if warm_c is None else np.array(warm_c)
+        self._laws = self._make_laws(warm[[segment.run for segment in self._segments]].repeat(self._n, axis=0))
 
     def _take_forms(self) -> None:
         if any(robot.tilt.any() for robot in self._robots):
@@ -116,7 +130,7 @@ class _Batch:
                 field.shape
             )
 
-    def _make_laws(self) -> list[Law]:
+    def _make_laws(self, warm_c: Array) -> list[Law]:
         plant, copies = self._plant, len(self._segments)
         robots = [robot for _ in range(copies) for robot in self._robots]
         fields = Fields(
@@ -125,7 +139,7 @@ class _Batch:
             friction=_column(self._batch, "dof_frictionloss", plant.dof),
             link=np.maximum(plant.model.dof_M0[plant.dof] - plant.model.dof_armature[plant.dof], 1e-6)[None].repeat(len(robots), 0),
         )  # fmt: skip
-        first, last = first_laws(robots), last_laws(robots, fields)
+        first, last = first_laws(robots, warm_c), last_laws(robots, fields)
         for name, values in (("dof_armature", fields.armature), ("dof_damping", fields.damping)):
             self._batch.expand(name)[:, plant.dof] = values
         return [*first, *laws_of([robot.laws for robot in robots], len(plant.joints)), self._note, *last]
