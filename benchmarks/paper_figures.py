@@ -6,9 +6,9 @@
     python benchmarks/paper_figures.py learning-start # 5,000 steps and 2,000
     python benchmarks/paper_figures.py reward-scale   # 1 and 100
 
-Runs lie in OUT/FIGURE and go on where they were stopped; what is long enough is not trained again. Every figure is the
-mean and ± 3 standard errors over seeds of the average reward over 120 s; the command says how many seeds reach what the
-project asks of the agent, and when.
+Runs lie in OUT/runs, those with the paper's settings once for all figures, and go on where they were stopped; what is long
+enough is not trained again. Every figure is the mean and ± 3 standard errors over seeds of the average reward over 120 s; the
+command says how many seeds reach what the project asks of the agent, and when.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Figure:
 
     Attributes:
         agent: `sac` or `sarsa`.
-        variants: name → settings that differ from the paper's.
+        variants: name → settings that differ from the paper's; none of them is `paper` in all figures.
         words: what it shows.
     """
 
@@ -47,31 +47,35 @@ class Figure:
 
 
 FIGURES: Mapping[str, Figure] = {
-    "sac": Figure("sac", {"sac": {}}, "the paper's settings"),
-    "sarsa": Figure("sarsa", {"sarsa": {}}, "the paper's settings"),
+    "sac": Figure("sac", {"paper": {}}, "the paper's settings"),
+    "sarsa": Figure("sarsa", {"paper": {}}, "the paper's settings"),
     "layer-norm": Figure(
         "sac",
-        {"layer-norm": {}, "none": {"layer_norm": False}},
+        {"paper": {}, "no-layer-norm": {"layer_norm": False}},
         "the paper: LayerNorm learns faster, with less variance",
     ),
     "learning-start": Figure(
-        "sac", {"2000": {}, "5000": {"learning_start": 5_000}}, "the paper: starting earlier loses nothing"
+        "sac", {"paper": {}, "start-5000": {"learning_start": 5_000}}, "the paper: starting earlier loses nothing"
     ),
     "reward-scale": Figure(
-        "sac", {"100": {}, "1": {"reward_scale": 1.0}}, "the paper: larger rewards learn much faster"
+        "sac", {"paper": {}, "scale-1": {"reward_scale": 1.0}}, "the paper: larger rewards learn much faster"
     ),
 }
 
 
 def train_one(agent: str, folder: Path, steps: int, seed: int, changed: Mapping[str, Any]) -> float:
-    """Train one seed, or go on with it; s of processor time that it took."""
+    """Train one seed, or go on with it; s of processor time that it took now."""
     import gymnasium
 
     import openant_env  # noqa: F401
     from openant_agents import sac, sarsa
+    from openant_agents.runs import read_curve
 
+    curve = folder / "learning_curve.csv"
+    if curve.is_file() and max((point.step for point in read_curve(folder)), default=0) >= steps:
+        return 0.0
     begun = time.process_time()
-    options: dict[str, Any] = {"kit": "standard"}
+    options: dict[str, Any] = {"kit": "standard", "task": "back-and-forth"}
     if agent == "sarsa":
         options |= {"dt": 0.05, "action_range": "sarsa"}
     env = gymnasium.make("openant/Ant-v0", **options)
@@ -93,9 +97,8 @@ def main() -> None:
     chosen = parser.parse_args()
     figure = FIGURES[chosen.figure]
     steps = chosen.steps or HOUR[figure.agent]
-    place = chosen.out / chosen.figure
     work = [
-        (place / f"{name}-{seed}", seed, changed)
+        (chosen.out / "runs" / f"{figure.agent}-{name}-{seed}", seed, changed)
         for seed in range(chosen.seeds)
         for name, changed in figure.variants.items()
     ]
@@ -109,7 +112,7 @@ def main() -> None:
 
     curves = [read_run_curve(folder) for folder, _, _ in work]
     groups = group_runs(curves)
-    picture = place.with_suffix(".png")
+    picture = chosen.out / f"{chosen.figure}.png"
     plot_groups(groups, picture, singly=len(groups) == 1)
     asked = ASKED_M_S[figure.agent]
     print(f"{chosen.figure}: {figure.words}")

@@ -2,12 +2,15 @@
 
 A third of the way the servos' bus is unplugged for five seconds; at two thirds training is killed (`kill -9`) and begun again
 with the same command. At the end every step's period, measured from command to command in the recordings' own stamps, is
-compared with what the run said of itself: a missed deadline that was not reported is a failure.
+compared with what the run said of itself: a missed deadline that was not reported is a failure (exit code 1).
+
+The virtual robot stands for servos that do not share this computer: where that is allowed, it comes before other programs.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import signal
@@ -42,6 +45,12 @@ def wait_for(run: Path, steps: int, process: subprocess.Popen[bytes]) -> None:
         time.sleep(0.05)
 
 
+def first() -> None:
+    """Called in a process that is to come before others."""
+    with contextlib.suppress(PermissionError):
+        os.nice(-10)
+
+
 def periods(recordings: Path) -> np.ndarray:
     """s between changes of the commands in every recording: each action of chance or policy is another command."""
     found = []
@@ -72,7 +81,10 @@ def main() -> None:
         scenario, ready, run = folder / "floor.toml", folder / "ready.json", folder / "run"
         scenario.write_text('[robot]\nsetup = "floor"\n[clock]\nmode = "real"\n')
         start = [sys.executable, "-m", "openant_tools.cli"]
-        virtual = subprocess.Popen([*start, "virtual", "start", "--scenario", scenario, "--ready-file", ready])
+        virtual = subprocess.Popen(
+            [*start, "virtual", "start", "--scenario", scenario, "--ready-file", ready], preexec_fn=first
+        )
+        process: subprocess.Popen[bytes] | None = None
         try:
             while not ready.is_file():
                 time.sleep(0.05)
@@ -97,18 +109,21 @@ def main() -> None:
                 sys.exit(f"training ended with status {process.returncode}")
             took = time.monotonic() - began
         finally:
-            virtual.terminate()
-            virtual.wait()
+            for one in (process, virtual):
+                if one is not None and one.poll() is None:
+                    one.terminate()
+                    one.wait()
         measured = periods(run / "recordings")
         late = int((measured > DT_S + LATE_S).sum())
         result = json.loads((folder / "result.json").read_text())
         transitions = np.fromfile(run / "transitions.f32", np.float32).reshape(-1, 59)
         interventions = (run / "interventions.csv").read_text().splitlines()[1:]
+        told = int((transitions[:, 33] > DT_S + LATE_S).sum())
         answer = {
             "steps": rows(run), "steps_at_kill": kept, "robot_minutes": result["seconds"] / 60, "wall_minutes": took / 60,
             "updates": result["updates"], "late_steps_in_recordings": late,
             # each transition carries the time that it took, those before the kill included
-            "late_steps_in_transitions": int((transitions[:, 33] > DT_S + LATE_S).sum()),
+            "late_steps_in_transitions": told,
             "late_steps_told_since_kill": result["late"],
             "period_median_s": float(np.median(measured)), "period_p99_s": float(np.quantile(measured, 0.99)),
             "interventions": interventions, "load_average": os.getloadavg()[0],
@@ -116,6 +131,8 @@ def main() -> None:
         print(json.dumps(answer, indent=2))
         if options.json is not None:
             options.json.write_text(json.dumps(answer, indent=2) + "\n")
+        if late > told:
+            sys.exit(f"{late - told} late steps were not reported")
 
 
 if __name__ == "__main__":
