@@ -280,7 +280,7 @@ def rank(out: Path, policies: Path, seconds: float, plays: int, docs: Path | Non
         "| robot | simulation | Spearman | Kendall | rank violation, cm/s | regret, cm/s | its best on the robot |",
         "|---|---|---|---|---|---|---|",
     ]
-    sums: dict[str, list[float]] = {}
+    sums: dict[str, list[tuple[float, ...]]] = {}
     for real in sorted(out.glob("models/*/real.json")):
         place, answer = real.parent, real.parent / "ranking.json"
         nominal = out / "nominal.json"
@@ -295,21 +295,22 @@ def rank(out: Path, policies: Path, seconds: float, plays: int, docs: Path | Non
                 words += ["--sim", f"{name}={place / name}.json"]
         if openant(
             "policies", "rank", "--policies", policies, "--real", real, "--sim", f"nominal={nominal}", *words,
-            "--seconds", seconds, "--report", place / "ranking", "--json", answer,
+            "--flag-by", "none", "--report", place / "ranking", "--json", answer,
         ):  # fmt: skip
             continue
         diagnosis = place / "diagnosis.json"
         verdict = json.loads(diagnosis.read_text())["verdict"] if diagnosis.exists() else "not diagnosed"
         for name, one in json.loads(answer.read_text())["agreement"].items():
             s, k = one["spearman"], one["kendall"]
-            sums.setdefault(name, []).append(s["value"])
+            violation, lost = 100 * one["rank_violation_m_s"]["value"], 100 * one["regret_m_s"]["value"]
+            sums.setdefault(name, []).append((s["value"], k["value"], violation, lost))
             lines.append(
                 f"| {place.name} ({verdict}) | {name} | {s['value']:.2f} [{s['low']:.2f}, {s['high']:.2f}] | {k['value']:.2f}"
-                f" [{k['low']:.2f}, {k['high']:.2f}] | {100 * one['rank_violation_m_s']['value']:.1f} |"
-                f" {100 * one['regret_m_s']['value']:.1f} | {one['best_is']} of {one['policies']} |"
+                f" [{k['low']:.2f}, {k['high']:.2f}] | {violation:.1f} | {lost:.1f} | {one['best_is']} of {one['policies']} |"
             )
     for name, values in sums.items():
-        lines.append(f"| mean of {len(values)} | {name} | {np.mean(values):.2f} | | | | |")
+        s, k, violation, regret = np.mean(values, axis=0)
+        lines.append(f"| mean of {len(values)} | {name} | {s:.2f} | {k:.2f} | {violation:.1f} | {regret:.1f} | |")
     text = "\n".join(lines)
     print(text)
     if docs is not None:
