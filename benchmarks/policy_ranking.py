@@ -6,9 +6,10 @@
     python benchmarks/policy_ranking.py rank   --out SET --policies DIR [--docs docs/policies-result.md]
 
 `make` draws robots with one medium or large effect each, whose answers are sealed, and lets each play the blind benchmark's
-runs. `models` makes three simulations of each robot from these runs alone: the nominal model, `sysid fit`'s, and that of
-`gap diagnose`, which calibrates the nominal model and adds the effects that it finds: all robots are then compared with the
-same simulated ones, made once (of `--motions`, where a set of those motions was prepared before). `play` lets policies walk on the true robots, simulated by the blind benchmark's own code at half a
+runs. `models` makes three simulations of each robot from these runs alone: the nominal model; `sysid fit`'s; and the nominal
+model with the effects that `gap diagnose` finds, calibrated again by `sysid fit` with them in it. Diagnosing the nominal model
+compares all robots with the same simulated ones, made once (of `--motions`, where a set of those motions was prepared before).
+`play` lets policies walk on the true robots, simulated by the blind benchmark's own code at half a
 millisecond: no line of it is the environments'. `rank` plays them in the simulations (`openant policies rank`).
 Each step goes on where it was stopped.
 """
@@ -65,8 +66,8 @@ def openant(*words: object) -> int:
     ).returncode
 
 
-def models(out: Path) -> None:
-    for folder in sorted(out.glob("robot-*")):
+def models(out: Path, only: str | None) -> None:
+    for folder in sorted(out.glob(only or "robot-*")):
         place = out / "models" / folder.name
         runs = [folder / f"{name}.parquet" for name in RUNS]
         stand = [run for run in runs if run.name.startswith("stand")]
@@ -74,8 +75,9 @@ def models(out: Path) -> None:
         begun = time.monotonic()
         if not (place / "fit" / "calibrated.xml").exists():
             openant(
-                "sysid", "fit", *stand, "--hold-out", held_out[0], "--model", out / "model.xml", "--out", place / "fit"
-            )
+                "sysid", "fit", *stand, "--hold-out", held_out[0], "--model", out / "model.xml", "--no-effects",
+                "--out", place / "fit",
+            )  # fmt: skip
         print(f"{folder.name}: fitted in {time.monotonic() - begun:.0f} s", flush=True)
         calibrated = place / "fit" / "calibrated.xml"
         _robot(place / "calibrated", calibrated)
@@ -86,16 +88,19 @@ def models(out: Path) -> None:
             openant("gap", "diagnose", *runs, *words, "--model", out / "model.xml", "--json", diagnosis)
         verdict = json.loads(diagnosis.read_text())["verdict"]
         print(f"{folder.name}: diagnosed as {verdict} in {time.monotonic() - begun:.0f} s", flush=True)
-        if not (place / "diagnosed").exists():
-            _robot(place / "diagnosed", out / "model.xml")
+        diagnosed, begun = place / "diagnosed", time.monotonic()
+        if not (diagnosed / "improved.xml").exists():
+            _robot(diagnosed, out / "model.xml")
             openant(
-                "gap", "apply", diagnosis, "--model", out / "model.xml", "--out", place / "diagnosed" / "improved.xml",
-                "--robot", place / "diagnosed",
+                "gap", "apply", diagnosis, "--model", out / "model.xml", "--out", diagnosed / "improved.xml",
+                "--robot", diagnosed,
             )  # fmt: skip
-            from openant_tools.robot.folder import RobotFolder
-
-            if (place / "diagnosed" / "improved.xml").exists():
-                RobotFolder.at(place / "diagnosed").update({"model": "improved.xml"})
+        if not (place / "fit-diagnosed" / "fit.json").exists():
+            openant(
+                "sysid", "fit", *stand, "--hold-out", held_out[0], "--robot", diagnosed, "--no-effects",
+                "--out", place / "fit-diagnosed",
+            )  # fmt: skip
+        print(f"{folder.name}: fitted again with what was found in {time.monotonic() - begun:.0f} s", flush=True)
 
 
 def _robot(folder: Path, model: Path) -> None:
@@ -331,7 +336,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--plays", type=int, default=3)
     parser.add_argument("--docs", type=Path)
-    parser.add_argument("--only", metavar="ROBOT", help="play on this one only, such as robot-000")
+    parser.add_argument("--only", metavar="ROBOT", help="model or play on this one only, such as robot-000")
     chosen = parser.parse_args()
     key = None
     if chosen.key_file is not None:
@@ -341,7 +346,7 @@ def main() -> None:
     if chosen.step == "make":
         make(chosen.out, chosen.robots, chosen.seed_from, chosen.motions, key)
     elif chosen.step == "models":
-        models(chosen.out)
+        models(chosen.out, chosen.only)
     elif chosen.step == "play":
         play(chosen.out, chosen.policies, key, chosen.seconds, chosen.plays, chosen.only)
     else:
