@@ -28,6 +28,7 @@ from openant_tools.robot.config import Effect as Entry
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
+from openant_tools.sysid.beyond import leaves_more_than_noise, with_effects
 from openant_tools.sysid.identify import identify
 from openant_tools.sysid.parameter import choose, colours
 from openant_tools.sysid.result import write_fit
@@ -205,7 +206,7 @@ def rubbing_pendulum(t: np.ndarray, command: np.ndarray, coefficient: float) -> 
     return np.array(out)
 
 
-def test_load_friction_of_another_simulation_is_identified_and_written(tmp_path: Path) -> None:
+def test_load_friction_of_another_simulation_is_found_unasked_and_written_beside_the_plain_fit(tmp_path: Path) -> None:
     path = write(tmp_path / "pendulum.xml", pendulum())
     t = np.arange(0.0, 5.0, 0.01)
     runs = []
@@ -215,20 +216,28 @@ def test_load_friction_of_another_simulation_is_identified_and_written(tmp_path:
         position = np.round(position / ENCODER_RAD) * ENCODER_RAD
         runs.append(Run(f"run{k}", Facts(joints=("joint",)), t, {"cmd.joint": command[:, 0], "pos.joint": position}))
     plain = identify(runs[:2], path, runs[2:])
-    result = identify(runs[:2], path, runs[2:], also=["load_friction"])
+    assert leaves_more_than_noise(plain)
+    result = with_effects(plain, runs[:2], runs[2:])
+    assert result is not None
     assert result.after.full < 0.6 * plain.after.full
     value = next(value for value in result.values if value.name == "load_friction.joint")
     assert value.accepted
     # Another law of friction at rest: near, if not within an interval that knows this one only.
     assert value.value == pytest.approx(0.25, abs=0.06)
 
-    written = write_fit(result, tmp_path / "fit")
-    assert tmp_path / "fit" / "calibrated.effects.toml" in written
-    entries = tomllib.loads((tmp_path / "fit" / "calibrated.effects.toml").read_text())["effect"]
+    out = tmp_path / "fit"
+    written = write_fit(plain, out, result)
+    beside = out / "with-effects" / "calibrated.effects.toml"
+    assert beside in written
+    assert out / "calibrated.xml" in written
+    assert not (out / "calibrated.effects.toml").exists()
+    entries = tomllib.loads(beside.read_text())["effect"]
     assert entries == [
         {"effect": "load_friction", "joints": ["joint"], "enabled": True,
          "parameters": {"coefficient": pytest.approx(value.value, rel=1e-5)}}
     ]  # fmt: skip
+    write_fit(plain, out)
+    assert sorted(file.name for file in out.iterdir()) == ["calibrated.xml", "fit.json", "report.html"]
 
 
 def test_entries_and_values_say_the_same() -> None:

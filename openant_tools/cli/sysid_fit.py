@@ -12,6 +12,7 @@ from openant_tools.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
+    from openant_tools.sysid.identify import Identification
 
 __all__ = ["fit"]
 
@@ -27,6 +28,7 @@ __all__ = ["fit"]
 @click.option("--kind", "kinds", multiple=True, metavar="KIND", help="Fit this kind of parameter only. Repeatable.")
 @click.option("--also", multiple=True, metavar="KIND", help="Fit this kind besides the default ones. Repeatable.")
 @click.option("--measured-supply", is_flag=True, help="Gains and torque limits follow the logged voltage.")
+@click.option("--no-effects", is_flag=True, help="Do not try what plain MuJoCo has no feature for.")
 @click.option(
     "--parameters",
     "declared",
@@ -45,6 +47,7 @@ def fit(
     kinds: tuple[str, ...],
     also: tuple[str, ...],
     measured_supply: bool,
+    no_effects: bool,
     declared: Path | None,
     tie: str,
     robot: Path | None,
@@ -63,14 +66,21 @@ def fit(
     coulomb_friction, zero_offset, action_delay; electrical_damping where torque was off for a while; floor_friction and
     contact_softness where the robot stood on the floor. Others by name: actuator_lag, torque_limit, speed_limit, link_mass,
     torso_mass, contact_impedance; and what MuJoCo has no feature for (load_friction, stribeck_friction_static_nm, dead_zone,
-    voltage_sag …), which is written to calibrated.effects.toml and into robot.toml, and acts in the environment. Anything else in an MJCF with --parameters (docs/identify.md). Exit code 1: nothing beats
+    voltage_sag …), which is written to calibrated.effects.toml and into robot.toml, and acts in the environment. Anything
+    else in an MJCF with --parameters (docs/identify.md).
+
+    Where what is left is not noise, load_friction is tried by itself; if held-out runs are followed better with it, that model
+    goes to DIR/with-effects and into the robot's folder, and DIR keeps the best for plain MuJoCo. Exit code 1: nothing beats
     the given model.
     """
+    from dataclasses import replace
+
     from openant_tools.recording.tables import read_run
     from openant_tools.robot.folder import RobotFolder
+    from openant_tools.sysid.beyond import TRIED, with_effects
     from openant_tools.sysid.declared import read_declarations
     from openant_tools.sysid.identify import identify
-    from openant_tools.sysid.result import write_fit, write_robot
+    from openant_tools.sysid.result import WITH_EFFECTS, write_fit, write_robot
 
     folder = None if robot is None else RobotFolder.at(robot)
     described = folder
@@ -79,6 +89,9 @@ def fit(
         model = described.model_path()
     recordings = [read_run(path) for path in runs]
     held_out = [read_run(path) for path in hold_out]
+    declarations = None if declared is None else read_declarations(declared)
+    entries = () if described is None else described.config().effects
+    richer = None
     with progress_bar("fitting", remaining=False) as tell:
         result = identify(
             recordings,
@@ -89,14 +102,30 @@ def fit(
             also=also,
             measured_supply=measured_supply,
             tie=tie,
-            declared=None if declared is None else read_declarations(declared),
-            effects=() if described is None else described.config().effects,
+            declared=declarations,
+            effects=entries,
             progress=tell,
         )
+        # A list of kinds that was given is the builder's word that nothing else is wanted.
+        if not (no_effects or kinds or (declarations and declarations.kinds)):
+            words = f"with {', '.join(kind.replace('_', ' ') for kind in TRIED)}"
+            richer = with_effects(
+                result,
+                recordings,
+                held_out,
+                also=also,
+                tie=tie,
+                declared=declarations,
+                measured_supply=measured_supply,
+                effects=entries,
+                progress=lambda what, done: tell(f"{words}: {what}", done),
+            )
+        if richer is not None:
+            result = replace(result, notes=(*result.notes, _recommendation(result, richer, out / WITH_EFFECTS)))
         tell("writing the report", 1.0)
-        written = write_fit(result, out)
-    if folder is not None and result.accepted:
-        write_robot(result, folder)
+        written = write_fit(result, out, richer)
+    if folder is not None and (result.accepted or richer is not None):
+        write_robot(richer or result, folder)
         written.append(folder.config_file)
 
     width = max(len(value.name) for value in result.values)
@@ -112,11 +141,27 @@ def fit(
     )
     for note in result.notes:
         click.echo(note)
-    if not result.accepted:
+    if not result.accepted and richer is None:
         click.echo("nothing that was fitted beats the given model on held-out runs; calibrated.xml is the given model")
     for path in written:
         click.echo(f"wrote {path}", err=True)
-    return 0 if result.accepted else 1
+    return 0 if result.accepted or richer is not None else 1
+
+
+def _recommendation(plain: Identification, richer: Identification, folder: Path) -> str:
+    from openant_tools.sysid.beyond import TRIED
+
+    found = [
+        f"{value.name} = {value.value:.3g} {value.unit}"
+        for value in richer.values
+        if value.accepted and value.name.partition(".")[0] in TRIED
+    ]
+    return (
+        f"More is explained by what plain MuJoCo has no feature for: with {', '.join(found)} the error on held-out runs is "
+        f"{1e3 * richer.after.full:.2f} instead of {1e3 * plain.after.full:.2f} mrad over full runs, and "
+        f"{1e3 * richer.after.horizon:.2f} instead of {1e3 * plain.after.horizon:.2f} mrad at 0.5 s. That model and its "
+        f"effects, which act in openant_env, are in {folder}; with --robot they are the robot's."
+    )
 
 
 def _robot_here() -> RobotFolder:

@@ -309,8 +309,8 @@ TORSO_STD = 0.05
 IMPEDANCE_STD = 0.15
 #: What brakes a DC servo beyond its friction is back-EMF, which vanishes with the torque: a share near 1, this uncertain.
 ELECTRICAL_STD = 0.3
-#: rad; a position error at which small servos have long saturated
-USUAL_ERROR_RAD = 0.3
+#: rad; the greatest error that a servo works with, about: gains may be set low, but the friction of its gears stays
+USUAL_ERROR_RAD = 1.0
 #: Friction of a small geared servo is of the order of a tenth of its stall torque; a model that has none says nothing
 #: about it, so its prior is that wide.
 FRICTION_SHARE = 0.1

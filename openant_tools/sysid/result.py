@@ -6,6 +6,7 @@ import contextlib
 import datetime
 import json
 import os
+import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -21,17 +22,24 @@ from openant_tools.sysid.identify import Identification, calibrated, restated
 from openant_tools.sysid.kinds import KINDS
 from openant_tools.sysid.report import fit_report
 
-__all__ = ["effects_beside", "write_fit", "write_robot"]
+__all__ = ["WITH_EFFECTS", "effects_beside", "write_fit", "write_robot"]
 
 CALIBRATED = "calibrated.xml"
 #: beside it: what MuJoCo has no feature for
 EFFECTS = "calibrated.effects.toml"
+#: the folder beside it for the fit that is better with effects than any without
+WITH_EFFECTS = "with-effects"
 
 
-def write_fit(result: Identification, out: Path) -> list[Path]:
+def write_fit(result: Identification, out: Path, richer: Identification | None = None) -> list[Path]:
     """Write the model, the figures and the report into `out`, together or not at all; returns what was written.
 
     Where nothing was accepted the model is the given one, so that a script can go on with `calibrated.xml` either way.
+
+    Args:
+        result: the fit.
+        out: the folder.
+        richer: what is better than it with effects that plain MuJoCo cannot play, for a folder of its own within.
     """
     runs = ", ".join(run.name for data in result.datasets for run in data.runs)
     note = f"Calibrated by `openant sysid fit` on {datetime.date.today()} from {result.model.name} and {runs}"
@@ -43,7 +51,13 @@ def write_fit(result: Identification, out: Path) -> list[Path]:
         fit_report(result).write(report)
         for path in effects:
             write_text(path, as_toml(entries, note))
-    return [out / name for name in names]
+    # What an earlier fit left here would pass for a part of this one.
+    if not entries:
+        (out / EFFECTS).unlink(missing_ok=True)
+    if richer is None:
+        shutil.rmtree(out / WITH_EFFECTS, ignore_errors=True)
+        return [out / name for name in names]
+    return [*(out / name for name in names), *write_fit(richer, out / WITH_EFFECTS)]
 
 
 @contextmanager

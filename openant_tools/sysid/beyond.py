@@ -1,0 +1,76 @@
+"""What a plain model leaves, tried with the effects that MuJoCo has no feature for.
+
+A fit of what MuJoCo carries comes first, because its model plays anywhere. Where what it leaves is not noise, the same fit
+is done once more with what geared servos are known to do beside it, and kept apart: only if it follows held-out runs better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from openant_tools.recording.run import Run
+from openant_tools.robot.config import Effect as Entry
+from openant_tools.sysid.declared import Declaration
+from openant_tools.sysid.fit import WHITE, sensor_floor
+from openant_tools.sysid.identify import WORTH, Identification, identify
+
+__all__ = ["TRIED", "leaves_more_than_noise", "with_effects"]
+
+Progress = Callable[[str, float], None]
+
+#: the effects, as kinds of parameters: on real gears (docs/effects.md) no law of constant friction explains as much
+TRIED = ("load_friction",)
+#: residuals below this many deviations of the encoder's rounding are not worth a second fit
+WORTH_LOOKING = 3.0
+
+
+def leaves_more_than_noise(result: Identification) -> bool:
+    """Whether some joint's residual is the model's error: far above the encoder's step, and no white noise."""
+    runs = [run for data in result.datasets for run in data.runs]
+    period = float(np.median(np.concatenate([np.diff(run.t) for run in runs])))
+    floor = sensor_floor(runs, result.joints)
+    return any(
+        result.correlation_s[joint] > WHITE * period and result.noise[joint] > WORTH_LOOKING * least
+        for joint, least in zip(result.joints, floor, strict=True)
+    )
+
+
+def with_effects(
+    plain: Identification,
+    runs: Sequence[Run],
+    hold_out: Sequence[Run] = (),
+    *,
+    also: Sequence[str] = (),
+    tie: str = "joint",
+    declared: Declaration | None = None,
+    measured_supply: bool = False,
+    effects: Sequence[Entry] = (),
+    progress: Progress | None = None,
+) -> Identification | None:
+    """The fit with TRIED beside what `plain` fitted, if that follows held-out runs better at both horizons; else None.
+
+    Args:
+        plain: what `identify` made of the same runs with the same arguments.
+        runs, hold_out, also, tie, declared, measured_supply, effects, progress: as `identify` took them.
+    """
+    known = {name for name, _ in plain.acting}
+    tried = [kind for kind in TRIED if kind not in (*also, *known)]
+    if not tried or not leaves_more_than_noise(plain):
+        return None
+    richer = identify(
+        runs,
+        plain.model,
+        hold_out,
+        joints=plain.joints,
+        also=[*also, *tried],
+        tie=tie,
+        declared=declared,
+        measured_supply=measured_supply,
+        effects=effects,
+        progress=progress,
+    )
+    found = any(value.accepted and value.name.partition(".")[0] in tried for value in richer.values)
+    short, long = richer.after.horizon / plain.after.horizon, richer.after.full / plain.after.full
+    return richer if found and max(short, long) < 1.0 and min(short, long) < 1.0 - WORTH else None
