@@ -411,6 +411,9 @@ class Engine:
 
     def _cycle(self, wake: float, cycles: int) -> None:
         if self._lost:
+            if self._recorder is not None:
+                gone = [(Answer(servo.id, None, 0, Cause.PORT), None) for servo in self._servos.servos]
+                self._record(self.clock.now(), None, wake, gone, None)
             self._try_reopen()
             return
         cmd_t: float | None = None

@@ -33,8 +33,8 @@ COMB_WAIT_S = 2.5e-3
 BEATS = 0.5
 #: s, USB hands over in frames of it, timers count in it; share of steps that are whole ones where answers come so
 TICK_S, IN_TICKS = 1e-3, 0.6
-#: parts of a timer's period, of which each has so much of its share where reads begin at all phases alike
-PHASES, EVEN = 12, 0.6
+#: s, parts of a timer's period, of which each has so much of its share where reads begin at all phases alike
+PHASE_S, EVEN = 0.1e-3, 0.6
 #: bytes that the longest block read of ours is long on the wire, with its frame
 LONGEST_ANSWER = 38
 #: episodes a minute where `often` begins; a thousand times as many are as often as can be
@@ -540,9 +540,9 @@ def _least_waits(rtt: Array, wire: float, period_s: float) -> Array:
     """(J,) s that each servo waits at least before it answers, where a timer of this period hands answers over.
 
     An answer ends within the period before the tick that brings it. Reads begin at several phases of the timer, so that its
-    end is known better than to a period: after the latest tick less a period, and before the earliest one; and not
-    before the end of the answer before it and its own time on the wire. What USB adds now and then blurs that by some tenths
-    of a ms, too much for single servos where the timer is long: then only the whole staircase counts.
+    end is known better than to a period: after the latest tick less a period, and before the earliest one; and not before
+    the end of the answer before it. What USB adds now and then blurs that by some tenths of a ms, too much for single servos
+    where the timer is long: then only the whole staircase counts.
     """
     j = rtt.shape[1]
     low, high = np.full(j, -np.inf), np.full(j, np.inf)
@@ -558,10 +558,7 @@ def _least_waits(rtt: Array, wire: float, period_s: float) -> Array:
     first, last = seen[0], seen[-1]
     waits = np.full(j, max(0.0, (low[last] - high[first]) / (last - first) - wire))
     if period_s <= TICK_S:
-        for k in range(1, j):
-            low[k] = max(low[k], low[k - 1] + wire)
-        for k in range(j - 2, -1, -1):
-            high[k] = min(high[k], high[k + 1] - wire)
+        low, high = np.maximum.accumulate(low), np.minimum.accumulate(high[::-1])[::-1]
         waits[1:] = np.maximum(waits[1:], low[1:] - high[:-1] - wire)
     return waits
 
@@ -569,7 +566,7 @@ def _least_waits(rtt: Array, wire: float, period_s: float) -> Array:
 def _at_all_phases(rtt: Array, period_s: float) -> bool:
     """Whether reads begin at all phases of a timer alike."""
     first = rtt[np.isfinite(rtt[:, 0]), 0]
-    count = np.histogram(first / period_s % 1.0, PHASES, (0.0, 1.0))[0]
+    count = np.histogram(first / period_s % 1.0, round(period_s / PHASE_S), (0.0, 1.0))[0]
     return bool(count.min() > EVEN * count.mean())
 
 
