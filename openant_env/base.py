@@ -14,7 +14,7 @@ from openant_env.actions import action_map
 from openant_env.metrics import AverageReward
 from openant_env.observations import ORDERS, layout
 from openant_env.robots import SimulatedRobot
-from openant_env.tasks import make_task
+from openant_env.tasks import BackAndForth, make_task
 from openant_tools.errors import BadInput
 
 __all__ = ["AntBase", "Observation", "OnFall", "unit"]
@@ -64,7 +64,8 @@ class AntBase(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
             robot.action_range if action_range is None else action_range, joints, robot.low, robot.high
         )
         self.layout = layout(joints, observation_order)
-        self.task = make_task(task, task_options)
+        circle = {"radius_m": robot.arena.radius_m} if task == BackAndForth.name else {}
+        self.task = make_task(task, {**circle, **(task_options or {})})
         self.average_reward = AverageReward()
         self._on_fall = on_fall
         self._time_limit_s = math.inf if time_limit_s is None else float(time_limit_s)

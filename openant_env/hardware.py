@@ -75,7 +75,8 @@ class AntHardware(AntBase):
             "default". One that is started here stands on the floor where its scenario allows.
         clock: "real" or "stepped", of a virtual robot started here; None for stepped unless its scenario says otherwise.
         task, task_options, dt, action_range, observation_order, on_fall, time_limit_s: as in `openant_env.ant`. The
-            circle's centre is where the robot stands first, unless `task_options` say otherwise.
+            circle's centre is that of robot.toml's `[arena]`, else where the robot stands first, unless `task_options`
+            say otherwise.
         bus, imu, camera: in place of what robot.toml names.
         recordings: folder for the recording of every connection; None: `recordings/` of the robot's folder.
         tag_patience_s: s without a pose, which keeps its last value meanwhile, after which the robot counts as lost.
@@ -118,7 +119,10 @@ class AntHardware(AntBase):
             on_fall=on_fall, time_limit_s=time_limit_s,
         )  # fmt: skip
         self.render_mode = None
+        centre = self.robot.arena.centre_m
         self._chosen_origin = "origin" in (task_options or {})
+        if isinstance(self.task, BackAndForth) and centre is not None and not self._chosen_origin:
+            (self.task.ox, self.task.oy), self._chosen_origin = centre, True
         self._tag_patience_s = float(tag_patience_s)
         self._patience_s = math.inf if patience_s is None else float(patience_s)
         self._notice = notice or _log.warning

@@ -18,7 +18,7 @@ from openant_tools.effects.rollout import EffectValues
 from openant_tools.effects.sensing import SensingEffects
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, load_plant
-from openant_tools.robot.config import ACTION_PRESETS, ActionRange, Effect
+from openant_tools.robot.config import ACTION_PRESETS, ActionRange, Arena, Effect
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import ANGLE_LIMIT_RAD
@@ -47,6 +47,7 @@ class SimulatedRobot:
         action_range: what actions of −1…1 mean unless someone asks for another range.
         dt_s: s, the length of a step unless someone asks for another.
         measured_bounds: name of an observation → (low, high), as far as they were measured.
+        arena: the circle to learn in.
         folder: the robot's folder, None for the nominal one.
         identified: whether its model is one that was fitted to it; the nominal robot is what it is.
         effects: what acts beside the model, between its steps; commands: on the way to the servos; sensing: in sensors.
@@ -64,6 +65,7 @@ class SimulatedRobot:
     commands: CommandEffects | None = None
     sensing: SensingEffects | None = None
     joints: tuple[str, ...] = tuple(JOINTS)
+    arena: Arena = field(default_factory=Arena)
 
     def load(self) -> Plant:
         """Its model on the floor, with the sensors `pos.J` and `vel.J` added where the file has none.
@@ -146,6 +148,7 @@ def simulated_robot(
         effects=values_of(acting, tuple(JOINTS), folder.config_file),
         commands=commands_of(acting, tuple(JOINTS), folder.config_file),
         sensing=sensing_of(acting, folder.config_file),
+        arena=config.arena,
     )
 
 

@@ -54,7 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> RobotFolder:
     """A robot whose zeros someone has measured, and whose tag is known."""
     return create_robot(
         tmp_path_factory.mktemp("robot") / "my-ant",
-        values={"camera.body_tag_id": 12},
+        values={"camera.body_tag_id": 12, "arena.centre_m": [0.1, -0.05], "arena.radius_m": 0.4},
         provenance={"motors": Provenance("measured", "openant calib zeros")},
     )
 
@@ -141,6 +141,8 @@ def test_it_has_the_spaces_and_words_of_the_simulation(walker: Walker, folder: R
     assert real.observation_space == simulated.observation_space
     assert real.action_space == simulated.action_space
     assert real.describe() == simulated.describe()
+    assert (real.task.ox, real.task.oy, real.task.radius_m) == (0.1, -0.05, 0.4)
+    assert (simulated.task.ox, simulated.task.oy, simulated.task.radius_m) == (0.0, 0.0, 0.4)
     (first, before), (theirs, info) = real.reset(seed=3), simulated.reset(seed=3)
     assert before.keys() >= info.keys()
     seen = dict(zip(real.observation_names, zip(first, theirs, strict=True), strict=True))
