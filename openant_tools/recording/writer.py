@@ -143,9 +143,10 @@ class RecordingWriter:
     def cycle(self, cycle: Cycle) -> None:
         """Record one turn of the bus loop. Costs a microsecond: encoding and disk are another thread's."""
         if self._shift:
-            times = {"cmd_t": cycle.cmd_t, "obs_t": cycle.obs_t, "act_t": cycle.act_t}
-            moved = {name: None if at is None else at + self._shift for name, at in times.items()}
-            cycle = replace(cycle, t=cycle.t + self._shift, **moved)
+            cmd_t, obs_t, act_t = (
+                None if at is None else at + self._shift for at in (cycle.cmd_t, cycle.obs_t, cycle.act_t)
+            )
+            cycle = replace(cycle, t=cycle.t + self._shift, cmd_t=cmd_t, obs_t=obs_t, act_t=act_t)
         self._put((_CYCLE, cycle.t, cycle))
         self.cycles += 1
 
