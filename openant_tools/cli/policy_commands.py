@@ -47,5 +47,5 @@ def policy_commands(run: Path, out: Path, folder: RobotFolder | None) -> Path:
     table = out.with_name(f"{out.stem}-policy.parquet")
     columns = {f"cmd.{joint}": column for joint, column in zip(joints, commands.T, strict=True)}
     facts = Facts(joints=joints, setup="floor", protocol="walk", notes=f"commanded by {run} in the simulation")
-    write_table(Run(table.stem, facts, np.arange(len(commands)) * dt, columns), table)
+    write_table(Run(table.stem, facts, dt * np.arange(len(commands), dtype=np.float64), columns), table)
     return table
