@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -590,7 +590,7 @@ class Engine:
     # ---- what a cycle leaves behind ------------------------------------------------------------------------------
 
     def _record(
-        self, t: float, cmd_t: float | None, wake: float, answers: list[tuple[Answer, Block | None]],
+        self, t: float, cmd_t: float | None, wake: float, answers: Sequence[tuple[Answer, Block | None]],
         agent: tuple[float, float] | None,
     ) -> None:  # fmt: skip
         assert self._recorder is not None
