@@ -284,7 +284,7 @@ def test_a_virtual_robot_does_not_outlive_who_started_it(tmp_path):
         time.sleep(0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 @pytest.mark.timeout(1800)
 def test_from_loose_motors_to_a_passport_and_on_to_learning(tmp_path):
     ant, report = tmp_path / "ant", tmp_path / "walk.json"

@@ -280,7 +280,8 @@ size = 0.03
 # ---- the whole walk ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
+@pytest.mark.timeout(1800)
 def test_the_whole_walk_by_its_screens_from_loose_motors_to_the_passport(tmp_path: Path, brisk: None) -> None:
     said = dict[str, str]()
 
