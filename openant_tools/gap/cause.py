@@ -124,6 +124,7 @@ class Cause:
         together: sizes share one magnitude in a random direction (a vector); else each is drawn by itself.
         shows: whether it can show on what was recorded.
         signal: the signal of the log that it acts on, where that is not the motion itself.
+        witness: a signal that shows it beside the motion, and nothing else does.
         stated: from the quantities to the catalogue's parameters, where those are not the same.
         restored: from a diagnosis' parameters back to the quantities, with what its coordinates were.
     """
@@ -138,6 +139,7 @@ class Cause:
     together: bool = False
     shows: Callable[[Reference], bool] = everywhere
     signal: str | None = None
+    witness: str | None = None
     stated: Callable[[Values, Reference, Ints], dict[str, float]] = lambda values, reference, joints: dict(values)
     restored: Callable[[Values, Values, Reference, Ints], dict[str, float]] = lambda given, x, reference, joints: dict(
         given

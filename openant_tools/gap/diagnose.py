@@ -25,10 +25,13 @@ from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis,
 from openant_tools.gap.explain import Explained, Part, Scene, fit, robot_with
 from openant_tools.gap.features import Floats, differences
 from openant_tools.gap.judge import Judge, Judgement, train, whitening_of
+from openant_tools.gap.late import late_velocity
 from openant_tools.gap.measure import Measurement, measure
+from openant_tools.gap.next import suggestion
 from openant_tools.gap.prepare import Prepared, prepare
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.robot import Robot
+from openant_tools.gap.sets import SetFits, choose, motions_of
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.gap import excess
 from openant_tools.model.plant import Setup
@@ -55,6 +58,8 @@ PLACES = 2
 ADDS, ADDS_ALONE, EXPLAINS = 0.02, 0.2, 0.35
 #: °C between runs from which heat is asked about, and its cause
 WARMED_C, HEAT = 2.5, "thermal_derating"
+#: 1/°C of torque that any motor loses: copper's resistance grows by 0.4 %, and its magnets weaken; twice that is an effect
+COPPER = 0.01
 #: gaps that are so many floors, of robots whose energy is so many gates, ask for an explanation; beyond ODD gates no robot of
 #: the build is healthy, whatever the judge says
 LARGE, STRANGE, ODD = 3.0, 3.0, 20.0
@@ -62,6 +67,12 @@ LARGE, STRANGE, ODD = 3.0, 3.0, 20.0
 APART = 0.01
 #: s that a diagnosis gives to simulated robots where the protocol was never seen; `prepare` by itself takes what it needs
 PREPARE_S = 900.0
+#: robots of no more joints are cheap to simulate: all suspects are fitted together
+FEW_JOINTS = 2
+#: nothing is surer
+SURELY = 0.99
+#: effects in a set that is not told from others, at most
+TOGETHER = 3
 #: how what is left of the gap counts beside the judge's probability
 LEFT_COUNTS = 5.0
 
@@ -107,20 +118,27 @@ def diagnose(
     case = _Case(protocol, coarse, prepared, measured, judge, found, training, model, runs, hold_out)
     judgement = judge.say(case.features)
     first = _shown(judgement, protocol)
-    if first[0][1] < DOUBT and judgement.energy < STRANGE:
+    # No template was as warm as this robot was in each run: what a thermometer shows is asked about wherever it may sit.
+    warmed = [HEAT] if max(float(one.warm_c.max()) for one in protocol.runs) > WARMED_C else []
+    if first[0][1] < DOUBT and judgement.energy < STRANGE and not warmed:
         tell(1.0, "done")
         return _healthy(case, judgement, first)
     scenes = _scenes(prepared, coarse, found, training)
     # Where nothing is likely and yet the log is strange, the likeliest few have to answer.
     puzzled = first[0][1] < FINDING and judgement.energy > STRANGE
     suspects = [name for n, (name, chance) in enumerate(first) if chance > SUSPECT or n < LIKELIEST][:SUSPECTS]
-    if puzzled:
+    few = len(wanted) <= FEW_JOINTS
+    if puzzled or few:
         suspects = [name for name, _ in first[: max(PUZZLED, len(suspects))]]
-    # No template was as warm as this robot was in each run: what a thermometer shows is asked about wherever it may sit.
-    warmed = [HEAT] if max(float(one.warm_c.max()) for one in protocol.runs) > WARMED_C else []
+    if few:
+        suspects += [name for name in _questioned(protocol) if name not in suspects and name in judgement.places]
     suspects += [name for name in warmed if name not in suspects and name in judgement.places]
     explained = _explain(scenes, suspects, judgement, thorough=warmed)
+    if warmed and HEAT in explained and explained[HEAT].x["loss_per_c"] < COPPER and len(explained) > 1:
+        del explained[HEAT]
     tell(0.85, "held-out runs")
+    if few:
+        return _decide_together(case, judgement, first, explained)
     return _decide(case, judgement, first, explained, scenes)
 
 
@@ -387,6 +405,107 @@ def _decide(
     )  # fmt: skip
 
 
+def _questioned(protocol: Protocol) -> list[str]:
+    """What the given model may get wrong by construction: that is tried whatever the judge says."""
+    out = []
+    if not protocol.reference.friction.any():
+        out.append("coulomb_friction")
+    if any((one.run.signal("torque", protocol.joints, default=1.0) == 0).any() for one in protocol.runs):
+        # Damping that stands in the joint brakes with torque off, too.
+        out.append("electrical_damping")
+    return out
+
+
+def _decide_together(
+    case: _Case, judgement: Judgement, ranked: Sequence[tuple[str, float]], explained: dict[str, Explained]
+) -> Diagnosis:
+    """Real servos have several causes at once: where all can be fitted together they are, and what can be spared goes."""
+    windows = Windows(case.protocol)
+    fits = SetFits(windows, case.training, list(range(len(case.training), len(case.protocol.runs))))
+    probability = dict(ranked)
+    moving = [name for name in explained if not catalogue()[name].beside_joints]
+    seen = {signal for one in case.protocol.runs for signal in one.seen}
+    witnessed = {name for name in moving if catalogue()[name].witness in seen and probability[name] > FINDING}
+    parts, starts = [explained[name].part for name in moving], [explained[name].x for name in moving]
+    choice = choose(fits, parts, starts, probability, witnessed)
+    chosen, floor = choice.chosen, float(np.sqrt(np.mean(windows.floor**2)))
+    notes = [
+        f"closed where left out: {', '.join(f'{name} {100 * share:.0f} %' for name, share in chosen.folds.items())}"
+    ]
+    late = _late_register(case)
+    if late is not None:
+        explained, probability = (
+            {**explained, late[0].part.cause: late[0]},
+            {**probability, late[0].part.cause: late[1]},
+        )
+    beside = []
+    for name, one in explained.items():
+        if name in chosen.names or probability[name] < FINDING:
+            continue
+        shares = sorted(fits.by_signal(chosen.refit, one.part, one.x).items(), key=lambda item: -item[1])
+        if shares and shares[0][1] > ADDS:
+            beside.append(name)
+            notes.append(f"{name} moves no joint and closes {100 * shares[0][1]:.0f} % of the gap of {shares[0][0]}")
+    likely = max((probability[name] for name in chosen.names), default=0.0)
+    gained = chosen.closed - choice.nothing.closed
+    sure = likely > FINDING or (judgement.energy > 1 and gained > ADDS_ALONE and chosen.closed > EXPLAINS)
+    selected = (*(choice.removal if sure else ()), *beside)
+    ambiguous: tuple[tuple[str, ...], ...] = ()
+    one_motion = len(motions_of(case.protocol, range(len(case.protocol.runs)))) == 1
+    if not selected:
+        verdict = NONE if judgement.energy < ODD else UNEXPLAINED
+    elif selected[0] in beside:
+        verdict = selected[0]
+    elif excess(chosen.before, floor) > LARGE * floor and min(chosen.closed - EXPLAINS, chosen.worst) < 0:
+        verdict, selected = UNEXPLAINED, ()
+    elif one_motion or choice.open:
+        others = choice.rival.names if choice.rival is not None else ()
+        likeliest = [name for name, _ in ranked if name in moving]
+        group = dict.fromkeys((selected[0], *(name for name in (*others, *likeliest) if name not in chosen.names)))
+        verdict, ambiguous = AMBIGUOUS, (tuple(group)[:TOGETHER],)
+        if one_motion:
+            notes.append("one kind of motion alone: what fits it may fit no other")
+    else:
+        verdict = selected[0]
+    order = [
+        *selected,
+        *sorted((name for name in explained if name not in selected), key=lambda name: -probability[name]),
+    ]
+    effects = []
+    for name in order:
+        one, alone = explained[name], choice.alone.get(name)
+        if alone is None:
+            effects.append(_found(case, one, probability[name], None))
+            continue
+        fitted = chosen if name in chosen.names else alone
+        one = dataclasses.replace(one, x=fitted.point(name), std=fitted.spread(name))
+        effects.append(_found(case, one, probability[name], dataclasses.replace(alone.closure, refit=fitted.refit)))
+    gap = {
+        "before": chosen.before, "after": chosen.before if verdict == NONE else chosen.after, "floor": floor,
+        "refit": choice.nothing.after,
+    }  # fmt: skip
+    confidence = 1 - likely if verdict == NONE else max((probability[name] for name in selected[:1]), default=likely)
+    return _diagnosis(
+        case, verdict, confidence, (*effects, *_rest(ranked, order)), selected, ambiguous, gap,
+        {name: choice.removal[name] for name in selected if name in choice.removal}, judgement,
+        None if verdict == NONE else calibration_of(windows, chosen.refit), notes,
+    )  # fmt: skip
+
+
+def _late_register(case: _Case) -> tuple[Explained, float] | None:
+    """A velocity register that is late by the log's own word, with the probability that it is so beyond tolerance."""
+    joints = case.protocol.joints
+    late = late_velocity([one.run for one in case.protocol.runs], joints)
+    cause = catalogue()["sensor_delay"]
+    least = next(q.small for q in cause.quantities if q.name == "vel")
+    if late is None or late.beyond(least) < FINDING:
+        return None
+    x, std = (
+        {q.name: value if q.name == "vel" else 0.0 for q in cause.quantities} for value in (late.delay_s, late.std_s)
+    )
+    return Explained(Part(cause.name, tuple(range(len(joints)))), x, std, math.nan), min(late.beyond(least), SURELY)
+
+
 def _score(probability: float, closure: Closure) -> float:
     """How a cause ranks: by the judge, and by what it leaves of the gap on held-out runs."""
     return math.log(max(probability, 1e-3)) - LEFT_COUNTS * math.log(max(1 - closure.closed, 0.0) + 0.05)
@@ -413,7 +532,7 @@ def _rest(ranked: Sequence[tuple[str, float]], done: Sequence[str]) -> tuple[Fou
 def _diagnosis(
     case: _Case, verdict: str, confidence: float, effects: tuple[Found, ...], selected: tuple[str, ...],
     ambiguous: tuple[tuple[str, ...], ...], gap: dict[str, float], removal: dict[str, float], judgement: Judgement,
-    calibration: dict[str, dict[str, float]] | None,
+    calibration: dict[str, dict[str, float]] | None, notes: Sequence[str] = (),
 ) -> Diagnosis:  # fmt: skip
     signals = case.measured.as_json()["signals"]
     return Diagnosis(
@@ -425,12 +544,12 @@ def _diagnosis(
         effects=effects,
         selected=selected,
         ambiguous_with=ambiguous,
-        next_experiment=None,
+        next_experiment=suggestion(verdict, ambiguous, len(motions_of(case.protocol, range(len(case.protocol.runs))))),
         gap={**gap, "energy": judgement.energy, "signals": signals},
         where=case.measured.as_json()["where"],
         calibration=calibration or {},
         removal=removal,
-        notes=_notes(case),
+        notes=(*_notes(case), *notes),
     )
 
 

@@ -22,7 +22,7 @@ from openant_tools.gap.robot import Reference, Robot
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.rollout import Rollouts
 
-__all__ = ["Explained", "Hypothesis", "Part", "Scene", "fit", "robot_with"]
+__all__ = ["Explained", "Hypothesis", "Part", "Scene", "bounds_of", "fit", "robot_with"]
 
 Array = NDArray[np.float64]
 
@@ -171,17 +171,17 @@ def fit(scene: Scene, starts: Mapping[Part, Mapping[str, float]]) -> list[Explai
 
 
 def _bounds(search: _Search) -> tuple[Array, Array]:
-    low, high = [], []
-    for q in search.quantities:
-        if q.shape:
-            low.append(q.small / 2)
-            high.append(q.large * 2)
-            continue
-        low.append(-q.large * BEYOND if q.signed else 0.0)
-        # A share cannot be more than all.
-        share = q.unit == "1" and not q.signed and search.part.cause != "payload"
-        high.append(min(q.large * BEYOND, WHOLE) if share else q.large * BEYOND)
+    low, high = zip(*(bounds_of(q) for q in search.quantities), strict=True)
     return np.array(low), np.array(high)
+
+
+def bounds_of(q: Quantity) -> tuple[float, float]:
+    """Between which a coordinate is sought."""
+    if q.shape:
+        return q.small / 2, q.large * 2
+    # A share cannot be more than all.
+    share = q.unit == "1" and not q.signed
+    return -q.large * BEYOND if q.signed else 0.0, min(q.large * BEYOND, WHOLE) if share else q.large * BEYOND
 
 
 def _evaluate(scene: Scene, searches: Sequence[_Search]) -> None:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.gap.apply import robot_of
-from openant_tools.gap.diagnosis import NONE, Diagnosis, Found
+from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
 from openant_tools.gap.protocol import FLOOR_STEP_S, STAND_STEP_S
 from openant_tools.gap.robot import USUAL_NOISE, Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
@@ -32,7 +32,7 @@ from openant_tools.recording.run import Facts, Run
 from openant_tools.robot.joints import JOINTS
 from openant_tools.sysid.protocols import FULL, PROTOCOLS, CommandSpace, Protocol, protocols
 
-__all__ = ["Answer", "Experiment", "experiments"]
+__all__ = ["Answer", "Experiment", "experiments", "suggestion"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
@@ -47,6 +47,8 @@ SECONDS, RATE_HZ = 8.0, 50.0
 BLOCK_S = 0.1
 #: experiments shown
 SHOWN = 5
+#: kinds of motion without which too many causes fit a robot
+KINDS = 3
 #: rad, of joints without a range
 REACH_RAD = 0.6
 
@@ -150,6 +152,32 @@ def experiments(
     else:
         said = "No protocol of the library tells these apart well; log more signals (current, voltage, IMU), or repeat the runs."
     return Answer(said, open_, (*listed, *by_hand))
+
+
+def suggestion(verdict: str, together: Sequence[Sequence[str]], kinds: int) -> str | None:
+    """What to record or do to settle what a diagnosis leaves open, without simulating anything; None where nothing is.
+
+    Args:
+        together: causes that it could not tell apart. kinds: of motion, that its runs had.
+    """
+    if verdict not in (AMBIGUOUS, UNEXPLAINED):
+        return None
+    if kinds < KINDS:
+        return (
+            f"record at least {KINDS} kinds of motion, steps and slow reversals among them, and each at two gains where the "
+            "servo lets you: too many causes fit fewer"
+        )
+    for group in together:
+        for pair in itertools.combinations(group, 2):
+            action = ACTIONS.get(frozenset(pair))
+            if action is not None:
+                return f"{action[0]}: {action[1]}"
+    if verdict == AMBIGUOUS:
+        return "record another motion: `openant gap next` on the JSON of this diagnosis says which tells these causes apart best"
+    return (
+        "look at the robot where the gap is largest, and repeat the runs, so that what changes from run to run is told from "
+        "what does not"
+    )
 
 
 def _possible(found: Diagnosis) -> list[Found]:

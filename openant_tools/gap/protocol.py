@@ -23,7 +23,7 @@ from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 
-__all__ = ["Played", "Protocol", "same", "shown"]
+__all__ = ["Played", "Protocol", "alike", "same", "shown"]
 
 Array = NDArray[np.float64]
 
@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 GRID_S = 0.02
 #: rad: commands that differ by less on the whole are the same
 SAME_RAD = 0.01
+#: correlation from which commands are those of one kind of motion
+ALIKE = 0.95
 #: s at a run's beginning in which its positions say where it rests, and rad by which robots at rest differ at most
 BEGIN_S, ELSEWHERE_RAD = 0.1, 0.05
 #: smaller changes of a supply's share are rounding of numbers
@@ -212,6 +214,17 @@ def same(one: Array, other: Array) -> bool:
         return False
     # A step that comes a sample early is a large difference for a moment: the median does not see it.
     return float(np.quantile(np.abs(one[:n] - other[:n]).max(axis=1), 0.75)) <= SAME_RAD
+
+
+def alike(one: Run, other: Run, joints: Sequence[str]) -> bool:
+    """Whether two runs are of one kind of motion: of one protocol, or with commands that differ by little but size."""
+    names = one.facts.protocol, other.facts.protocol
+    if None not in names:
+        return names[0] == names[1]
+    a, b = _on_grid(one, joints), _on_grid(other, joints)
+    n = min(len(a), len(b))
+    a, b = a[:n] - a[:n].mean(axis=0), b[:n] - b[:n].mean(axis=0)
+    return float(np.sum(a * b)) > ALIKE * float(np.sqrt(np.sum(a**2) * np.sum(b**2)))
 
 
 def _on_grid(run: Run, joints: Sequence[str]) -> Array:

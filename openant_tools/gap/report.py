@@ -121,10 +121,6 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
 def _what_next(found: Diagnosis) -> str:
     if found.verdict == NONE:
         return "Nothing: the model is as good as these runs can tell."
-    if found.verdict == UNEXPLAINED:
-        return "Look at the robot where the gap is largest; repeat the runs, so that what changes from run to run is told from what does not."
-    if found.verdict == AMBIGUOUS:
-        return "Run `openant gap next` on the JSON of this diagnosis: it simulates what is left on every protocol."
     return "Write the improved model with `openant gap apply`, and record another motion to hold out against it."
 
 

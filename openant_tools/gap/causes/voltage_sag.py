@@ -20,4 +20,5 @@ CAUSE = Cause(
     quantities=(amount("resistance_ohm", "Ω", 0.25, 4.0),),
     enter=_enter,
     native=False,
+    witness="volt",
 )
