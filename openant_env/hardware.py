@@ -16,6 +16,7 @@ import logging
 import math
 import threading
 import time
+import tomllib
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -30,6 +31,7 @@ from openant_env.robots import simulated_robot
 from openant_env.tasks import BackAndForth
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.recording.run import Facts
+from openant_tools.robot.derating import derating_of
 from openant_tools.robot.folder import RobotFolder
 
 __all__ = ["AntHardware"]
@@ -66,8 +68,9 @@ class AntHardware(AntBase):
     Spaces, reward and info are those of `openant/Ant-v0` (`openant_env.ant`). In addition info holds `period_s` (s, from
     the last command to this one), `overruns` (steps so far that began late), `observation_age_s` (s, of joints, IMU and
     position, as of the step's end), `missed` (answers of servos that did not come in this step), `joint_temperatures`
-    (°C), `joint_loads` (A or share of full load, as the servos measure) and `supply_v`; and `void` where a stop came in the
-    way of a step: its action was not carried out, so that there is nothing to learn from it.
+    (°C), `joint_loads` (A or share of full load, as the servos measure) and `supply_v`; `derating`, the share of each joint's
+    way from its rest that is left to it by the `[derating]` rules of robot.toml, 1 for a cool servo; and `void` where a stop
+    came in the way of a step: its action was not carried out, so that there is nothing to learn from it.
 
     Args:
         robot: a robot's folder (or its robot.toml). None only with `virtual`: an Ant as the guide says.
@@ -131,6 +134,10 @@ class AntHardware(AntBase):
         self._held = contextlib.ExitStack()
         folder = None if robot is None else RobotFolder.at(robot)
         described = None if folder is None else folder.config()
+        self._derating = None
+        if folder is not None:
+            said = tomllib.loads(folder.config_file.read_text(encoding="utf-8"))
+            self._derating = derating_of(said, str(folder.config_file))
         rate_hz = engine_rate(self.dt)
         self._cycle_s = 1.0 / rate_hz
         try:
@@ -198,7 +205,8 @@ class AntHardware(AntBase):
         self._observed_at = time.monotonic()
         self._fallen_s = self._wound_rad = 0.0
         self._overruns = 0
-        self._told_late = -math.inf
+        self._told_late = self._told_warm = -math.inf
+        self._shares = np.ones(len(joints))
         self._reboots: deque[float] = deque(maxlen=REBOOTS)
         #: joint → whether it is left to cool down
         self._cooling: dict[str, bool] = {}
@@ -270,6 +278,7 @@ class AntHardware(AntBase):
             raise BadInput("the robot does not stand yet", remedy="reset the environment first")
         chosen_at = time.monotonic()
         self._set_command(action)
+        self._derate()
         before = self._t
         try:
             rows, number = self.link.go(self._command, self.dt, (self._observed_at, chosen_at))
@@ -293,6 +302,21 @@ class AntHardware(AntBase):
         if terminated or truncated:
             self._reason, self._ready = info["reason"], False
         return observation, reward, terminated, truncated, info
+
+    def _derate(self) -> None:
+        """Let a servo that is warm go less far from its rest, so that it cools instead of shutting down."""
+        if self._derating is None:
+            return
+        share = self._derating.share(dict(zip(self.robot.joints, self._temps.tolist(), strict=True)))
+        self._shares = np.array([share[joint] for joint in self.robot.joints])
+        self._command[:] = self.actions.rest + self._shares * (self._command - self.actions.rest)
+        if self._shares.min() < 1.0 and self._t - self._told_warm > REPEAT_S:
+            self._told_warm = self._t
+            joint = int(self._shares.argmin())
+            self._notice(
+                f"{self.robot.joints[joint]} is at {self._temps[joint]:.0f} °C: it goes {100 * self._shares[joint]:.0f} % of "
+                "the way that it is told"
+            )
 
     def _stopped(self, why: str) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """A step that torque off ended: what was seen last stands in, and no reward is given for it."""
@@ -386,6 +410,7 @@ class AntHardware(AntBase):
             "missed": missed,
             "joint_temperatures": self._temps.copy(),
             "joint_loads": self._efforts.copy(),
+            "derating": self._shares.copy(),
             "supply_v": self._volts,
         }
 

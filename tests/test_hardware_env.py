@@ -24,6 +24,7 @@ from openant_tools.comms.clock import VirtualControl
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.recording.reader import read_recording
 from openant_tools.robot.config import Provenance
+from openant_tools.robot.derating import derating_of
 from openant_tools.robot.folder import RobotFolder, create_robot
 
 #: small pictures, few of them: finding tags is most of what a stepped robot waits for
@@ -40,6 +41,7 @@ look_at = [-0.35, 0.2, 0.0]
 mode = "stepped"
 """
 STILL = np.zeros(8, np.float32)
+RULE = {"start_c": 62.0, "stop_c": 70.0, "least": 0.4}
 
 
 @pytest.fixture(scope="module")
@@ -255,6 +257,22 @@ def test_a_virtual_robot_that_needs_hands_is_put_back(walker: Walker, where: dic
     assert "the virtual robot is put back where it began" in walker.said
     assert not walker.env.step(STILL)[3]
     assert np.hypot(*walker._control.ask("state")["base"]["position"][:2]) < 0.05
+
+
+def test_a_warm_servo_goes_less_far_by_the_rule_of_robot_toml(walker: Walker, monkeypatch: pytest.MonkeyPatch) -> None:
+    env, knee = walker.env, walker.env.robot.joints.index("knee_fl")
+    monkeypatch.setattr(env, "_derating", derating_of({"derating": {"knee_fl": RULE}}))
+    outwards = np.full(8, 0.2, np.float32)
+    info = env.step(outwards)[4]
+    assert info["derating"].tolist() == [1.0] * 8
+    env._temps[knee] = 66.0
+    info = env.step(outwards)[4]
+    assert info["derating"][knee] == pytest.approx(0.7)
+    assert (np.delete(info["derating"], knee) == 1.0).all()
+    full = env.actions.centre + 0.2 * env.actions.half
+    rest = env.actions.rest
+    assert env._command == pytest.approx(rest + info["derating"] * (full - rest), abs=1e-6)
+    assert any("knee_fl is at 66 °C: it goes 70 % of the way" in words for words in walker.said)
 
 
 # ---------------------------------------------------------------------------------------------------- what is refused
