@@ -155,7 +155,7 @@ PROTOCOLS: Mapping[str, tuple[str, tuple[Part, ...]]] = {
     # Runs and times after a comparison on simulated robots (runs of about 36 s): in the air a mix with holds; on the floor
     # shifts in two headings, lifts, scrub and gait. Hops and push-ups are left out: impacts differ between simulators.
     FULL: (
-        "what tells effects apart best: on the stand, then on the floor in two headings",
+        "what tells effects apart best",
         (
             Part(20.0, _air),
             Part(16.0, _floor, "floor"),
