@@ -1,7 +1,7 @@
 """How good the thermal forecast is: rooms, servos and loads drawn by chance, a forecast after ten minutes, and what came.
 
     python benchmarks/thermal_forecast.py --rooms 20                   the table for docs/thermal.md
-    python benchmarks/thermal_forecast.py --rooms 20 --json table.json
+    python benchmarks/thermal_forecast.py --rooms 20 --seed-from COMMIT --json table.json
     python benchmarks/thermal_forecast.py --stress                     the paper's stress test, an hour, four robots
 
 Each case is a robot with its own thermal sizes in its own room, under its own load, with the virtual robot's heat and none
@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.blind.make import seed_of_commit
 from openant_tools.recording.run import Facts, Run
 from openant_tools.report import plots
 from openant_tools.robot.control_table import AMPERE_PER_COUNT
@@ -245,7 +246,8 @@ def _minutes(interval: tuple[float, float, float] | None) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rooms", type=int, default=20, help="cases with a shutdown, from seed 0 on")
+    parser.add_argument("--rooms", type=int, default=20, help="cases with a shutdown, from the first seed on")
+    parser.add_argument("--seed-from", metavar="COMMIT", help="the first seed, from a commit's hash: nobody chose it")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--stress", action="store_true", help="the paper's stress test instead")
     parser.add_argument("--picture", type=Path, help="of the Lite's forecast, with --stress")
@@ -254,7 +256,7 @@ def main() -> int:
         print(stress(options.picture), end="")
         return 0
     cases: list[Case] = []
-    seed = 0
+    seed = 0 if options.seed_from is None else seed_of_commit(options.seed_from)[0]
     while sum(one.shutdown_s is not None for one in cases) < options.rooms:
         found = case(seed)
         if found is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,11 @@ from click.testing import CliRunner
 
 from openant_tools.blind.soak_virtual import swinging_soak
 from openant_tools.cli.comms import comms
+from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.dropouts.diagnose import diagnose_dropouts
 from openant_tools.comms.dropouts.log import read_log
+from openant_tools.comms.setup import config_of_unknown_robot
+from openant_tools.comms.soak import soak as soak_bus
 from openant_tools.comms.step_timing import step_timing
 from openant_tools.comms.thinning import Thinning
 from openant_tools.errors import BadInput
@@ -20,6 +24,7 @@ from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run, write_table
 from openant_tools.recording.telemetry import Answer, Cycle
+from openant_tools.virtual.process import virtual_robot
 from openant_tools.virtual.scenario import parse_scenario
 
 #: cause → settings of the virtual robot's fault; each shows within seconds
@@ -75,6 +80,55 @@ def test_bytes_show_the_fault_and_are_kept_around_each_loss(tmp_path: Path) -> N
     longer = CliRunner().invoke(comms, [*ask[:-3], "--minutes", "0.2", "--yes", "--resume"])
     assert longer.exit_code == 0, longer.output
     assert read_recording(out).run.duration_s > recording.run.duration_s + 1.0
+
+
+#: cause → settings of the fault, when it begins and ends (s after the soak does): seen through every packet, its CRC, the
+#: driver's deadlines, and the guards that stop the motion and let it go on
+BYTES: dict[str, tuple[dict[str, Any], float, float]] = {
+    "power_connector": ({"openings_per_rad": 0.3, "open_s": 0.1}, 0.0, 99.0),
+    "broken_wire": ({"where": ["knee_fl"], "depends_on": "knee_fl", "below_rad": -1.0}, 0.0, 99.0),
+    "bad_servo": ({"where": ["hip_fr"], "fraction": 0.15}, 0.0, 99.0),
+    "line_noise": ({"byte_error": 0.001}, 0.0, 99.0),
+    "return_delay": ({"delay_s": 0.0005}, 0.0, 99.0),
+    "latency_timer": ({"timer_s": 0.016}, 0.0, 99.0),
+    "host_stall": ({"every_s": 1.3, "for_s": 0.15}, 0.0, 99.0),
+    "usb_unplug": ({}, 3.0, 5.0),
+    "duplicate_id": ({"where": ["knee_rr"], "of": "hip_fl"}, 3.0, 99.0),
+    "write_read_gap": ({"gap_s": 0.001}, 0.0, 99.0),
+}
+
+
+@pytest.fixture(scope="module")
+def stepped_robot() -> Iterator[Mapping[str, str | None]]:
+    with virtual_robot("default", clock="stepped", camera=False) as found:
+        yield found
+
+
+@pytest.mark.parametrize("cause", list(BYTES))
+def test_bytes_show_each_fault(cause: str, stepped_robot: Mapping[str, str | None], tmp_path: Path) -> None:
+    bus, control_path = stepped_robot["bus"], stepped_robot["control"]
+    assert bus is not None
+    assert control_path is not None
+    control = VirtualControl(control_path)
+    settings, begins, ends = BYTES[cause]
+    now = float(control.ask("now")["t"])
+    control.ask("fault", cause=cause, on=True, **settings, from_s=now + begins, to_s=now + ends)
+    try:
+        config = config_of_unknown_robot(bus, control_path, rate_hz=30.0)
+        soaked = soak_bus(config, tmp_path / "soak.mcap", 7.0, thin_s=None)
+    finally:
+        control.ask("fault", cause=cause, on=False, **{key: settings[key] for key in ("where",) if key in settings})
+        control.close()
+    assert soaked.seconds >= 7.0
+    run = read_recording(soaked.path).run
+    found = diagnose_dropouts([run])
+    assert found.verdict == cause, found.as_json()["causes"][:2]
+    if cause == "usb_unplug":
+        assert (run.column("ok.hip_rr") == 0).sum() > 40, "that the port is gone stands in the recording, row by row"
+        assert set(run.columns["err.hip_rr"].tolist()) == {"", "port"}
+    if cause == "host_stall":
+        assert found.measures.losses == "no", "a host that wakes late finds what came meanwhile"
+        assert run.column("wake").max() > 0.1
 
 
 def _cycle(t: float, err: str = "", wake: float = 0.0, volt: int = 120) -> Cycle:
