@@ -137,6 +137,8 @@ class Learner:
         self._publish()
         try:
             self._say("ready", agent.updates)
+            os.nice(NICE)
+            _share(NICE)
             while True:
                 self._read()
                 due = job.updates_per_step * (agent.replay.added - settings.learning_start)
@@ -149,6 +151,7 @@ class Learner:
                 if time.monotonic() - self._saved_at > CHECKPOINT_EVERY_S:
                     self._save()
         except _Stopped:
+            _share(0)  # nobody walks any more, but someone waits
             self._read()
             self._save()
             with contextlib.suppress(_Stopped):
@@ -204,6 +207,15 @@ class Learner:
         self._saved_at = time.monotonic()
 
 
+def _share(nice: int) -> None:
+    """Where Linux shares processors between sessions first (autogroups), have ours come before or after others.
+
+    This process is the only one of its session; its own priority alone counts for nothing beside other sessions.
+    """
+    with contextlib.suppress(OSError):  # another system, or one that shares between processes
+        Path("/proc/self/autogroup").write_text(str(nice), encoding="ascii")
+
+
 def main() -> None:
     """Arguments: file descriptors of the connection and of the weights. The job comes first over the connection."""
     # Ctrl-C at the terminal is for the acting process, which then tells us.
@@ -211,7 +223,6 @@ def main() -> None:
     connection = Connection(int(sys.argv[1]))
     job, count = connection.recv()
     torch.set_num_threads(1)
-    os.nice(NICE)
     weights = SharedWeights(count, int(sys.argv[2]))
     try:
         Learner(job, connection, weights).run()
