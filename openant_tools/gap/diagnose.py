@@ -338,12 +338,15 @@ def _decide(
     best = names[0]
     chosen, whole = [best], alone[best]
     beyond = {best: whole.closed - refit.closed}
-    if beyond[best] > ADDS_ALONE:
+    # Joint positions say little of the body: there closure alone proves nothing that the judge does not half believe.
+    beside = catalogue()[best].beside_joints
+    proved = beyond[best] > ADDS_ALONE and (not beside or probability[best] > SECOND)
+    if proved:
         # What none of the others closes speaks for a cause whatever the judge thought of it.
         scores = np.array([_score(probability[name], alone[name]) for name in names])
         share = float(1 / np.exp(scores - scores[0]).sum())
         probability[best] = max(probability[best], share * min(beyond[best], 1.0))
-    if probability[best] > FINDING or beyond[best] > ADDS_ALONE:
+    if probability[best] > FINDING or proved:
         left = _without(case, explained[best])
         for name, chance in _shown(left, case.protocol)[:2]:
             if (
@@ -359,18 +362,17 @@ def _decide(
             _, _, (both,) = closures(
                 windows, [_start(windows, [explained[one] for one in [*chosen, name]])], held_out, case.training
             )
-            beside = catalogue()[name].beside_joints
-            if both.closed > whole.closed + ADDS or (beside and chance > FINDING and both.closed > whole.closed - ADDS):
+            silent = catalogue()[name].beside_joints and chance > FINDING
+            if both.closed > whole.closed + ADDS or (silent and both.closed > whole.closed - ADDS):
                 beyond[name] = both.closed - whole.closed
                 beyond[best] = both.closed - (alone[name].closed if name in alone else refit.closed)
                 chosen.append(name)
                 whole = both
                 probability[name] = max(probability[name], chance)
                 break
-    beside = catalogue()[best].beside_joints
-    sure = probability[best] > FINDING or (
-        judgement.energy > 1 and beyond[best] > ADDS_ALONE and alone[best].closed > EXPLAINS
-    )
+    sure = probability[best] > FINDING or (judgement.energy > 1 and proved and alone[best].closed > EXPLAINS)
+    if probability[best] < CERTAIN and not explained[best].beyond_tolerance:
+        sure = False
     verdict, selected = best, tuple(sorted(chosen, key=lambda name: -beyond[name]))
     ambiguous: tuple[tuple[str, ...], ...] = ()
     rivals = [

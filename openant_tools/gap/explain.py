@@ -73,6 +73,12 @@ class Explained:
     std: Mapping[str, float]
     misfit: float
 
+    @property
+    def beyond_tolerance(self) -> bool:
+        """Whether it is larger than what healthy robots have."""
+        sizes = [q for q in self.part.definition.quantities if not q.shape]
+        return any(abs(self.x[q.name]) >= q.small for q in sizes)
+
 
 @dataclass
 class Scene:
