@@ -204,10 +204,10 @@ def reliability_figure(found: SoakScore) -> Figure:
 
 
 _HOW = (
-    "**What is drawn.** A third of the soaks is healthy and lasts 10 minutes or more; the others have one cause each, every cause",
-    "of the list in turn, at a random place, of a strength drawn over one to two decades. Rows come 10 to 100 times a second; any",
-    "column in eight is missing, unless the cause shows in nothing else; some logs have four to six servos; in a fifth nobody says",
-    "how the servos are wired. A bad cable has at least two servos behind it: with one, it cannot be told from that servo.",
+    "**What is drawn.** Healthy soaks last 10 minutes or more; the others have one cause each, every cause of the list in turn, at",
+    "a random place, of a strength drawn over one to two decades. Rows come 10 to 100 times a second; any column in eight is",
+    "missing, unless the cause shows in nothing else; some logs have four to six servos; in a fifth nobody says how the servos are",
+    "wired. A bad cable has at least two servos behind it: with one, it cannot be told from that servo.",
     "",
     "**Two makers.** `tables` writes columns by forms of its own (`blind/soak_tables.py`: no firmware, no packets; motion, load,",
     "supply, round trips and the host's clock are drawn). `virtual` asks the virtual robot's bus transaction by transaction while it",
@@ -234,7 +234,8 @@ def write_soak_docs(found: SoakScore, path: Path) -> None:
         "# The blind check of dropout attribution", "",
         "<!-- Written by `openant comms blind score SET --docs docs/comms-blind.md`: do not edit. -->", "",
         "```sh",
-        "openant comms blind make --out SET --seed-from COMMIT --key-file KEY    # answers sealed",
+        f"openant comms blind make --out SET --seed-from COMMIT --key-file KEY --soaks {facts['soaks']} "
+        f"--healthy {facts['mix']['healthy']:.2g} --virtual {facts['mix']['virtual']:.2g}    # answers sealed",
         "openant comms blind run SET",
         "openant comms blind score SET --key-file KEY --docs docs/comms-blind.md",
         "```", "", *_HOW, "", "## Result", "",
