@@ -34,6 +34,8 @@ Array = NDArray[np.float64]
 ROUNDS = 2
 #: derivatives of a fit that starts anew
 ANEW = 2
+#: and of the best in the end
+SETTLED = 1
 #: share of a coordinate, and of a large one, by which it is varied; of what tolerances let move, in tolerances
 STEP, LEAST_STEP, TOLERANCE_STEP = 0.05, 0.02, 0.3
 #: dampings of Levenberg and Marquardt that are tried side by side, and the first of them
@@ -287,13 +289,21 @@ class SetFits:
             _Search(parts, np.array([point[q.name] for part, point in zip(parts, x, strict=True) for q in part.definition.quantities] + [0.0] * n))
             for parts, x in sets
         ]  # fmt: skip
-        for _ in range(ANEW):
+        self.settle(searches, ANEW)
+        return searches
+
+    def settle(self, searches: Sequence[_Search], times: int) -> None:
+        """Fit on from where each of them is."""
+        for search in searches:
+            search.done = False
+        for _ in range(times):
             going = [search for search in searches if not search.done]
             if going:
                 self._differentiate(going)
             for _ in range(ROUNDS):
                 self._improve(going)
-        return searches
+        # Folds step from here without another look: what rank-one updates say would lead them astray.
+        self._differentiate(searches)
 
     def without(self, search: _Search, removed: Sequence[Sequence[str]]) -> list[_Search]:
         """The same set without some of its causes, for each of `removed`, fitted on from where it ended."""
@@ -431,6 +441,8 @@ def choose(
     removal: dict[str, float] = {}
     rival = None
     if best.names:
+        fits.settle([search], SETTLED)
+        (best,) = fits.judge([search])
         spared = list(zip(best.names, fits.judge(_each_spared(fits, search)), strict=True))
         removal = dict(sorted(((name, best.closed - one.closed) for name, one in spared), key=lambda item: -item[1]))
         first = next(iter(removal))
