@@ -216,6 +216,22 @@ def test_a_loop_faster_than_the_agent_repeats_its_command() -> None:
     assert found.action_to_observation.mean == pytest.approx(0.1132, abs=1e-4)
 
 
+def test_what_a_loop_reads_while_the_agent_thinks_is_not_what_it_saw() -> None:
+    """As recordings of the environment have it: a row each 10 ms, the agent's times in the rows of its commands."""
+    n = 12 * 20
+    t = 0.01 * np.arange(n)
+    cmd_t = np.repeat(t[::12], 12) + 1e-3
+    obs_t, act_t = np.full(n, np.nan), np.full(n, np.nan)
+    # The read two cycles before the command is observed after 4 ms, and thought about for 12.
+    obs_t[12::12], act_t[12::12] = t[10:-12:12] + 4e-3, t[10:-12:12] + 16e-3
+    cmd = np.repeat(np.arange(20.0), 12) / 20
+    columns = {"cmd.knee": cmd, "rtt.knee": np.full(n, 3e-3), "cmd_t": cmd_t, "obs_t": obs_t, "act_t": act_t}
+    found = step_timing(Run("env", Facts(("knee",)), t, columns))
+    mean = {part.name: part.mean for part in found.parts}
+    assert found.told_apart
+    assert mean == pytest.approx({"command": 5e-3, "wait": 99e-3, "read": 3e-3, "observe": 1e-3, "decide": 12e-3})
+
+
 def test_timing_says_what_it_cannot_use(tmp_path: Path) -> None:
     still = steps(apart=False)
     still.columns["cmd.knee"][:] = 0.0  # type: ignore[index]

@@ -143,7 +143,10 @@ def step_timing(run: Run) -> StepTiming:
     starts, longest = [], PAUSE * float(np.median(np.diff(left)))
     for k in range(len(first) - 1):
         begin, end = float(left[k]), float(left[k + 1])
-        row = int(np.searchsorted(run.t, end, side="right")) - 1
+        # The read that counts is the last one; of a loop that reads on while the agent thinks, the last that it saw.
+        seen_at = min(end, float(observed[first[k + 1]])) if apart else end
+        row = int(np.searchsorted(run.t, seen_at, side="right")) - 1
+        row -= bool(apart and row > 0 and run.t[row] + took[row] > seen_at)
         if not 0 < end - begin < longest or row < 0 or run.t[row] <= begin:
             continue
         read_at = float(run.t[row])
