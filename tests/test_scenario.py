@@ -10,7 +10,9 @@ import pytest
 
 from openant_tools.comms import protocol2 as p2
 from openant_tools.errors import BadInput
+from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.mjcf import nominal_mjcf
+from openant_tools.virtual.body import Body, BodySettings
 from openant_tools.virtual.imperfections import CATALOGUE
 from openant_tools.virtual.scenario import load_scenario, parse_scenario
 from openant_tools.virtual.start import build
@@ -332,6 +334,23 @@ def test_a_tilted_floor_tilts_gravity():
     x, _, z = world.body.accelerometer
     assert x == pytest.approx(-9.81 * math.sin(0.1), abs=1e-3)
     assert z == pytest.approx(9.81 * math.cos(0.1), abs=1e-3)
+
+
+def test_feet_that_stick_press_the_floor_and_not_the_knees():
+    def standing(adhesion_n):
+        pose = {joint: -0.9 if "knee" in joint else 0.0 for joint in JOINTS}
+        body = Body(BodySettings(setup="floor", adhesion_n=adhesion_n, pose_rad=pose), tuple(JOINTS))
+        body.damping[:] = 0.05
+        start = body.q.copy()
+        for _ in range(1500):
+            body.torque[:] = 10.0 * (start - body.q)
+            body.step()
+        contacts = body.data.contact[: body.data.ncon]
+        return sum(float(body.data.efc_force[one.efc_address]) for one in contacts), np.abs(body.torque).max()
+
+    (free_n, torque_nm), (stuck_n, stuck_nm) = standing(0.0), standing(1.5)
+    assert stuck_n - free_n == pytest.approx(4 * 1.5, abs=0.1)
+    assert stuck_nm < 1.05 * torque_nm  # as a payload of 6 N it would be half as much again
 
 
 def test_dropped_commands_do_not_arrive():

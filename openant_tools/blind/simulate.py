@@ -155,10 +155,16 @@ def _pull(robot: TrueRobot, model: mujoco.MjModel) -> Callable[[mujoco.MjData], 
             force, damping, stiffness, anchor = m.cable
             data.xfrc_applied[torso, :3] = force - damping * data.qvel[:3] - stiffness * (data.qpos[:3] - anchor)
         if m.adhesion_n:
-            pairs = data.contact.geom
-            touching = set(pairs[(pairs == floor).any(axis=1)].ravel().tolist())
+            pairs, places = data.contact.geom, data.contact.pos
+            on_floor = (pairs == floor).any(axis=1)
             for geom, body in feet.items():
-                data.xfrc_applied[body, 2] = -m.adhesion_n if geom in touching else 0.0
+                data.xfrc_applied[body] = 0.0
+                mine = on_floor & (pairs == geom).any(axis=1)
+                if mine.any():
+                    # It sticks where it touches, which turns the leg about its own centre besides.
+                    down = np.array([0.0, 0.0, -m.adhesion_n])
+                    data.xfrc_applied[body, :3] = down
+                    data.xfrc_applied[body, 3:] = np.cross(places[mine].mean(axis=0) - data.xipos[body], down)
 
     return pull
 

@@ -180,10 +180,15 @@ class Body:
             wrench[:3] -= cable.damping_n_s_m * data.qvel[:3]
             wrench[:3] -= cable.stiffness_n_m * (data.qpos[:3] - np.asarray(cable.anchor_m))
         if self.settings.adhesion_n:
-            touching = {int(g) for contact in data.contact[: data.ncon] for g in contact.geom}
+            pull = np.array([0.0, 0.0, -self.settings.adhesion_n])
             for geom in self._feet:
                 body = self.model.geom_bodyid[geom]
-                data.xfrc_applied[body, 2] = -self.settings.adhesion_n if geom in touching else 0.0
+                touching = (data.contact.geom == geom).any(axis=1)
+                data.xfrc_applied[body] = 0.0
+                if touching.any():
+                    # It sticks where it touches, which turns the leg about its own centre besides.
+                    arm = data.contact.pos[touching].mean(axis=0) - data.xipos[body]
+                    data.xfrc_applied[body] = [*pull, *np.cross(arm, pull)]
 
     # ---- what sensors of the body see ----
 
