@@ -1,7 +1,7 @@
 """How much of a real servo each law of friction explains: two gains fitted, the third held out, each in turn.
 
-Rungs: none, viscous, Coulomb, both, Stribeck, load-dependent; each with the nominal supply and with the logged voltage.
-The figure is the root mean square of measured minus simulated position over whole runs, pooled over the three gains
+Rungs: none, viscous, Coulomb, both, Stribeck, load-dependent, and that with more of it at rest; each with the nominal supply
+and with the logged voltage. The figure is the root mean square of measured minus simulated position over whole runs, pooled over the three gains
 held out; beside it what the same law leaves of runs that it was fitted to. Finished fits are kept in --cache, so that an
 interrupted run goes on where it was.
 
@@ -45,6 +45,7 @@ RUNGS = {
     "both": ("damping", "coulomb_friction"),
     "Stribeck": ("damping", "coulomb_friction", "stribeck_friction_static_nm", "stribeck_friction_velocity_rad_s"),
     "load": ("damping", "coulomb_friction", "load_friction"),
+    "load, at rest": ("damping", "coulomb_friction", "load_friction", "load_friction_at_rest"),
 }
 
 

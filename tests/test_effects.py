@@ -127,6 +127,18 @@ def test_loaded_gears_hold_what_the_motor_does_not(servo: Plant, quantity: str, 
     assert free < rubbed <= 1.02 * most
 
 
+@pytest.mark.parametrize(("at_rest", "moves"), [(0.0, True), (0.8, False)])
+def test_loaded_gears_stick(servo: Plant, at_rest: float, moves: bool) -> None:
+    """Held up at 1 rad and told to go 0.05 rad higher: 0.4 N·m of the motor, 0.26 N·m of load, 0.33 N·m between them.
+
+    (MuJoCo's dry friction creeps where it holds, here by 0.01 rad/s.)
+    """
+    t = np.arange(0.0, 0.3, 0.01)
+    run = Run("hold", Facts(joints=servo.joints), t, {"cmd.joint": np.full_like(t, 1.05), "pos.joint": np.ones_like(t)})
+    found = rollout(Rollouts(servo, [run]), [servo.model], [{("load_friction", "at_rest"): np.array([at_rest])}])
+    assert (abs(found.pos[0, -1, 0] - 1.0) > 0.01) == moves
+
+
 def test_a_dead_zone_leaves_its_half_width_open(servo: Plant) -> None:
     assert held_up(servo, {("dead_zone", "width_rad"): 0.1}) - held_up(servo, {}) == pytest.approx(0.05, abs=0.01)
 

@@ -77,7 +77,7 @@ def fit(
 
     from openant_tools.recording.tables import read_run
     from openant_tools.robot.folder import RobotFolder
-    from openant_tools.sysid.beyond import TRIED, with_effects
+    from openant_tools.sysid.beyond import with_effects
     from openant_tools.sysid.declared import read_declarations
     from openant_tools.sysid.identify import identify
     from openant_tools.sysid.result import WITH_EFFECTS, write_fit, write_robot
@@ -108,7 +108,7 @@ def fit(
         )
         # A list of kinds that was given is the builder's word that nothing else is wanted.
         if not (no_effects or kinds or (declarations and declarations.kinds)):
-            words = f"with {', '.join(kind.replace('_', ' ') for kind in TRIED)}"
+            words = "with friction that follows the load"
             richer = with_effects(
                 result,
                 recordings,

@@ -3,7 +3,8 @@
 A gear carries what the motor gives on its one side and what the link asks on its other; standing still the two are the
 same. In motion they differ by what inertia and friction take, and which of them the teeth feel is a matter of the gear. Each form
 has a coefficient of its own; what they say adds up. The usual one takes the mean of both sides: on a real servo
-(docs/effects.md) it explains more than either alone or the greater of them.
+(docs/effects.md) it explains more than either alone or the greater of them. Loaded gears also stick: `at_rest` is what the
+coefficient is larger by while they stand still, and dies out with speed as Stribeck's does.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import numpy as np
 
 from openant_tools.effects.effect import Effect, Quantity, Values
 from openant_tools.effects.step import Law, Step
+from openant_tools.effects.stribeck_friction import USUAL_VELOCITY_RAD_S
 
 __all__ = ["EFFECT"]
 
@@ -19,11 +21,14 @@ __all__ = ["EFFECT"]
 def _law(values: Values) -> Law:
     motor = values["motor_side"] + values["coefficient"] / 2
     link = values["link_side"] + values["coefficient"] / 2
-    greater = values["greater_side"]
+    greater, at_rest = values["greater_side"], values["at_rest"] / 2
+    sticks = bool(at_rest.any())
 
     def act(step: Step) -> None:
         given, asked = np.abs(step.motor_torque), np.abs(step.load)
         step.friction += motor * given + link * asked + greater * np.maximum(given, asked)
+        if sticks:
+            step.friction += at_rest * (given + asked) * np.exp(-((step.velocity / USUAL_VELOCITY_RAD_S) ** 2))
 
     return act
 
@@ -37,6 +42,7 @@ EFFECT = Effect(
         Quantity("motor_side", "N·m/(N·m)", 0.25, high=0.9),
         Quantity("link_side", "N·m/(N·m)", 0.25, high=0.9),
         Quantity("greater_side", "N·m/(N·m)", 0.25, high=0.9),
+        Quantity("at_rest", "N·m/(N·m)", 0.25, high=0.9),
     ),
     order=30,
     law=_law,

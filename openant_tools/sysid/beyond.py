@@ -15,13 +15,14 @@ from openant_tools.robot.config import Effect as Entry
 from openant_tools.sysid.declared import Declaration
 from openant_tools.sysid.fit import WHITE, sensor_floor
 from openant_tools.sysid.identify import WORTH, Identification, identify
+from openant_tools.sysid.kinds import KINDS
 
 __all__ = ["TRIED", "leaves_more_than_noise", "with_effects"]
 
 Progress = Callable[[str, float], None]
 
 #: the effects, as kinds of parameters: on real gears (docs/effects.md) no law of constant friction explains as much
-TRIED = ("load_friction",)
+TRIED = ("load_friction", "load_friction_at_rest")
 #: residuals below this many deviations of the encoder's rounding are not worth a second fit
 WORTH_LOOKING = 3.0
 
@@ -55,8 +56,8 @@ def with_effects(
         plain: what `identify` made of the same runs with the same arguments.
         runs, hold_out, also, tie, declared, measured_supply, effects, progress: as `identify` took them.
     """
-    known = {name for name, _ in plain.acting}
-    tried = [kind for kind in TRIED if kind not in (*also, *known)]
+    acting = {name for name, _ in plain.effects}
+    tried = [kind for kind in TRIED if kind not in also and (KINDS[kind].effect or ("",))[0] not in acting]
     if not tried or not leaves_more_than_noise(plain):
         return None
     richer = identify(
