@@ -352,7 +352,9 @@ def _expectations(
             spread: float, k: int = k, parameter: Parameter = parameter, nominal: float = nominal
         ) -> tuple[float, float]:
             ends = np.clip(centre[k] + np.array([-spread, spread]), low[k], high[k])
-            return parameter.value(nominal, float(ends[0])), parameter.value(nominal, float(ends[1]))
+            # A bound comes back by way of u, with an error of rounding.
+            first, last = (round(parameter.value(nominal, float(end)), 12) for end in ends)
+            return first, last
 
         ends, prior = between(TWO_SIDED_95 * float(deviation[k])), between(TWO_SIDED_95)
         out.append(
