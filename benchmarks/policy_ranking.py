@@ -6,9 +6,9 @@
     python benchmarks/policy_ranking.py rank   --out SET --policies DIR [--docs docs/policies-result.md]
 
 `make` draws robots with one medium or large effect each, whose answers are sealed, and lets each play the blind benchmark's
-runs. `models` makes three simulations of each robot from these runs alone: the nominal model; `sysid fit`'s; and the nominal
-model with the effects that `gap diagnose` finds, calibrated again by `sysid fit` with them in it. Diagnosing the nominal model
-compares all robots with the same simulated ones, made once (of `--motions`, where a set of those motions was prepared before).
+runs. `models` makes three simulations of each robot from these runs alone: the nominal model; `sysid fit`'s; and what
+`gap apply` makes of the nominal model: calibrated by the diagnosis itself, with the effects that it found. Diagnosing the nominal
+model compares all robots with the same simulated ones, made once (of `--motions`, where a set of those was prepared before).
 `play` lets policies walk on the true robots, simulated by the blind benchmark's own code at half a
 millisecond: no line of it is the environments'. `rank` plays them in the simulations (`openant policies rank`).
 Each step goes on where it was stopped.
@@ -88,19 +88,13 @@ def models(out: Path, only: str | None) -> None:
             openant("gap", "diagnose", *runs, *words, "--model", out / "model.xml", "--json", diagnosis)
         verdict = json.loads(diagnosis.read_text())["verdict"]
         print(f"{folder.name}: diagnosed as {verdict} in {time.monotonic() - begun:.0f} s", flush=True)
-        diagnosed, begun = place / "diagnosed", time.monotonic()
+        diagnosed = place / "diagnosed"
         if not (diagnosed / "improved.xml").exists():
             _robot(diagnosed, out / "model.xml")
             openant(
                 "gap", "apply", diagnosis, "--model", out / "model.xml", "--out", diagnosed / "improved.xml",
                 "--robot", diagnosed,
             )  # fmt: skip
-        if not (place / "fit-diagnosed" / "fit.json").exists():
-            openant(
-                "sysid", "fit", *stand, "--hold-out", held_out[0], "--robot", diagnosed, "--no-effects",
-                "--out", place / "fit-diagnosed",
-            )  # fmt: skip
-        print(f"{folder.name}: fitted again with what was found in {time.monotonic() - begun:.0f} s", flush=True)
 
 
 def _robot(folder: Path, model: Path) -> None:
