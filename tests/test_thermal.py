@@ -327,7 +327,10 @@ def test_sinks_and_the_paper_are_compared(lite: Inputs) -> None:
     same = compare(fit([lite]), fit([lite]), joints={"knee_fl": "knee_fr"})[0]
     assert not same.certain
     assert same.joint == "knee_fl / knee_fr"
-    assert "as the paper's, within the interval" in against_paper(fit([lite]))
+    beside = against_paper(fit([lite]))
+    assert "as the paper's, within the interval" in beside.words
+    assert beside.later_s is not None
+    assert beside.later_s.low < 0 < beside.later_s.high
     with pytest.raises(BadInput, match="has no joint 'knee'"):
         compare(fit([lite]), fit([finned]), joints={"knee": "knee"})
 

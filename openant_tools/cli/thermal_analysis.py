@@ -250,10 +250,14 @@ def compare(
         raise BadInput("name two soaks, or one and --paper", remedy="openant thermal compare A B")
     one = fit_runs([_read(a)])
     if b is None:
-        words = against_paper(one.at(one.inputs.loaded_s))
-        click.echo(words)
+        beside = against_paper(one.at(one.inputs.loaded_s))
+        click.echo(beside.words)
         if json_file is not None:
-            _write(json_file, {"schema": "openant.thermal-compare/1", "a": str(a), "paper": words})
+            _write(json_file, {
+                "schema": "openant.thermal-compare/1", "a": str(a), "paper": beside.words, "joint": beside.joint,
+                "later_s": None if beside.later_s is None else beside.later_s.as_json(),
+                "above_limit_k": beside.above_limit_k.as_json(),
+            })  # fmt: skip
         return 0
     chosen = None
     if pairs:

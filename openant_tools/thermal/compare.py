@@ -17,7 +17,7 @@ from openant_tools.errors import BadInput
 from openant_tools.thermal.fit import Fit
 from openant_tools.thermal.forecast import Interval, forecast, present_load, settled, torque_load
 
-__all__ = ["PAPER", "ROOM_C", "Difference", "Paper", "against_paper", "compare"]
+__all__ = ["PAPER", "ROOM_C", "AgainstPaper", "Difference", "Paper", "against_paper", "compare"]
 
 Array = NDArray[np.float64]
 
@@ -137,7 +137,22 @@ PAPER: Mapping[str, Paper] = {
 }
 
 
-def against_paper(found: Fit) -> str:
+@dataclass(frozen=True)
+class AgainstPaper:
+    """This robot's warmest knee under its own load from a cold start, less the paper's.
+
+    Attributes:
+        later_s: how much later it shuts down; None where the paper's did not, or this one is not expected to.
+        above_limit_k: where it would settle, were there no limit, less the limit that the paper's knees touched.
+    """
+
+    joint: str
+    later_s: Interval | None
+    above_limit_k: Interval
+    words: str
+
+
+def against_paper(found: Fit) -> AgainstPaper:
     """This robot under its own load from a cold start, beside the paper's robot of the same knees.
 
     Raises:
@@ -156,15 +171,24 @@ def against_paper(found: Fit) -> str:
     told = forecast(found, present_load(found, whole=True), from_cold=True, torques=False)
     worst = max((told.joints[k] for k in knees), key=lambda one: (one.probability, one.settles_c.value))
     here = f"here, from a cold start, {worst.words}"
+    above = _less(worst.settles_c, paper.limit_c)
+    settles = f"settling {above.value:+.0f} [{above.low:+.0f}, {above.high:+.0f}] K from {paper.limit_c:.0f} °C"
     when = worst.seconds_to_limit
-    if paper.shutdown_s is None:
-        return f"Paper: {paper.words}. This robot: {here}."
-    if when is None:
-        verdict = "it stays cooler than the paper's"
-    elif when.low > paper.shutdown_s:
+    if paper.shutdown_s is None or when is None:
+        verdict = "" if paper.shutdown_s is None else ": it stays cooler than the paper's"
+        return AgainstPaper(worst.joint, None, above, f"Paper: {paper.words}. This robot: {here}, {settles}{verdict}.")
+    later = _less(when, paper.shutdown_s)
+    if later.low > 0:
         verdict = "it lasts longer than the paper's"
-    elif when.high < paper.shutdown_s:
+    elif later.high < 0:
         verdict = "it gives out sooner than the paper's"
     else:
         verdict = "as the paper's, within the interval"
-    return f"Paper: {paper.words}. This robot: {here}: {verdict}."
+    span = f"{later.value / 60:+.0f} [{later.low / 60:+.0f}, {later.high / 60:+.0f}] min"
+    return AgainstPaper(
+        worst.joint, later, above, f"Paper: {paper.words}. This robot: {here}, {span} from the paper's: {verdict}."
+    )
+
+
+def _less(interval: Interval, by: float) -> Interval:
+    return Interval(interval.value - by, interval.low - by, interval.high - by)
