@@ -154,7 +154,7 @@ def _recommendation(plain: Identification, richer: Identification, folder: Path)
     found = [
         f"{value.name} = {value.value:.3g} {value.unit}"
         for value in richer.values
-        if value.accepted and value.name.partition(".")[0] in TRIED
+        if value.accepted and value.value and value.name.partition(".")[0] in TRIED
     ]
     return (
         f"More is explained by what plain MuJoCo has no feature for: with {', '.join(found)} the error on held-out runs is "
