@@ -439,12 +439,20 @@ def choose(
     visited = [*zip(singles, [nothing, *alone], strict=True), *_fewer(fits, whole, value)]
     search, best = max(visited, key=lambda one: value(one[1]))
     removal: dict[str, float] = {}
-    rival = None
-    if best.names:
+    while best.names:
         fits.settle([search], SETTLED)
         (best,) = fits.judge([search])
-        spared = list(zip(best.names, fits.judge(_each_spared(fits, search)), strict=True))
-        removal = dict(sorted(((name, best.closed - one.closed) for name, one in spared), key=lambda item: -item[1]))
+        spared = _each_spared(fits, search)
+        left = fits.judge(spared)
+        lost = {name: best.closed - one.closed for name, one in zip(best.names, left, strict=True)}
+        removal = dict(sorted(lost.items(), key=lambda item: -item[1]))
+        fewer, without = max(zip(spared, left, strict=True), key=lambda one: value(one[1]))
+        if value(without) < value(best):
+            break
+        # What a fit that had not settled seemed to need can be spared after all.
+        search, best, removal = fewer, without, {}
+    rival = None
+    if removal:
         first = next(iter(removal))
         others = [one for one in visited if first not in one[1].names]
         other = max(others, key=lambda one: value(one[1]))[0]
