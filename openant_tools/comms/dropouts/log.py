@@ -192,16 +192,20 @@ def _filled(t: Array, values: Array, command: Array) -> Array:
     if not good.any():
         return np.where(np.isfinite(command), command, np.nan)
     filled = np.interp(t, t[good], values[good])
-    if np.isfinite(command).all() and np.ptp(command) > 0 and good.sum() > _FEWEST:
-        scatter, best = 0.3 * float(np.var(values[good])), None
+    # While torque is off nobody commands anything, and the joint does what it likes.
+    told = np.isfinite(command)
+    both = good & told
+    if both.sum() > _FEWEST and np.ptp(command[told]) > 0:
+        whole = np.interp(t, t[told], command[told])
+        scatter, best = 0.3 * float(np.var(values[both])), None
         for lag_s in _LAGS_S:
-            follows = _lagged(t, command, lag_s)
-            fit = np.polyfit(follows[good], values[good], 1) if np.ptp(follows[good]) > 0 else np.zeros(2)
-            left = float(np.var(values[good] - np.polyval(fit, follows[good])))
+            follows = _lagged(t, whole, lag_s)
+            fit = np.polyfit(follows[both], values[both], 1) if np.ptp(follows[both]) > 0 else np.zeros(2)
+            left = float(np.var(values[both] - np.polyval(fit, follows[both])))
             if left < scatter:
                 scatter, best = left, np.polyval(fit, follows)
         if best is not None:
-            filled = np.asarray(best, float)
+            filled = np.where(told, best, filled)
     return np.where(good, values, filled)
 
 
