@@ -29,7 +29,7 @@ import mujoco
 import numpy as np
 
 from openant_agents.policies import Policy, load_policy
-from openant_agents.ranking import Measured, find_policies, write_measured
+from openant_agents.ranking import Measured, find_policies, read_measured, write_measured
 from openant_agents.runs import read_facts
 from openant_env.observations import layout
 from openant_env.tasks import BackAndForth
@@ -276,8 +276,8 @@ def play(out: Path, policies: Path, key: bytes | None, seconds: float, plays: in
 
 def rank(out: Path, policies: Path, seconds: float, plays: int, docs: Path | None) -> None:
     lines = [
-        "| robot | simulation | Spearman | Kendall | rank violation, cm/s | regret, cm/s | its best on the robot |",
-        "|---|---|---|---|---|---|---|",
+        "| robot | simulation | Spearman | Kendall | rank violation, cm/s | regret, cm/s | its best on the robot | error, cm/s |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     sums: dict[str, list[tuple[float, ...]]] = {}
     for real in sorted(out.glob("models/*/real.json")):
@@ -297,19 +297,25 @@ def rank(out: Path, policies: Path, seconds: float, plays: int, docs: Path | Non
             "--flag-by", "none", "--report", place / "ranking", "--json", answer,
         ):  # fmt: skip
             continue
-        diagnosis = place / "diagnosis.json"
+        diagnosis, walked = place / "diagnosis.json", read_measured(real)
         verdict = json.loads(diagnosis.read_text())["verdict"] if diagnosis.exists() else "not diagnosed"
         for name, one in json.loads(answer.read_text())["agreement"].items():
             s, k = one["spearman"], one["kendall"]
             violation, lost = 100 * one["rank_violation_m_s"]["value"], 100 * one["regret_m_s"]["value"]
-            sums.setdefault(name, []).append((s["value"], k["value"], violation, lost))
+            # Mean over policies of how far the simulated reward is from the real one.
+            there = read_measured(nominal if name == "nominal" else place / f"{name}.json")
+            error = 100 * np.mean([abs(there[x].average_reward_m_s - y.average_reward_m_s) for x, y in walked.items()])
+            sums.setdefault(name, []).append((s["value"], k["value"], violation, lost, float(error)))
             lines.append(
                 f"| {place.name} ({verdict}) | {name} | {s['value']:.2f} [{s['low']:.2f}, {s['high']:.2f}] | {k['value']:.2f}"
                 f" [{k['low']:.2f}, {k['high']:.2f}] | {violation:.1f} | {lost:.1f} | {one['best_is']} of {one['policies']} |"
+                f" {error:.1f} |"
             )
     for name, values in sums.items():
-        s, k, violation, regret = np.mean(values, axis=0)
-        lines.append(f"| mean of {len(values)} | {name} | {s:.2f} | {k:.2f} | {violation:.1f} | {regret:.1f} | |")
+        s, k, violation, regret, error = np.mean(values, axis=0)
+        lines.append(
+            f"| mean of {len(values)} | {name} | {s:.2f} | {k:.2f} | {violation:.1f} | {regret:.1f} | | {error:.1f} |"
+        )
     text = "\n".join(lines)
     print(text)
     if docs is not None:
