@@ -154,6 +154,17 @@ def _origin(found: Score) -> str:
     return words + (f" {virtual} came from the virtual robot's bus." if "virtual" in makers else "")
 
 
+def _drawn(found: Score) -> list[str]:
+    groups = [case.answer.group for case in found.cases]
+    healthy, outside, two = (groups.count(name) for name in ("none", "outside", "two"))
+    return [
+        f"**What is drawn.** Of {len(groups)} robots {healthy} are healthy, {outside} have what the catalogue has no name for,",
+        f"{two} have two effects, the others one: every effect in turn, at a random joint or scope, small, medium or large. Every",
+        "other parameter lies somewhere within the tolerance of the catalogue, partly alike for all joints. Every second robot has a",
+        "tracker.",
+    ]
+
+
 def score_report(found: Score) -> Report:
     """Everything about how the diagnosis did."""
     report = Report("The blind benchmark", _origin(found), made_by="openant gap blind score")
@@ -182,7 +193,7 @@ def write_docs(found: Score, path: Path) -> None:
         "# The blind benchmark", "",
         "<!-- Written by `openant gap blind score SET --docs docs/blind.md`: do not edit. -->", "",
         "Robots that nobody chose, simulated by other code than the diagnosis uses, judged before the answers are opened.", "",
-        "```sh", *_COMMANDS, "```", "", *_HOW, "", "## Result", "", _origin(found), "", *table_lines(found), "",
+        "```sh", *_COMMANDS, "```", "", *_drawn(found), "", *_HOW, "", "## Result", "", _origin(found), "", *table_lines(found), "",
     ]  # fmt: skip
     if worst:
         lines += ["Commonest confusions: " + "; ".join(f"{a} taken for {b} ({n})" for a, b, n in worst) + ".", ""]
@@ -203,10 +214,6 @@ _COMMANDS = (
 )
 _SCOPES = "Scopes: one joint (j), the servos of one model (g), all joints (a), the body (b)."
 _HOW = (
-    "**What is drawn.** About a third of the robots is healthy, an eighth has what the catalogue has no name for, 15 % have two",
-    "effects, the others one: every effect in turn, at a random joint or scope, small, medium or large. Every other parameter lies",
-    "somewhere within the tolerance of the catalogue, partly alike for all joints. Every second robot has a tracker.",
-    "",
     "**What they do.** Three runs on the stand and four on the floor of about 9 s each, one table of commands for all, 50 rows a",
     "second; the last run of either is held out. Rows scatter by up to 0.6 ms, stamps by up to 0.3 ms.",
     "",
