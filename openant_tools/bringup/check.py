@@ -104,7 +104,7 @@ def check(bench: Bench) -> Procedure:
     limits = {motor.joint: (motor.min_rad, motor.max_rad) for motor in config.motors.values()}
     now = analyse(run, limits)
     problems += changed(baseline, now)
-    problems += loose({joint: one.lost for joint, one in now.items()}, config.bus.chain)
+    problems += loose(_lost(run), config.bus.chain)
     problems += _warm_or_weak(now, config)
     for joint, one in now.items():
         evidence.append(
@@ -216,7 +216,15 @@ def loose(lost: Mapping[str, float], chain: Sequence[Sequence[str]], known: Sequ
 
 
 def _lost(run: Run) -> dict[str, float]:
-    return {joint: float(np.mean(run.signal("ok", [joint], default=1.0) < 0.5)) for joint in run.joints}
+    """Joint → share of its answers that it lost by itself.
+
+    Servos answer one after another: one that waits in vain for the one before it is lost with it, which says nothing of its
+    own cable. Where most are lost together, it is none of theirs.
+    """
+    lost = run.signal("ok", default=1.0) < 0.5
+    before = np.column_stack([np.zeros(len(lost), bool), lost[:, :-1]])
+    own = lost & (~before | (lost.mean(axis=1) > 0.5)[:, None])
+    return dict(zip(run.joints, own.mean(axis=0).tolist(), strict=True))
 
 
 def _at_rest(bench: Bench, config: RobotConfig, evidence: list[Evidence]) -> list[str]:
