@@ -138,10 +138,7 @@ def only(*joints: str) -> Callable[[Walker], Awaitable[None]]:
     async def walk(walker: Walker) -> None:
         last = JOINT_NAMES[JOINT_NAMES.index(joints[-1]) + 1]
 
-        async def leave(walker: Walker) -> None:
-            walker.press("space")
-
-        walker.replies[f"({last})"] = leave
+        walker.replies[f"({last})"] = Walker.stop
         await walker.do("ids")
 
     return walk
@@ -170,15 +167,12 @@ def test_two_motors_the_wrong_model_and_a_cable_that_comes_out(box: Robot) -> No
         box.remote.ask("unplug", joint="hip_rr")
         await walker.begin(AGAIN)
 
-    async def stop(walker: Walker) -> None:
-        walker.press("space")
-
     replies = {
         "(hip_rr)": plug,
         "two servos answer at once": "try again",
         "this is a XM430-W350-T": "try again",
         "make this XC430-W240-T": pull_the_cable,
-        "(knee_rr)": stop,
+        "(knee_rr)": Walker.stop,
     }
     said = box.walk(walk, replies)
     assert "hip_rr: two servos answer at once under id 1 → unplug all but one" in said

@@ -69,11 +69,23 @@ class Walker:
         for key in keys:
             self.app.simulate_key(key)
 
+    async def stop(self) -> str | None:
+        """Press the stop key; the question that was open is gone when this ends."""
+        asked = self._waits()
+        self.press("space")
+        await self.until(lambda: self._waits() is not asked)
+        return None
+
     async def leave(self) -> None:
-        """Let what was pressed be answered, before the screens are taken away."""
-        answered = asyncio.Event()
-        self.app.call_later(answered.set)
-        await asyncio.wait_for(answered.wait(), PATIENCE_S)
+        """Let what was pressed be answered, before the screens are taken away.
+
+        A key goes from the program to the widget in focus, and from there up to the program again if nobody wants it.
+        """
+        up = sorted(self.app.screen.walk_children(with_self=True), key=lambda one: len(one.ancestors), reverse=True)
+        for pump in (self.app, *up, self.app):
+            answered = asyncio.Event()
+            if pump.call_later(answered.set):
+                await asyncio.wait_for(answered.wait(), PATIENCE_S)
 
     async def until(self, what: Callable[[], bool]) -> None:
         give_up = time.monotonic() + PATIENCE_S
