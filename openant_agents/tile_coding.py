@@ -4,14 +4,14 @@ Each of n tilings covers the space with boxes, `tiles` of them along the range o
 shifted against the others: tiling k by k(2i + 1)/n of a tile along the i-th number, the displacement by odd numbers that
 Miller and Glanz recommend and the Tiles3 software uses. Two points that share a box in one tiling share its weight.
 
-No hashing of boxes: each box that was ever seen has a row of its own, in the order of appearance, so that the code is
-exact for as long as the table has rows. Only then does a new box share the row of others, which is counted.
+No box shares a row by its hash: each box that was ever seen has a row of its own, in the order of appearance, so that the code
+is exact for as long as the table has rows. Only then does a new box share the row of others, which is counted. A hash only
+says where to look for a box's name (linear probing, Knuth 1998, section 6.4), for all tilings at once.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,15 @@ __all__ = ["TileCoder"]
 
 #: boxes along one number, beyond which a coordinate would not fit the byte it is kept in (one more for the shift)
 MOST_TILES = 126
+#: bytes of the words that a box's name is made of
+WORD = 8
+#: places for names at first; the share of them beyond which there are twice as many
+PLACES, CROWDED = 2**22, 0.5
+#: what stands in a place without a name
+EMPTY = -1
 
 Rows = NDArray[np.int64]
+Names = NDArray[np.void]
 
 
 class TileCoder:
@@ -69,17 +76,25 @@ class TileCoder:
         shift = (np.arange(tilings)[:, None] * (2 * inputs + 1)) % tilings
         # From how many n-ths on a point within its tile is pushed into the next.
         self._next_from = (tilings - shift).astype(np.int32)
-        # A box by name: its tiling and its coordinates.
-        self._boxes = np.empty((tilings, 2 + len(inputs)), np.uint8)
-        self._boxes[:, :2] = np.arange(tilings, dtype=np.uint16)[:, None].view(np.uint8)
-        self._names = self._boxes.view(f"V{self._boxes.shape[1]}").ravel()
-        self._row_of: dict[bytes, int] = {}
+        # A box by name: its tiling and its coordinates, in whole words.
+        self._place = np.zeros((tilings, -(-(2 + len(inputs)) // WORD) * WORD), np.uint8)
+        self._place[:, :2] = np.arange(tilings, dtype=np.uint16)[:, None].view(np.uint8)
+        self._coordinates = self._place[:, 2 : 2 + len(inputs)]
+        self._name = self._place.view(f"V{self._place.shape[1]}").ravel()
+        # The names by row, and the rows by hash: where a place is taken by another name, the next free one is used. The system
+        # gives memory only as rows are written.
+        self._names = np.empty(rows, self._name.dtype)
+        self._row_at = np.full(PLACES, EMPTY, np.int32)
+        # Odd numbers without a pattern, to mix a name's words by.
+        words = self._place.shape[1] // WORD
+        self._mix = np.random.default_rng(0).integers(2**63, size=words, dtype=np.uint64) * 2 + 1
+        self._used = 0
         self.shared = 0  # lookups of a box that has no row of its own, since the table was full
 
     @property
     def used(self) -> int:
         """Rows that belong to a box."""
-        return len(self._row_of)
+        return self._used
 
     def rows_of(self, observation: NDArray[np.floating], *, learn: bool = True) -> Rows:
         """The rows of the boxes that an observation falls into.
@@ -89,53 +104,68 @@ class TileCoder:
             learn: whether a box never seen before gets a row.
 
         Returns:
-            (tilings,), or fewer where a box has no row and is to get none.
+            (tilings,), the row of each tiling's box; the one beyond the table where a box has none and is to get none.
         """
-        row_of, found = self._row_of, []
-        for name in self._locate(observation):
-            row = row_of.get(name)
-            if row is None:
-                if len(row_of) < self.rows:
-                    if not learn:
-                        continue
-                    row = row_of[name] = len(row_of)
-                else:
-                    # The same row in every process, which Python's own hash of bytes is not.
-                    row = zlib.crc32(name) % self.rows
-                    self.shared += 1
-            found.append(row)
-        return np.array(found, np.int64)
+        self._locate(observation)
+        rows, places = self._find(self._name)
+        missing = np.flatnonzero(rows == EMPTY)
+        if len(missing) == 0:
+            return rows
+        free = self.rows - self._used
+        if free and not learn:
+            rows[missing] = self.rows
+            return rows
+        new, sharing = missing[:free], missing[free:]
+        rows[new] = np.arange(self._used, self._used + len(new))
+        self._names[rows[new]] = self._name[new]
+        self._used += len(new)
+        self._enter(rows[new], places[new])
+        # The same row in every process, which Python's own hash of bytes is not.
+        rows[sharing] = [zlib.crc32(self._name[k].tobytes()) % self.rows for k in sharing]
+        self.shared += len(sharing)
+        if self._used > CROWDED * len(self._row_at):
+            self._row_at = np.full(2 * len(self._row_at), EMPTY, np.int32)
+            everything = np.arange(self._used)
+            self._enter(everything, self._hashed(self._names[: self._used]))
+        return rows
 
-    def _locate(self, observation: NDArray[np.floating]) -> list[bytes]:
+    def _locate(self, observation: NDArray[np.floating]) -> None:
+        """Write the names of the boxes that an observation falls into."""
         inside = np.minimum(np.maximum(observation, self.low), self.high)
         steps = ((inside - self.low) * self._scale).astype(np.int32)  # in n-ths of a tile, never below 0
         whole = steps // self.tilings
         # (steps + shift) // n without dividing n times
-        np.add(
-            whole.astype(np.uint8),
-            steps - whole * self.tilings >= self._next_from,
-            out=self._boxes[:, 2:],
-            casting="unsafe",
-        )
-        names: list[bytes] = self._names.tolist()
-        return names
+        pushed = steps - whole * self.tilings >= self._next_from
+        np.add(whole.astype(np.uint8), pushed, out=self._coordinates, casting="unsafe")
 
-    # ------------------------------------------------------------------------------------------------- going on
+    def _hashed(self, names: Names) -> Rows:
+        """(boxes,) the place where to look first for a name."""
+        mixed = names.view(np.uint64).reshape(len(names), -1) @ self._mix
+        mixed ^= mixed >> np.uint64(29)
+        mixed *= self._mix[0]
+        places: Rows = (mixed >> np.uint64(32)).astype(np.int64)
+        return places & (len(self._row_at) - 1)
 
-    def names(self) -> NDArray[np.uint8]:
-        """(used, 2 + inputs): the box of each row: its tiling (two bytes) and coordinates."""
-        width = self._boxes.shape[1]
-        return np.frombuffer(b"".join(self._row_of), np.uint8).reshape(-1, width).copy()
+    def _find(self, names: Names) -> tuple[Rows, Rows]:
+        """(boxes,) the row of each name, or `EMPTY`, and its place, or the one that is free for it."""
+        places = self._hashed(names)
+        rows = self._row_at.take(places).astype(np.int64)
+        others = np.flatnonzero((rows != EMPTY) & (self._names.take(rows, mode="wrap") != names))
+        while len(others):
+            places[others] = self._after(places[others])
+            found = self._row_at.take(places[others])
+            rows[others] = found
+            others = others[(found != EMPTY) & (self._names.take(found, mode="wrap") != names[others])]
+        return rows, places
 
-    def restore(self, names: NDArray[np.uint8], shared: int) -> None:
-        """Give rows to these boxes, in order, instead of those seen so far.
+    def _enter(self, rows: Rows, places: Rows) -> None:
+        """Let names be found: rows (boxes,), from the places (boxes,) on."""
+        while len(rows):
+            free = self._row_at[places] == EMPTY
+            self._row_at[places[free]] = rows[free]
+            # Of several at one place the last has it, the others go on.
+            still = self._row_at[places] != rows
+            rows, places = rows[still], self._after(places[still])
 
-        Raises:
-            BadInput: they are of other inputs or of a larger table.
-        """
-        width = self._boxes.shape[1]
-        if names.ndim != 2 or names.shape[1] != width or len(names) > self.rows:
-            raise BadInput(f"boxes of shape {names.shape} do not fit {self.tilings} tilings of {width - 2} inputs")
-        boxes: Sequence[bytes] = np.ascontiguousarray(names).view(f"V{width}").ravel().tolist()
-        self._row_of = {name: row for row, name in enumerate(boxes)}
-        self.shared = shared
+    def _after(self, places: Rows) -> Rows:
+        return (places + 1) & (len(self._row_at) - 1)
