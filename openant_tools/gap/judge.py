@@ -2,20 +2,25 @@
 
 Differences are measured by what healthy robots of one build show: tolerances, chatter, numerical form and sensors in one
 covariance. In that measure a robot is compared with templates, each the model with one cause at one place: how well the best
-template of a cause fits, over all and signal by signal, is what a forest of trees decides by. Its probabilities are calibrated on
-robots that the deciding trees have not seen.
+template of a cause fits, over all and signal by signal, is what a forest of trees decides by, and small neural networks, which
+also see the differences themselves along their main directions. Both together err less than either. Their probabilities are
+calibrated on robots that the deciding trees and networks have not seen.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.ensemble import ExtraTreesClassifier
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
+from sklearn.model_selection import KFold
+from sklearn.neural_network import MLPClassifier
 
 from openant_tools.gap import tolerance
 from openant_tools.gap.cause import catalogue
@@ -37,7 +42,13 @@ CLIP = 40.0
 #: standard deviation of a robot within a tolerance, as a share of it
 SPREAD = 0.6
 #: the forest
-TREES, LEAF, TRIED = 500, 2, 0.15
+TREES, LEAF, TRIED = 300, 2, 0.15
+#: the networks: how many, each taught without its share of the robots; neurons, decay of weights, rounds of teaching
+NETWORKS, NEURONS, DECAY, ROUNDS = 4, 128, 1.0, 60
+#: robots of a step, at least; steps of a round, at most
+PORTION, STEPS = 64, 40
+#: main directions of the differences that they see, and of how many robots; deviations beyond which an input says no more
+DIRECTIONS, ENOUGH, FAR = 100, 3000, 5.0
 #: share of healthy robots whose energy lies above the gate
 GATE = 0.02
 #: causes whose templates show what tolerances do: cause → the tolerance of its coordinate, for a robot's reference
@@ -101,12 +112,67 @@ class Whitening:
 
 
 @dataclass(frozen=True)
+class Networks:
+    """Networks that have each been taught without one share of the robots; what they say is the mean of their logits.
+
+    Attributes:
+        centre: (features,) of the whitened differences' inverse hyperbolic sines. directions: (features, directions).
+        usual, spread: (inputs,) of the forest's inputs.
+    """
+
+    centre: Floats
+    directions: Floats
+    usual: Floats
+    spread: Floats
+    members: tuple[MLPClassifier, ...] = ()
+
+    @classmethod
+    def of(cls, z: Floats, inputs: Floats) -> Networks:
+        """For robots with whitened differences (robots, features) and inputs (robots, inputs)."""
+        x = np.arcsinh(z[:: -(-len(z) // ENOUGH)])
+        centre = x.mean(axis=0)
+        squares, vectors = np.linalg.eigh((x - centre) @ (x - centre).T)
+        squares, vectors = squares[-DIRECTIONS:], vectors[:, -DIRECTIONS:]
+        real = squares > 1e-6 * squares[-1]
+        # Along each direction these robots scatter by one.
+        directions = (x - centre).T @ (vectors[:, real] / squares[real]) * np.sqrt(len(x))
+        return cls(
+            centre, directions.astype(np.float32), inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-6)
+        )  # fmt: skip
+
+    def seen(self, z: Floats, inputs: Floats) -> Floats:
+        """(robots, …) what they are told of each robot."""
+        own = (np.arcsinh(z) - self.centre) @ self.directions
+        return np.hstack([own, ((inputs - self.usual) / self.spread).clip(-FAR, FAR)]).astype(np.float32)
+
+    def taught(self, x: Floats, labels: Ints, seed: int) -> tuple[Networks, Array]:
+        """The same with networks that have learned from robots, and the probabilities for those each had not seen."""
+        unseen, members = np.zeros(labels.shape), []
+        for mine, others in KFold(NETWORKS, shuffle=True, random_state=seed).split(x):
+            # Larger portions of more robots: as many steps whatever there is to learn from.
+            portion = min(max(PORTION, len(mine) // STEPS), len(mine))
+            one = MLPClassifier((NEURONS,), alpha=DECAY, max_iter=ROUNDS, batch_size=portion, random_state=seed)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ConvergenceWarning)  # to stop early is meant
+                one.fit(x[mine], labels[mine])
+            unseen[others] = _table(one.predict_proba(x[others]), labels.shape[1])
+            members.append(one)
+        return dataclasses.replace(self, members=tuple(members)), unseen
+
+    def logits(self, z: Floats, inputs: Floats, outputs: int) -> Array:
+        """(robots, outputs)."""
+        x = self.seen(z, inputs)
+        out: Array = np.mean([_logit(_table(one.predict_proba(x), outputs)) for one in self.members], axis=0)
+        return out
+
+
+@dataclass(frozen=True)
 class Judge:
     """A trained judge; `say` is what it is for.
 
     Attributes:
         causes: by name, in the order of its probabilities. joints: how many.
-        known: which causes, then joints, the forest tells.
+        known: which causes, then joints, the forest and the networks tell.
         means, logs: which of the features are block means, and which are logarithms of sizes.
         bank: cause, joints and coordinates of each template. templates: whitened.
         groups: of each block mean, its run and signal.
@@ -124,11 +190,12 @@ class Judge:
     groups: Ints
     gates: Array
     forest: ExtraTreesClassifier | None = None
+    networks: Networks | None = None
     known: Bools | None = None
     calibration: tuple[tuple[float, float], ...] = ()
 
-    def inputs(self, x: Floats) -> Floats:
-        """(robots, inputs) of the forest, of features (robots, features)."""
+    def inputs(self, x: Floats) -> tuple[Floats, Floats]:
+        """(robots, inputs) of the forest and (robots, differences) whitened, of features (robots, features)."""
         z = self.whitening(x[:, self.means])
         fit = self._fits(z)
         size = np.linalg.norm(z, axis=1, keepdims=True)
@@ -146,8 +213,7 @@ class Judge:
                 np.log10(own + 1e-3) - np.log10(size + 1e-3),
             ]
         logs = ((x[:, self.logs] - self.log_centre) / self.log_scale).clip(-8, 8)
-        out: Floats = np.concatenate([*parts, logs], axis=1).astype(np.float32)
-        return out
+        return np.concatenate([*parts, logs], axis=1).astype(np.float32), z
 
     def energy(self, x: Floats) -> Array:
         """(robots,) largest energy of any run's signal, as a multiple of its gate."""
@@ -156,12 +222,16 @@ class Judge:
     def say(self, x: Floats) -> Judgement:
         """Judge one robot, of features (features,)."""
         assert self.forest is not None
-        inputs = self.inputs(x[None])
-        raw = np.array([p[0, 1] if p.shape[1] > 1 else 0.0 for p in self.forest.predict_proba(inputs)])
+        assert self.networks is not None
+        assert self.known is not None
+        inputs, z = self.inputs(x[None])
+        count = int(self.known.sum())
+        votes = _table(self.forest.predict_proba(inputs), count)
+        raw = _together(_logit(votes), self.networks.logits(z, inputs, count))[0]
         n = len(self.causes)
         chances = np.zeros(n + self.joints)
-        chances[self.known] = [_logistic(a * _logit(p) + b) for p, (a, b) in zip(raw, self.calibration, strict=True)]
-        fit = self._fits(self.whitening(x[None, self.means]))[0]
+        chances[self.known] = [_logistic(a * value + b) for value, (a, b) in zip(raw, self.calibration, strict=True)]
+        fit = self._fits(z)[0]
         places: dict[str, list[tuple[tuple[int, ...], dict[str, float]]]] = {cause: [] for cause in self.causes}
         for k in np.argsort(-fit):
             name, where, x_ = self.bank[int(k)]
@@ -229,12 +299,16 @@ def train(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools], se
     forest = ExtraTreesClassifier(
         TREES, min_samples_leaf=LEAF, max_features=TRIED, bootstrap=True, oob_score=True, n_jobs=-1, random_state=seed
     )
-    inputs = np.concatenate([judge.inputs(x[taught[k : k + 256]]) for k in range(0, len(taught), 256)])
-    forest.fit(inputs, labels[np.ix_(taught, known)])
-    unseen = _unseen(forest, int(known.sum()))
-    calibration = tuple(_calibrated(unseen[:, n], labels[taught, k]) for n, k in enumerate(np.flatnonzero(known)))
+    some = [judge.inputs(x[taught[k : k + 256]]) for k in range(0, len(taught), 256)]
+    inputs, z = (np.concatenate(parts) for parts in zip(*some, strict=True))
+    wanted = labels[np.ix_(taught, known)]
+    forest.fit(inputs, wanted)
+    empty = Networks.of(z, inputs)
+    networks, guessed = empty.taught(empty.seen(z, inputs), wanted, seed)
+    unseen = _together(_logit(_unseen(forest, wanted.shape[1])), _logit(guessed))
+    calibration = tuple(_calibrated(unseen[:, n], wanted[:, n]) for n in range(wanted.shape[1]))
     forest.oob_decision_function_ = None  # of no use any more, and large
-    return dataclasses.replace(judge, forest=forest, known=known, calibration=calibration)
+    return dataclasses.replace(judge, forest=forest, networks=networks, known=known, calibration=calibration)
 
 
 def whitening_of(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools]) -> tuple[Whitening, Bools]:
@@ -329,6 +403,19 @@ def _unseen(forest: ExtraTreesClassifier, outputs: int) -> Array:
     return out
 
 
+def _table(said: Sequence[Array] | Array, outputs: int) -> Array:
+    """(robots, outputs) probabilities, in whatever form a classifier of several labels gives them."""
+    if isinstance(said, np.ndarray):
+        return said[:, -outputs:] if said.ndim == 2 else said[:, :, 1]
+    return np.stack([one[:, 1] if one.shape[1] > 1 else np.zeros(len(one)) for one in said], axis=1)
+
+
+def _together(votes: Array, networks: Array) -> Array:
+    """(robots, outputs) one logit of the forest's and the networks'."""
+    out: Array = (votes + networks) / 2
+    return out
+
+
 def _logit(p: float | Array) -> Array:
     clipped = np.clip(p, 0.002, 0.998)
     out: Array = np.log(clipped / (1 - clipped))
@@ -339,10 +426,10 @@ def _logistic(x: float | Array) -> float:
     return float(1 / (1 + np.exp(-x)))
 
 
-def _calibrated(votes: Array, label: Ints) -> tuple[float, float]:
-    """Platt's scale and offset on the logit of the votes."""
+def _calibrated(logits: Array, label: Ints) -> tuple[float, float]:
+    """Platt's scale and offset on a logit."""
     if label.sum() < 5:
         return 1.0, 0.0
-    model = LogisticRegression(C=10.0).fit(_logit(votes)[:, None], label)
+    model = LogisticRegression(C=10.0).fit(logits[:, None], label)
     scale = float(model.coef_[0, 0])
     return (scale, float(model.intercept_[0])) if scale > 0.1 else (1.0, 0.0)
