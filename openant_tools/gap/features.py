@@ -36,8 +36,6 @@ TORQUES = ("cur", "load", "pwm")
 SKIP_S, STAND_BLOCK_S, ONE_JOINT_BLOCK_S, FLOOR_BLOCK_S = 0.5, 0.1, 0.05, 0.2
 #: least size of a scatter, as a share of the signal's noise
 LEAST = 0.3
-#: which of the changes between rows stand for all: a late command makes many that are small, a lost one few that are large
-TAIL = (0.5, 0.9, 0.98)
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ class Layout:
         for signal in self.signals:
             n = _width(signal, self.joints)
             count = len(self.blocks(signal)) - 1
-            out[signal] = ["mean"] * (count * n) + ["size"] * n + ["rough"] * n + ["tail"] * (len(TAIL) * n)
+            out[signal] = ["mean"] * (count * n) + ["size"] * n + ["rough"] * n
         return out
 
     def features(self, differences: Signals) -> Floats:
@@ -84,14 +82,16 @@ class Layout:
             means = _means(x, self.t, edges)
             n = x.shape[0]
             size = np.log10(np.sqrt(np.nanmean(np.square(means), axis=1)) + _least(signal))
-            # What scatters faster than blocks: how large it is, and whether it comes evenly or in few large steps.
-            change = np.abs(np.diff(x[:, self.t >= SKIP_S], axis=1))
-            floor = LEAST * _least(signal)
-            rough = np.log10(np.sqrt(np.nanmean(np.square(change), axis=1)) + floor)
-            levels = np.log10(np.nan_to_num(np.nanquantile(change, TAIL, axis=1)) + floor)
+            rough = self._roughness(signal, x)
             parts += [np.nan_to_num(means).reshape(n, -1), np.nan_to_num(size), np.nan_to_num(rough)]
-            parts += [np.nan_to_num(level - rough) for level in levels]
         return np.concatenate(parts, axis=1).astype(np.float32)
+
+    def _roughness(self, signal: str, x: Floats) -> Floats:
+        """(robots, columns): logarithm of what scatters faster than blocks."""
+        seen = self.t >= SKIP_S
+        change = np.diff(x[:, seen], axis=1)
+        out: Floats = np.log10(np.sqrt(np.nanmean(np.square(change), axis=1)) + LEAST * _least(signal))
+        return out
 
 
 def logged(run: Run, joints: Sequence[str]) -> dict[str, Floats]:

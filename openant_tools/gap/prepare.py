@@ -122,17 +122,18 @@ def _simulate(
     ordered = dataclasses.replace(coarse, runs=tuple(coarse.runs[k] for k in np.argsort(kept.which)))
     whole, there = len(parts) * size, (len(parts) - len(missing)) * size
     jobs = joblib.Parallel(n_jobs=-1, return_as="generator_unordered")
-    made = jobs(joblib.delayed(_make)(ordered, n, size, _part(folder, n)) for n in missing)
-    for done, _ in enumerate(made, 1):
-        if progress is not None:
-            progress(done / len(missing), f"{there + done * size} of {whole} simulated robots")
-        enough = all(_part(folder, part).is_file() for part in parts if part * size < LEAST)
-        if seconds is not None and enough and time.monotonic() - begun > seconds:
-            write_text(folder / CLOSED, "")
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # that what was begun is dropped is meant
+    with warnings.catch_warnings():
+        # That a process which has grown is replaced is no one's concern, and that what was begun is dropped in the end is meant.
+        warnings.simplefilter("ignore", UserWarning)
+        made = jobs(joblib.delayed(_make)(ordered, n, size, _part(folder, n)) for n in missing)
+        for done, _ in enumerate(made, 1):
+            if progress is not None:
+                progress(done / len(missing), f"{there + done * size} of {whole} simulated robots")
+            enough = all(_part(folder, part).is_file() for part in parts if part * size < LEAST)
+            if seconds is not None and enough and time.monotonic() - begun > seconds:
+                write_text(folder / CLOSED, "")
                 made.close()
-            break
+                break
     _keep_small(folder)
 
 
