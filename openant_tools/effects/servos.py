@@ -113,8 +113,7 @@ class Servos:
         for name, value in changed.items():
             if self._changed[name] or not np.array_equal(value, rest[name]):
                 self._changed[name] = True
-                for j in range(len(plant.joints)):
-                    self._put(name, j, value[:, j])
+                self._put(name, value)
 
     def _read(self) -> dict[str, Array]:
         i, motor, fields = self.plant.actuator, self._motor, self._fields
@@ -134,26 +133,23 @@ class Servos:
             "friction": fields.dof_frictionloss[:, self.plant.dof].copy(),
         }
 
-    def _put(self, name: str, j: int, value: Array) -> None:
-        """Write one number of joint j's servo into the models of all simulations."""
-        i, motor = int(self.plant.actuator[j]), self._motor[j]
-        gain, bias = self._fields.actuator_gainprm[:, i], self._fields.actuator_biasprm[:, i]
+    def _put(self, name: str, value: Array) -> None:
+        """Write one number of every servo, (n, joints), into the models of all simulations."""
+        i, fields = self.plant.actuator, self._fields
+        motors, others = np.flatnonzero(self._motor), np.flatnonzero(~self._motor)
+        gain, bias = fields.actuator_gainprm, fields.actuator_biasprm
         if name == "stiffness":
-            if motor:
-                gain[:, KP] = value
-            else:
-                if self._fixed[j]:
-                    gain[:, 0] = self._ratio[:, j] * value
-                bias[:, 1] = -value
+            fixed = others[self._fixed[others]]
+            gain[:, i[motors], KP] = value[:, motors]
+            gain[:, i[fixed], 0] = self._ratio[:, fixed] * value[:, fixed]
+            bias[:, i[others], 1] = -value[:, others]
         elif name == "velocity_gain":
-            if motor:
-                gain[:, KD] = value + self._rest["back_emf"][:, j]
-            else:
-                bias[:, 2] = -value
-        elif motor:
-            gain[:, VMAX] = value * gain[:, RESISTANCE] / gain[:, MOTOR_CONSTANT]
-        elif self._limited[j]:
-            self._fields.actuator_forcerange[:, i] = np.stack([-value, value], axis=1)
+            gain[:, i[motors], KD] = value[:, motors] + self._rest["back_emf"][:, motors]
+            bias[:, i[others], 2] = -value[:, others]
+        else:
+            k, limited = i[motors], others[self._limited[others]]
+            gain[:, k, VMAX] = value[:, motors] * gain[:, k, RESISTANCE] / gain[:, k, MOTOR_CONSTANT]
+            fields.actuator_forcerange[:, i[limited]] = np.stack([-value[:, limited], value[:, limited]], axis=-1)
 
 
 def batch_of(plant: Plant, models: Sequence[mujoco.MjModel], copies: int, nthread: int = 0) -> tuple[Batch, Servos]:

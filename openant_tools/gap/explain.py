@@ -96,17 +96,26 @@ class Scene:
     seen: Floats
 
     def __post_init__(self) -> None:
-        self._rollouts = [Rollouts(one.plant, [one.run]) for one in self.runs]
+        # Runs on one plant are simulated side by side.
+        mine: dict[int, list[int]] = {}
+        for k, one in enumerate(self.runs):
+            mine.setdefault(id(one.plant), []).append(k)
+        self._together = [
+            (group, Rollouts(self.runs[group[0]].plant, [self.runs[k].run for k in group])) for group in mine.values()
+        ]
         self._nominal = dataclasses.replace(self.protocol, runs=tuple(self.runs)).nominal()
         self._target = self.whitening(self.seen[None, self.columns])[0]
 
     def residuals(self, robots: Sequence[Robot]) -> Floats:
         """(robots, features) whitened differences between the robot at hand and these."""
-        parts = []
-        for one, rollouts, nominal in zip(self.runs, self._rollouts, self._nominal, strict=True):
-            found = simulate(rollouts, robots, signals=one.signals, warm_c=[one.warm_c]).signals
-            parts.append(one.layout.features(differences(found, nominal, one.signals)))
-        x = np.concatenate(parts, axis=1)[:, self.columns]
+        parts: dict[int, Floats] = {}
+        for group, rollouts in self._together:
+            signals, warm_c = self.runs[group[0]].signals, [self.runs[k].warm_c for k in group]
+            found = simulate(rollouts, robots, signals=signals, warm_c=warm_c).signals
+            for k, rows in zip(group, rollouts.rows, strict=True):
+                own = {name: values[:, rows] for name, values in found.items()}
+                parts[k] = self.runs[k].layout.features(differences(own, self._nominal[k], signals))
+        x = np.concatenate([parts[k] for k in range(len(self.runs))], axis=1)[:, self.columns]
         out: Floats = np.nan_to_num(self.whitening(x) - self._target)
         return out
 
