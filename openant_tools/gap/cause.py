@@ -125,6 +125,7 @@ class Cause:
         shows: whether it can show on what was recorded.
         signal: the signal of the log that it acts on, where that is not the motion itself.
         witness: a signal that shows it beside the motion, and nothing else does.
+        random: whether it acts at random times: no simulation repeats what happened, and what one closes says little.
         stated: from the quantities to the catalogue's parameters, where those are not the same.
         restored: from a diagnosis' parameters back to the quantities, with what its coordinates were.
     """
@@ -140,6 +141,7 @@ class Cause:
     shows: Callable[[Reference], bool] = everywhere
     signal: str | None = None
     witness: str | None = None
+    random: bool = False
     stated: Callable[[Values, Reference, Ints], dict[str, float]] = lambda values, reference, joints: dict(values)
     restored: Callable[[Values, Values, Reference, Ints], dict[str, float]] = lambda given, x, reference, joints: dict(
         given

@@ -45,6 +45,8 @@ Progress = Callable[[float, str], None]
 
 #: probabilities: below which of the best nothing is fitted, below which a cause is not looked at, above which it is a finding
 DOUBT, SUSPECT, FINDING = 0.12, 0.07, 0.5
+#: probability from which a cause is believed if it takes away so much of what is strange that this share is left
+MAYBE, EASES = 0.2, 0.7
 #: probability of a cause that little closure on the held-out runs does not overrule: a stop, say, shows in few of them
 CERTAIN = 0.8
 #: how many causes are looked at, at most and at least; and at least where the log is strange and no cause likely
@@ -334,20 +336,29 @@ def _decide(
     starts = [nothing(windows), *(_start(windows, [explained[name]]) for name in names)]
     before, floor, (refit, *singles) = closures(windows, starts, held_out, case.training)
     alone = dict(zip(names, singles, strict=True))
-    names.sort(key=lambda name: -_score(probability[name], alone[name]))
+    score = {name: _score(probability[name], refit if catalogue()[name].random else alone[name]) for name in names}
+    names.sort(key=lambda name: -score[name])
     best = names[0]
     chosen, whole = [best], alone[best]
+    if probability[best] < FINDING:
+        # A comparison that counts has to be fair: without the cause, too, from where the fit with it ended.
+        warm = dataclasses.replace(nothing(windows), nuisance=alone[best].refit.nuisance)
+        _, _, (again,) = closures(windows, [warm], held_out, case.training)
+        refit = min(refit, again, key=lambda one: one.after)
     beyond = {best: whole.closed - refit.closed}
     # Joint positions say little of the body: there closure alone proves nothing that the judge does not half believe.
     beside = catalogue()[best].beside_joints
-    proved = beyond[best] > ADDS_ALONE and (not beside or probability[best] > SECOND)
+    proved = beyond[best] > ADDS_ALONE and (not beside or probability[best] > SECOND) and not catalogue()[best].random
     if proved:
         # What none of the others closes speaks for a cause whatever the judge thought of it.
-        scores = np.array([_score(probability[name], alone[name]) for name in names])
+        scores = np.array([score[name] for name in names])
         share = float(1 / np.exp(scores - scores[0]).sum())
         probability[best] = max(probability[best], share * min(beyond[best], 1.0))
-    if probability[best] > FINDING or proved:
+    left, eased = None, False
+    if probability[best] > MAYBE or proved:
         left = _without(case, explained[best])
+        eased = probability[best] > MAYBE and judgement.energy > 1 and left.energy < EASES * judgement.energy
+    if left is not None and (probability[best] > FINDING or proved or eased):
         for name, chance in _shown(left, case.protocol)[:2]:
             if (
                 name in chosen
@@ -370,7 +381,8 @@ def _decide(
                 whole = both
                 probability[name] = max(probability[name], chance)
                 break
-    sure = probability[best] > FINDING or (judgement.energy > 1 and proved and alone[best].closed > EXPLAINS)
+    sure = probability[best] > FINDING or eased
+    sure = sure or (judgement.energy > 1 and proved and alone[best].closed > EXPLAINS)
     if probability[best] < CERTAIN and not explained[best].beyond_tolerance:
         sure = False
     verdict, selected = best, tuple(sorted(chosen, key=lambda name: -beyond[name]))

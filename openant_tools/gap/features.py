@@ -34,6 +34,8 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
 TORQUES = ("cur", "load", "pwm")
 #: s: at the start of a run that is left out (where the robot really began is not known well), and of blocks
 SKIP_S, STAND_BLOCK_S, ONE_JOINT_BLOCK_S, FLOOR_BLOCK_S = 0.5, 0.1, 0.05, 0.2
+#: signals of which only changes are looked at: a foot that slips once as it begins to move puts the whole run elsewhere
+DRIFTING = ("base", "yaw")
 #: least size of a scatter, as a share of the signal's noise
 LEAST = 0.3
 
@@ -80,6 +82,8 @@ class Layout:
             x = differences[signal]
             edges = self.blocks(signal)
             means = _means(x, self.t, edges)
+            if signal in DRIFTING:
+                means = means - np.nanmean(means, axis=1, keepdims=True)
             n = x.shape[0]
             size = np.log10(np.sqrt(np.nanmean(np.square(means), axis=1)) + _least(signal))
             rough = self._roughness(signal, x)

@@ -22,4 +22,5 @@ CAUSE = Cause(
     quantities=(amount("std_s", "s", 0.0015, 0.015),),
     enter=_enter,
     native=False,
+    random=True,
 )

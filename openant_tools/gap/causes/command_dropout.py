@@ -27,4 +27,5 @@ CAUSE = Cause(
     ),
     enter=_enter,
     native=False,
+    random=True,
 )
