@@ -496,7 +496,11 @@ def test_halves_of_the_data_that_disagree_raise_an_alarm(model: Path) -> None:
     """Between two runs the robot's supply fell, and its stiffness with it."""
     before, after = Robot(7.6, 0.14), Robot(6.8, 0.14)
     kinds = ["stiffness", "damping", "coulomb_friction"]
-    torn = identify([before.record("a"), after.record("b", seed=1)], model, [before.record("c", seed=2)], kinds=kinds)
+    low = after.record("b", seed=1)
+    volts = np.full(low.t.size, 10.7)
+    low = replace(low, columns={**low.columns, "volt.joint": volts}, facts=replace(low.facts, supply_v=12.0))
+    torn = identify([before.record("a"), low], model, [before.record("c", seed=2)], kinds=kinds)
+    assert any("fell to 10.7 of 12 V in b" in note and "--measured-supply" in note for note in torn.notes)
     found = value(torn, "stiffness.joint")
     assert found.halves is not None
     assert found.halves == (pytest.approx(7.6, rel=0.03), pytest.approx(6.8, rel=0.03))

@@ -77,6 +77,8 @@ ON_FLOOR = ("floor_friction", "contact_softness")
 WORTH = 0.01
 #: share of a run's samples that may be missing without a word
 MISSING = 0.01
+#: share by which a supply falls before it is worth a word: a servo measures it in steps of 0.1 V
+SAG = 0.03
 #: s; a row's time stamp may be off by this much without a word
 STAMP_ERROR_S = 0.5e-3
 #: 95 % of a normal distribution
@@ -342,6 +344,7 @@ def identify(
         notes=(
             *_telemetry_notes(everything, telemetry),
             *_acting_notes(acting),
+            *(() if measured_supply else _supply_notes(everything, joints)),
             *_notes(estimate, joints, runs, values),
         ),
     )
@@ -608,6 +611,21 @@ def _acting_notes(acting: EffectValues) -> Iterator[str]:
         yield (
             f"What robot.toml says of {', '.join(names)} acted in every simulation as it stands there. Fit it too with "
             f"{' '.join(f'--also {name}' for name in names)}, or set enabled = false."
+        )
+
+
+def _supply_notes(runs: Sequence[Run], joints: Sequence[str]) -> Iterator[str]:
+    """Which runs logged a supply that is not the nominal one."""
+    low = {}
+    for run in runs:
+        if run.facts.supply_v and run.has("volt", joints):
+            volts = float(np.nanquantile(run.signal("volt", joints), 0.05))
+            if volts < (1 - SAG) * run.facts.supply_v:
+                low[run.name] = f"{volts:.1f} of {run.facts.supply_v:g} V in {run.name}"
+    if low:
+        yield (
+            f"The supply fell to {', '.join(low.values())}, and gains and torque limits with it: `--measured-supply` lets them "
+            "follow what was logged."
         )
 
 
