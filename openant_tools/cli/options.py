@@ -79,6 +79,6 @@ def robot_folder(robot: Path | None, *, must_exist: bool = True) -> Path:
         raise BadInput(
             "there is no robot.toml here",
             where=folder,
-            remedy="name one with --robot DIR, or make one with `openant config import antNN.json --robot DIR`",
+            remedy="name one with --robot DIR, or make one with `openant config new --robot DIR`",
         )
     return folder
