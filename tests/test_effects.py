@@ -28,10 +28,7 @@ from openant_tools.robot.config import Effect as Entry
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
-from openant_tools.sysid.beyond import leaves_more_than_noise, with_effects
-from openant_tools.sysid.identify import identify
 from openant_tools.sysid.parameter import choose, colours
-from openant_tools.sysid.result import write_fit
 
 #: a size of each parameter that shows
 SHOWING = {
@@ -221,34 +218,37 @@ def rubbing_pendulum(t: np.ndarray, command: np.ndarray, coefficient: float) -> 
 def test_load_friction_of_another_simulation_is_found_unasked_and_written_beside_the_plain_fit(tmp_path: Path) -> None:
     path = write(tmp_path / "pendulum.xml", pendulum())
     t = np.arange(0.0, 5.0, 0.01)
-    runs = []
+    tables = []
     for k in range(3):
         command = sweep(t, 1 + k, 0.9)[:, -1:]
         position = rubbing_pendulum(t, command[:, 0], 0.25)
         position = np.round(position / ENCODER_RAD) * ENCODER_RAD
-        runs.append(Run(f"run{k}", Facts(joints=("joint",)), t, {"cmd.joint": command[:, 0], "pos.joint": position}))
-    plain = identify(runs[:2], path, runs[2:])
-    assert leaves_more_than_noise(plain)
-    result = with_effects(plain, runs[:2], runs[2:])
-    assert result is not None
-    assert result.after.full < 0.6 * plain.after.full
-    value = next(value for value in result.values if value.name == "load_friction.joint")
-    assert value.accepted
-    # Another law of friction at rest: near, if not within an interval that knows this one only.
-    assert value.value == pytest.approx(0.25, abs=0.06)
-
+        run = Run(f"run{k}", Facts(joints=("joint",)), t, {"cmd.joint": command[:, 0], "pos.joint": position})
+        tables.append(tmp_path / f"run{k}.parquet")
+        write_table(run, tables[-1])
     out = tmp_path / "fit"
-    written = write_fit(plain, out, result)
-    beside = out / "with-effects" / "calibrated.effects.toml"
-    assert beside in written
-    assert out / "calibrated.xml" in written
+    asked = [*tables[:2], "--hold-out", tables[2], "--model", path, "--out", out]
+    ran = CliRunner().invoke(fit, [str(word) for word in asked], standalone_mode=False)
+    assert ran.exception is None
+    assert "More is explained by what plain MuJoCo has no feature for: with load_friction.joint = 0.2" in ran.output
+
+    plain, richer = (json.loads((folder / "fit.json").read_text()) for folder in (out, out / "with-effects"))
+    assert richer["held_out"]["after"]["gap_full_rad"] < 0.6 * plain["held_out"]["after"]["gap_full_rad"]
+    assert "load_friction.joint" in richer["accepted"]
+    assert not any(name.startswith("load_friction") for name in plain["parameters"])
+    value = richer["parameters"]["load_friction.joint"]["value"]
+    # Another law of friction at rest: near, if not within an interval that knows this one only.
+    assert value == pytest.approx(0.25, abs=0.06)
+    assert (out / "calibrated.xml").exists()
     assert not (out / "calibrated.effects.toml").exists()
-    entries = tomllib.loads(beside.read_text())["effect"]
+    entries = tomllib.loads((out / "with-effects" / "calibrated.effects.toml").read_text())["effect"]
     assert entries == [
         {"effect": "load_friction", "joints": ["joint"], "enabled": True,
-         "parameters": {"coefficient": pytest.approx(value.value, rel=1e-5)}}
+         "parameters": {"coefficient": pytest.approx(value, rel=1e-5)}}
     ]  # fmt: skip
-    write_fit(plain, out)
+    # Said not to want them, nothing of theirs is left.
+    ran = CliRunner().invoke(fit, [*(str(word) for word in asked), "--no-effects"], standalone_mode=False)
+    assert ran.exception is None
     assert sorted(file.name for file in out.iterdir()) == ["calibrated.xml", "fit.json", "report.html"]
 
 

@@ -17,7 +17,7 @@ from openant_tools.sysid.fit import WHITE, sensor_floor
 from openant_tools.sysid.identify import WORTH, Identification, identify
 from openant_tools.sysid.kinds import KINDS
 
-__all__ = ["TRIED", "leaves_more_than_noise", "with_effects"]
+__all__ = ["TRIED", "with_effects"]
 
 Progress = Callable[[str, float], None]
 
@@ -27,7 +27,7 @@ TRIED = ("load_friction", "load_friction_at_rest")
 WORTH_LOOKING = 3.0
 
 
-def leaves_more_than_noise(result: Identification) -> bool:
+def _leaves_more_than_noise(result: Identification) -> bool:
     """Whether some joint's residual is the model's error: far above the encoder's step, and no white noise."""
     runs = [run for data in result.datasets for run in data.runs]
     period = float(np.median(np.concatenate([np.diff(run.t) for run in runs])))
@@ -58,7 +58,7 @@ def with_effects(
     """
     acting = {name for name, _ in plain.effects}
     tried = [kind for kind in TRIED if kind not in also and (KINDS[kind].effect or ("",))[0] not in acting]
-    if not tried or not leaves_more_than_noise(plain):
+    if not tried or not _leaves_more_than_noise(plain):
         return None
     richer = identify(
         runs,
