@@ -230,6 +230,14 @@ def test_a_robot_done_is_not_done_again_and_one_refused_is_tried_again(sealed_se
     assert asked == ["robot-000", "robot-001", "robot-002", "robot-002"]
 
 
+def test_a_robot_that_is_not_wholly_made_yet_is_not_judged(sealed_set: tuple[Path, Path, bytes]) -> None:
+    folder = sealed_set[0]
+    for path in (folder / "robot-001").glob("stand-1.*"):
+        path.unlink()
+    assert run_set(folder, diagnose=says) == 2
+    assert not verdict_path(folder, "robot-001").exists()
+
+
 def test_two_workers_of_a_dask_cluster_share_the_robots(sealed_set: tuple[Path, Path, bytes]) -> None:
     distributed = pytest.importorskip("distributed")
     import cloudpickle

@@ -94,3 +94,9 @@ def test_a_large_motion_tells_a_limit_from_stiffness(model: Path) -> None:
 def test_nothing_is_open_where_nothing_was_found(model: Path) -> None:
     healthy = diagnosis(model, found("stiffness_error", "all", scale=0.9), selected=False, verdict="none")
     assert experiments(healthy, model).experiments == ()
+
+
+def test_friction_that_is_alike_either_way_is_plain_friction() -> None:
+    cause = catalogue()["asymmetric_friction"]
+    assert cause.simpler({"positive_nm": 0.17, "negative_nm": 0.168}) == "coulomb_friction"
+    assert cause.simpler({"positive_nm": 0.14, "negative_nm": 0.06}) is None

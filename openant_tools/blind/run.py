@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -74,7 +74,7 @@ def run_set(
     Raises:
         BadInput: no set, or the backend is not installed.
     """
-    todo = [robot for robot in folders_of(folder) if not _judged(verdict_path(folder, robot.name))]
+    todo = [robot for robot in _whole(folders_of(folder)) if not _judged(verdict_path(folder, robot.name))]
     if not todo:
         return 0
     # Who is to help is asked for first: the first robot may take half an hour.
@@ -86,6 +86,12 @@ def run_set(
         for done, name in enumerate(Parallel(return_as="generator_unordered")(work), 2):
             progress(name, done / len(todo))
     return len(todo)
+
+
+def _whole(robots: Sequence[Path]) -> list[Path]:
+    """Those that have every run: one whose making was stopped lacks some until the set is made further."""
+    runs = {robot: len(list(robot.glob("*.json"))) for robot in robots}
+    return [robot for robot in robots if runs[robot] == max(runs.values())]
 
 
 def _judged(path: Path) -> bool:

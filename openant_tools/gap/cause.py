@@ -125,6 +125,8 @@ class Cause:
         shows: whether it can show on what was recorded.
         signal: the signal of the log that it acts on, where that is not the motion itself.
         witness: a signal that shows it beside the motion, and nothing else does.
+        silent: whether command and encoder shift alike, so that joint positions hardly show it.
+        simpler: the cause that it is no more than at coordinates like these, if it is.
         random: whether it acts at random times: no simulation repeats what happened, and what one closes says little.
         stated: from the quantities to the catalogue's parameters, where those are not the same.
         restored: from a diagnosis' parameters back to the quantities, with what its coordinates were.
@@ -141,6 +143,8 @@ class Cause:
     shows: Callable[[Reference], bool] = everywhere
     signal: str | None = None
     witness: str | None = None
+    silent: bool = False
+    simpler: Callable[[Mapping[str, float]], str | None] = lambda x: None
     random: bool = False
     stated: Callable[[Values, Reference, Ints], dict[str, float]] = lambda values, reference, joints: dict(values)
     restored: Callable[[Values, Values, Reference, Ints], dict[str, float]] = lambda given, x, reference, joints: dict(
@@ -155,7 +159,7 @@ class Cause:
     @property
     def beside_joints(self) -> bool:
         """Whether joint positions say little of it: it acts on the body, or on another signal of the log."""
-        return self.of_body or self.signal is not None
+        return self.of_body or self.signal is not None or self.silent
 
     def values(self, x: Mapping[str, float], reference: Reference, joints: Ints) -> dict[str, float]:
         """The parameters at a point of the coordinates."""

@@ -336,6 +336,14 @@ def _decide(
     starts = [nothing(windows), *(_start(windows, [explained[name]]) for name in names)]
     before, floor, (refit, *singles) = closures(windows, starts, held_out, case.training)
     alone = dict(zip(names, singles, strict=True))
+    for name in list(names):
+        simpler = catalogue()[name].simpler(alone[name].refit.x[0])
+        if simpler in alone:
+            # Where it is no more than another cause, it is that one.
+            names.remove(name)
+            del explained[name]
+            probability[simpler] = min(probability[simpler] + probability[name], SURELY)
+            ranked = [(other, 0.0 if other == name else chance) for other, chance in ranked]
     score = {name: _score(probability[name], refit if catalogue()[name].random else alone[name]) for name in names}
     names.sort(key=lambda name: -score[name])
     best = names[0]

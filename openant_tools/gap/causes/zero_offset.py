@@ -20,4 +20,5 @@ CAUSE = Cause(
     quantities=(amount("angle_rad", "rad", 0.012, 0.16, signed=True),),
     enter=_enter,
     native=True,
+    silent=True,
 )
