@@ -23,19 +23,16 @@ from openant_tools.gap.cause import Scope, catalogue
 from openant_tools.gap.closure import Closure, Refit, Windows, calibration_of, closures, nothing
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found, Span
 from openant_tools.gap.explain import Explained, Part, Scene, fit, robot_with
-from openant_tools.gap.features import Floats, differences
+from openant_tools.gap.features import Floats
 from openant_tools.gap.judge import Judge, Judgement, train, whitening_of
 from openant_tools.gap.late import late_velocity
 from openant_tools.gap.measure import Measurement, measure
 from openant_tools.gap.next import suggestion
 from openant_tools.gap.prepare import Prepared, prepare
 from openant_tools.gap.protocol import Protocol
-from openant_tools.gap.robot import Robot
 from openant_tools.gap.sets import SetFits, choose, motions_of
-from openant_tools.gap.simulation import simulate
 from openant_tools.model.gap import excess
 from openant_tools.model.plant import Setup
-from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.sysid.identify import joints_in_common, own_model
 
@@ -58,6 +55,8 @@ PLACES = 2
 #: held-out closure that an addition must bring; that one cause must bring beyond what tolerances do, where the judge doubts;
 #: and below which a set explains nothing
 ADDS, ADDS_ALONE, EXPLAINS = 0.02, 0.2, 0.35
+#: and that a second cause must bring which the judge does not expect
+ADDS_MUCH = 0.15
 #: °C between runs from which heat is asked about, and its cause
 WARMED_C, HEAT = 2.5, "thermal_derating"
 #: 1/°C of torque that any motor loses: copper's resistance grows by 0.4 %, and its magnets weaken; twice that is an effect
@@ -278,38 +277,10 @@ def _explain(
 
 
 def _without(case: _Case, explained: Explained) -> Judgement:
-    """What the judge says of what is left once a cause is taken into account.
-
-    The features that the cause makes on the model are taken off; logarithms of sizes do not subtract, and stay as healthy.
-    """
-    coarse = case.coarse
-    scene = robot_with(coarse.reference, (explained.part,), (explained.x,))
-    parts = []
-    for plant in {id(one.plant): one.plant for one in coarse.runs}.values():
-        mine = [k for k in case.training if coarse.runs[k].plant is plant]
-        if not mine:
-            continue
-        rollouts = Rollouts(plant, [coarse.runs[k].run for k in mine])
-        both = simulate(
-            rollouts,
-            [Robot(len(case.protocol.joints)), scene],
-            signals=coarse.runs[mine[0]].signals,
-            warm_c=[coarse.runs[k].warm_c for k in mine],
-        ).signals
-        for k, rows in zip(mine, rollouts.rows, strict=True):
-            one = coarse.runs[k]
-            apart = differences(
-                {name: values[1:, rows] for name, values in both.items()},
-                {name: values[:1, rows] for name, values in both.items()},
-                one.signals,
-            )
-            parts.append((k, one.layout.features(apart)[0][case.found[k][1]]))
-    made = np.concatenate([part for _, part in sorted(parts, key=lambda item: case.training.index(item[0]))])
-    x = case.features.copy()
-    judge = case.judge
-    x[judge.means] -= made[judge.means]
-    x[judge.logs] = judge.log_centre
-    return judge.say(x)
+    """What the judge says of what is left once a cause is taken into account: against the model that has it."""
+    robot = robot_with(case.coarse.reference, (explained.part,), (explained.x,))
+    left = case.coarse.features(robot)
+    return case.judge.say(np.concatenate([left[k][0][left[k][1]] for k in case.training]))
 
 
 def _healthy(case: _Case, judgement: Judgement, ranked: Sequence[tuple[str, float]]) -> Diagnosis:
@@ -367,12 +338,24 @@ def _decide(
         left = _without(case, explained[best])
         eased = probability[best] > MAYBE and judgement.energy > 1 and left.energy < EASES * judgement.energy
     if left is not None and (probability[best] > FINDING or proved or eased):
-        for name, chance in _shown(left, case.protocol)[:2]:
-            if (
-                name in chosen
-                or max(chance, probability[name] if name in explained else 0.0) < SECOND
-                or chance < SUSPECT
-            ):
+        seconds = [
+            (name, chance, ADDS)
+            for name, chance in _shown(left, case.protocol)[:2]
+            if max(chance, probability[name] if name in explained else 0.0) > SECOND and chance > SUSPECT
+        ]
+        # And what the judge half hides behind the first, where it closes much of what the first leaves.
+        closing = [
+            name
+            for name in names
+            if probability[name] > SUSPECT
+            and alone[name].closed > refit.closed + ADDS_ALONE
+            and explained[name].beyond_tolerance
+            and not catalogue()[name].beside_joints
+            and not catalogue()[name].random
+        ]
+        seconds += [(name, 0.0, ADDS_MUCH) for name in sorted(closing, key=lambda name: -alone[name].closed)[:1]]
+        for name, chance, adds in seconds:
+            if name in chosen:
                 continue
             more = explained.get(name) or _explain(scenes, [name], left).get(name)
             if more is None:
@@ -382,7 +365,7 @@ def _decide(
                 windows, [_start(windows, [explained[one] for one in [*chosen, name]])], held_out, case.training
             )
             silent = catalogue()[name].beside_joints and chance > FINDING
-            if both.closed > whole.closed + ADDS or (silent and both.closed > whole.closed - ADDS):
+            if both.closed > whole.closed + adds or (silent and both.closed > whole.closed - adds):
                 beyond[name] = both.closed - whole.closed
                 beyond[best] = both.closed - (alone[name].closed if name in alone else refit.closed)
                 chosen.append(name)

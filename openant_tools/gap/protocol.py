@@ -173,20 +173,25 @@ class Protocol:
             reference=dataclasses.replace(self.reference, seen=other.reference.seen),
         )
 
-    def nominal(self) -> list[dict[str, Floats]]:
-        """Of each run, what the model does with its commands from its start on, at its own rows."""
+    def nominal(self, robot: Robot | None = None) -> list[dict[str, Floats]]:
+        """Of each run, what the model (or another robot) does with its commands from its start on, at its own rows."""
         out: list[dict[str, Floats]] = [{} for _ in self.runs]
         for plant in {id(one.plant): one.plant for one in self.runs}.values():
             mine = [k for k, one in enumerate(self.runs) if one.plant is plant]
             rollouts = Rollouts(plant, [self.runs[k].run for k in mine])
-            found = simulate(rollouts, [Robot(len(self.joints))], signals=self.runs[mine[0]].signals).signals
+            found = simulate(
+                rollouts,
+                [robot or Robot(len(self.joints))],
+                signals=self.runs[mine[0]].signals,
+                warm_c=[self.runs[k].warm_c for k in mine],
+            ).signals
             for k, rows in zip(mine, rollouts.rows, strict=True):
                 out[k] = {name: values[:, rows] for name, values in found.items()}
         return out
 
-    def features(self) -> list[tuple[Floats, NDArray[np.bool_]]]:
-        """Of each run, its features and which of them its log has."""
-        return [one.features(nominal) for one, nominal in zip(self.runs, self.nominal(), strict=True)]
+    def features(self, robot: Robot | None = None) -> list[tuple[Floats, NDArray[np.bool_]]]:
+        """Of each run, its features against the model (or another robot) and which of them its log has."""
+        return [one.features(nominal) for one, nominal in zip(self.runs, self.nominal(robot), strict=True)]
 
     def commands(self) -> list[Array]:
         """Of each run (times, joints) rad on a grid."""

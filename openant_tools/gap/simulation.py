@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 CHUNK_BYTES = 64 * 2**20
 #: s over which velocities become an acceleration
 ACCELERATION_S = 0.01
+#: time constants of a lag after which what was commanded is forgotten
+REMEMBERS = 5.0
 #: base signals and how many columns they have
 BASE = {"gyro": 3, "acc": 3, "base": 3, "yaw": 1}
 
@@ -211,8 +213,12 @@ class _Batch:
                 mean[:, j] = column.mean(edges - robot.delay[j])[:, 0]
         if robot.lag.any():
             mean = mean.copy()
+            # What a servo still follows when a window begins was commanded before it.
+            back = edges[0] - h * np.arange(round(REMEMBERS * float(robot.lag.max()) / h), -1, -1)
             for filtered in np.flatnonzero(robot.lag):
-                mean[:, filtered] = _filtered(mean[:, filtered], h / float(robot.lag[filtered]))
+                before = commands.mean(back - robot.delay[filtered])[:, filtered]
+                whole = np.concatenate([before, mean[:, filtered]])
+                mean[:, filtered] = _filtered(whole, h / float(robot.lag[filtered]))[len(before) :]
         return mean
 
     def _lost(self, robot: Robot, times: Array, j: int) -> NDArray[np.bool_]:
