@@ -44,17 +44,18 @@ class Fields:
     link: Array
 
 
-def first_laws(robots: Sequence[Robot], warm_c: Array) -> list[Law]:
+def first_laws(robots: Sequence[Robot], warm_c: Array, asked: Array) -> list[Law]:
     """The laws on what the servo is asked and may give.
 
     Args:
         warm_c: (robots, joints) °C, by which servos are known to be warmer as the run begins.
+        asked: (robots, joints) rad, where a setpoint of limited rate is as the simulation begins; NaN: where it is asked to be.
     """
     laws: list[Law] = []
     slew, no_load = _table(robots, "slew"), _table(robots, "no_load")
     derating = _table(robots, "derating")
     if np.isfinite(slew).any():
-        laws.append(_slewing(slew))
+        laws.append(_slewing(slew, asked))
     steps = np.array([[robot.form.encoder_rad if robot.form else 0.0] for robot in robots])
     if steps.any():
         laws.append(_rounding(steps, _table(robots, "zero")))
@@ -95,12 +96,12 @@ def _table(robots: Sequence[Robot], name: str) -> Array:
     return np.array([getattr(robot, name) for robot in robots])
 
 
-def _slewing(rate: Array) -> Law:
+def _slewing(rate: Array, begun: Array) -> Law:
     at: list[Array] = []
 
     def act(step: Step) -> None:
         if not at:
-            at.append(step.setpoint.copy())
+            at.append(np.where(np.isnan(begun), step.setpoint, begun))
         at[0] += np.clip(step.setpoint - at[0], -rate * step.dt, rate * step.dt)
         step.setpoint = at[0].copy()
 

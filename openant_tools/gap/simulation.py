@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 CHUNK_BYTES = 64 * 2**20
 #: s over which velocities become an acceleration
 ACCELERATION_S = 0.01
+#: s, of which what a setpoint of limited rate did before a simulation begins is followed
+SLEW_STEP_S = 0.01
 #: time constants of a lag after which what was commanded is forgotten
 REMEMBERS = 5.0
 #: base signals and how many columns they have
@@ -141,10 +143,34 @@ class _Batch:
             friction=_column(self._batch, "dof_frictionloss", plant.dof),
             link=np.maximum(plant.model.dof_M0[plant.dof] - plant.model.dof_armature[plant.dof], 1e-6)[None].repeat(len(robots), 0),
         )  # fmt: skip
-        first, last = first_laws(robots, warm_c), last_laws(robots, fields)
+        first, last = first_laws(robots, warm_c, self._asked()), last_laws(robots, fields)
         for name, values in (("dof_armature", fields.armature), ("dof_damping", fields.damping)):
             self._batch.expand(name)[:, plant.dof] = values
         return [*first, *laws_of([robot.laws for robot in robots], len(plant.joints)), self._note, *last]
+
+    def _asked(self) -> Array:
+        """(segments · robots, joints) rad: how far setpoints of limited rate have come as each segment begins, else NaN."""
+        out = np.full((len(self._segments), self._n, len(self._plant.joints)), np.nan)
+        for r, robot in enumerate(self._robots):
+            limited = np.isfinite(robot.slew)
+            if not limited.any():
+                continue
+            at: dict[int, tuple[float, Array]] = {}
+            for s in sorted(range(len(self._segments)), key=lambda s: self._segments[s].start):
+                segment = self._segments[s]
+                times = segment.commands.times
+                now, level = at.get(segment.run, (float(times[0]), segment.commands.values[0]))
+                for late in np.arange(now, segment.start, SLEW_STEP_S):
+                    asked = np.array(
+                        [segment.commands.at(late - robot.delay[j : j + 1])[0, j] for j in np.flatnonzero(limited)]
+                    )
+                    level = level.copy()
+                    level[limited] += np.clip(
+                        asked - level[limited], *(robot.slew[limited] * SLEW_STEP_S * sign for sign in (-1, 1))
+                    )
+                at[segment.run] = max(now, segment.start), level
+                out[s, r, limited] = level[limited] - robot.zero[limited]
+        return out.reshape(-1, len(self._plant.joints))
 
     def _note(self, step: Step) -> None:
         """What the motors give and get, before laws on what comes of it."""
