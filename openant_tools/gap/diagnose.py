@@ -428,7 +428,11 @@ def _decide_together(
     windows = Windows(case.protocol)
     fits = SetFits(windows, case.training, list(range(len(case.training), len(case.protocol.runs))))
     probability = dict(ranked)
+    late = _late_register(case)
     moving = [name for name in explained if not catalogue()[name].beside_joints]
+    if late is not None:
+        # What the log itself shows needs no fit to positions, and none may make something else of it.
+        moving = [name for name in moving if name != late[0].part.cause]
     seen = {signal for one in case.protocol.runs for signal in one.seen}
     witnessed = {name for name in moving if catalogue()[name].witness in seen and probability[name] > FINDING}
     parts, starts = [explained[name].part for name in moving], [explained[name].x for name in moving]
@@ -437,7 +441,6 @@ def _decide_together(
     notes = [
         f"closed where left out: {', '.join(f'{name} {100 * share:.0f} %' for name, share in chosen.folds.items())}"
     ]
-    late = _late_register(case)
     if late is not None:
         explained, probability = (
             {**explained, late[0].part.cause: late[0]},

@@ -7,7 +7,6 @@ causes are simulated side by side.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -17,10 +16,8 @@ from numpy.typing import NDArray
 from openant_tools.gap.cause import Cause, Quantity, catalogue, enter
 from openant_tools.gap.features import Floats, differences
 from openant_tools.gap.judge import Whitening
-from openant_tools.gap.protocol import Played, Protocol
+from openant_tools.gap.protocol import Played, Players, Protocol
 from openant_tools.gap.robot import Reference, Robot
-from openant_tools.gap.simulation import simulate
-from openant_tools.model.rollout import Rollouts
 
 __all__ = ["Explained", "Hypothesis", "Part", "Scene", "bounds_of", "fit", "robot_with"]
 
@@ -96,26 +93,17 @@ class Scene:
     seen: Floats
 
     def __post_init__(self) -> None:
-        # Runs on one plant are simulated side by side.
-        mine: dict[int, list[int]] = {}
-        for k, one in enumerate(self.runs):
-            mine.setdefault(id(one.plant), []).append(k)
-        self._together = [
-            (group, Rollouts(self.runs[group[0]].plant, [self.runs[k].run for k in group])) for group in mine.values()
-        ]
-        self._nominal = dataclasses.replace(self.protocol, runs=tuple(self.runs)).nominal()
+        self._players = Players.of(self.runs)
+        self._nominal = self._players.play([Robot(len(self.protocol.joints))])
         self._target = self.whitening(self.seen[None, self.columns])[0]
 
     def residuals(self, robots: Sequence[Robot]) -> Floats:
         """(robots, features) whitened differences between the robot at hand and these."""
-        parts: dict[int, Floats] = {}
-        for group, rollouts in self._together:
-            signals, warm_c = self.runs[group[0]].signals, [self.runs[k].warm_c for k in group]
-            found = simulate(rollouts, robots, signals=signals, warm_c=warm_c).signals
-            for k, rows in zip(group, rollouts.rows, strict=True):
-                own = {name: values[:, rows] for name, values in found.items()}
-                parts[k] = self.runs[k].layout.features(differences(own, self._nominal[k], signals))
-        x = np.concatenate([parts[k] for k in range(len(self.runs))], axis=1)[:, self.columns]
+        parts = [
+            one.layout.features(differences(found, nominal, one.signals))
+            for one, found, nominal in zip(self.runs, self._players.play(robots), self._nominal, strict=True)
+        ]
+        x = np.concatenate(parts, axis=1)[:, self.columns]
         out: Floats = np.nan_to_num(self.whitening(x) - self._target)
         return out
 

@@ -406,7 +406,7 @@ def _unseen(forest: ExtraTreesClassifier, outputs: int) -> Array:
 def _table(said: Sequence[Array] | Array, outputs: int) -> Array:
     """(robots, outputs) probabilities, in whatever form a classifier of several labels gives them."""
     if isinstance(said, np.ndarray):
-        return said[:, -outputs:] if said.ndim == 2 else said[:, :, 1]
+        return said[:, -outputs:]
     return np.stack([one[:, 1] if one.shape[1] > 1 else np.zeros(len(one)) for one in said], axis=1)
 
 

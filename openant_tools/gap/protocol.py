@@ -23,7 +23,7 @@ from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 
-__all__ = ["Played", "Protocol", "alike", "same", "shown"]
+__all__ = ["Played", "Players", "Protocol", "alike", "same", "shown"]
 
 Array = NDArray[np.float64]
 
@@ -80,6 +80,36 @@ class Played:
         x = self.layout.features(differences(seen, nominal, self.signals))[0]
         there = [np.full(len(names), name in self.seen) for name, names in self.layout.groups().items()]
         return x, np.concatenate(there)
+
+
+@dataclass(frozen=True)
+class Players:
+    """Runs made ready to be played: those on one plant are simulated side by side.
+
+    Attributes:
+        runs: in order. groups: of each plant, which runs are on it, and they prepared.
+    """
+
+    runs: tuple[Played, ...]
+    groups: tuple[tuple[tuple[int, ...], Rollouts], ...]
+
+    @classmethod
+    def of(cls, runs: Sequence[Played]) -> Players:
+        on: dict[int, list[int]] = {}
+        for k, one in enumerate(runs):
+            on.setdefault(id(one.plant), []).append(k)
+        groups = ((tuple(mine), Rollouts(runs[mine[0]].plant, [runs[k].run for k in mine])) for mine in on.values())
+        return cls(tuple(runs), tuple(groups))
+
+    def play(self, robots: Sequence[Robot]) -> list[dict[str, Floats]]:
+        """Of each run, what robots do with its commands: signal → (robots, rows, columns)."""
+        out: list[dict[str, Floats]] = [{} for _ in self.runs]
+        for mine, rollouts in self.groups:
+            warm_c = [self.runs[k].warm_c for k in mine]
+            found = simulate(rollouts, robots, signals=self.runs[mine[0]].signals, warm_c=warm_c).signals
+            for k, rows in zip(mine, rollouts.rows, strict=True):
+                out[k] = {name: values[:, rows] for name, values in found.items()}
+        return out
 
 
 @dataclass(frozen=True)
@@ -175,19 +205,7 @@ class Protocol:
 
     def nominal(self, robot: Robot | None = None) -> list[dict[str, Floats]]:
         """Of each run, what the model (or another robot) does with its commands from its start on, at its own rows."""
-        out: list[dict[str, Floats]] = [{} for _ in self.runs]
-        for plant in {id(one.plant): one.plant for one in self.runs}.values():
-            mine = [k for k, one in enumerate(self.runs) if one.plant is plant]
-            rollouts = Rollouts(plant, [self.runs[k].run for k in mine])
-            found = simulate(
-                rollouts,
-                [robot or Robot(len(self.joints))],
-                signals=self.runs[mine[0]].signals,
-                warm_c=[self.runs[k].warm_c for k in mine],
-            ).signals
-            for k, rows in zip(mine, rollouts.rows, strict=True):
-                out[k] = {name: values[:, rows] for name, values in found.items()}
-        return out
+        return Players.of(self.runs).play([robot or Robot(len(self.joints))])
 
     def features(self, robot: Robot | None = None) -> list[tuple[Floats, NDArray[np.bool_]]]:
         """Of each run, its features against the model (or another robot) and which of them its log has."""

@@ -150,27 +150,28 @@ class _Batch:
 
     def _asked(self) -> Array:
         """(segments · robots, joints) rad: how far setpoints of limited rate have come as each segment begins, else NaN."""
-        out = np.full((len(self._segments), self._n, len(self._plant.joints)), np.nan)
-        for r, robot in enumerate(self._robots):
-            limited = np.isfinite(robot.slew)
-            if not limited.any():
-                continue
-            at: dict[int, tuple[float, Array]] = {}
-            for s in sorted(range(len(self._segments)), key=lambda s: self._segments[s].start):
-                segment = self._segments[s]
-                times = segment.commands.times
-                now, level = at.get(segment.run, (float(times[0]), segment.commands.values[0]))
-                for late in np.arange(now, segment.start, SLEW_STEP_S):
-                    asked = np.array(
-                        [segment.commands.at(late - robot.delay[j : j + 1])[0, j] for j in np.flatnonzero(limited)]
-                    )
-                    level = level.copy()
-                    level[limited] += np.clip(
-                        asked - level[limited], *(robot.slew[limited] * SLEW_STEP_S * sign for sign in (-1, 1))
-                    )
-                at[segment.run] = max(now, segment.start), level
-                out[s, r, limited] = level[limited] - robot.zero[limited]
-        return out.reshape(-1, len(self._plant.joints))
+        shape = (len(self._segments), self._n, len(self._plant.joints))
+        out = np.full(shape, np.nan)
+        rate, delay = (np.array([getattr(robot, name) for robot in self._robots]) for name in ("slew", "delay"))
+        limited = np.isfinite(rate)
+        if not limited.any():
+            return out.reshape(-1, shape[2])
+        for run in {segment.run for segment in self._segments}:
+            mine = [s for s, segment in enumerate(self._segments) if segment.run == run]
+            commands = self._segments[mine[0]].commands
+            starts = [self._segments[s].start for s in mine]
+            grid = np.arange(commands.times[0], max(starts) + SLEW_STEP_S, SLEW_STEP_S)
+            path = np.empty((len(grid), *shape[1:]))
+            for r, j in np.ndindex(*shape[1:]):
+                path[:, r, j] = commands.column(j).at(grid - delay[r, j])[:, 0] if limited[r, j] else 0.0
+            for k in range(1, len(grid)):
+                path[k] = path[k - 1] + np.clip(path[k] - path[k - 1], -rate * SLEW_STEP_S, rate * SLEW_STEP_S)
+            for s, start in zip(mine, starts, strict=True):
+                at = np.clip((start - grid[0]) / SLEW_STEP_S, 0, len(grid) - 1)
+                low = min(int(at), len(grid) - 2)
+                begun = path[low] + (path[low + 1] - path[low]) * (at - low) if len(grid) > 1 else path[0]
+                out[s] = np.where(limited, begun - self._zero[: self._n], np.nan)
+        return out.reshape(-1, shape[2])
 
     def _note(self, step: Step) -> None:
         """What the motors give and get, before laws on what comes of it."""
