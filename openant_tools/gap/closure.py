@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.cause import Quantity, enter
 from openant_tools.gap.explain import Hypothesis
+from openant_tools.gap.features import after_torque_on
 from openant_tools.gap.protocol import Played, Protocol
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
@@ -102,7 +103,11 @@ class Windows:
         self._rollouts = [Rollouts(one.plant, [one.run], HORIZON_S) for one in protocol.runs]
         coarse = protocol.coarse()
         self._quick = [Rollouts(one.plant, [one.run], HORIZON_S) for one in coarse.runs]
-        self._measured = [one.run.signal("pos", protocol.joints) for one in protocol.runs]
+        unsure = [after_torque_on(one.run, protocol.joints) for one in protocol.runs]
+        self._measured = [
+            np.where(there, np.nan, one.run.signal("pos", protocol.joints))
+            for one, there in zip(protocol.runs, unsure, strict=True)
+        ]
         self.floor = floors([one.run for one in protocol.runs], protocol.joints)[0]
         self._sigma = np.maximum(self.floor, LEAST_SIGMA_RAD)
 

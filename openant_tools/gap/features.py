@@ -16,10 +16,11 @@ from openant_tools.gap.robot import USUAL_NOISE, Robot
 from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
 
-__all__ = ["COLUMNS", "Layout", "Signals", "logged", "with_noise"]
+__all__ = ["COLUMNS", "Layout", "Signals", "after_torque_on", "logged", "with_noise"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
+Bools = NDArray[np.bool_]
 #: signal → (robots, rows, columns)
 Signals = Mapping[str, Floats]
 
@@ -36,6 +37,10 @@ TORQUES = ("cur", "load", "pwm")
 SKIP_S, STAND_BLOCK_S, ONE_JOINT_BLOCK_S, FLOOR_BLOCK_S = 0.5, 0.1, 0.05, 0.2
 #: signals of which only changes are looked at: a foot that slips once as it begins to move puts the whole run elsewhere
 DRIFTING = ("base", "yaw")
+#: s after torque comes on in which servos differ: one starts from where it is, another from where it was last told to go
+TAKES_UP_S = 0.3
+#: factors within which one joint's torque may need another scale than most: what is beyond is no matter of scale
+OWN_SCALE = 4 / 3
 #: least size of a scatter, as a share of the signal's noise
 LEAST = 0.3
 
@@ -48,6 +53,7 @@ class Layout:
         t: (rows,) s since the run's start. setup: how the robot stood. joints: how many.
         signals: which, in order.
         seconds: how long the protocol's run is: a log that goes on longer is cut there.
+        unsure: (rows, joints) as `after_torque_on`.
     """
 
     t: Array
@@ -55,6 +61,7 @@ class Layout:
     joints: int
     signals: tuple[str, ...]
     seconds: float
+    unsure: Bools
 
     def blocks(self, signal: str) -> Array:
         """Edges of the blocks of a signal, s."""
@@ -80,6 +87,8 @@ class Layout:
         parts = []
         for signal in self.signals:
             x = differences[signal]
+            if signal not in COLUMNS and self.unsure.any():
+                x = np.where(self.unsure, np.float32(np.nan), x)
             edges = self.blocks(signal)
             means = _means(x, self.t, edges)
             if signal in DRIFTING:
@@ -96,6 +105,15 @@ class Layout:
         change = np.diff(x[:, seen], axis=1)
         out: Floats = np.log10(np.sqrt(np.nanmean(np.square(change), axis=1)) + LEAST * _least(signal))
         return out
+
+
+def after_torque_on(run: Run, joints: Sequence[str]) -> Bools:
+    """(rows, joints): where torque has just come on, and nobody knows what a late or slow servo still had in mind."""
+    off = run.signal("torque", joints, default=1.0) == 0
+    out = np.zeros(off.shape, bool)
+    for row, joint in np.argwhere(off[:-1] & ~off[1:]):
+        out[:, joint] |= (run.t > run.t[row]) & (run.t < run.t[row + 1] + TAKES_UP_S)
+    return out
 
 
 def logged(run: Run, joints: Sequence[str]) -> dict[str, Floats]:
@@ -124,7 +142,7 @@ def logged(run: Run, joints: Sequence[str]) -> dict[str, Floats]:
 def differences(seen: Signals, simulated: Signals, names: Sequence[str]) -> dict[str, Floats]:
     """What was seen minus what the model does, (robots, rows, columns) each.
 
-    A torque is scaled first, joint by joint, so that it fits the model's best: its unit is not known. Supplies are shares of
+    A torque is scaled first, so that it fits the model's best: its unit is not known, and no two servos have quite the same. Supplies are shares of
     the best seen. Base and heading count from where the robot started.
     """
     out: dict[str, Floats] = {}
@@ -137,8 +155,8 @@ def differences(seen: Signals, simulated: Signals, names: Sequence[str]) -> dict
                 power, 1e-12
             )
             usual = np.median(np.abs(slope), axis=1, keepdims=True)
-            slope = np.where(np.abs(slope) > 0.2 * usual, slope, usual)
-            out[name] = (x / np.maximum(np.abs(slope), 1e-12)[:, None] - model).astype(np.float32)
+            scale = np.clip(np.abs(slope), usual / OWN_SCALE, usual * OWN_SCALE)
+            out[name] = (x / np.maximum(scale, 1e-12)[:, None] - model).astype(np.float32)
         elif name == "volt":
             best = np.nanpercentile(x.reshape(len(x), -1), 95, axis=1)[:, None, None]
             out[name] = (x / best - 1).astype(np.float32)

@@ -23,11 +23,13 @@ from sklearn.model_selection import KFold
 from sklearn.neural_network import MLPClassifier
 
 from openant_tools.gap import tolerance
+from openant_tools.gap.by_joint import FEWEST_JOINTS, ByJoint, places_of
 from openant_tools.gap.cause import catalogue
-from openant_tools.gap.features import Floats
+from openant_tools.gap.features import COLUMNS, Floats
 from openant_tools.gap.population import Case
 from openant_tools.gap.prepare import Prepared
 from openant_tools.gap.robot import Reference
+from openant_tools.model.plant import Setup
 
 __all__ = ["Judge", "Judgement", "Whitening", "train", "whitening_of"]
 
@@ -49,6 +51,8 @@ NETWORKS, NEURONS, DECAY, ROUNDS = 4, 128, 1.0, 60
 PORTION, STEPS = 64, 40
 #: main directions of the differences that they see, and of how many robots; deviations beyond which an input says no more
 DIRECTIONS, ENOUGH, FAR = 100, 3000, 5.0
+#: signals of single joints that are looked at by themselves, too
+LOOKED_AT = ("pos", "vel", "torque")
 #: share of healthy robots whose energy lies above the gate
 GATE = 0.02
 #: causes whose templates show what tolerances do: cause → the tolerance of its coordinate, for a robot's reference
@@ -191,11 +195,12 @@ class Judge:
     gates: Array
     forest: ExtraTreesClassifier | None = None
     networks: Networks | None = None
+    by_joint: ByJoint | None = None
     known: Bools | None = None
     calibration: tuple[tuple[float, float], ...] = ()
 
-    def inputs(self, x: Floats) -> tuple[Floats, Floats]:
-        """(robots, inputs) of the forest and (robots, differences) whitened, of features (robots, features)."""
+    def inputs(self, x: Floats) -> tuple[Floats, Floats, Floats]:
+        """Of features (robots, features): inputs of the forest but what single joints say, differences whitened, logarithms."""
         z = self.whitening(x[:, self.means])
         fit = self._fits(z)
         size = np.linalg.norm(z, axis=1, keepdims=True)
@@ -212,8 +217,8 @@ class Judge:
                 self._by_cause(self._fits(z, mine)) / np.maximum(own, 1e-6),
                 np.log10(own + 1e-3) - np.log10(size + 1e-3),
             ]
-        logs = ((x[:, self.logs] - self.log_centre) / self.log_scale).clip(-8, 8)
-        return np.concatenate([*parts, logs], axis=1).astype(np.float32), z
+        logs = ((x[:, self.logs] - self.log_centre) / self.log_scale).clip(-8, 8).astype(np.float32)
+        return np.concatenate([*parts, logs], axis=1).astype(np.float32), z, logs
 
     def energy(self, x: Floats) -> Array:
         """(robots,) largest energy of any run's signal, as a multiple of its gate."""
@@ -224,7 +229,9 @@ class Judge:
         assert self.forest is not None
         assert self.networks is not None
         assert self.known is not None
-        inputs, z = self.inputs(x[None])
+        inputs, z, logs = self.inputs(x[None])
+        if self.by_joint is not None:
+            inputs = np.concatenate([inputs, self.by_joint.said(z, logs)], axis=1)
         count = int(self.known.sum())
         votes = _table(self.forest.predict_proba(inputs), count)
         raw = _together(_logit(votes), self.networks.logits(z, inputs, count))[0]
@@ -270,8 +277,8 @@ def train(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools], se
     kept = np.concatenate(list(columns))
     x = np.concatenate([prepared.features[k] for k in which], axis=1)[:, kept]
     templates = np.concatenate([prepared.templates[k] for k in which], axis=1)[:, kept]
-    means, groups = _layout(prepared, which)
-    means, groups = means[kept], np.unique(groups[kept], return_inverse=True)[1]
+    means, groups, owners = (every[kept] for every in _layout(prepared, which))
+    groups = np.unique(groups, return_inverse=True)[1]
     healthy = np.flatnonzero(prepared.healthy())
     np.random.default_rng(seed).shuffle(healthy)
     # Those that the measure comes from look too healthy to it: they must not teach what healthy looks like.
@@ -300,7 +307,12 @@ def train(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools], se
         TREES, min_samples_leaf=LEAF, max_features=TRIED, bootstrap=True, oob_score=True, n_jobs=-1, random_state=seed
     )
     some = [judge.inputs(x[taught[k : k + 256]]) for k in range(0, len(taught), 256)]
-    inputs, z = (np.concatenate(parts) for parts in zip(*some, strict=True))
+    inputs, z, told = (np.concatenate(parts) for parts in zip(*some, strict=True))
+    if joints >= FEWEST_JOINTS:
+        by_joint, said = _by_joint(prepared, judge, which, kept, owners).taught(
+            z, told, [prepared.cases[k].causes for k in taught], seed
+        )
+        judge, inputs = dataclasses.replace(judge, by_joint=by_joint), np.concatenate([inputs, said], axis=1)
     wanted = labels[np.ix_(taught, known)]
     forest.fit(inputs, wanted)
     empty = Networks.of(z, inputs)
@@ -313,21 +325,47 @@ def train(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools], se
 
 def whitening_of(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools]) -> tuple[Whitening, Bools]:
     """The measure of some runs' block means alone, and which of their features it takes."""
-    means, _ = _layout(prepared, which)
+    means, _, _ = _layout(prepared, which)
     chosen = means & np.concatenate(list(columns))
     x = np.concatenate([prepared.features[k] for k in which], axis=1)[:, chosen]
     templates = np.concatenate([prepared.templates[k] for k in which], axis=1)[:, chosen]
     return _whiten(x[prepared.healthy()], templates, prepared.bank, prepared.protocol.reference), chosen
 
 
-def _layout(prepared: Prepared, which: Sequence[int]) -> tuple[Bools, Ints]:
-    """Which features are block means, and to which run and signal each belongs."""
-    means, groups = [], []
+def _layout(prepared: Prepared, which: Sequence[int]) -> tuple[Bools, Ints, Ints]:
+    """Which features are block means, to which run and signal each belongs, and to which joint, −1 for the body's."""
+    means, groups, owners = [], [], []
     for n, k in enumerate(which):
-        for m, kinds in enumerate(prepared.protocol.runs[k].layout.groups().values()):
+        layout = prepared.protocol.runs[k].layout
+        for m, (signal, kinds) in enumerate(layout.groups().items()):
             means += [kind == "mean" for kind in kinds]
             groups += [100 * n + m] * len(kinds)
-    return np.array(means), np.array(groups)
+            owners += [-1] * len(kinds) if signal in COLUMNS else [j % layout.joints for j in range(len(kinds))]
+    return np.array(means), np.array(groups), np.array(owners)
+
+
+def _by_joint(prepared: Prepared, judge: Judge, which: Sequence[int], kept: Bools, owners: Ints) -> ByJoint:
+    """What is to look at single joints: at each setup's runs, and on the stand at each signal by itself."""
+    floor, signal = [], []
+    for k in which:
+        played = prepared.protocol.runs[k]
+        for name, kinds in played.layout.groups().items():
+            floor += [played.plant.setup is Setup.FLOOR] * len(kinds)
+            signal += [name] * len(kinds)
+    on_floor, of = np.array(floor)[kept][judge.means], np.array(signal)[kept][judge.means]
+    mine = owners[judge.means]
+    views = [~on_floor, on_floor, *(~on_floor & (of == name) for name in LOOKED_AT)]
+    causes = tuple(name for name in judge.causes if not catalogue()[name].of_body)
+    return ByJoint(
+        causes=causes,
+        groups=tuple(np.array(group) for group in prepared.protocol.servos()),
+        parts=tuple(
+            tuple(part for view in views if (part := view & (mine == j)).any()) for j in range(judge.joints)
+        ),
+        bank=tuple(places_of(judge.bank, causes, j) for j in range(judge.joints)),
+        templates=judge.templates,
+        logs=tuple(owners[judge.logs] == j for j in range(judge.joints)),
+    )  # fmt: skip
 
 
 def _labels(prepared: Prepared, names: Sequence[str], joints: int) -> Ints:

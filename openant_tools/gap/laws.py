@@ -6,7 +6,7 @@ cannot, because a hinge or a motor more would be another model, and so have them
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,8 +24,10 @@ Array = NDArray[np.float64]
 HARD = 0.15
 #: share of critical damping in a spring
 DAMPED = 0.3
-#: kg·m² that a rotor leaves at the joint once it turns by itself
-BARE = 1e-5
+#: share of a servo's inertia that turns with its output, behind play or spring
+OUTPUT = 0.1
+#: N·m/rad of teeth, and N·m from which more torque bends them no further as a simulation begins
+TEETH, HELD = 200.0, 0.5
 #: numbers that only must not be zero
 TINY = 1e-9
 
@@ -36,12 +38,14 @@ class Fields:
 
     Attributes:
         armature, damping, friction: kg·m², N·m·s/rad, N·m. link: kg·m², inertia of the joint's links without the rotor.
+        damp: gives the joints another damping, (n, joints) N·m·s/rad, from the step on that comes.
     """
 
     armature: Array
     damping: Array
     friction: Array
     link: Array
+    damp: Callable[[Array], None]
 
 
 def first_laws(robots: Sequence[Robot], warm_c: Array, asked: Array) -> list[Law]:
@@ -176,35 +180,47 @@ def _bending(bristle: Array, inertia: Array) -> Law:
 def _transmitting(play: Array, compliance: Array, fields: Fields, before: NDArray[np.bool_]) -> Law:
     """A rotor behind play or a spring; the servo's loop closes over both, as the encoder sits on the output, or `before` them.
 
-    The rotor is integrated here, semi-implicitly; the joint keeps its links. Hard teeth are as stiff as a step can take.
+    The rotor is integrated here, the link by MuJoCo. Both take what passes between them implicitly, as teeth are far too stiff
+    for steps that long: a spring k that is seen where it will be at the step's end is a spring and a damper k·dt.
     """
     mine = (play > 0) | (compliance > 0)
-    rotor, damping = np.where(mine, fields.armature, 1.0), np.where(mine, fields.damping, 0.0)
-    link = np.maximum(fields.link, 10 * BARE)
-    fields.armature[mine] = np.minimum(BARE, fields.armature[mine])
+    rotor, damping = np.where(mine, (1 - OUTPUT) * fields.armature, 1.0), np.where(mine, fields.damping, 0.0)
+    fields.armature[mine] *= OUTPUT
     fields.damping[mine] = 0.0
+    spring = np.where(compliance > 0, 1 / np.maximum(compliance, 1 / TEETH), TEETH)
+    damper = 2 * DAMPED * np.sqrt(spring * np.minimum(fields.link + fields.armature, rotor))
+    half = play / 2
     angle: list[Array] = []
     speed = np.zeros(play.shape)
 
     def act(step: Step) -> None:
+        h = step.dt
         if not angle:
-            angle.append(step.position.copy())
+            # At rest the teeth that carry the load are the ones that touch.
+            held = np.clip(step.motor_torque, -HELD, HELD)
+            angle.append(step.position + np.where(mine, half * np.sign(held) + held / spring, 0.0))
             speed[:] = step.velocity
-        hard = HARD * np.minimum(link, rotor) / step.dt**2
-        spring = np.where(compliance > 0, np.minimum(1 / np.maximum(compliance, TINY), hard), hard)
-        damper = 2 * DAMPED * np.sqrt(spring * np.minimum(link, rotor))
-        twist = angle[0] - step.position
-        beyond = np.sign(twist) * np.maximum(np.abs(twist) - play / 2, 0.0)
-        passed = np.where(beyond != 0, spring * beyond + damper * (speed - step.velocity), 0.0)
-        seen = step.position, step.velocity
-        step.position, step.velocity = np.where(before, angle[0], seen[0]), np.where(before, speed, seen[1])
-        motor = step.motor_torque
-        step.position, step.velocity = seen
-        faster = (speed + step.dt / rotor * (motor + step.torque - passed)) / (1 + step.dt * damping / rotor)
-        slowed = np.sign(faster) * np.maximum(np.abs(faster) - step.dt * step.friction / rotor, 0.0)
-        speed[:] = np.where(mine, slowed, step.velocity)
-        angle[0] = np.where(mine, angle[0] + step.dt * speed, step.position)
+        position, velocity = step.position, step.velocity
+        step.position, step.velocity = np.where(before, angle[0], position), np.where(before, speed, velocity)
+        driven = step.motor_torque + step.torque
+        step.position, step.velocity = position, velocity
+        twist = angle[0] - position
+        ahead = twist + h * (speed - velocity)
+        side = np.where(half > 0, np.sign(ahead), 1.0)
+        touching = (np.abs(ahead) > half) | (half == 0)
+        for _ in range(2):
+            k, c = np.where(touching, spring, 0.0), np.where(touching, damper, 0.0)
+            heavy = rotor + h * (damping + c + h * k)
+            faster = (rotor * speed + h * (driven - k * (twist - h * velocity - side * half) + c * velocity)) / heavy
+            slowed = np.sign(faster) * np.maximum(np.abs(faster) - h * step.friction / heavy, 0.0)
+            pushed = k * (twist + h * (slowed - velocity) - side * half) + c * (slowed - velocity)
+            # Teeth push and never pull.
+            touching &= (half == 0) | (pushed * side > 0)
+        speed[:] = np.where(mine, slowed, velocity)
+        angle[0] = np.where(mine, angle[0] + h * speed, position)
+        passed = k * (angle[0] - position - side * half) + c * speed
         step.torque = np.where(mine, passed, step.torque)
+        fields.damp(np.where(mine, c + h * k, fields.damping))
         step.friction = np.where(mine, 0.0, step.friction)
         step.stiffness = np.where(mine, TINY, step.stiffness)
         step.velocity_gain = np.where(mine, TINY, step.velocity_gain)

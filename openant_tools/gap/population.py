@@ -15,6 +15,7 @@ from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.tolerance import random_form, resting, scatter
+from openant_tools.model.plant import Setup
 from openant_tools.model.rollout import Rollouts
 
 __all__ = ["Case", "applicable", "draw", "play", "templates"]
@@ -29,7 +30,7 @@ COUNTS_ONE_JOINT = (0.15, 0.30, 0.2, 0.15, 0.1, 0.06, 0.04)
 #: what tolerances are drawn wider by
 WIDTH = 1.15
 #: °C by which servos warm up at most from one run to the next
-WARMING_C = 4.0
+WARMING_C = 5.0
 #: how unequal the joints are that share a cause
 UNEQUAL = 0.1
 #: strengths of templates
@@ -145,15 +146,23 @@ def play(protocol: Protocol, cases: Sequence[Case], seed: int) -> list[Floats]:
     # The first is the model itself, that the others are compared with.
     robots = [Robot(len(protocol.joints)), *(robot_of(protocol, case) for case in cases)]
     steps = {} if cases[0].seed < 0 else protocol.resolution()
+    heat, turns = [robot.heat_c for robot in robots], _turns(protocol, rng)
     out = []
     for k, played in enumerate(protocol.runs):
+        for robot, begun in zip(robots, heat, strict=True):
+            robot.heat_c = begun + robot.warming_c * turns[k]
         rollouts = Rollouts(played.plant, [played.run], nthread=1)
         signals = simulate(rollouts, robots, seed=seed * 64 + k, signals=played.signals).signals
         nominal = {name: values[:1] for name, values in signals.items()}
         noisy = with_noise({name: values[1:] for name, values in signals.items()}, robots[1:], steps, rng)
         # A robot that no step can hold together shows as very ill, not as infinite.
         found = played.layout.features(differences(noisy, nominal, played.signals))
-        for robot in robots:
-            robot.heat_c += robot.warming_c
         out.append(np.clip(np.nan_to_num(found, nan=0.0, posinf=LARGEST, neginf=-LARGEST), -LARGEST, LARGEST))
     return out
+
+
+def _turns(protocol: Protocol, rng: np.random.Generator) -> Ints:
+    """(runs,) which run came first, which next: as they are given, or those on the stand before those on the floor."""
+    floor = np.array([one.plant.setup is Setup.FLOOR for one in protocol.runs])
+    order = np.argsort(floor, kind="stable") if rng.random() < 0.5 else np.arange(len(floor))
+    return np.argsort(order)

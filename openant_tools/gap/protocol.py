@@ -12,10 +12,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.features import COLUMNS, Floats, Layout, differences, logged
+from openant_tools.gap.features import COLUMNS, Floats, Layout, after_torque_on, differences, logged
 from openant_tools.gap.robot import Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.floor import resolution
@@ -71,8 +72,9 @@ class Played:
     @property
     def layout(self) -> Layout:
         return Layout(
-            self.run.t - self.run.t[0], self.plant.setup, len(self.plant.joints), self.signals, self.run.duration_s
-        )
+            self.run.t - self.run.t[0], self.plant.setup, len(self.plant.joints), self.signals, self.run.duration_s,
+            after_torque_on(self.run, self.plant.joints),
+        )  # fmt: skip
 
     def features(self, nominal: Mapping[str, Floats]) -> tuple[Floats, NDArray[np.bool_]]:
         """(features,) of the run itself against what the model does, and which of them its log has."""
@@ -173,6 +175,8 @@ class Protocol:
                     else min(0.002, one.plant.timestep * 2)
                 )
                 model.opt.tolerance = max(model.opt.tolerance, 1e-6)
+                # One robot is one island: sorting what touches costs more than it saves.
+                model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
                 plants[id(one.plant)] = dataclasses.replace(one.plant, model=model)
         return dataclasses.replace(
             self, runs=tuple(dataclasses.replace(one, plant=plants[id(one.plant)]) for one in self.runs)

@@ -137,11 +137,17 @@ class _Batch:
     def _make_laws(self, warm_c: Array) -> list[Law]:
         plant, copies = self._plant, len(self._segments)
         robots = [robot for _ in range(copies) for robot in self._robots]
+        dampings = self._batch.expand("dof_damping")
+
+        def damp(values: Array) -> None:
+            dampings[:, plant.dof] = values
+
         fields = Fields(
             armature=_column(self._batch, "dof_armature", plant.dof),
             damping=_column(self._batch, "dof_damping", plant.dof),
             friction=_column(self._batch, "dof_frictionloss", plant.dof),
             link=np.maximum(plant.model.dof_M0[plant.dof] - plant.model.dof_armature[plant.dof], 1e-6)[None].repeat(len(robots), 0),
+            damp=damp,
         )  # fmt: skip
         first, last = first_laws(robots, warm_c, self._asked()), last_laws(robots, fields)
         for name, values in (("dof_armature", fields.armature), ("dof_damping", fields.damping)):

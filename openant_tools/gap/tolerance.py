@@ -91,7 +91,7 @@ def random_form(rng: np.random.Generator, encoder_rad: float) -> Form:
         contact_damping=math.exp(rng.uniform(*CONTACT_DAMPING)),
         contact_give=math.exp(rng.uniform(*CONTACT_FORM)),
         contact_depth=math.exp(rng.uniform(*CONTACT_FORM)),
-        loop_behind=bool(rng.random() < 0.7),
+        loop_behind=bool(rng.random() < 0.9),
     )  # fmt: skip
 
 

@@ -1,0 +1,72 @@
+"""Play and springs of simulated robots against another simulator of them, which steps five times as finely."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from openant_tools.blind.commands import RATE_HZ, motions
+from openant_tools.blind.draw import Answer, Drawn
+from openant_tools.blind.log import logged
+from openant_tools.blind.robot import true_robot
+from openant_tools.blind.simulate import simulate as simulate_truth
+from openant_tools.gap.cause import catalogue, enter
+from openant_tools.gap.features import TAKES_UP_S, after_torque_on
+from openant_tools.gap.protocol import Players, Protocol
+from openant_tools.gap.robot import Robot
+from openant_tools.recording.run import Facts, Run
+from openant_tools.robot.joints import JOINT_NAMES
+from openant_tools.robot.mjcf import nominal_model_path
+
+SECONDS, SEED = 3.5, 5
+
+
+def moved_by(effect: str, joint: str, run: str, **parameters: float) -> tuple[np.ndarray, np.ndarray]:
+    """(rows,) rad, what an effect changes of a joint's motion: as the other simulator has it, and as ours does."""
+    motion = next(one for one in motions(4242) if one.name == run)
+    rows = round(RATE_HZ * SECONDS)
+    motion = dataclasses.replace(motion, commands=motion.commands[:rows], limp=motion.limp[:rows])
+    drawn = Drawn(effect, (joint,), parameters, "medium")
+    robots = [
+        true_robot(Answer("single", effects, SEED, "batch", False)) for effects in ((), (drawn,))
+    ]  # fmt: skip
+    healthy, ill = (
+        logged(robot, motion, 0, trace) for robot, trace in zip(robots, simulate_truth(robots, motion, 0), strict=True)
+    )
+    protocol = Protocol.of([healthy], nominal_model_path(), JOINT_NAMES, [None]).coarse()
+    at = np.array([JOINT_NAMES.index(joint)])
+    cause = catalogue()[effect]
+    x = {q.name: q.back(parameters[q.name], q.scale(protocol.reference, at)) for q in cause.quantities}
+    robot = Robot(8, protocol.reference.low, protocol.reference.high)
+    enter(robot, protocol.reference, [(effect, [int(at[0])], x)])
+    (ours,) = Players.of(protocol.runs).play([Robot(8), robot])
+    true = ill.column(f"pos.{joint}") - healthy.column(f"pos.{joint}")
+    return true[10:], (ours["pos"][1] - ours["pos"][0])[10:, at[0]].astype(float)
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameters"), [("backlash", {"gap_rad": 0.03}), ("joint_compliance", {"stiffness_nm_rad": 4.0})]
+)
+def test_play_and_springs_move_a_joint_as_two_inertias_do(effect: str, parameters: dict[str, float]) -> None:
+    true, ours = moved_by(effect, "knee_fl", "stand-1", **parameters)
+    assert np.corrcoef(true, ours)[0, 1] > 0.7
+    assert 0.5 < np.std(ours) / np.std(true) < 2
+
+
+def test_a_knee_that_is_loaded_one_way_does_not_rattle_in_its_play() -> None:
+    true, ours = moved_by("backlash", "knee_fl", "floor-1", gap_rad=0.022)
+    assert np.std(true) < math.radians(0.3)
+    assert np.std(ours) < math.radians(0.5)
+
+
+def test_what_follows_torque_that_comes_on_is_unsure_for_a_while() -> None:
+    t = np.arange(100) / 50
+    on = np.ones(100)
+    on[30:50] = 0
+    run = Run("r", Facts(joints=("a",)), t, {"pos.a": t, "cmd.a": t, "torque.a": on})
+    rows = np.flatnonzero(after_torque_on(run, ["a"])[:, 0])
+    assert rows[0] == 50
+    assert rows[-1] == pytest.approx(50 + TAKES_UP_S * 50, abs=1)
