@@ -67,7 +67,7 @@ LARGE, STRANGE, ODD = 3.0, 3.0, 20.0
 #: sets whose closures differ by less are not told apart
 APART = 0.01
 #: s that a diagnosis gives to simulated robots where the protocol was never seen; `prepare` by itself takes what it needs
-PREPARE_S = 900.0
+PREPARE_S = 720.0
 #: robots of no more joints are cheap to simulate: all suspects are fitted together
 FEW_JOINTS = 2
 #: nothing is surer
@@ -346,7 +346,7 @@ def _decide(
         # And what the judge half hides behind the first, where it closes much of what the first leaves.
         closing = [
             name
-            for name in names
+            for name in names[1:]
             if probability[name] > SUSPECT
             and alone[name].closed > refit.closed + ADDS_ALONE
             and explained[name].beyond_tolerance

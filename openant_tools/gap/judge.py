@@ -10,6 +10,7 @@ calibrated on robots that the deciding trees and networks have not seen.
 from __future__ import annotations
 
 import dataclasses
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -37,8 +38,8 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
-#: directions kept of what healthy robots do beyond their tolerances
-HEALTHY_DIRECTIONS = 40
+#: share by which what healthy robots show beyond their tolerances is taken for independent noise
+SHRUNK = 0.5
 #: deviations beyond which a difference says no more
 CLIP = 40.0
 #: standard deviation of a robot within a tolerance, as a share of it
@@ -282,7 +283,7 @@ def train(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools], se
     healthy = np.flatnonzero(prepared.healthy())
     np.random.default_rng(seed).shuffle(healthy)
     # Those that the measure comes from look too healthy to it: they must not teach what healthy looks like.
-    measure, others = np.split(healthy, [max(20, len(healthy) // 2)])
+    measure, others = np.split(healthy, [max(20, len(healthy) * 3 // 5)])
     whitening = _whiten(x[measure][:, means], templates[:, means], prepared.bank, prepared.protocol.reference)
     moved = whitening.measure(np.clip(templates[:, means] / whitening.scale, -CLIP, CLIP).astype(np.float32))
     seen = np.linalg.norm(moved, axis=1) > 1e-3
@@ -389,16 +390,12 @@ def _whiten(x: Floats, templates: Floats, bank: Sequence[Case], reference: Refer
     tolerances = _tolerances(templates / scale, bank, reference)
     inner = np.linalg.solve(tolerances.T @ tolerances + np.eye(tolerances.shape[1]), tolerances.T @ d.T)
     rest = d - (tolerances @ inner).T
-    # Directions from one half, what lies along them from the other: neither flatters itself.
-    half = len(rest) // 2
-    a, b = rest[:half], rest[half:]
-    count = max(2, min(HEALTHY_DIRECTIONS, half // 3))
-    _, vectors = np.linalg.eigh(a @ a.T)
-    own = np.linalg.qr(a.T @ vectors[:, -count:])[0]
-    along = b @ own
-    variance = float(np.mean((b - along @ own.T) ** 2))
-    more = np.sqrt(np.maximum(np.mean(along**2, axis=0) - variance, 0.0))
-    both = np.hstack([tolerances, own * more])
+    # Few robots and many features: their covariance, shrunk a little towards independence (Ledoit and Wolf 2004).
+    squares, vectors = np.linalg.eigh(rest @ rest.T / len(rest))
+    real = squares > 1e-6 * squares[-1]
+    own = rest.T @ (vectors[:, real] / np.sqrt(len(rest)))  # as long as the robots scatter along it
+    variance = SHRUNK * float(np.mean(rest**2))
+    both = np.hstack([tolerances, own * np.float32(math.sqrt(1 - SHRUNK))])
     squares, vectors = np.linalg.eigh(both.T @ both)
     keep = squares > 1e-6 * squares.max()
     basis = (both @ vectors[:, keep]) / np.sqrt(squares[keep])

@@ -328,7 +328,9 @@ class _States:
         if name == "vel":
             return mixed(self.vel)
         if name == "torque":
-            return mixed(self.torque)
+            # What a servo says it gives is what it gave last: a command sent beside the reading is not in it yet.
+            given: Array = self.torque[np.maximum(low - 1, 0), sim].astype(np.float64)
+            return given
         if name == "volt":
             return mixed(self.share)
         place = mixed(self.place)
