@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 HARD = 0.15
 #: share of critical damping in a spring
 DAMPED = 0.3
-#: share of a servo's inertia that turns with its output, behind play or spring
-OUTPUT = 0.1
+#: share of a servo's inertia that turns with its output, behind play or spring; next to none where a hinge stands for them
+OUTPUT, BARE = 0.1, 1e-3
 #: N·m/rad of teeth, and N·m from which more torque bends them no further as a simulation begins
 TEETH, HELD = 200.0, 0.5
 #: numbers that only must not be zero
@@ -184,18 +184,20 @@ def _transmitting(play: Array, compliance: Array, fields: Fields, before: NDArra
     for steps that long: a spring k that is seen where it will be at the step's end is a spring and a damper k·dt.
     """
     mine = (play > 0) | (compliance > 0)
-    rotor, damping = np.where(mine, (1 - OUTPUT) * fields.armature, 1.0), np.where(mine, fields.damping, 0.0)
-    fields.armature[mine] *= OUTPUT
+    output = np.where(mine, np.where(before, BARE, OUTPUT), 1.0)
+    rotor, damping = np.where(mine, (1 - output) * fields.armature, 1.0), np.where(mine, fields.damping, 0.0)
+    fields.armature[:] *= output
     fields.damping[mine] = 0.0
     spring = np.where(compliance > 0, 1 / np.maximum(compliance, 1 / TEETH), TEETH)
     damper = 2 * DAMPED * np.sqrt(spring * np.minimum(fields.link + fields.armature, rotor))
     half = play / 2
     angle: list[Array] = []
-    speed = np.zeros(play.shape)
+    speed, before_that = np.zeros(play.shape), np.zeros(play.shape)
 
     def act(step: Step) -> None:
         h = step.dt
         if not angle:
+            before_that[:] = step.velocity
             # At rest the teeth that carry the load are the ones that touch.
             held = np.clip(step.motor_torque, -HELD, HELD)
             angle.append(step.position + np.where(mine, half * np.sign(held) + held / spring, 0.0))
@@ -204,6 +206,10 @@ def _transmitting(play: Array, compliance: Array, fields: Fields, before: NDArra
         step.position, step.velocity = np.where(before, angle[0], position), np.where(before, speed, velocity)
         driven = step.motor_torque + step.torque
         step.position, step.velocity = position, velocity
+        # The link goes on as it did: what it gets and what the rotor loses are then the same to the second order.
+        going = 2 * velocity - before_that
+        before_that[:] = velocity
+        velocity = going
         twist = angle[0] - position
         ahead = twist + h * (speed - velocity)
         side = np.where(half > 0, np.sign(ahead), 1.0)
@@ -216,7 +222,7 @@ def _transmitting(play: Array, compliance: Array, fields: Fields, before: NDArra
             pushed = k * (twist + h * (slowed - velocity) - side * half) + c * (slowed - velocity)
             # Teeth push and never pull.
             touching &= (half == 0) | (pushed * side > 0)
-        speed[:] = np.where(mine, slowed, velocity)
+        speed[:] = np.where(mine, slowed, step.velocity)
         angle[0] = np.where(mine, angle[0] + h * speed, position)
         passed = k * (angle[0] - position - side * half) + c * speed
         step.torque = np.where(mine, passed, step.torque)

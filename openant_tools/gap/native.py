@@ -16,7 +16,7 @@ import numpy as np
 from lxml import etree
 from numpy.typing import NDArray
 
-from openant_tools.gap.laws import DAMPED, HARD
+from openant_tools.gap.laws import DAMPED, HARD, TEETH
 from openant_tools.gap.robot import Robot, tilted
 from openant_tools.model.body import torso_body
 from openant_tools.model.mjcf import actuator_element, in_degrees, joint_element, number, numbers
@@ -219,12 +219,12 @@ def _stops(root: Element, plant: Plant, robot: Robot, j: int) -> None:
     ends = np.array([max(given[0], low + reading), min(given[1], high + reading)])
     element.set("range", numbers(np.degrees(ends) if _turns(model, joint) and in_degrees(root) else ends))
     element.set("limited", "true")
-    _hard(element, plant, math.sqrt(HARD) / 2)
+    # It throws back as that of `laws` does.
+    _stop(element, plant.timestep / (HARD / 2), math.sqrt(HARD) / 2)
 
 
-def _hard(joint: Element, plant: Plant, damping: float) -> None:
-    """Stops of screws and teeth, which throw back as those of `laws` do: a spring as stiff as there, and its damping ratio."""
-    seconds = plant.timestep / (math.sqrt(HARD) * damping)
+def _stop(joint: Element, seconds: float, damping: float) -> None:
+    """The time constant and the damping ratio of a joint's ends."""
     joint.set("solreflimit", numbers([seconds, damping]))
     joint.set("solimplimit", STOP_IMPEDANCE)
 
@@ -292,6 +292,8 @@ def _series(root: Element, plant: Plant, robot: Robot, j: int, done: Edit) -> No
     shape = {name: str(value) for name, value in element.attrib.items() if name in ("axis", "pos", "class")}
     turn = math.degrees(1.0) if _turns(model, int(model.dof_jntid[dof])) and in_degrees(root) else 1.0
     both = bool(play and compliance)
+    rotor = max(float(model.dof_armature[dof]), 1e-6)
+    link = max(float(model.dof_M0[dof]) - float(model.dof_armature[dof]), 1e-6)
     made = []
     for name, there in (("play", play), ("spring", compliance)):
         if not there:
@@ -306,14 +308,15 @@ def _series(root: Element, plant: Plant, robot: Robot, j: int, done: Edit) -> No
         if name == "play":
             hinge.set("range", numbers([-play / 2 * turn, play / 2 * turn]))
             hinge.set("limited", "true")
-            _hard(hinge, plant, DAMPED)
+            # As stiff, and as damped, as the teeth of `laws`, between the two inertias that they part.
+            between = link * rotor / (link + rotor)
+            ratio = DAMPED * math.sqrt(min(link, rotor) / between)
+            _stop(hinge, math.sqrt(between / TEETH) / ratio, ratio)
         else:
             stiffness = 1 / compliance
-            rotor = float(model.dof_armature[dof])
-            link = max(float(model.dof_M0[dof]) - rotor, 1e-6)
             hinge.set("limited", "false")
             hinge.set("stiffness", number(stiffness))
-            hinge.set("damping", number(2 * DAMPED * math.sqrt(stiffness * min(link, max(rotor, 1e-6)))))
+            hinge.set("damping", number(2 * DAMPED * math.sqrt(stiffness * min(link, rotor))))
         made.append(hinge)
     at = element
     for hinge in made:
