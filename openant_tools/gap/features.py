@@ -39,8 +39,8 @@ SKIP_S, STAND_BLOCK_S, ONE_JOINT_BLOCK_S, FLOOR_BLOCK_S = 0.5, 0.1, 0.05, 0.2
 DRIFTING = ("base", "yaw")
 #: s after torque comes on in which servos differ: one starts from where it is, another from where it was last told to go
 TAKES_UP_S = 0.3
-#: factors within which one joint's torque may need another scale than most: what is beyond is no matter of scale
-OWN_SCALE = 4 / 3
+#: factors within which one joint may need another scale of torque than most: servos of a robot differ so far in N·m per ampere
+OWN_SCALE = 2.0
 #: least size of a scatter, as a share of the signal's noise
 LEAST = 0.3
 
