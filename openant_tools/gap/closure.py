@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.cause import Quantity, enter
 from openant_tools.gap.explain import Hypothesis
-from openant_tools.gap.features import after_torque_on
+from openant_tools.gap.features import around_switching
 from openant_tools.gap.protocol import Played, Protocol
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
@@ -103,7 +103,7 @@ class Windows:
         self._rollouts = [Rollouts(one.plant, [one.run], HORIZON_S) for one in protocol.runs]
         coarse = protocol.coarse()
         self._quick = [Rollouts(one.plant, [one.run], HORIZON_S) for one in coarse.runs]
-        unsure = [after_torque_on(one.run, protocol.joints) for one in protocol.runs]
+        unsure = [around_switching(one.run, protocol.joints) for one in protocol.runs]
         self._measured = [
             np.where(there, np.nan, one.run.signal("pos", protocol.joints))
             for one, there in zip(protocol.runs, unsure, strict=True)

@@ -16,7 +16,7 @@ from openant_tools.gap.robot import USUAL_NOISE, Robot
 from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
 
-__all__ = ["COLUMNS", "Layout", "Signals", "after_torque_on", "logged", "with_noise"]
+__all__ = ["COLUMNS", "Layout", "Signals", "around_switching", "logged", "with_noise"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -39,6 +39,8 @@ SKIP_S, STAND_BLOCK_S, ONE_JOINT_BLOCK_S, FLOOR_BLOCK_S = 0.5, 0.1, 0.05, 0.2
 DRIFTING = ("base", "yaw")
 #: s after torque comes on in which servos differ: one starts from where it is, another from where it was last told to go
 TAKES_UP_S = 0.3
+#: s after torque is gone in which what a servo says of it may be old
+LETS_GO_S = 0.03
 #: factors within which one joint may need another scale of torque than most: servos of a robot differ so far in N·m per ampere
 OWN_SCALE = 2.0
 #: least size of a scatter, as a share of the signal's noise
@@ -53,7 +55,7 @@ class Layout:
         t: (rows,) s since the run's start. setup: how the robot stood. joints: how many.
         signals: which, in order.
         seconds: how long the protocol's run is: a log that goes on longer is cut there.
-        unsure: (rows, joints) as `after_torque_on`.
+        unsure: (rows, joints) as `around_switching`.
     """
 
     t: Array
@@ -107,12 +109,16 @@ class Layout:
         return out
 
 
-def after_torque_on(run: Run, joints: Sequence[str]) -> Bools:
-    """(rows, joints): where torque has just come on, and nobody knows what a late or slow servo still had in mind."""
+def around_switching(run: Run, joints: Sequence[str]) -> Bools:
+    """(rows, joints): where torque has just come on, and nobody knows what a late or slow servo still had in mind.
+
+    And, for as long as a reading may be old, where it has just gone.
+    """
     off = run.signal("torque", joints, default=1.0) == 0
     out = np.zeros(off.shape, bool)
-    for row, joint in np.argwhere(off[:-1] & ~off[1:]):
-        out[:, joint] |= (run.t > run.t[row]) & (run.t < run.t[row + 1] + TAKES_UP_S)
+    for row, joint in np.argwhere(off[:-1] != off[1:]):
+        lasts = TAKES_UP_S if off[row, joint] else LETS_GO_S
+        out[:, joint] |= (run.t > run.t[row]) & (run.t < run.t[row + 1] + lasts)
     return out
 
 

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.features import COLUMNS, Floats, Layout, after_torque_on, differences, logged
+from openant_tools.gap.features import COLUMNS, Floats, Layout, around_switching, differences, logged
 from openant_tools.gap.robot import Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.floor import resolution
@@ -73,7 +73,7 @@ class Played:
     def layout(self) -> Layout:
         return Layout(
             self.run.t - self.run.t[0], self.plant.setup, len(self.plant.joints), self.signals, self.run.duration_s,
-            after_torque_on(self.run, self.plant.joints),
+            around_switching(self.run, self.plant.joints),
         )  # fmt: skip
 
     def features(self, nominal: Mapping[str, Floats]) -> tuple[Floats, NDArray[np.bool_]]:
