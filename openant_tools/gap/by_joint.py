@@ -9,17 +9,15 @@ robot then goes by.
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.model_selection import KFold
 from sklearn.neural_network import MLPClassifier
 
 from openant_tools.gap.features import Floats
+from openant_tools.gap.networks import logits_of, teach
 
 __all__ = ["FEWEST_JOINTS", "ByJoint", "places_of"]
 
@@ -29,10 +27,10 @@ Ints = NDArray[np.int64]
 
 #: robots of fewer joints have nothing to learn from each other's
 FEWEST_JOINTS = 3
-#: the networks: how many, each taught without its share of the robots; neurons, decay of weights, rounds, robots of a step
-NETWORKS, NEURONS, DECAY, ROUNDS, PORTION = 3, 192, 1.0, 20, 256
-#: deviations beyond which an input says no more, and logits beyond which an answer
-FAR, SURE = 5.0, 6.0
+#: the networks: how many, each taught without its share of the robots; neurons, rounds, joints of a step
+NETWORKS, NEURONS, ROUNDS, PORTION = 3, 192, 20, 256
+#: deviations beyond which an input says no more
+FAR = 5.0
 #: templates whose part at a joint is shorter do not show there
 SHORT = 0.3
 
@@ -91,21 +89,15 @@ class ByJoint:
                 labels[row, list(mine[name][0]), self.causes.index(name)] = 1
         flat = x.reshape(-1, x.shape[2])
         self = dataclasses.replace(self, usual=flat.mean(axis=0), spread=flat.std(axis=0) + np.float32(1e-6))
-        scaled, members, unseen = self._scaled(x), [], np.zeros(labels.shape)
-        for some, others in KFold(NETWORKS, shuffle=True, random_state=seed).split(x):
-            portion = min(PORTION, len(some))
-            one = MLPClassifier((NEURONS,), alpha=DECAY, max_iter=ROUNDS, batch_size=portion, random_state=seed)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", ConvergenceWarning)  # to stop early is meant
-                one.fit(scaled[some].reshape(-1, x.shape[2]), labels[some].reshape(-1, labels.shape[2]))
-            unseen[others] = _logits(one, scaled[others])
-            members.append(one)
-        return dataclasses.replace(self, members=tuple(members)), self._summary(unseen)
+        members, unseen = teach(
+            self._scaled(x), labels, shares=NETWORKS, neurons=NEURONS, rounds=ROUNDS, portion=PORTION, seed=seed
+        )  # fmt: skip
+        return dataclasses.replace(self, members=members), self._summary(unseen)
 
     def said(self, z: Floats, logs: Floats) -> Floats:
         """(robots, inputs of the judge) of differences whitened and of logarithms, (robots, …) each."""
         x = self._scaled(self.seen(z, logs))
-        return self._summary(np.mean([_logits(one, x) for one in self.members], axis=0))
+        return self._summary(logits_of(self.members, x, len(self.causes)))
 
     def _scaled(self, x: Floats) -> Floats:
         out: Floats = ((x - self.usual) / self.spread).clip(-FAR, FAR)
@@ -118,15 +110,6 @@ class ByJoint:
         parts = [mean, ordered[:, -1], ordered[:, -2], ordered[:, -1] - mean]
         parts += [logits[:, group].mean(axis=1) for group in self.groups]
         return np.concatenate(parts, axis=1).astype(np.float32)
-
-
-def _logits(one: MLPClassifier, x: Floats) -> Array:
-    """(robots, joints, causes)."""
-    p = np.asarray(one.predict_proba(x.reshape(-1, x.shape[2])))
-    edge = 1 / (1 + np.exp(SURE))
-    p = p.clip(edge, 1 - edge)
-    out: Array = np.log(p / (1 - p)).reshape(*x.shape[:2], -1)
-    return out
 
 
 def places_of(

@@ -11,22 +11,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.ensemble import ExtraTreesClassifier
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
-from sklearn.model_selection import KFold
 from sklearn.neural_network import MLPClassifier
 
 from openant_tools.gap import tolerance
 from openant_tools.gap.by_joint import FEWEST_JOINTS, ByJoint, places_of
 from openant_tools.gap.cause import catalogue
 from openant_tools.gap.features import COLUMNS, Floats
+from openant_tools.gap.networks import logit, logits_of, teach
 from openant_tools.gap.population import Case
 from openant_tools.gap.prepare import Prepared
 from openant_tools.gap.robot import Reference
@@ -46,8 +44,8 @@ CLIP = 40.0
 SPREAD = 0.6
 #: the forest
 TREES, LEAF, TRIED = 300, 2, 0.15
-#: the networks: how many, each taught without its share of the robots; neurons, decay of weights, rounds of teaching
-NETWORKS, NEURONS, DECAY, ROUNDS = 4, 128, 1.0, 60
+#: the networks: how many, each taught without its share of the robots; neurons, rounds of teaching
+NETWORKS, NEURONS, ROUNDS = 4, 128, 60
 #: robots of a step, at least; steps of a round, at most
 PORTION, STEPS = 64, 40
 #: main directions of the differences that they see, and of how many robots; deviations beyond which an input says no more
@@ -151,24 +149,17 @@ class Networks:
         return np.hstack([own, ((inputs - self.usual) / self.spread).clip(-FAR, FAR)]).astype(np.float32)
 
     def taught(self, x: Floats, labels: Ints, seed: int) -> tuple[Networks, Array]:
-        """The same with networks that have learned from robots, and the probabilities for those each had not seen."""
-        unseen, members = np.zeros(labels.shape), []
-        for mine, others in KFold(NETWORKS, shuffle=True, random_state=seed).split(x):
-            # Larger portions of more robots: as many steps whatever there is to learn from.
-            portion = min(max(PORTION, len(mine) // STEPS), len(mine))
-            one = MLPClassifier((NEURONS,), alpha=DECAY, max_iter=ROUNDS, batch_size=portion, random_state=seed)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", ConvergenceWarning)  # to stop early is meant
-                one.fit(x[mine], labels[mine])
-            unseen[others] = _table(one.predict_proba(x[others]), labels.shape[1])
-            members.append(one)
-        return dataclasses.replace(self, members=tuple(members)), unseen
+        """The same with networks that have learned from robots, and the logits for those each had not seen."""
+        # Larger portions of more robots: as many steps whatever there is to learn from.
+        portion = max(PORTION, len(x) * (NETWORKS - 1) // NETWORKS // STEPS)
+        members, unseen = teach(
+            x, labels, shares=NETWORKS, neurons=NEURONS, rounds=ROUNDS, portion=portion, seed=seed
+        )  # fmt: skip
+        return dataclasses.replace(self, members=members), unseen
 
     def logits(self, z: Floats, inputs: Floats, outputs: int) -> Array:
         """(robots, outputs)."""
-        x = self.seen(z, inputs)
-        out: Array = np.mean([_logit(_table(one.predict_proba(x), outputs)) for one in self.members], axis=0)
-        return out
+        return logits_of(self.members, self.seen(z, inputs), outputs)
 
 
 @dataclass(frozen=True)
@@ -235,7 +226,7 @@ class Judge:
             inputs = np.concatenate([inputs, self.by_joint.said(z, logs)], axis=1)
         count = int(self.known.sum())
         votes = _table(self.forest.predict_proba(inputs), count)
-        raw = _together(_logit(votes), self.networks.logits(z, inputs, count))[0]
+        raw = _together(logit(votes), self.networks.logits(z, inputs, count))[0]
         n = len(self.causes)
         chances = np.zeros(n + self.joints)
         chances[self.known] = [_logistic(a * value + b) for value, (a, b) in zip(raw, self.calibration, strict=True)]
@@ -278,8 +269,8 @@ def train(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools], se
     kept = np.concatenate(list(columns))
     x = np.concatenate([prepared.features[k] for k in which], axis=1)[:, kept]
     templates = np.concatenate([prepared.templates[k] for k in which], axis=1)[:, kept]
-    means, groups, owners = (every[kept] for every in _layout(prepared, which))
-    groups = np.unique(groups, return_inverse=True)[1]
+    told_by = _layout(prepared, which).only(kept)
+    means, groups = told_by.means, told_by.groups
     healthy = np.flatnonzero(prepared.healthy())
     np.random.default_rng(seed).shuffle(healthy)
     # Those that the measure comes from look too healthy to it: they must not teach what healthy looks like.
@@ -310,7 +301,7 @@ def train(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools], se
     some = [judge.inputs(x[taught[k : k + 256]]) for k in range(0, len(taught), 256)]
     inputs, z, told = (np.concatenate(parts) for parts in zip(*some, strict=True))
     if joints >= FEWEST_JOINTS:
-        by_joint, said = _by_joint(prepared, judge, which, kept, owners).taught(
+        by_joint, said = _by_joint(prepared, judge, told_by).taught(
             z, told, [prepared.cases[k].causes for k in taught], seed
         )
         judge, inputs = dataclasses.replace(judge, by_joint=by_joint), np.concatenate([inputs, said], axis=1)
@@ -318,7 +309,7 @@ def train(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools], se
     forest.fit(inputs, wanted)
     empty = Networks.of(z, inputs)
     networks, guessed = empty.taught(empty.seen(z, inputs), wanted, seed)
-    unseen = _together(_logit(_unseen(forest, wanted.shape[1])), _logit(guessed))
+    unseen = _together(logit(_unseen(forest, wanted.shape[1])), guessed)
     calibration = tuple(_calibrated(unseen[:, n], wanted[:, n]) for n in range(wanted.shape[1]))
     forest.oob_decision_function_ = None  # of no use any more, and large
     return dataclasses.replace(judge, forest=forest, networks=networks, known=known, calibration=calibration)
@@ -326,46 +317,67 @@ def train(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools], se
 
 def whitening_of(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools]) -> tuple[Whitening, Bools]:
     """The measure of some runs' block means alone, and which of their features it takes."""
-    means, _, _ = _layout(prepared, which)
-    chosen = means & np.concatenate(list(columns))
+    chosen = _layout(prepared, which).means & np.concatenate(list(columns))
     x = np.concatenate([prepared.features[k] for k in which], axis=1)[:, chosen]
     templates = np.concatenate([prepared.templates[k] for k in which], axis=1)[:, chosen]
     return _whiten(x[prepared.healthy()], templates, prepared.bank, prepared.protocol.reference), chosen
 
 
-def _layout(prepared: Prepared, which: Sequence[int]) -> tuple[Bools, Ints, Ints]:
-    """Which features are block means, to which run and signal each belongs, and to which joint, −1 for the body's."""
-    means, groups, owners = [], [], []
+@dataclass(frozen=True)
+class _Layout:
+    """Of each feature: whether it is a block mean, its run's number and whether that stood on the floor, its signal and joint.
+
+    Attributes:
+        joints: −1 for the body's.
+    """
+
+    means: Bools
+    runs: Ints
+    floor: Bools
+    signals: NDArray[np.str_]
+    joints: Ints
+
+    def only(self, kept: Bools) -> _Layout:
+        return _Layout(self.means[kept], self.runs[kept], self.floor[kept], self.signals[kept], self.joints[kept])
+
+    @property
+    def groups(self) -> Ints:
+        """Of each feature, a number for its run and signal, from 0."""
+        _, signals = np.unique(self.signals, return_inverse=True)
+        return np.unique(self.runs * (signals.max() + 1) + signals, return_inverse=True)[1]
+
+
+def _layout(prepared: Prepared, which: Sequence[int]) -> _Layout:
+    means, runs, floor, signals, joints = [], [], [], [], []
     for n, k in enumerate(which):
-        layout = prepared.protocol.runs[k].layout
-        for m, (signal, kinds) in enumerate(layout.groups().items()):
-            means += [kind == "mean" for kind in kinds]
-            groups += [100 * n + m] * len(kinds)
-            owners += [-1] * len(kinds) if signal in COLUMNS else [j % layout.joints for j in range(len(kinds))]
-    return np.array(means), np.array(groups), np.array(owners)
-
-
-def _by_joint(prepared: Prepared, judge: Judge, which: Sequence[int], kept: Bools, owners: Ints) -> ByJoint:
-    """What is to look at single joints: at each setup's runs, and on the stand at each signal by itself."""
-    floor, signal = [], []
-    for k in which:
         played = prepared.protocol.runs[k]
-        for name, kinds in played.layout.groups().items():
+        for signal, kinds in played.layout.groups().items():
+            means += [kind == "mean" for kind in kinds]
+            runs += [n] * len(kinds)
             floor += [played.plant.setup is Setup.FLOOR] * len(kinds)
-            signal += [name] * len(kinds)
-    on_floor, of = np.array(floor)[kept][judge.means], np.array(signal)[kept][judge.means]
-    mine = owners[judge.means]
-    views = [~on_floor, on_floor, *(~on_floor & (of == name) for name in LOOKED_AT)]
+            signals += [signal] * len(kinds)
+            joints += [-1] * len(kinds) if signal in COLUMNS else [j % played.layout.joints for j in range(len(kinds))]
+    return _Layout(np.array(means), np.array(runs), np.array(floor), np.array(signals), np.array(joints))
+
+
+def _by_joint(prepared: Prepared, judge: Judge, told_by: _Layout) -> ByJoint:
+    """What is to look at single joints: at each setup's runs, and on the stand at each signal by itself."""
+    of_means = told_by.only(judge.means)
+    views = [
+        ~of_means.floor,
+        of_means.floor,
+        *(~of_means.floor & (of_means.signals == name) for name in LOOKED_AT),
+    ]
     causes = tuple(name for name in judge.causes if not catalogue()[name].of_body)
     return ByJoint(
         causes=causes,
         groups=tuple(np.array(group) for group in prepared.protocol.servos()),
         parts=tuple(
-            tuple(part for view in views if (part := view & (mine == j)).any()) for j in range(judge.joints)
+            tuple(part for view in views if (part := view & (of_means.joints == j)).any()) for j in range(judge.joints)
         ),
         bank=tuple(places_of(judge.bank, causes, j) for j in range(judge.joints)),
         templates=judge.templates,
-        logs=tuple(owners[judge.logs] == j for j in range(judge.joints)),
+        logs=tuple(told_by.joints[judge.logs] == j for j in range(judge.joints)),
     )  # fmt: skip
 
 
@@ -448,12 +460,6 @@ def _table(said: Sequence[Array] | Array, outputs: int) -> Array:
 def _together(votes: Array, networks: Array) -> Array:
     """(robots, outputs) one logit of the forest's and the networks'."""
     out: Array = (votes + networks) / 2
-    return out
-
-
-def _logit(p: float | Array) -> Array:
-    clipped = np.clip(p, 0.002, 0.998)
-    out: Array = np.log(clipped / (1 - clipped))
     return out
 
 

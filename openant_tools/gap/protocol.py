@@ -10,6 +10,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import mujoco
@@ -69,7 +70,7 @@ class Played:
         columns = {name: values for name, values in run.columns.items() if not name.startswith("base.")}
         return cls(dataclasses.replace(run, columns=columns), plant, signals, seen, warm_c)
 
-    @property
+    @cached_property
     def layout(self) -> Layout:
         return Layout(
             self.run.t - self.run.t[0], self.plant.setup, len(self.plant.joints), self.signals, self.run.duration_s,
