@@ -35,6 +35,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_agents.compiled import compiled
 from openant_agents.primitives import Gait
 from openant_agents.runs import CurvePoint, Run, load_checkpoint, read_facts
 from openant_agents.tile_coding import Rows, TileCoder
@@ -118,12 +119,15 @@ class Sarsa:
         self._tiles = np.empty((TRACES, coder.tilings), np.int64)
         self._actions = np.empty(TRACES, np.int64)
         self._strengths, self._owed = np.empty(TRACES), np.empty(TRACES)
-        self._ones = np.ones(coder.tilings, np.float32)
         self._fading = 0.0  # γλ over the transition that the newest trace began
         self._seen: deque[tuple[bytes, Rows]] = deque(maxlen=2)  # where a transition began and ended
         self._valued: tuple[Rows, NDArray[np.float64]] | None = None  # what was last asked for since weights changed
         self.decisions = 0
         self.moved = 0.0  # sum of how far the weights were ever moved
+        # Compiled before anybody waits for it.
+        nowhere = np.full(coder.tilings, coder.rows)
+        _values(self.weights, nowhere, self._tiles[:0], self._actions[:0], self._owed[:0])
+        _pay(self.weights, nowhere, np.int64(0), np.float64(0.0))
 
     def rows_of(self, observation: Array) -> Rows:
         """The coder's rows of an observation (float32); those of the last two are remembered.
@@ -142,12 +146,8 @@ class Sarsa:
         """(actions,): Q of each primitive where the tiles have these rows."""
         if self._valued is not None and self._valued[0] is rows:
             return self._valued[1]
-        values = (self._ones @ self.weights.take(rows, axis=0)).astype(np.float64)
-        if self._first < self._end:
-            mine = slice(self._first, self._end)
-            # A box is of one tiling, so that only rows at the same place can be the same box.
-            shared = np.add.reduce(self._tiles[mine] == rows, axis=1, dtype=np.int64)
-            values += np.bincount(self._actions[mine], shared * self._owed[mine], self.actions)
+        mine = slice(self._first, self._end)
+        values = _values(self.weights, rows, self._tiles[mine], self._actions[mine], self._owed[mine])
         self._valued = rows, values
         return values
 
@@ -159,7 +159,7 @@ class Sarsa:
     def _pay(self) -> None:
         """Forget the oldest trace; what its tiles are owed becomes theirs."""
         oldest = self._first
-        np.add.at(self.weights[:, self._actions[oldest]], self._tiles[oldest], np.float32(self._owed[oldest]))
+        _pay(self.weights, self._tiles[oldest], self._actions[oldest], self._owed[oldest])
         self._first += 1
 
     def choose(self, rows: Rows) -> int:
@@ -205,8 +205,7 @@ class Sarsa:
         value = self.values(rows)[action]
         error = float(settings.reward_scale * reward + discount * following - value)
 
-        mine = slice(self._first, self._end)
-        self._strengths[mine] *= self._fading
+        self._strengths[self._first : self._end] *= self._fading
         while self._first < self._end and self._strengths[self._first] < FADED:
             self._pay()
         if self._end == len(self._tiles):
@@ -231,6 +230,30 @@ class Sarsa:
             new[:count] = old[mine]
             setattr(self, name, new)
         self._first, self._end = 0, count
+
+
+@compiled
+def _values(
+    weights: Array, rows: Rows, tiles: Rows, actions: NDArray[np.int64], owed: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(actions,) Q where the tiles have these rows: what their weights are, and what traces (traces, tilings) owe them."""
+    out = np.zeros(weights.shape[1])
+    for row in rows:
+        for a in range(len(out)):
+            out[a] += weights[row, a]
+    for n in range(len(tiles)):
+        shared = 0
+        # A box is of one tiling, so that only rows at the same place can be the same box.
+        for k in range(len(rows)):
+            shared += tiles[n, k] == rows[k]
+        out[actions[n]] += shared * owed[n]
+    return out
+
+
+@compiled
+def _pay(weights: Array, rows: Rows, action: np.int64, owed: np.float64) -> None:
+    for row in rows:
+        weights[row, action] += owed
 
 
 # ------------------------------------------------------------------------------------------------ a run's decisions

@@ -6,7 +6,7 @@ Miller and Glanz recommend and the Tiles3 software uses. Two points that share a
 
 No box shares a row by its hash: each box that was ever seen has a row of its own, in the order of appearance, so that the code
 is exact for as long as the table has rows. Only then does a new box share the row of others, which is counted. A hash only
-says where to look for a box's name (linear probing, Knuth 1998, section 6.4), for all tilings at once.
+says where to look for a box's name (linear probing, Knuth 1998, section 6.4). The looking up is compiled.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_agents.compiled import compiled
 from openant_tools.errors import BadInput
 
 __all__ = ["TileCoder"]
@@ -30,7 +31,8 @@ PLACES, CROWDED = 2**22, 0.5
 EMPTY = -1
 
 Rows = NDArray[np.int64]
-Names = NDArray[np.void]
+Words = NDArray[np.uint64]
+Floats = NDArray[np.float64]
 
 
 class TileCoder:
@@ -75,21 +77,20 @@ class TileCoder:
         # Whole boxes of displacement change no box's extent; without them coordinates stay small.
         shift = (np.arange(tilings)[:, None] * (2 * inputs + 1)) % tilings
         # From how many n-ths on a point within its tile is pushed into the next.
-        self._next_from = (tilings - shift).astype(np.int32)
+        self._next_from = (tilings - shift).astype(np.int64)
         # A box by name: its tiling and its coordinates, in whole words.
         self._place = np.zeros((tilings, -(-(2 + len(inputs)) // WORD) * WORD), np.uint8)
         self._place[:, :2] = np.arange(tilings, dtype=np.uint16)[:, None].view(np.uint8)
-        self._coordinates = self._place[:, 2 : 2 + len(inputs)]
-        self._name = self._place.view(f"V{self._place.shape[1]}").ravel()
+        self._name = self._place.view(np.uint64)
         # The names by row, and the rows by hash: where a place is taken by another name, the next free one is used. The system
         # gives memory only as rows are written.
-        self._names = np.empty(rows, self._name.dtype)
+        self._names = np.empty((rows, self._name.shape[1]), np.uint64)
         self._row_at = np.full(PLACES, EMPTY, np.int32)
         # Odd numbers without a pattern, to mix a name's words by.
-        words = self._place.shape[1] // WORD
-        self._mix = np.random.default_rng(0).integers(2**63, size=words, dtype=np.uint64) * 2 + 1
+        self._mix = np.random.default_rng(0).integers(2**63, size=self._name.shape[1], dtype=np.uint64) * 2 + 1
         self._used = 0
         self.shared = 0  # lookups of a box that has no row of its own, since the table was full
+        self.rows_of(self.low, learn=False)  # compiled before anybody waits for it
 
     @property
     def used(self) -> int:
@@ -106,66 +107,104 @@ class TileCoder:
         Returns:
             (tilings,), the row of each tiling's box; the one beyond the table where a box has none and is to get none.
         """
-        self._locate(observation)
-        rows, places = self._find(self._name)
-        missing = np.flatnonzero(rows == EMPTY)
-        if len(missing) == 0:
-            return rows
-        free = self.rows - self._used
-        if free and not learn:
+        rows = np.empty(self.tilings, np.int64)
+        self._used, complete = _look_up(
+            np.asarray(observation, np.float64), self.low, self.high, self._scale, self._next_from, self._place,
+            self._name, self._names, self._row_at, self._mix, self._used, learn, rows,
+        )  # fmt: skip
+        missing = () if complete else np.flatnonzero(rows == EMPTY)
+        if len(missing) and self._used < self.rows:
             rows[missing] = self.rows
-            return rows
-        new, sharing = missing[:free], missing[free:]
-        rows[new] = np.arange(self._used, self._used + len(new))
-        self._names[rows[new]] = self._name[new]
-        self._used += len(new)
-        self._enter(rows[new], places[new])
-        # The same row in every process, which Python's own hash of bytes is not.
-        rows[sharing] = [zlib.crc32(self._name[k].tobytes()) % self.rows for k in sharing]
-        self.shared += len(sharing)
+        elif len(missing):
+            # The same row in every process, which Python's own hash of bytes is not.
+            rows[missing] = [zlib.crc32(self._place[k].tobytes()) % self.rows for k in missing]
+            self.shared += len(missing)
         if self._used > CROWDED * len(self._row_at):
             self._row_at = np.full(2 * len(self._row_at), EMPTY, np.int32)
-            everything = np.arange(self._used)
-            self._enter(everything, self._hashed(self._names[: self._used]))
+            _enter_all(self._names, self._used, self._row_at, self._mix)
         return rows
 
-    def _locate(self, observation: NDArray[np.floating]) -> None:
-        """Write the names of the boxes that an observation falls into."""
-        inside = np.minimum(np.maximum(observation, self.low), self.high)
-        steps = ((inside - self.low) * self._scale).astype(np.int32)  # in n-ths of a tile, never below 0
-        whole = steps // self.tilings
+
+@compiled
+def _look_up(
+    observation: Floats,
+    low: Floats,
+    high: Floats,
+    scale: Floats,
+    next_from: Rows,
+    place: NDArray[np.uint8],
+    name: Words,
+    names: Words,
+    row_at: NDArray[np.int32],
+    mix: Words,
+    used: int,
+    learn: bool,
+    rows: Rows,
+) -> tuple[int, bool]:
+    """Write the row of each tiling's box, and to new boxes their rows and names.
+
+    Args:
+        observation, low, high: (inputs,). scale: (inputs,) n-ths of a tile per unit. next_from: (tilings, inputs).
+        place, name: (tilings, …) the boxes' names, as bytes and as words; their coordinates are written.
+        names: (rows, words) of all boxes. row_at: (places,) by hash.
+        used: how many rows have a box. learn: whether a new box gets one.
+        rows: (tilings,) to write to; `EMPTY` where a box has none.
+
+    Returns:
+        How many rows have a box now; whether each tiling's box has one.
+    """
+    tilings, complete = len(rows), True
+    # In n-ths of a tile, never below 0.
+    steps = ((np.minimum(np.maximum(observation, low), high) - low) * scale).astype(np.int64)
+    whole = steps // tilings
+    left = steps - whole * tilings
+    places = np.empty(tilings, np.int64)
+    for k in range(tilings):
         # (steps + shift) // n without dividing n times
-        pushed = steps - whole * self.tilings >= self._next_from
-        np.add(whole.astype(np.uint8), pushed, out=self._coordinates, casting="unsafe")
+        for i in range(len(steps)):
+            place[k, 2 + i] = whole[i] + (left[i] >= next_from[k, i])
+        places[k] = _hashed(name[k], mix) & (len(row_at) - 1)
+    # The memory's answers, far apart, are waited for together.
+    for k in range(tilings):
+        rows[k] = row_at[places[k]]
+    for k in range(tilings):
+        at, row = _find(places[k], name[k], names, row_at)
+        if row == EMPTY and learn and used < len(names):
+            row = np.int64(used)
+            row_at[at] = row
+            names[row] = name[k]
+            used += 1
+        complete &= row != EMPTY
+        rows[k] = row
+    return used, complete
 
-    def _hashed(self, names: Names) -> Rows:
-        """(boxes,) the place where to look first for a name."""
-        mixed = names.view(np.uint64).reshape(len(names), -1) @ self._mix
-        mixed ^= mixed >> np.uint64(29)
-        mixed *= self._mix[0]
-        places: Rows = (mixed >> np.uint64(32)).astype(np.int64)
-        return places & (len(self._row_at) - 1)
 
-    def _find(self, names: Names) -> tuple[Rows, Rows]:
-        """(boxes,) the row of each name, or `EMPTY`, and its place, or the one that is free for it."""
-        places = self._hashed(names)
-        rows = self._row_at.take(places).astype(np.int64)
-        others = np.flatnonzero((rows != EMPTY) & (self._names.take(rows, mode="wrap") != names))
-        while len(others):
-            places[others] = self._after(places[others])
-            found = self._row_at.take(places[others])
-            rows[others] = found
-            others = others[(found != EMPTY) & (self._names.take(found, mode="wrap") != names[others])]
-        return rows, places
+@compiled
+def _hashed(name: Words, mix: Words) -> np.int64:
+    mixed = np.uint64(0)
+    for i in range(len(name)):
+        mixed += name[i] * mix[i]
+    return np.int64(((mixed ^ (mixed >> np.uint64(29))) * mix[0]) >> np.uint64(32))
 
-    def _enter(self, rows: Rows, places: Rows) -> None:
-        """Let names be found: rows (boxes,), from the places (boxes,) on."""
-        while len(rows):
-            free = self._row_at[places] == EMPTY
-            self._row_at[places[free]] = rows[free]
-            # Of several at one place the last has it, the others go on.
-            still = self._row_at[places] != rows
-            rows, places = rows[still], self._after(places[still])
 
-    def _after(self, places: Rows) -> Rows:
-        return (places + 1) & (len(self._row_at) - 1)
+@compiled
+def _find(at: np.int64, name: Words, names: Words, row_at: NDArray[np.int32]) -> tuple[np.int64, np.int64]:
+    """From a place on, where a name stands, or could, and its row or `EMPTY`."""
+    while True:
+        row = np.int64(row_at[at])
+        if row == EMPTY:
+            return at, row
+        same = True
+        for i in range(len(name)):
+            same &= names[row, i] == name[i]
+        if same:
+            return at, row
+        at = (at + 1) & (len(row_at) - 1)
+
+
+@compiled
+def _enter_all(names: Words, used: int, row_at: NDArray[np.int32], mix: Words) -> None:
+    """Let the names of all rows be found."""
+    for row in range(used):
+        at, _ = _find(_hashed(names[row], mix) & (len(row_at) - 1), names[row], names, row_at)
+        row_at[at] = row
