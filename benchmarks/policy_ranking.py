@@ -6,8 +6,8 @@
     python benchmarks/policy_ranking.py rank   --out SET --policies DIR [--docs docs/policies-result.md]
 
 `make` draws robots with one medium or large effect each, whose answers are sealed, and lets each play the blind benchmark's
-runs. `models` makes three simulations of each robot from these runs alone: the nominal model; `sysid fit`'s; and what
-`gap apply` makes of the nominal model: calibrated by the diagnosis itself, with the effects that it found. Diagnosing the nominal
+runs. `models` makes three simulations of each robot from these runs alone: the nominal model; `sysid fit`'s of it; and the one
+that `gap apply` makes with the effects that were diagnosed, calibrated by `sysid fit`, too. Diagnosing the nominal
 model compares all robots with the same simulated ones, made once (of `--motions`, where a set of those was prepared before).
 `play` lets policies walk on the true robots, simulated by the blind benchmark's own code at half a
 millisecond: no line of it is the environments'. `rank` plays them in the simulations (`openant policies rank`).
@@ -94,6 +94,11 @@ def models(out: Path, only: str | None) -> None:
             openant(
                 "gap", "apply", diagnosis, "--model", out / "model.xml", "--out", diagnosed / "improved.xml",
                 "--robot", diagnosed,
+            )  # fmt: skip
+            # What the diagnosis moves within tolerances is a means to an end; what is left is calibrated as in the other.
+            openant(
+                "sysid", "fit", *stand, "--hold-out", held_out[0], "--robot", diagnosed, "--no-effects",
+                "--out", place / "refit",
             )  # fmt: skip
 
 

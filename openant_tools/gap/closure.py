@@ -95,6 +95,9 @@ class Windows:
 
     Args:
         protocol: the robot and its runs, at the model's own step.
+
+    Attributes:
+        measured: of each run, (rows, joints) rad; NaN where nobody knows what a servo had in mind (`around_switching`).
     """
 
     def __init__(self, protocol: Protocol) -> None:
@@ -104,7 +107,7 @@ class Windows:
         coarse = protocol.coarse()
         self._quick = [Rollouts(one.plant, [one.run], HORIZON_S) for one in coarse.runs]
         unsure = [around_switching(one.run, protocol.joints) for one in protocol.runs]
-        self._measured = [
+        self.measured = [
             np.where(there, np.nan, one.run.signal("pos", protocol.joints))
             for one, there in zip(protocol.runs, unsure, strict=True)
         ]
@@ -127,7 +130,7 @@ class Windows:
         rollouts = (self._quick if quick else self._rollouts)[k]
         robots = [self.robot(refit) for refit in refits]
         found = simulate(rollouts, robots, signals=("pos",), warm_c=[self.protocol.runs[k].warm_c]).signals["pos"]
-        out: Array = self._measured[k][None] - found.astype(np.float64)
+        out: Array = self.measured[k][None] - found.astype(np.float64)
         return out
 
     def refit(self, start: Refit, training: Sequence[int], leave_out: Sequence[int]) -> tuple[Refit, list[Refit]]:

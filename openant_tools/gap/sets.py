@@ -172,7 +172,6 @@ class SetFits:
         coarse = protocol.coarse()
         # One thread: what one joint's steps take is less than waiting for each other.
         self._rollouts = [Rollouts(one.plant, [one.run], HORIZON_S, nthread=1) for one in coarse.runs]
-        self._measured = [one.run.signal("pos", protocol.joints) for one in protocol.runs]
         self._weight, self._run = [], []
         for k in training:
             t = protocol.runs[k].run.t
@@ -187,7 +186,7 @@ class SetFits:
             errors = self.windows.errors(k, refits)
         else:
             robots = [self.windows.robot(refit) for refit in refits]
-            errors = self._measured[k][None] - simulate(self._rollouts[k], robots, signals=("pos",)).signals["pos"]
+            errors = self.windows.measured[k][None] - simulate(self._rollouts[k], robots, signals=("pos",)).signals["pos"]
         out: Array = np.nan_to_num(errors).reshape(len(refits), -1)
         return out
 
@@ -326,7 +325,7 @@ class SetFits:
             squares = np.square(self._errors(k, refits, exact=exact)).sum(axis=1)
             before[mine] += squares[0]
             after[:, mine] += squares[1:].reshape(n, len(mine))
-            counts[mine] += np.isfinite(self._measured[k]).sum()
+            counts[mine] += np.isfinite(self.windows.measured[k]).sum()
         floor = float(np.sqrt(np.mean(self.windows.floor**2)))
         out = []
         for s, search in enumerate(searches):
