@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.cause import Quantity, enter
 from openant_tools.gap.explain import Hypothesis
-from openant_tools.gap.features import around_switching
+from openant_tools.gap.features import Floats, around_switching
 from openant_tools.gap.protocol import Played, Protocol
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
@@ -146,10 +146,13 @@ class Windows:
         u: Array = np.concatenate([centre, start.nuisance])
         prior = np.concatenate([centre, np.zeros(len(self.names))])
         blocks: dict[int, tuple[Array, Array]] = {}
+        slopes: dict[int, Floats] = {}
         at = u
         for _ in range(ITERATIONS):
             at = u
-            blocks = {k: self._normal(k, start, at) for k in fitted}
+            for k in fitted:
+                slopes[k], left = self._linear(k, start, at, slopes.get(k))
+                blocks[k] = (slopes[k] @ slopes[k].T).astype(np.float64), (slopes[k] @ left).astype(np.float64)
             u = self._solve(start, at, prior, scale, blocks.values())
         folds = [[block for k, block in blocks.items() if k != out] for out in leave_out]
         return _from(start, u), [_from(start, self._solve(start, at, prior, scale, fold)) for fold in folds]
@@ -167,13 +170,18 @@ class Windows:
         clipped: Array = np.clip(found, low, high)
         return clipped
 
-    def _normal(self, k: int, start: Refit, u: Array) -> tuple[Array, Array]:
-        """Normal matrix and gradient of run k at a point."""
+    def _linear(self, k: int, start: Refit, u: Array, known: Floats | None) -> tuple[Floats, Floats]:
+        """Weighted slopes (coordinates, rows) of run k at a point, and errors (rows,).
+
+        Args:
+            known: slopes nearby. What moves within tolerance moves little: only those of the causes are looked at again.
+        """
         one = self.protocol.runs[k]
+        causes = len(u) - len(self.names)
         columns = self._colours(one, start)
-        steps = np.concatenate(
-            [np.maximum(0.05 * np.abs(u[: len(u) - len(self.names)]), 1e-3), np.full(len(self.names), 0.3)]
-        )
+        if known is not None:
+            columns = columns[:causes]
+        steps = np.concatenate([np.maximum(0.05 * np.abs(u[:causes]), 1e-3), np.full(len(self.names), 0.3)])
         refits = [_from(start, u)]
         for members in columns:
             moved = u.copy()
@@ -184,12 +192,12 @@ class Windows:
         period = float(np.median(np.diff(one.run.t)))
         weight = 1 / (self._sigma * np.sqrt(max(1.0, INDEPENDENT_S / period)))
         base = np.nan_to_num(errors[0]) * weight
-        tangent = np.zeros((len(u), base.size), np.float32)
+        slopes = np.zeros((len(u), base.size), np.float32) if known is None else known.copy()
         for row, members in enumerate(columns, 1):
             change = np.nan_to_num(errors[row] - errors[0]) * weight
             for p, mask in members:
-                tangent[p] = (np.where(mask, change, 0.0) / steps[p]).ravel()
-        return (tangent @ tangent.T).astype(np.float64), (tangent @ base.ravel().astype(np.float32)).astype(np.float64)
+                slopes[p] = (np.where(mask, change, 0.0) / steps[p]).ravel()
+        return slopes, base.ravel().astype(np.float32)
 
     def _colours(self, one: Played, start: Refit) -> list[list[tuple[int, NDArray[np.bool_]]]]:
         """Coordinates that one simulation can vary, because on the stand legs do not move each other."""

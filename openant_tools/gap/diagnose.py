@@ -7,11 +7,13 @@ large it would be; held-out closure decides between them, and says when none wil
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import joblib
 import numpy as np
@@ -24,7 +26,7 @@ from openant_tools.gap.closure import Closure, Refit, Windows, calibration_of, c
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found, Span
 from openant_tools.gap.explain import Explained, Part, Scene, fit, robot_with
 from openant_tools.gap.features import Floats
-from openant_tools.gap.judge import Judge, Judgement, train, whitening_of
+from openant_tools.gap.judge import Judge, Judgement, Metric, metric_of, train
 from openant_tools.gap.late import late_velocity
 from openant_tools.gap.measure import Measurement, measure
 from openant_tools.gap.next import suggestion
@@ -39,6 +41,7 @@ from openant_tools.sysid.identify import joints_in_common, own_model
 __all__ = ["diagnose"]
 
 Progress = Callable[[float, str], None]
+Stored = TypeVar("Stored")
 
 #: probabilities: below which of the best nothing is fitted, below which a cause is not looked at, above which it is a finding
 DOUBT, SUSPECT, FINDING = 0.12, 0.07, 0.5
@@ -66,8 +69,9 @@ COPPER = 0.01
 LARGE, STRANGE, ODD = 3.0, 3.0, 20.0
 #: sets whose closures differ by less are not told apart
 APART = 0.01
-#: s that a diagnosis gives to simulated robots where the protocol was never seen; `prepare` by itself takes what it needs
-PREPARE_S = 720.0
+#: s that a diagnosis gives to simulated robots where the protocol was never seen; `prepare` by itself takes what it needs. On two
+#: usual cores they are there before; on slow ones it is better to wait than to judge by few
+PREPARE_S = 1080.0
 #: robots of no more joints are cheap to simulate: all suspects are fitted together
 FEW_JOINTS = 2
 #: nothing is surer
@@ -214,22 +218,37 @@ def _check_motion(runs: Sequence[Run], joints: Sequence[str]) -> None:
 
 def _judge(prepared: Prepared, which: Sequence[int], columns: Sequence[NDArray[np.bool_]], tell: Progress) -> Judge:
     """The trained judge for these runs and signals, from the cache where it stands there."""
+
+    def make() -> Judge:
+        tell(0.63, "training the judge")
+        return train(prepared, which, columns)
+
+    return _kept(Judge, make, prepared, which, columns)
+
+
+def _kept(
+    kind: type[Stored],
+    make: Callable[[], Stored],
+    prepared: Prepared,
+    which: Sequence[int],
+    columns: Sequence[NDArray[np.bool_]],
+) -> Stored:
+    """What follows from a preparation for some runs and signals: made once, then read again."""
     state = hashlib.sha256(repr((list(which), len(prepared.cases))).encode())
     for mine in columns:
         state.update(mine.tobytes())
-    path = prepared.folder / f"judge-{state.hexdigest()[:16]}.joblib"
+    path = prepared.folder / f"{kind.__name__.lower()}-{state.hexdigest()[:16]}.joblib"
     if path.is_file():
         try:
             found = joblib.load(path)
-            if isinstance(found, Judge):
+            if isinstance(found, kind):
                 return found
         except Exception:  # whatever an interrupted or foreign file does, it is made anew
             path.unlink(missing_ok=True)
-    tell(0.63, "training the judge")
-    judge = train(prepared, which, columns)
+    made = make()
     with atomic_writer(path) as file:
-        joblib.dump(judge, file)
-    return judge
+        joblib.dump(made, file)
+    return made
 
 
 def _scenes(
@@ -244,9 +263,10 @@ def _scenes(
         mine = [k for k in training if coarse.runs[k].plant.setup is setup]
         if not mine:
             continue
-        whitening, columns = whitening_of(prepared, mine, [found[k][1] for k in mine])
+        columns = [found[k][1] for k in mine]
+        metric = _kept(Metric, functools.partial(metric_of, prepared, mine, columns), prepared, mine, columns)
         seen = np.concatenate([found[k][0] for k in mine])
-        scenes[setup] = Scene(coarse, [coarse.runs[k] for k in mine], whitening, columns, seen)
+        scenes[setup] = Scene(coarse, [coarse.runs[k] for k in mine], metric, seen)
     return scenes
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.cause import Cause, Quantity, catalogue, enter
 from openant_tools.gap.features import Floats, differences
-from openant_tools.gap.judge import Whitening
+from openant_tools.gap.judge import Metric
 from openant_tools.gap.protocol import Played, Players, Protocol
 from openant_tools.gap.robot import Reference, Robot
 
@@ -24,7 +24,7 @@ __all__ = ["Explained", "Hypothesis", "Part", "Scene", "bounds_of", "fit", "robo
 Array = NDArray[np.float64]
 
 #: iterations of Gauss and Newton, and the least improvement (share) that goes on
-ITERATIONS, ENOUGH = 3, 5e-3
+ITERATIONS, ENOUGH = 3, 0.015
 #: share of a size by which it is varied, and the least variation in units of `small`
 STEP, LEAST_STEP = 0.08, 0.25
 #: how far beyond `large` a size may go
@@ -82,20 +82,19 @@ class Scene:
     """The runs on which causes are compared, and the measure.
 
     Attributes:
-        protocol: for sizes and scopes. runs: those simulated. whitening: of their features, one after another.
+        protocol: for sizes and scopes. runs: those simulated. metric: of their features, one after another.
         seen: (features,) of the robot at hand.
     """
 
     protocol: Protocol
     runs: Sequence[Played]
-    whitening: Whitening
-    columns: NDArray[np.bool_]
+    metric: Metric
     seen: Floats
 
     def __post_init__(self) -> None:
         self._players = Players.of(self.runs)
         self._nominal = self._players.play([Robot(len(self.protocol.joints))])
-        self._target = self.whitening(self.seen[None, self.columns])[0]
+        self._target = self.metric(self.seen[None])[0]
 
     def residuals(self, robots: Sequence[Robot]) -> Floats:
         """(robots, features) whitened differences between the robot at hand and these."""
@@ -103,8 +102,7 @@ class Scene:
             one.layout.features(differences(found, nominal, one.signals))
             for one, found, nominal in zip(self.runs, self._players.play(robots), self._nominal, strict=True)
         ]
-        x = np.concatenate(parts, axis=1)[:, self.columns]
-        out: Floats = np.nan_to_num(self.whitening(x) - self._target)
+        out: Floats = np.nan_to_num(self.metric(np.concatenate(parts, axis=1)) - self._target)
         return out
 
 

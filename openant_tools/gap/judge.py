@@ -30,7 +30,7 @@ from openant_tools.gap.prepare import Prepared
 from openant_tools.gap.robot import Reference
 from openant_tools.model.plant import Setup
 
-__all__ = ["Judge", "Judgement", "Whitening", "train", "whitening_of"]
+__all__ = ["Judge", "Judgement", "Metric", "Whitening", "metric_of", "train"]
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -112,6 +112,22 @@ class Whitening:
         """(robots, features) of differences already scaled."""
         out: Floats = (d / self.rest + ((d @ self.basis) * self.gains) @ self.basis.T).astype(np.float32)
         return out
+
+
+@dataclass(frozen=True)
+class Metric:
+    """What distances between robots are measured in: a whitening of some features.
+
+    Attributes:
+        columns: (features,) which it takes.
+    """
+
+    whitening: Whitening
+    columns: Bools
+
+    def __call__(self, x: Floats) -> Floats:
+        """(robots, features) of differences, all of them."""
+        return self.whitening(x[:, self.columns])
 
 
 @dataclass(frozen=True)
@@ -315,12 +331,12 @@ def train(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools], se
     return dataclasses.replace(judge, forest=forest, networks=networks, known=known, calibration=calibration)
 
 
-def whitening_of(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools]) -> tuple[Whitening, Bools]:
-    """The measure of some runs' block means alone, and which of their features it takes."""
+def metric_of(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools]) -> Metric:
+    """The metric of some runs' block means alone."""
     chosen = _layout(prepared, which).means & np.concatenate(list(columns))
     x = np.concatenate([prepared.features[k] for k in which], axis=1)[:, chosen]
     templates = np.concatenate([prepared.templates[k] for k in which], axis=1)[:, chosen]
-    return _whiten(x[prepared.healthy()], templates, prepared.bank, prepared.protocol.reference), chosen
+    return Metric(_whiten(x[prepared.healthy()], templates, prepared.bank, prepared.protocol.reference), chosen)
 
 
 @dataclass(frozen=True)

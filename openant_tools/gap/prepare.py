@@ -12,8 +12,9 @@ import os
 import shutil
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ Array = NDArray[np.float64]
 CACHE_VARIABLE = "OPENANT_CACHE"
 LARGEST_BYTES = 4 * 2**30
 #: what is stored is bound to the code that made it: raise it when simulated robots change
-VERSION = 11
+VERSION = 12
 #: robots of a part, and of a whole preparation where the robot has many joints and where it has one or two
 PART, ROBOTS, ROBOTS_ONE_JOINT = 96, 3360, 16_000
 #: robots without which no judge is trained, and the file that says that no more are to be made unless asked for
@@ -49,16 +50,36 @@ class Prepared:
 
     Attributes:
         protocol: the one that was prepared. folder: where it is kept.
-        cases: the robots. features: of each run, (robots, features).
-        bank: robots that are as the model says but for one cause. templates: of each run, their features.
+        which: of each run, which of those kept there it is.
+        cases: the robots. parts: where they are kept.
+        bank: robots that are as the model says but for one cause. banks: where they are kept.
     """
 
     protocol: Protocol
     folder: Path
+    which: tuple[int, ...]
     cases: tuple[Case, ...]
-    features: tuple[Floats, ...]
+    parts: tuple[int, ...]
     bank: tuple[Case, ...]
-    templates: tuple[Floats, ...]
+    banks: tuple[int, ...]
+
+    @cached_property
+    def features(self) -> tuple[Floats, ...]:
+        """Of each run, (robots, features)."""
+        return self._read(self.parts)
+
+    @cached_property
+    def templates(self) -> tuple[Floats, ...]:
+        """Of each run, (robots of the bank, features)."""
+        return self._read(self.banks)
+
+    def _read(self, parts: Sequence[int]) -> tuple[Floats, ...]:
+        found: list[list[Floats]] = [[] for _ in self.which]
+        for part in parts:
+            with np.load(_part(self.folder, part)) as stored:
+                for mine, k in zip(found, self.which, strict=True):
+                    mine.append(stored[f"run{k}"].astype(np.float32))
+        return tuple(np.concatenate(mine) for mine in found)
 
     def healthy(self) -> NDArray[np.bool_]:
         """(robots,) which have no cause."""
@@ -98,16 +119,10 @@ def prepare(
         _simulate(kept, coarse, range(-banks, parts), size, seconds, progress)
     os.utime(kept.folder)
     there = [part for part in range(parts) if _part(kept.folder, part).is_file()]
-    features: list[list[Floats]] = [[] for _ in coarse.runs]
-    for part in [*there, *range(-1, -banks - 1, -1)]:
-        with np.load(_part(kept.folder, part)) as stored:
-            for mine, k in zip(features, kept.which, strict=True):
-                mine.append(stored[f"run{k}"].astype(np.float32))
     causes = applicable(coarse)
     cases = [draw(coarse, part * size + k, causes) for part in there for k in range(size)]
-    n, whole = len(cases), [np.concatenate(mine) for mine in features]
     return Prepared(
-        protocol, kept.folder, tuple(cases), tuple(x[:n] for x in whole), tuple(bank), tuple(x[n:] for x in whole)
+        protocol, kept.folder, kept.which, tuple(cases), tuple(there), tuple(bank), tuple(range(-1, -banks - 1, -1))
     )
 
 

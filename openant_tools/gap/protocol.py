@@ -37,6 +37,8 @@ SAME_RAD = 0.01
 ALIKE = 0.95
 #: s at a run's beginning in which its positions say where it rests, and rad by which robots at rest differ at most
 BEGIN_S, ELSEWHERE_RAD = 0.1, 0.05
+#: share of the time in which commands are slower than what they often ask for, and the least of the fastest that this is
+OFTEN, LEAST_OF_MOST = 0.9, 0.2
 #: smaller changes of a supply's share are rounding of numbers
 LEAST_CHANGE = 1e-6
 #: s, steps of simulated populations, in which they cost the least that does not show beside tolerances
@@ -267,6 +269,12 @@ def _on_grid(run: Run, joints: Sequence[str]) -> Array:
     return out
 
 
+def _speeds(x: Array) -> Array:
+    """(joints,) rad/s that commands often ask for, of those at any time (rows, joints): a step asks for any speed at all."""
+    often: Array = np.maximum(np.quantile(x, OFTEN, axis=0), LEAST_OF_MOST * x.max(axis=0))
+    return often
+
+
 def _resolution(runs: Sequence[Run], signal: str, joints: Sequence[str]) -> float:
     steps = [resolution(run, signal, joint) for run in runs for joint in joints]
     return float(np.median([step for step in steps if step > 0] or [0.0]))
@@ -300,7 +308,7 @@ def shown(runs: Sequence[Run], joints: Sequence[str]) -> Seen:
     for run in runs:
         grid = _on_grid(run, joints)
         if len(grid) > 5:
-            speeds.append(np.abs(grid[5:] - grid[:-5]).max(axis=0) / (5 * GRID_S))
+            speeds.append(_speeds(np.abs(grid[5:] - grid[:-5]) / (5 * GRID_S)))
         positions.append(run.signal("pos", joints))
     seen = np.concatenate(positions)
     low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)

@@ -54,7 +54,7 @@ class Seen:
     """What runs show of a robot's motion.
 
     Attributes:
-        speed: rad/s, (joints,) that the commands ask for at most. low, high: rad, between which the joint was seen.
+        speed: rad/s, (joints,) that the commands often ask for. low, high: rad, between which the joint was seen.
         encoder_rad: the steps of its encoders, 0 where none show.
     """
 

@@ -186,7 +186,9 @@ class SetFits:
             errors = self.windows.errors(k, refits)
         else:
             robots = [self.windows.robot(refit) for refit in refits]
-            errors = self.windows.measured[k][None] - simulate(self._rollouts[k], robots, signals=("pos",)).signals["pos"]
+            errors = (
+                self.windows.measured[k][None] - simulate(self._rollouts[k], robots, signals=("pos",)).signals["pos"]
+            )
         out: Array = np.nan_to_num(errors).reshape(len(refits), -1)
         return out
 
