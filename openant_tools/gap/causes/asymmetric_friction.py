@@ -30,8 +30,8 @@ CAUSE = Cause(
     words="dry friction differs by direction",
     scopes=(Scope.JOINT, Scope.SERVO, Scope.ALL),
     quantities=(
-        amount("positive_nm", "N·m", 0.035, 0.25, scale=usual_torque),
-        amount("negative_nm", "N·m", 0.035, 0.25, scale=usual_torque),
+        amount("positive_nm", "N·m", 0.035, 0.35, scale=usual_torque),
+        amount("negative_nm", "N·m", 0.035, 0.35, scale=usual_torque),
     ),
     enter=_enter,
     native=False,

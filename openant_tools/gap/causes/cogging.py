@@ -19,7 +19,7 @@ CAUSE = Cause(
     words="a torque repeats with the joint's angle",
     scopes=(Scope.JOINT, Scope.SERVO, Scope.ALL),
     quantities=(
-        amount("amplitude_nm", "N·m", 0.03, 0.25, scale=usual_torque),
+        amount("amplitude_nm", "N·m", 0.03, 0.4, scale=usual_torque),
         shape("periods", "1", 6.0, 40.0, levels=12),
     ),
     enter=_enter,

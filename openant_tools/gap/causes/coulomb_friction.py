@@ -17,7 +17,7 @@ CAUSE = Cause(
     family="friction",
     words="dry friction is not what the model says",
     scopes=(Scope.JOINT, Scope.SERVO, Scope.ALL),
-    quantities=(amount("torque_nm", "N·m", 0.025, 0.22, signed=True, scale=usual_torque),),
+    quantities=(amount("torque_nm", "N·m", 0.025, 0.4, signed=True, scale=usual_torque),),
     enter=_enter,
     native=True,
 )

@@ -21,7 +21,7 @@ CAUSE = Cause(
     family="contact",
     words="feet stick to the floor",
     scopes=(Scope.BODY,),
-    quantities=(amount("force_n", "N", 0.05, 0.5, scale=_weight),),
+    quantities=(amount("force_n", "N", 0.05, 0.9, scale=_weight),),
     enter=_enter,
     native=True,
     shows=lambda reference: reference.floor,
