@@ -64,9 +64,9 @@ def eval_(
       openant eval my-ant/runs/sac-1 --seconds 120 --json eval.json --strip walk.png
       openant eval my-ant/runs/sac-1 --seconds 120 --env hardware --robot my-ant
     """
-    from openant_tools.cli.learning import need_torch
+    from openant_tools.cli.learning import need_agents
 
-    need_torch()
+    need_agents()
     from rich.console import Console
     from rich.progress import Progress
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from openant_agents.drops import DropWatch
     from openant_agents.training import Progress
 
-__all__ = ["LearningBar", "kit_option", "need_torch", "robot_argument", "settings_of", "settings_option"]
+__all__ = ["LearningBar", "kit_option", "need_agents", "robot_argument", "settings_of", "settings_option"]
 
 Settings = TypeVar("Settings")
 
@@ -30,12 +30,13 @@ settings_option = click.option(
 )  # fmt: skip
 
 
-def need_torch() -> None:
+def need_agents() -> None:
     """Refuse in one line where the agents' extra is not installed."""
     import importlib.util
 
-    if importlib.util.find_spec("torch") is None:
-        raise BadInput("agents need torch, which is not installed", remedy="pip install 'openant-tools[agents]'")
+    for name in ("torch", "numba"):
+        if importlib.util.find_spec(name) is None:
+            raise BadInput(f"agents need {name}, which is not installed", remedy="pip install 'openant-tools[agents]'")
 
 
 def read_settings(file: Path | None, agent: str) -> dict[str, Any]:

@@ -30,9 +30,9 @@ def plot(runs: tuple[Path, ...], out: Path, singly: bool, json_file: Path | None
     Example:
       openant plot my-ant/runs/sac-* my-ant/runs/sarsa-* --out curves.png
     """
-    from openant_tools.cli.learning import need_torch
+    from openant_tools.cli.learning import need_agents
 
-    need_torch()
+    need_agents()
     from openant_agents.curves import band, group_runs, plot_groups, read_run_curve
     from openant_agents.drops import write_drops
     from openant_tools.files import write_text

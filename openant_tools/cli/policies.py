@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from openant_tools.cli.learning import need_torch
+from openant_tools.cli.learning import need_agents
 from openant_tools.cli.options import json_option, report_option
 from openant_tools.errors import BadInput
 
@@ -62,7 +62,7 @@ def policies() -> None:
 )  # fmt: skip
 def play(folder: Path, seconds: float, plays: int, place: str, yes: bool, json_file: Path) -> None:
     """Play every policy in one place and write what each achieved."""
-    need_torch()
+    need_agents()
     from openant_agents.ranking import find_policies, read_measured, write_measured
 
     runs = find_policies(folder)
@@ -107,7 +107,7 @@ def rank(
       openant policies rank --policies my-ant/runs --real measured.json \\
         --sim nominal=nominal --sim calibrated=my-ant --sim diagnosed=my-ant-diagnosed --report ranking
     """
-    need_torch()
+    need_agents()
     from openant_agents.exploits import DISTURBANCES, flag
     from openant_agents.ranking import agreement, find_policies
     from openant_agents.ranking_figure import draw_ranking

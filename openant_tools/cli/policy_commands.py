@@ -29,12 +29,12 @@ def policy_commands(run: Path, out: Path, folder: RobotFolder | None) -> Path:
     from openant_agents.policies import load_policy
     from openant_agents.rollout import commands_of
     from openant_agents.runs import read_facts
-    from openant_tools.cli.learning import need_torch
+    from openant_tools.cli.learning import need_agents
     from openant_tools.cli.walking import SIMULATED_ID, environment
     from openant_tools.recording.run import Facts, Run
     from openant_tools.recording.tables import write_table
 
-    need_torch()
+    need_agents()
     options = dict(read_facts(run)["env"]["options"])
     for name in ("virtual", "clock"):
         options.pop(name, None)

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from openant_tools.cli.learning import need_torch, settings_of, settings_option
+from openant_tools.cli.learning import need_agents, settings_of, settings_option
 from openant_tools.cli.options import json_option
 from openant_tools.cli.train_sarsa import sarsa
 from openant_tools.cli.training import (
@@ -87,7 +87,7 @@ def sac(
       openant eval my-ant/runs/sac-1 --seconds 120
       openant train sac --env hardware --robot my-ant --out my-ant/runs/real-1
     """
-    need_torch()
+    need_agents()
     name, options = place_of(where, robot, kit, virtual_source, clock, task, effects)
     if dt is not None:
         options["dt"] = dt

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from openant_tools.cli.learning import need_torch, settings_of, settings_option
+from openant_tools.cli.learning import need_agents, settings_of, settings_option
 from openant_tools.cli.options import json_option
 from openant_tools.cli.training import (
     effects_option,
@@ -65,7 +65,7 @@ def sarsa(
       openant eval my-ant/runs/sarsa-1 --seconds 120
       openant train sarsa --env hardware --robot my-ant --out my-ant/runs/real-sarsa-1
     """
-    need_torch()
+    need_agents()
     name, options = place_of(where, robot, kit, virtual_source, clock, task, effects)
     options |= {"dt": dt, "action_range": action_range}
 

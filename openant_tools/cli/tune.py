@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from openant_tools.cli.learning import LearningBar, kit_option, need_torch, robot_argument
+from openant_tools.cli.learning import LearningBar, kit_option, need_agents, robot_argument
 from openant_tools.cli.options import json_option, robot_option
 from openant_tools.errors import BadInput
 
@@ -58,7 +58,7 @@ def tune(
       openant tune sarsa --robot my-ant --storage sqlite:///tune.db --json best.json
       openant train sarsa --robot my-ant --settings best.json --out my-ant/runs/tuned
     """
-    need_torch()
+    need_agents()
     import importlib.util
 
     if importlib.util.find_spec("optuna") is None:
