@@ -49,6 +49,8 @@ DOUBT, SUSPECT, FINDING = 0.12, 0.07, 0.5
 MAYBE, EASES = 0.2, 0.7
 #: probability of a cause that little closure on the held-out runs does not overrule: a stop, say, shows in few of them
 CERTAIN = 0.8
+#: share of its least size below which a cause that was re-fitted on the runs has vanished
+VANISHED = 0.1
 #: how many causes are looked at, at most and at least; and at least where the log is strange and no cause likely
 SUSPECTS, LIKELIEST, PUZZLED = 5, 3, 7
 #: probability of a second cause, once the first is taken into account
@@ -117,8 +119,9 @@ def diagnose(
         protocol = Protocol.of(everything, model, wanted, [own_model(run) for run in everything])
     protocol = dataclasses.replace(protocol, reference=coarse.reference)
     found = coarse.features()
-    training = list(range(len(runs)))
-    judge = _judge(prepared, training, [columns for _, columns in found], tell)
+    # In the order in which they were prepared, in whatever order they are named: so one judge serves them all.
+    training = sorted(range(len(runs)), key=lambda k: prepared.which[k])
+    judge = _judge(prepared, training, [found[k][1] for k in training], tell)
     tell(0.7, "causes")
     case = _Case(protocol, coarse, prepared, measured, judge, found, training, model, runs, hold_out)
     judgement = judge.say(case.features)
@@ -234,7 +237,7 @@ def _kept(
     columns: Sequence[NDArray[np.bool_]],
 ) -> Stored:
     """What follows from a preparation for some runs and signals: made once, then read again."""
-    state = hashlib.sha256(repr((list(which), len(prepared.cases))).encode())
+    state = hashlib.sha256(repr(([prepared.which[k] for k in which], len(prepared.cases))).encode())
     for mine in columns:
         state.update(mine.tobytes())
     path = prepared.folder / f"{kind.__name__.lower()}-{state.hexdigest()[:16]}.joblib"
@@ -409,11 +412,12 @@ def _decide(
         verdict, selected = (NONE if judgement.energy < ODD else UNEXPLAINED), ()
     elif (
         not beside
-        and probability[best] < CERTAIN
         and excess(before, floor) > LARGE * floor
         and whole.closed < EXPLAINS
         and judgement.energy > STRANGE
+        and (probability[best] < CERTAIN or _vanished(alone[best].refit))
     ):
+        # However sure the judge is: what leaves the gap, or comes out as nothing at all, is not what makes it.
         verdict, selected = UNEXPLAINED, ()
     elif rivals:
         verdict, ambiguous = AMBIGUOUS, ((best, *rivals),)
@@ -428,6 +432,12 @@ def _decide(
         case, verdict, confidence, (*effects, *_rest(ranked, order)), selected, ambiguous, gap, removal, judgement,
         None if verdict == NONE else calibration_of(windows, whole.refit),
     )  # fmt: skip
+
+
+def _vanished(refit: Refit) -> bool:
+    """Whether of a cause by itself nothing is left, once it was re-fitted on the runs."""
+    (part,), (x,) = refit.hypothesis, refit.x
+    return all(abs(x[q.name]) < VANISHED * q.small for q in part.definition.quantities if not q.shape)
 
 
 def _questioned(protocol: Protocol) -> list[str]:
