@@ -68,6 +68,15 @@ def test_late_commands_are_named_and_close_the_gap(model: Path) -> None:
     assert sum(place["share"] for place in found.where if place["signal"] == "pos") == pytest.approx(1, abs=0.01)
 
 
+def test_the_order_in_which_runs_are_named_does_not_matter(model: Path) -> None:
+    runs = recorded(pendulum(), late_s=0.04)
+    first, other = (diagnose(some, model, robots=ROBOTS) for some in (runs, [runs[2], runs[0], runs[1]]))
+    for one, same in zip(first.effects, other.effects, strict=True):
+        assert same.effect == one.effect
+        assert same.probability == pytest.approx(one.probability, abs=1e-6)
+    assert other.gap["after"] == pytest.approx(first.gap["after"], rel=1e-3)
+
+
 def test_bad_input_is_one_line(model: Path) -> None:
     runs = recorded(pendulum())
     with pytest.raises(BadInput, match="one run is not enough"):
