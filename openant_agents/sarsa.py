@@ -124,10 +124,6 @@ class Sarsa:
         self._valued: tuple[Rows, NDArray[np.float64]] | None = None  # what was last asked for since weights changed
         self.decisions = 0
         self.moved = 0.0  # sum of how far the weights were ever moved
-        # Compiled before anybody waits for it.
-        nowhere = np.full(coder.tilings, coder.rows)
-        _values(self.weights, nowhere, self._tiles[:0], self._actions[:0], self._owed[:0])
-        _pay(self.weights, nowhere, np.int64(0), np.float64(0.0))
 
     def rows_of(self, observation: Array) -> Rows:
         """The coder's rows of an observation (float32); those of the last two are remembered.
@@ -254,6 +250,14 @@ def _values(
 def _pay(weights: Array, rows: Rows, action: np.int64, owed: np.float64) -> None:
     for row in rows:
         weights[row, action] += owed
+
+
+def _compile() -> None:
+    """Have the machine code of all that a decision does: an agent may be made while its robot moves."""
+    agent = Sarsa(TileCoder(np.zeros(1), np.ones(1), tiles=1, tilings=1, rows=2), 1, Settings(), seed=0)
+    rows = agent.rows_of(np.zeros(1, np.float32))
+    agent.learn(rows, 0, 0.0, STEP_S, rows, 0)
+    agent.settle()
 
 
 # ------------------------------------------------------------------------------------------------ a run's decisions
@@ -407,6 +411,7 @@ def train(
     describe = getattr(env.unwrapped, "describe", None)
     described = dict(describe()) if describe is not None else {}
     gait = _gait(env, described)
+    _compile()
     bounds = _Bounds.of(env)
     run = Run(
         folder,
@@ -650,6 +655,7 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any], *, explore: bool = F
                 remedy="make the environment as run.json says",
             )
     checkpoint = load_checkpoint(folder)
+    _compile()
     settings, seed = Settings(**facts["settings"]), int(facts["seed"])
     _, agent = _learned(folder, checkpoint, len(gait), settings, seed)
     if agent is None:

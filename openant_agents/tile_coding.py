@@ -85,12 +85,11 @@ class TileCoder:
         # The names by row, and the rows by hash: where a place is taken by another name, the next free one is used. The system
         # gives memory only as rows are written.
         self._names = np.empty((rows, self._name.shape[1]), np.uint64)
-        self._row_at = np.full(PLACES, EMPTY, np.int32)
         # Odd numbers without a pattern, to mix a name's words by.
         self._mix = np.random.default_rng(0).integers(2**63, size=self._name.shape[1], dtype=np.uint64) * 2 + 1
         self._used = 0
         self.shared = 0  # lookups of a box that has no row of its own, since the table was full
-        self.rows_of(self.low, learn=False)  # compiled before anybody waits for it
+        self._make_places(PLACES)
 
     @property
     def used(self) -> int:
@@ -120,9 +119,13 @@ class TileCoder:
             rows[missing] = [zlib.crc32(self._place[k].tobytes()) % self.rows for k in missing]
             self.shared += len(missing)
         if self._used > CROWDED * len(self._row_at):
-            self._row_at = np.full(2 * len(self._row_at), EMPTY, np.int32)
-            _enter_all(self._names, self._used, self._row_at, self._mix)
+            self._make_places(2 * len(self._row_at))
         return rows
+
+    def _make_places(self, count: int) -> None:
+        """So many places to look for names, those of all rows among them."""
+        self._row_at = np.full(count, EMPTY, np.int32)
+        _enter_all(self._names, self._used, self._row_at, self._mix)
 
 
 @compiled

@@ -219,6 +219,21 @@ def test_the_update_is_that_of_the_book(seed):
     assert agent.decisions == 60
 
 
+def test_no_decision_waits_for_a_compiler(monkeypatch):
+    made = [tile_coding._look_up, tile_coding._enter_all, sarsa._values, sarsa._pay]
+    sarsa._compile()
+    before = [len(function.signatures) for function in made]
+    monkeypatch.setattr(tile_coding, "PLACES", 64)  # so that names need more room on the way
+    agent = Sarsa(TileCoder(np.full(3, -1.0), np.ones(3), tiles=4, tilings=24, rows=2**12), 8, Settings(), seed=0)
+    seen = np.random.default_rng(0).uniform(-1, 1, (60, 3)).astype(np.float32)
+    for here, there in zip(seen, seen[1:], strict=False):
+        rows, following = agent.rows_of(here), agent.rows_of(there)
+        agent.learn(rows, agent.choose(rows), 0.01, 0.5, following, agent.choose(following))
+    agent.coder.rows_of(seen[0], learn=False)
+    assert agent.coder.used > 64
+    assert [len(function.signatures) for function in made] == before
+
+
 def test_chance_and_ties():
     coder = TileCoder(np.zeros(1), np.ones(1), tiles=1, tilings=4, rows=10)
     agent = Sarsa(coder, 8, Settings(epsilon=0.0), seed=0)

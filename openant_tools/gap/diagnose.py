@@ -7,7 +7,6 @@ large it would be; held-out closure decides between them, and says when none wil
 from __future__ import annotations
 
 import dataclasses
-import functools
 import hashlib
 import math
 from collections.abc import Callable, Sequence
@@ -121,7 +120,8 @@ def diagnose(
     found = coarse.features()
     # In the order in which they were prepared, in whatever order they are named: so one judge serves them all.
     training = sorted(range(len(runs)), key=lambda k: prepared.which[k])
-    judge = _judge(prepared, training, [found[k][1] for k in training], tell)
+    tell(0.63, "the judge")
+    judge = _kept(Judge, train, prepared, training, [found[k][1] for k in training])
     tell(0.7, "causes")
     case = _Case(protocol, coarse, prepared, measured, judge, found, training, model, runs, hold_out)
     judgement = judge.say(case.features)
@@ -219,19 +219,9 @@ def _check_motion(runs: Sequence[Run], joints: Sequence[str]) -> None:
         )  # fmt: skip
 
 
-def _judge(prepared: Prepared, which: Sequence[int], columns: Sequence[NDArray[np.bool_]], tell: Progress) -> Judge:
-    """The trained judge for these runs and signals, from the cache where it stands there."""
-
-    def make() -> Judge:
-        tell(0.63, "training the judge")
-        return train(prepared, which, columns)
-
-    return _kept(Judge, make, prepared, which, columns)
-
-
 def _kept(
     kind: type[Stored],
-    make: Callable[[], Stored],
+    make: Callable[[Prepared, Sequence[int], Sequence[NDArray[np.bool_]]], Stored],
     prepared: Prepared,
     which: Sequence[int],
     columns: Sequence[NDArray[np.bool_]],
@@ -248,7 +238,7 @@ def _kept(
                 return found
         except Exception:  # whatever an interrupted or foreign file does, it is made anew
             path.unlink(missing_ok=True)
-    made = make()
+    made = make(prepared, which, columns)
     with atomic_writer(path) as file:
         joblib.dump(made, file)
     return made
@@ -266,8 +256,7 @@ def _scenes(
         mine = [k for k in training if coarse.runs[k].plant.setup is setup]
         if not mine:
             continue
-        columns = [found[k][1] for k in mine]
-        metric = _kept(Metric, functools.partial(metric_of, prepared, mine, columns), prepared, mine, columns)
+        metric = _kept(Metric, metric_of, prepared, mine, [found[k][1] for k in mine])
         seen = np.concatenate([found[k][0] for k in mine])
         scenes[setup] = Scene(coarse, [coarse.runs[k] for k in mine], metric, seen)
     return scenes
@@ -415,9 +404,9 @@ def _decide(
         and excess(before, floor) > LARGE * floor
         and whole.closed < EXPLAINS
         and judgement.energy > STRANGE
-        and (probability[best] < CERTAIN or _vanished(alone[best].refit))
+        and (probability[best] < CERTAIN or (_vanished(alone[best].refit) and not catalogue()[best].random))
     ):
-        # However sure the judge is: what leaves the gap, or comes out as nothing at all, is not what makes it.
+        # However sure the judge is: what comes out as nothing at all is not what makes the gap. No fit finds what is random.
         verdict, selected = UNEXPLAINED, ()
     elif rivals:
         verdict, ambiguous = AMBIGUOUS, ((best, *rivals),)
