@@ -3,6 +3,7 @@ that no kill undoes."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -226,7 +227,7 @@ def test_no_decision_waits_for_a_compiler(monkeypatch):
     monkeypatch.setattr(tile_coding, "PLACES", 64)  # so that names need more room on the way
     agent = Sarsa(TileCoder(np.full(3, -1.0), np.ones(3), tiles=4, tilings=24, rows=2**12), 8, Settings(), seed=0)
     seen = np.random.default_rng(0).uniform(-1, 1, (60, 3)).astype(np.float32)
-    for here, there in zip(seen, seen[1:], strict=False):
+    for here, there in itertools.pairwise(seen):
         rows, following = agent.rows_of(here), agent.rows_of(there)
         agent.learn(rows, agent.choose(rows), 0.01, 0.5, following, agent.choose(following))
     agent.coder.rows_of(seen[0], learn=False)
