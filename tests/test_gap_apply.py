@@ -17,6 +17,7 @@ from plants import pendulum, sweep, write
 
 from openant_tools.cli.gap import gap
 from openant_tools.effects.entries import values_of
+from openant_tools.effects.rollout import rollout
 from openant_tools.errors import BadInput
 from openant_tools.gap.apply import apply, robot_of, write_robot
 from openant_tools.gap.cause import Cause, Scope, catalogue
@@ -111,6 +112,23 @@ def test_electrical_damping_goes_with_the_torque(model: Path, tmp_path: Path) ->
     off = replayed(tmp_path / "improved.xml", run, Setup.STAND) - simulated
     assert np.sqrt(np.mean((simulated - given) ** 2)) > 0.02
     assert np.sqrt(np.mean(off**2)) < 0.002
+
+
+@pytest.mark.parametrize("electrical", [0.0, 1.0])
+def test_gears_carry_what_back_emf_leaves(electrical: float, model: Path, tmp_path: Path) -> None:
+    """Both effects at once: the file has the damping in its servo, what stands beside it the friction."""
+    plant = load_plant(model)
+    run = commanded(plant, sweep(T, 1))
+    robot, bare = Robot(1), Robot(1)
+    robot.electrical[:] = bare.electrical[:] = 0.8
+    robot.law("load_friction", "coefficient")[:] = 0.4
+    robot.law("load_friction", "electrical")[:] = electrical
+    without, simulated = simulate(Rollouts(plant, [run]), [bare, robot], signals=["pos"]).signals["pos"].astype(float)
+    write_robot(model, robot, tmp_path / "improved.xml", note="a test")
+    written = load_plant(tmp_path / "improved.xml")
+    (played,) = rollout(Rollouts(written, [run]), [written.model], [robot.laws]).pos
+    assert np.sqrt(np.mean((simulated - without) ** 2)) > 0.01
+    assert np.sqrt(np.mean((played - simulated) ** 2)) < 1e-3
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,8 @@
 A gear carries what the motor gives on its one side and what the link asks on its other; standing still the two are the
 same. In motion they differ by what inertia and friction take, and which of them the teeth feel is a matter of the gear. Each form
 has a coefficient of its own; what they say adds up. The usual one takes the mean of both sides: on a real servo
-(docs/effects.md) it explains more than either alone or the greater of them. Loaded gears also stick: `at_rest` is what the
+(docs/effects.md) it explains more than either alone or the greater of them. Damping that is back-EMF is lost in the motor and
+never reaches the gears: `electrical` says how much of the joint's is. Loaded gears also stick: `at_rest` is what the
 coefficient is larger by while they stand still, and dies out with speed as Stribeck's does.
 """
 
@@ -22,10 +23,14 @@ def _law(values: Values) -> Law:
     motor = values["motor_side"] + values["coefficient"] / 2
     link = values["link_side"] + values["coefficient"] / 2
     greater, at_rest = values["greater_side"], values["at_rest"] / 2
-    sticks = bool(at_rest.any())
+    electrical = values["electrical"]
+    brakes, sticks = bool(electrical.any()), bool(at_rest.any())
 
     def act(step: Step) -> None:
-        given, asked = np.abs(step.motor_torque), np.abs(step.load)
+        given, asked = step.motor_torque, np.abs(step.load)
+        if brakes:
+            given = given - np.where(step.on, electrical * step.damping * step.velocity, 0.0)
+        given = np.abs(given)
         step.friction += motor * given + link * asked + greater * np.maximum(given, asked)
         if sticks:
             step.friction += at_rest * (given + asked) * np.exp(-((step.velocity / USUAL_VELOCITY_RAD_S) ** 2))
@@ -43,6 +48,7 @@ EFFECT = Effect(
         Quantity("link_side", "N·m/(N·m)", 0.25, high=0.9),
         Quantity("greater_side", "N·m/(N·m)", 0.25, high=0.9),
         Quantity("at_rest", "N·m/(N·m)", 0.25, high=0.9),
+        Quantity("electrical", "1", 0.5, high=1.0),
     ),
     order=30,
     law=_law,

@@ -19,6 +19,10 @@ __all__ = ["Servos", "batch_of", "single"]
 Array = NDArray[np.float64]
 #: setpoint filters of a position servo (`timeconst`): the servo follows their state instead of its control
 FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
+#: fields of the models that servos are read from and written to
+_READ = (
+    "actuator_group", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "dof_damping", "dof_frictionloss",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,7 @@ class Fields:
     actuator_gainprm: Array
     actuator_biasprm: Array
     actuator_forcerange: Array
+    dof_damping: Array
     dof_frictionloss: Array
 
 
@@ -100,6 +105,7 @@ class Servos:
             velocity_gain=rest["velocity_gain"] * share,
             limit=rest["limit"] * share,
             back_emf=rest["back_emf"],
+            damping=rest["damping"],
             friction=rest["friction"].copy(),
             torque=np.zeros(rest["friction"].shape),
             supply=np.broadcast_to(share, rest["friction"].shape),
@@ -130,6 +136,7 @@ class Servos:
             "velocity_gain": np.where(motor, gain[..., KD] - back_emf, -bias[..., 2]),
             "limit": np.where(motor, stall, np.where(self._limited, force, np.inf)),
             "back_emf": back_emf,
+            "damping": fields.dof_damping[:, self.plant.dof].copy(),
             "friction": fields.dof_frictionloss[:, self.plant.dof].copy(),
         }
 
@@ -165,13 +172,11 @@ def batch_of(plant: Plant, models: Sequence[mujoco.MjModel], copies: int, nthrea
             field = batch.expand(name)
             field[:] = np.tile(values.reshape(len(models), *field.shape[1:]), (copies, *[1] * (field.ndim - 1)))
     states = {name: batch.bind(name) for name in ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "qfrc_bias")}
-    changed = ("actuator_group", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "dof_frictionloss")
-    fields = Fields(**states, **{name: batch.expand(name) for name in changed})
+    fields = Fields(**states, **{name: batch.expand(name) for name in _READ})
     return batch, Servos(plant, base, fields)
 
 
 def single(plant: Plant, model: mujoco.MjModel, data: mujoco.MjData) -> Servos:
     """One simulation; the laws write into `model` itself."""
     states = {name: getattr(data, name)[None] for name in ("qpos", "qvel", "act", "ctrl", "qfrc_applied", "qfrc_bias")}
-    changed = ("actuator_group", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "dof_frictionloss")
-    return Servos(plant, model, Fields(**states, **{name: getattr(model, name)[None] for name in changed}))
+    return Servos(plant, model, Fields(**states, **{name: getattr(model, name)[None] for name in _READ}))

@@ -24,7 +24,7 @@ class Step:
     """One step of n simulations of robots with the same joints; arrays are (n, joints) unless said otherwise.
 
     A servo's torque is clip(stiffness · (setpoint − position) − velocity_gain · velocity, ±limit) − back_emf · velocity,
-    and nothing where its torque is off.
+    and nothing where its torque is off. Its joint's own damping, and friction, come on top.
 
     Attributes:
         dt: s, of the step. time: (n,) s since each simulation's start.
@@ -33,6 +33,7 @@ class Step:
         on: whether torque is on; read only.
         setpoint: rad, where the servo is told to go.
         stiffness, velocity_gain, limit, back_emf: of the servo: N·m/rad, N·m·s/rad, N·m, N·m·s/rad.
+        damping: N·m·s/rad, of the joint itself, which stays with torque off; read only.
         friction: N·m, the most that dry friction in the joint holds.
         torque: N·m put on the joint beside all this.
         supply: share of the nominal voltage that reaches the servo, which stiffness, gains and limit already follow.
@@ -49,6 +50,7 @@ class Step:
     velocity_gain: Array
     limit: Array
     back_emf: Array
+    damping: Array
     friction: Array
     torque: Array
     supply: Array

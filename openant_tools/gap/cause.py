@@ -26,6 +26,7 @@ __all__ = [
     "factor",
     "rate",
     "shape",
+    "share",
     "usual_torque",
 ]
 
@@ -57,6 +58,7 @@ class Quantity:
         scale: what an x of 1 means on this robot.
         shape: it says how an effect acts, not how much: never absent, drawn between small and large.
         levels: from how many values of a shape it is sought, because what it makes has many valleys.
+        share: it is a shape between 0 and 1, any of them as likely.
     """
 
     name: str
@@ -69,9 +71,17 @@ class Quantity:
     scale: Scale
     shape: bool = False
     levels: int = 1
+    share: bool = False
+
+    @property
+    def middle(self) -> float:
+        """Of a shape, the value in its middle."""
+        return 0.5 * (self.small + self.large) if self.share else float(np.sqrt(self.small * self.large))
 
     def sought(self) -> list[float]:
         """The values of a shape from which it is sought, evenly by their logarithms."""
+        if self.share:
+            return [(k + 0.5) / self.levels for k in range(self.levels)]
         return [float(self.small * (self.large / self.small) ** ((k + 0.5) / self.levels)) for k in range(self.levels)]
 
 
@@ -99,6 +109,11 @@ def rate(name: str, unit: str, small: float, large: float, scale: Scale) -> Quan
 def shape(name: str, unit: str, low: float, high: float, *, levels: int = 1) -> Quantity:
     """A parameter of how it acts."""
     return Quantity(name, unit, lambda x, s: x, lambda v, s: v, low, high, False, _one, shape=True, levels=levels)
+
+
+def share(name: str) -> Quantity:
+    """A parameter of how it acts that is a share of something."""
+    return Quantity(name, "1", lambda x, s: x, lambda v, s: v, 0.0, 1.0, False, _one, shape=True, share=True)
 
 
 def usual_torque(reference: Reference, joints: Ints) -> float:
@@ -216,7 +231,8 @@ class Cause:
             out[q.name] = float(size)
         for q in self.quantities:
             if q.shape:
-                out[q.name] = float(q.small * (q.large / q.small) ** rng.random())
+                chance = float(rng.random())
+                out[q.name] = chance if q.share else float(q.small * (q.large / q.small) ** chance)
         return out
 
 

@@ -142,7 +142,9 @@ class Windows:
         runs = self.protocol.runs
         fitted = [k for k in training if runs[k].plant.setup is Setup.STAND] or list(training)
         centre = _vector(start)
-        scale = np.concatenate([np.maximum(POLISH * np.abs(centre), 1e-3), np.full(len(self.names), SPREAD)])
+        shares = np.array([q.share for q in _quantities(start)], bool)
+        sizes = np.where(shares, POLISH, np.maximum(POLISH * np.abs(centre), 1e-3))
+        scale = np.concatenate([sizes, np.full(len(self.names), SPREAD)])
         u: Array = np.concatenate([centre, start.nuisance])
         prior = np.concatenate([centre, np.zeros(len(self.names))])
         blocks: dict[int, tuple[Array, Array]] = {}
@@ -181,7 +183,9 @@ class Windows:
         columns = self._colours(one, start)
         if known is not None:
             columns = columns[:causes]
-        steps = np.concatenate([np.maximum(0.05 * np.abs(u[:causes]), 1e-3), np.full(len(self.names), 0.3)])
+        shares = np.array([q.share for q in _quantities(start)], bool)
+        sizes = np.where(shares, 0.1, np.maximum(0.05 * np.abs(u[:causes]), 1e-3))
+        steps = np.concatenate([sizes, np.full(len(self.names), 0.3)])
         refits = [_from(start, u)]
         for members in columns:
             moved = u.copy()
@@ -313,6 +317,8 @@ def nothing(windows: Windows) -> Refit:
 
 def _limits(quantity: Quantity, at: float) -> tuple[float, float]:
     """Between which a size may be polished that was found somewhere: it keeps its sign, and a shape its reason."""
+    if quantity.share:
+        return 0.0, 1.0
     if quantity.shape:
         return quantity.small / 2, quantity.large * 2
     return (0.0, FARTHEST * at) if at >= 0 else (FARTHEST * at, 0.0)

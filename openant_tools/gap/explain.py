@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 ITERATIONS, ENOUGH = 3, 0.015
 #: share of a size by which it is varied, and the least variation in units of `small`
 STEP, LEAST_STEP = 0.08, 0.25
+#: how much shares that only say how an effect acts are varied by
+LEAST_SHARE = 0.2
 #: how far beyond `large` a size may go
 BEYOND = 2.5
 #: the largest share that anything may take
@@ -178,6 +180,8 @@ def _bounds(search: _Search) -> tuple[Array, Array]:
 
 def bounds_of(q: Quantity) -> tuple[float, float]:
     """Between which a coordinate is sought."""
+    if q.share:
+        return 0.0, 1.0
     if q.shape:
         return q.small / 2, q.large * 2
     # A share cannot be more than all.
@@ -197,7 +201,7 @@ def _tangents(scene: Scene, searches: Sequence[_Search]) -> list[Floats]:
     for search in searches:
         _low, high = _bounds(search)
         for k, q in enumerate(search.quantities):
-            step = STEP * abs(search.u[k]) if q.shape else max(STEP * abs(search.u[k]), LEAST_STEP * q.small)
+            step = STEP * abs(search.u[k]) if q.shape and not q.share else max(STEP * abs(search.u[k]), _least(q))
             if search.u[k] + step > high[k]:
                 step = -step
             u = search.u.copy()
@@ -213,6 +217,10 @@ def _tangents(scene: Scene, searches: Sequence[_Search]) -> list[Floats]:
         out.append(rows)
         at += n
     return out
+
+
+def _least(q: Quantity) -> float:
+    return LEAST_SHARE if q.share else LEAST_STEP * q.small
 
 
 def _explained(search: _Search) -> Explained:

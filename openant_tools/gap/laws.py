@@ -16,7 +16,7 @@ from openant_tools.effects.step import Law, Step
 from openant_tools.effects.thermal_derating import Heating
 from openant_tools.gap.robot import Robot
 
-__all__ = ["Fields", "first_laws", "last_laws"]
+__all__ = ["Fields", "back_emf", "first_laws", "last_laws"]
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ class Fields:
     damp: Callable[[Array], None]
 
 
-def first_laws(robots: Sequence[Robot], warm_c: Array, asked: Array) -> list[Law]:
+def first_laws(robots: Sequence[Robot], fields: Fields, warm_c: Array, asked: Array) -> list[Law]:
     """The laws on what the servo is asked and may give.
 
     Args:
@@ -69,15 +69,16 @@ def first_laws(robots: Sequence[Robot], warm_c: Array, asked: Array) -> list[Law
         laws.append(Heating({"loss_per_c": derating, "time_constant_s": seconds}, heat_c))
     if np.isfinite(no_load).any():
         laws.append(_fading(no_load))
+    if (slope := back_emf(robots, fields)).any():
+        laws.append(_generating(slope))
     return laws
 
 
 def last_laws(robots: Sequence[Robot], fields: Fields) -> list[Law]:
     """The laws on what reaches the link."""
     laws: list[Law] = []
-    electrical = _table(robots, "electrical")
-    if electrical.any():
-        laws.append(_braking(electrical * fields.damping / np.maximum(1 - electrical, TINY)))
+    if (slope := back_emf(robots, fields)).any():
+        laws.append(_braking(slope))
     low, high = _table(robots, "stop_low"), _table(robots, "stop_high")
     if np.isfinite(low).any() or np.isfinite(high).any():
         # What stops behind play or a spring is the link alone.
@@ -94,6 +95,13 @@ def last_laws(robots: Sequence[Robot], fields: Fields) -> list[Law]:
         before = np.array([[robot.form is not None and not robot.form.loop_behind] for robot in robots])
         laws.append(_transmitting(play, compliance, fields, before))
     return laws
+
+
+def back_emf(robots: Sequence[Robot], fields: Fields) -> Array:
+    """N·m·s/rad of what was damping in the joints."""
+    electrical = _table(robots, "electrical")
+    slope: Array = electrical * fields.damping / np.maximum(1 - electrical, TINY)
+    return slope
 
 
 def _table(robots: Sequence[Robot], name: str) -> Array:
@@ -132,8 +140,20 @@ def _fading(no_load: Array) -> Law:
     return act
 
 
-def _braking(slope: Array) -> Law:
+def _generating(slope: Array) -> Law:
+    """What follows from a motor's torque follows from what its back-EMF leaves."""
+
     def act(step: Step) -> None:
+        step.back_emf = step.back_emf + slope
+
+    return act
+
+
+def _braking(slope: Array) -> Law:
+    """Models of many robots at once have no back-EMF to be changed: it acts as a torque beside the servo's."""
+
+    def act(step: Step) -> None:
+        step.back_emf = step.back_emf - slope
         step.torque -= np.where(step.on, slope * step.velocity, 0.0)
 
     return act

@@ -35,6 +35,7 @@ class Form:
             impedance is, and on the depth at which it is reached.
         loop_behind: a servo measures behind its play or spring, as encoders on output shafts do; a written MJCF, whose
             servos measure their own joint, cannot.
+        tells_duty: what a servo says of its torque is what it puts on its motor, which back-EMF takes nothing from.
     """
 
     integrator: int = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
@@ -47,6 +48,7 @@ class Form:
     contact_give: float = 1.0
     contact_depth: float = 1.0
     loop_behind: bool = True
+    tells_duty: bool = True
 
 
 @dataclass(frozen=True)

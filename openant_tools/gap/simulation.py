@@ -19,7 +19,7 @@ from scipy.signal import lfilter
 from openant_tools.effects.rollout import laws_of
 from openant_tools.effects.servos import batch_of
 from openant_tools.effects.step import Law, Step
-from openant_tools.gap.laws import Fields, first_laws, last_laws
+from openant_tools.gap.laws import Fields, back_emf, first_laws, last_laws
 from openant_tools.gap.robot import Cable, Robot, tilted
 from openant_tools.model.body import torso_body
 from openant_tools.model.plant import Plant, Setup
@@ -149,7 +149,9 @@ class _Batch:
             link=np.maximum(plant.model.dof_M0[plant.dof] - plant.model.dof_armature[plant.dof], 1e-6)[None].repeat(len(robots), 0),
             damp=damp,
         )  # fmt: skip
-        first, last = first_laws(robots, warm_c, self._asked()), last_laws(robots, fields)
+        duty = np.array([[robot.form is None or robot.form.tells_duty] for robot in robots])
+        self._untold = np.where(duty, back_emf(robots, fields), 0.0)
+        first, last = first_laws(robots, fields, warm_c, self._asked()), last_laws(robots, fields)
         for name, values in (("dof_armature", fields.armature), ("dof_damping", fields.damping)):
             self._batch.expand(name)[:, plant.dof] = values
         return [*first, *laws_of([robot.laws for robot in robots], len(plant.joints)), self._note, *last]
@@ -181,7 +183,10 @@ class _Batch:
 
     def _note(self, step: Step) -> None:
         """What the motors give and get, before laws on what comes of it."""
-        self._given = step.motor_torque, step.supply
+        told = step.motor_torque
+        if self._untold.any():
+            told = told + np.where(step.on, self._untold * step.velocity, 0.0)
+        self._given = told, step.supply
 
     def play(self, out: dict[str, NDArray[np.float32]]) -> None:
         plant, segments, n = self._plant, self._segments, self._n

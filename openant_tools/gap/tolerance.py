@@ -92,6 +92,7 @@ def random_form(rng: np.random.Generator, encoder_rad: float) -> Form:
         contact_give=math.exp(rng.uniform(*CONTACT_FORM)),
         contact_depth=math.exp(rng.uniform(*CONTACT_FORM)),
         loop_behind=bool(rng.random() < 0.9),
+        tells_duty=bool(rng.random() < 0.5),
     )  # fmt: skip
 
 
