@@ -321,6 +321,18 @@ def test_a_run_that_is_none_is_refused_in_words(robot: RobotFolder, tmp_path: Pa
     asyncio.run(look())
 
 
+def test_a_tick_that_was_due_as_the_program_closed_does_nothing(robot: RobotFolder) -> None:
+    async def close() -> OpenAnt:
+        app = OpenAnt(robot.path)
+        async with app.run_test(size=(80, 24)):
+            pass
+        return app
+
+    app = asyncio.run(close())
+    assert not app.screen_stack
+    app.tick()
+
+
 def test_a_fault_stays_until_it_has_been_seen(robot: RobotFolder) -> None:
     async def look() -> None:
         app = OpenAnt(robot.path, ticking=False)

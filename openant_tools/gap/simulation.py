@@ -29,8 +29,8 @@ __all__ = ["BASE", "Log", "simulate"]
 
 Array = NDArray[np.float64]
 
-#: bytes of states kept while a batch runs; more robots at a time gain nothing
-CHUNK_BYTES = 64 * 2**20
+#: bytes of states while a batch runs: with a third of it a robot takes a quarter longer, with three times as much a tenth less
+CHUNK_BYTES = 192 * 2**20
 #: s over which velocities become an acceleration
 ACCELERATION_S = 0.01
 #: s, of which what a setpoint of limited rate did before a simulation begins is followed

@@ -160,6 +160,8 @@ class OpenAnt(App[int]):
 
     def tick(self) -> None:
         """Let the screen show what came since the last tick."""
+        if not self.screen_stack:  # a last tick that was due as the program closed
+            return
         before = self.session.feed
         self.session.tick()
         notices, self.session.notices = self.session.notices, []
