@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
 from openant_tools.gap.cause import Quantity, enter
 from openant_tools.gap.explain import Hypothesis
@@ -28,15 +29,17 @@ __all__ = ["Closure", "Refit", "Windows", "calibration_of", "closures", "nothing
 
 Array = NDArray[np.float64]
 
-#: standard deviation of a prior, as a share of the tolerance; and where it ends
-SPREAD, END = 0.6, 1.3
+#: standard deviation of a prior, as a share of the tolerance; and where it ends: a re-fit within tolerance is no effect
+SPREAD, END = 0.6, 1.0
 #: rows (of some tens of milliseconds each) of one window say about as much as one: errors within it go together
 INDEPENDENT_S = 0.5
 #: standard deviation that sizes of causes keep from where they were found, as a share
 POLISH = 0.3
 #: times what it was found to be that a size may become
 FARTHEST = 2.5
-ITERATIONS = 2
+ITERATIONS = 3
+#: by which bounds are wider than what lies on them
+TINY = 1e-12
 #: rad, the least that a position is known to
 LEAST_SIGMA_RAD = 2e-4
 
@@ -149,12 +152,18 @@ class Windows:
         prior = np.concatenate([centre, np.zeros(len(self.names))])
         blocks: dict[int, tuple[Array, Array]] = {}
         slopes: dict[int, Floats] = {}
-        at = u
+        at, least = u, np.inf
         for _ in range(ITERATIONS):
-            at = u
+            found, cost = {}, float(np.sum(np.square((u - prior) / scale)))
             for k in fitted:
-                slopes[k], left = self._linear(k, start, at, slopes.get(k))
-                blocks[k] = (slopes[k] @ slopes[k].T).astype(np.float64), (slopes[k] @ left).astype(np.float64)
+                slopes[k], left = self._linear(k, start, u, slopes.get(k))
+                found[k] = (slopes[k] @ slopes[k].T).astype(np.float64), (slopes[k] @ left).astype(np.float64)
+                cost += float(left.astype(np.float64) @ left)
+            if cost > least:
+                # Farther than the slopes hold.
+                u = (at + u) / 2
+                continue
+            at, least, blocks = u, cost, found
             u = self._solve(start, at, prior, scale, blocks.values())
         folds = [[block for k, block in blocks.items() if k != out] for out in leave_out]
         return _from(start, u), [_from(start, self._solve(start, at, prior, scale, fold)) for fold in folds]
@@ -166,11 +175,14 @@ class Windows:
         normal, gradient = np.diag(1 / scale**2), (u - prior) / scale**2
         for more, slope in blocks:
             normal, gradient = normal + more, gradient + slope
-        found = u - np.linalg.solve(normal, gradient)
         ends = [_limits(q, float(at)) for q, at in zip(_quantities(start), prior, strict=False)]
         low, high = np.array([*ends, *[(-END, END)] * len(self.names)]).T
-        clipped: Array = np.clip(found, low, high)
-        return clipped
+        # What ends at a bound leaves its part to the others: clipped afterwards it would leave it undone.
+        root = np.linalg.cholesky(normal)
+        low, high = np.minimum(low, u) - TINY, np.maximum(high, u) + TINY
+        inside = lsq_linear(root.T, -np.linalg.solve(root, gradient), bounds=(low - u, high - u))
+        found: Array = u + inside.x
+        return found
 
     def _linear(self, k: int, start: Refit, u: Array, known: Floats | None) -> tuple[Floats, Floats]:
         """Weighted slopes (coordinates, rows) of run k at a point, and errors (rows,).
