@@ -263,8 +263,9 @@ def _scenes(
 
 
 def _scene_of(cause: str, scenes: dict[Setup, Scene]) -> Scene:
-    body = catalogue()[cause].of_body
-    first = Setup.FLOOR if body else Setup.STAND
+    # What shifts command and encoder alike shows where feet stand, and hardly anywhere else.
+    floor = catalogue()[cause].of_body or catalogue()[cause].silent
+    first = Setup.FLOOR if floor else Setup.STAND
     return scenes.get(first) or next(iter(scenes.values()))
 
 
@@ -386,6 +387,8 @@ def _decide(
                 break
     sure = probability[best] > FINDING or eased
     sure = sure or (judgement.energy > 1 and proved and alone[best].closed > EXPLAINS)
+    # Where the judge is sure of something, and the log is strange, which of its suspects it is the fits may say.
+    sure = sure or (judgement.energy > STRANGE and max(probability[name] for name in names) > FINDING)
     if probability[best] < CERTAIN and not explained[best].beyond_tolerance:
         sure = False
     verdict, selected = best, tuple(sorted(chosen, key=lambda name: -beyond[name]))
@@ -407,6 +410,9 @@ def _decide(
         and (probability[best] < CERTAIN or (_vanished(alone[best].refit) and not catalogue()[best].random))
     ):
         # However sure the judge is: what comes out as nothing at all is not what makes the gap. No fit finds what is random.
+        verdict, selected = UNEXPLAINED, ()
+    elif beside and probability[best] < CERTAIN and left is not None and min(judgement.energy, left.energy) > STRANGE:
+        # Strange with it, too: a foot that came off is no offset, though nothing known is more like it.
         verdict, selected = UNEXPLAINED, ()
     elif rivals:
         verdict, ambiguous = AMBIGUOUS, ((best, *rivals),)

@@ -18,6 +18,7 @@ from openant_tools.gap.features import Floats, differences
 from openant_tools.gap.judge import Metric
 from openant_tools.gap.protocol import Played, Players, Protocol
 from openant_tools.gap.robot import Reference, Robot
+from openant_tools.model.plant import Setup
 
 __all__ = ["Explained", "Hypothesis", "Part", "Scene", "bounds_of", "fit", "robot_with"]
 
@@ -25,8 +26,10 @@ Array = NDArray[np.float64]
 
 #: iterations of Gauss and Newton, and the least improvement (share) that goes on
 ITERATIONS, ENOUGH = 3, 0.015
-#: share of a size by which it is varied, and the least variation in units of `small`
+#: share of a size by which it is varied, and the least variation in units of `small`; where feet touch the floor less says how
+#: contacts chatter, not what the size does
 STEP, LEAST_STEP = 0.08, 0.25
+FLOOR_STEP, FLOOR_LEAST_STEP = 0.5, 1.0
 #: how much shares that only say how an effect acts are varied by
 LEAST_SHARE = 0.2
 #: how far beyond `large` a size may go
@@ -198,10 +201,14 @@ def _evaluate(scene: Scene, searches: Sequence[_Search]) -> None:
 def _tangents(scene: Scene, searches: Sequence[_Search]) -> list[Floats]:
     """Of each search (coordinates, features): how the residual moves with each coordinate."""
     robots, steps = [], []
+    floor = any(one.plant.setup is Setup.FLOOR for one in scene.runs)
+    share, least = (FLOOR_STEP, FLOOR_LEAST_STEP) if floor else (STEP, LEAST_STEP)
     for search in searches:
         _low, high = _bounds(search)
         for k, q in enumerate(search.quantities):
-            step = STEP * abs(search.u[k]) if q.shape and not q.share else max(STEP * abs(search.u[k]), _least(q))
+            # A shape may be small; a share that only says how an effect acts may be nothing.
+            smallest = LEAST_SHARE if q.share else 0.0 if q.shape else least * q.small
+            step = max(share * abs(search.u[k]), smallest)
             if search.u[k] + step > high[k]:
                 step = -step
             u = search.u.copy()
@@ -217,10 +224,6 @@ def _tangents(scene: Scene, searches: Sequence[_Search]) -> list[Floats]:
         out.append(rows)
         at += n
     return out
-
-
-def _least(q: Quantity) -> float:
-    return LEAST_SHARE if q.share else LEAST_STEP * q.small
 
 
 def _explained(search: _Search) -> Explained:
