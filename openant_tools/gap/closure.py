@@ -40,6 +40,8 @@ FARTHEST = 2.5
 ITERATIONS = 3
 #: by which bounds are wider than what lies on them
 TINY = 1e-12
+#: rad: no joint is farther off than in a simulation that fell apart
+LOST_RAD = 10.0
 #: rad, the least that a position is known to
 LEAST_SIGMA_RAD = 2e-4
 
@@ -134,6 +136,10 @@ class Windows:
         robots = [self.robot(refit) for refit in refits]
         found = simulate(rollouts, robots, signals=("pos",), warm_c=[self.protocol.runs[k].warm_c]).signals["pos"]
         out: Array = self.measured[k][None] - found.astype(np.float64)
+        begun = min(int(segment.row[0]) for segment in rollouts.segments)
+        # A robot that no step holds together is as wrong as can be: neither right nor unknown.
+        lost = ~(np.abs(found[:, begun:]) < LOST_RAD)
+        out[:, begun:][lost & np.isfinite(self.measured[k][begun:])[None]] = LOST_RAD
         return out
 
     def refit(self, start: Refit, training: Sequence[int], leave_out: Sequence[int]) -> tuple[Refit, list[Refit]]:
@@ -179,9 +185,12 @@ class Windows:
         low, high = np.array([*ends, *[(-END, END)] * len(self.names)]).T
         # What ends at a bound leaves its part to the others: clipped afterwards it would leave it undone.
         root = np.linalg.cholesky(normal)
-        low, high = np.minimum(low, u) - TINY, np.maximum(high, u) + TINY
-        inside = lsq_linear(root.T, -np.linalg.solve(root, gradient), bounds=(low - u, high - u))
-        found: Array = u + inside.x
+        inside = lsq_linear(
+            root.T,
+            -np.linalg.solve(root, gradient),
+            bounds=(np.minimum(low - u, 0) - TINY, np.maximum(high - u, 0) + TINY),
+        )
+        found: Array = np.clip(u + inside.x, low, high)
         return found
 
     def _linear(self, k: int, start: Refit, u: Array, known: Floats | None) -> tuple[Floats, Floats]:
