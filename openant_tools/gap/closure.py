@@ -38,6 +38,8 @@ POLISH = 0.3
 #: times what it was found to be that a size may become
 FARTHEST = 2.5
 ITERATIONS = 3
+#: times what slopes foretold that may be left: beyond, they are looked at anew
+FORETOLD = 1.3
 #: by which bounds are wider than what lies on them
 TINY = 1e-12
 #: rad: no joint is farther off than in a simulation that fell apart
@@ -158,19 +160,30 @@ class Windows:
         prior = np.concatenate([centre, np.zeros(len(self.names))])
         blocks: dict[int, tuple[Array, Array]] = {}
         slopes: dict[int, Floats] = {}
-        at, least = u, np.inf
-        for _ in range(ITERATIONS):
+        at, least, expected = u, np.inf, np.inf
+
+        def linear() -> tuple[dict[int, tuple[Array, Array]], float]:
             found, cost = {}, float(np.sum(np.square((u - prior) / scale)))
             for k in fitted:
                 slopes[k], left = self._linear(k, start, u, slopes.get(k))
                 found[k] = (slopes[k] @ slopes[k].T).astype(np.float64), (slopes[k] @ left).astype(np.float64)
                 cost += float(left.astype(np.float64) @ left)
+            return found, cost
+
+        for _ in range(ITERATIONS):
+            found, cost = linear()
             if cost > least:
                 # Farther than the slopes hold.
                 u = (at + u) / 2
                 continue
+            if cost > FORETOLD * expected:
+                slopes.clear()
+                found, cost = linear()
             at, least, blocks = u, cost, found
             u = self._solve(start, at, prior, scale, blocks.values())
+            moved = u - at
+            expected = least + float(np.sum((u - prior) ** 2 / scale**2) - np.sum((at - prior) ** 2 / scale**2))
+            expected += sum(float(2 * slope @ moved + moved @ more @ moved) for more, slope in blocks.values())
         folds = [[block for k, block in blocks.items() if k != out] for out in leave_out]
         return _from(start, u), [_from(start, self._solve(start, at, prior, scale, fold)) for fold in folds]
 

@@ -1,0 +1,89 @@
+"""What is left of the gap once the model is re-fitted: within tolerance, within bounds, and honest where a simulation falls apart."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from plants import ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, write
+
+import openant_tools.gap.closure as closure
+from openant_tools.gap.cause import catalogue
+from openant_tools.gap.closure import Refit, Windows, closures, nothing
+from openant_tools.gap.explain import Part
+from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.simulation import Log
+
+#: on a stand nothing of the world touches the robot
+BENCH = '<geom name="bench" type="plane" size="1 1 0.1" pos="0 0 -0.12"/>'
+T = 2.0 + np.arange(150) / 50
+
+
+def protocol(folder: Path, *, kp: float, dry: float) -> Protocol:
+    """Two sweeps of a robot with another stiffness and friction than its model's 8 N·m/rad and 0.03 N·m."""
+    robot = mujoco.MjModel.from_xml_string(
+        pendulum(
+            f'<position {SERVO} kp="{kp}" forcerange="-4 4"/>',
+            joint=f'damping="0.12" armature="0.006" frictionloss="{dry}"',
+        ).replace(BENCH, "")
+    )
+    robot.opt.timestep = 0.0005
+    runs = []
+    for seed in (1, 2):
+        columns = drive(robot, ["joint"], T, seed * 0.4 * sweep(T, 1), noise=3e-4, quantum=ENCODER_RAD)
+        runs.append(run_of(columns, T, ["joint"], f"sweep-{seed}"))
+    model = pendulum(
+        f'<position {SERVO} kp="8" forcerange="-4 4"/>', joint='damping="0.12" armature="0.006" frictionloss="0.03"'
+    )
+    return Protocol.of(runs, write(folder / "given.xml", model), ["joint"], [None, None])
+
+
+def test_a_refit_stays_within_tolerance_and_is_the_best_there(tmp_path: Path) -> None:
+    """Stiffness is half as large again, far beyond its 15 %: some end at their bounds, the others where they then serve best."""
+    windows = Windows(protocol(tmp_path, kp=12.0, dry=0.05))
+    found, _ = windows.refit(nothing(windows), [0, 1], ())
+    assert np.abs(found.nuisance).max() == pytest.approx(1.0)
+
+    def left(u: np.ndarray[Any, np.dtype[np.float64]]) -> float:
+        refits = [dataclasses.replace(found, nuisance=u)]
+        return sum(float(np.nansum(windows.errors(k, refits) ** 2)) for k in (0, 1))
+
+    least = left(found.nuisance)
+    assert least < 0.1 * left(np.zeros(len(windows.names)))
+    for k in range(len(windows.names)):
+        for step in (-0.3, 0.3):
+            moved = found.nuisance.copy()
+            moved[k] = np.clip(moved[k] + step, -1.0, 1.0)
+            assert least < 1.1 * left(moved)
+
+
+@pytest.mark.parametrize("name", ["actuator_lag", "action_delay", "load_friction", "backlash"])
+def test_a_cause_that_is_not_there_ends_at_nothing_and_not_beyond(name: str, tmp_path: Path) -> None:
+    windows = Windows(protocol(tmp_path, kp=8.0, dry=0.03))
+    start = catalogue()[name].starts(0.2)[0]
+    cause = Refit((Part(name, (0,)),), (start,), np.zeros(len(windows.names)))
+    before, floor, (_, found) = closures(windows, [nothing(windows), cause], (), [0, 1])
+    size = catalogue()[name].quantities[0].name
+    assert 0 <= found.refit.x[0][size] < start[size]
+    assert np.isfinite([before, floor, found.after, found.low, found.high]).all()
+
+
+def test_a_simulation_that_falls_apart_is_wrong_and_not_unknown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    windows = Windows(protocol(tmp_path, kp=8.0, dry=0.03))
+    sound = closure.simulate
+
+    def falls_apart(*args: Any, **options: Any) -> Log:
+        found = sound(*args, **options).signals["pos"]
+        found[1, len(T) // 2 :] = np.nan
+        return Log({"pos": found})
+
+    monkeypatch.setattr(closure, "simulate", falls_apart)
+    right, wrong = windows.errors(0, [None, None])
+    assert np.nanmax(np.abs(right)) < 0.1
+    assert np.nanmin(np.abs(wrong[len(T) // 2 :])) == pytest.approx(closure.LOST_RAD)
