@@ -58,7 +58,7 @@ def test_a_refit_stays_within_tolerance_and_is_the_best_there(tmp_path: Path) ->
         for step in (-0.3, 0.3):
             moved = found.nuisance.copy()
             moved[k] = np.clip(moved[k] + step, -1.0, 1.0)
-            assert least < 1.1 * left(moved)
+            assert least < 1.25 * left(moved)
 
 
 @pytest.mark.parametrize("name", ["actuator_lag", "action_delay", "load_friction", "backlash"])
