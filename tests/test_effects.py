@@ -140,8 +140,8 @@ def test_gears_do_not_carry_what_back_emf_takes(servo: Plant) -> None:
     """A servo that has to follow a ramp gives its damping's torque; if that is back-EMF, no gear feels it."""
     t = np.arange(0.0, 1.0, 0.01)
     run = Run("ramp", Facts(joints=servo.joints), t, {"cmd.joint": 2 * t - 1, "pos.joint": np.full_like(t, -1.0)})
-    felt, plain = np.array([0.5]), {("load_friction", "coefficient"): np.array([0.5])}
-    values = [{}, plain, {**plain, ("load_friction", "electrical"): 2 * felt}]
+    plain = {("load_friction", "coefficient"): np.array([0.5])}
+    values = [{}, plain, {**plain, ("load_friction", "electrical"): np.array([1.0])}]
     free, geared, electrical = rollout(Rollouts(servo, [run]), [servo.model] * 3, values).pos[:, :, 0]
     behind = [float(np.mean(2 * t - 1 - path)) for path in (free, geared, electrical)]
     assert behind[0] < behind[2] < behind[1] - 0.1 * (behind[1] - behind[0])

@@ -73,16 +73,15 @@ class Quantity:
     levels: int = 1
     share: bool = False
 
-    @property
-    def middle(self) -> float:
-        """Of a shape, the value in its middle."""
-        return 0.5 * (self.small + self.large) if self.share else float(np.sqrt(self.small * self.large))
+    def between(self, way: float) -> float:
+        """Of a shape, the value so far (0 … 1) between its least and its largest: by logarithms, unless it is a share."""
+        if self.share:
+            return self.small + (self.large - self.small) * way
+        return float(self.small * (self.large / self.small) ** way)
 
     def sought(self) -> list[float]:
-        """The values of a shape from which it is sought, evenly by their logarithms."""
-        if self.share:
-            return [(k + 0.5) / self.levels for k in range(self.levels)]
-        return [float(self.small * (self.large / self.small) ** ((k + 0.5) / self.levels)) for k in range(self.levels)]
+        """The values of a shape from which it is sought, evenly between its ends."""
+        return [self.between((k + 0.5) / self.levels) for k in range(self.levels)]
 
 
 def _one(reference: Reference, joints: Ints) -> float:
@@ -231,8 +230,7 @@ class Cause:
             out[q.name] = float(size)
         for q in self.quantities:
             if q.shape:
-                chance = float(rng.random())
-                out[q.name] = chance if q.share else float(q.small * (q.large / q.small) ** chance)
+                out[q.name] = q.between(float(rng.random()))
         return out
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from openant_tools.gap.cause import Quantity, enter
-from openant_tools.gap.explain import Hypothesis
+from openant_tools.gap.explain import Hypothesis, bounds_of
 from openant_tools.gap.features import Floats, around_switching
 from openant_tools.gap.protocol import Played, Protocol
 from openant_tools.gap.robot import Robot
@@ -351,10 +351,8 @@ def nothing(windows: Windows) -> Refit:
 
 def _limits(quantity: Quantity, at: float) -> tuple[float, float]:
     """Between which a size may be polished that was found somewhere: it keeps its sign, and a shape its reason."""
-    if quantity.share:
-        return 0.0, 1.0
     if quantity.shape:
-        return quantity.small / 2, quantity.large * 2
+        return bounds_of(quantity)
     return (0.0, FARTHEST * at) if at >= 0 else (FARTHEST * at, 0.0)
 
 

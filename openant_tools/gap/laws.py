@@ -48,10 +48,11 @@ class Fields:
     damp: Callable[[Array], None]
 
 
-def first_laws(robots: Sequence[Robot], fields: Fields, warm_c: Array, asked: Array) -> list[Law]:
+def first_laws(robots: Sequence[Robot], generated: Array, warm_c: Array, asked: Array) -> list[Law]:
     """The laws on what the servo is asked and may give.
 
     Args:
+        generated: what `back_emf` says of them.
         warm_c: (robots, joints) °C, by which servos are known to be warmer as the run begins.
         asked: (robots, joints) rad, where a setpoint of limited rate is as the simulation begins; NaN: where it is asked to be.
     """
@@ -69,16 +70,16 @@ def first_laws(robots: Sequence[Robot], fields: Fields, warm_c: Array, asked: Ar
         laws.append(Heating({"loss_per_c": derating, "time_constant_s": seconds}, heat_c))
     if np.isfinite(no_load).any():
         laws.append(_fading(no_load))
-    if (slope := back_emf(robots, fields)).any():
-        laws.append(_generating(slope))
+    if generated.any():
+        laws.append(_generating(generated))
     return laws
 
 
-def last_laws(robots: Sequence[Robot], fields: Fields) -> list[Law]:
+def last_laws(robots: Sequence[Robot], generated: Array, fields: Fields) -> list[Law]:
     """The laws on what reaches the link."""
     laws: list[Law] = []
-    if (slope := back_emf(robots, fields)).any():
-        laws.append(_braking(slope))
+    if generated.any():
+        laws.append(_braking(generated))
     low, high = _table(robots, "stop_low"), _table(robots, "stop_high")
     if np.isfinite(low).any() or np.isfinite(high).any():
         # What stops behind play or a spring is the link alone.
@@ -98,7 +99,7 @@ def last_laws(robots: Sequence[Robot], fields: Fields) -> list[Law]:
 
 
 def back_emf(robots: Sequence[Robot], fields: Fields) -> Array:
-    """N·m·s/rad of what was damping in the joints."""
+    """(robots, joints) N·m·s/rad of what was damping in the joints and is back-EMF."""
     electrical = _table(robots, "electrical")
     slope: Array = electrical * fields.damping / np.maximum(1 - electrical, TINY)
     return slope

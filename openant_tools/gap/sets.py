@@ -208,7 +208,7 @@ class SetFits:
         """Where each coordinate is likely, how far from there, and between which ends it lies."""
         own, n = search.quantities, len(self.windows.names)
         lows, highs = np.array([bounds_of(q) for q in own]).reshape(-1, 2).T
-        centre = np.array([q.middle if q.shape else 0.0 for q in own])
+        centre = np.array([q.between(0.5) if q.shape else 0.0 for q in own])
         width = np.array([LIKELY * q.large for q in own])
         return (
             np.concatenate([centre, np.zeros(n)]), np.concatenate([width, np.full(n, SPREAD)]),

@@ -150,8 +150,11 @@ class _Batch:
             damp=damp,
         )  # fmt: skip
         duty = np.array([[robot.form is None or robot.form.tells_duty] for robot in robots])
-        self._untold = np.where(duty, back_emf(robots, fields), 0.0)
-        first, last = first_laws(robots, fields, warm_c, self._asked()), last_laws(robots, fields)
+        generated = back_emf(robots, fields)
+        untold = np.where(duty, generated, 0.0)
+        self._untold = untold if untold.any() else None
+        first = first_laws(robots, generated, warm_c, self._asked())
+        last = last_laws(robots, generated, fields)
         for name, values in (("dof_armature", fields.armature), ("dof_damping", fields.damping)):
             self._batch.expand(name)[:, plant.dof] = values
         return [*first, *laws_of([robot.laws for robot in robots], len(plant.joints)), self._note, *last]
@@ -184,7 +187,7 @@ class _Batch:
     def _note(self, step: Step) -> None:
         """What the motors give and get, before laws on what comes of it."""
         told = step.motor_torque
-        if self._untold.any():
+        if self._untold is not None:
             told = told + np.where(step.on, self._untold * step.velocity, 0.0)
         self._given = told, step.supply
 
