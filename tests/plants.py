@@ -21,6 +21,10 @@ ENCODER_RAD = 2 * np.pi / 4096
 SERVO = 'name="joint" joint="joint"'
 
 
+#: of the world: what falls below the pendulum would land on it; on a stand nothing does
+BENCH = '<geom name="bench" type="plane" size="1 1 0.1" pos="0 0 -0.12"/>'
+
+
 def pendulum(
     servo: str = f'<position {SERVO} kp="8" forcerange="-1.5 1.5"/>',
     *,
@@ -35,7 +39,7 @@ def pendulum(
   {compiler}
   <option {option}/>
   <worldbody>
-    <geom name="bench" type="plane" size="1 1 0.1" pos="0 0 -0.12"/>
+    {BENCH}
     <body name="arm">
       <joint name="joint" axis="0 1 0" {joint}/>
       <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.1" size="0.01" mass="0.02"/>

@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from plants import ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, write
+from plants import BENCH, ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, write
 
 import openant_tools.gap.closure as closure
 from openant_tools.gap.cause import catalogue
@@ -18,8 +18,6 @@ from openant_tools.gap.explain import Part
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.simulation import Log
 
-#: on a stand nothing of the world touches the robot
-BENCH = '<geom name="bench" type="plane" size="1 1 0.1" pos="0 0 -0.12"/>'
 T = 2.0 + np.arange(150) / 50
 
 

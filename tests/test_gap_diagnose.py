@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from plants import ENCODER_RAD, drive, pendulum, run_of, sweep, write
+from plants import BENCH, ENCODER_RAD, drive, pendulum, run_of, sweep, write
 
 from openant_tools.errors import BadInput
 from openant_tools.gap.diagnose import diagnose
@@ -32,9 +32,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def recorded(text: str, late_s: float = 0.0) -> list[Run]:
     """Three motions of a robot of this MJCF whose commands come late."""
     # On a stand nothing of the robot touches the world (formats, section 1).
-    robot = mujoco.MjModel.from_xml_string(
-        text.replace('<geom name="bench" type="plane" size="1 1 0.1" pos="0 0 -0.12"/>', "")
-    )
+    robot = mujoco.MjModel.from_xml_string(text.replace(BENCH, ""))
     robot.opt.timestep = 0.0005
     runs = []
     for k, (reach, fast) in enumerate([(0.6, 2.5), (0.9, 1.5), (0.35, 3.5)]):

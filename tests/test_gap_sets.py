@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from plants import ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, write
+from plants import BENCH, ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, write
 
 from openant_tools.gap.cause import catalogue
 from openant_tools.gap.closure import Windows
@@ -28,7 +28,7 @@ GIVEN = pendulum(f'<position {SERVO} kp="8" forcerange="-4 4"/>', joint='damping
 ROBOT = pendulum(
     f'<position {SERVO} kp="8" kv="0.11" forcerange="-4 4"/>',
     joint='damping="0.01" armature="0.006" frictionloss="0.12"',
-).replace('<geom name="bench" type="plane" size="1 1 0.1" pos="0 0 -0.12"/>', "")
+).replace(BENCH, "")
 
 
 def recorded(**facts: str) -> list[Run]:
