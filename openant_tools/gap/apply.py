@@ -17,6 +17,7 @@ from openant_tools.effects.entries import as_toml, entries_of
 from openant_tools.errors import BadInput
 from openant_tools.files import write_text
 from openant_tools.gap.cause import catalogue
+from openant_tools.gap.closure import BODY, adjust
 from openant_tools.gap.diagnosis import Diagnosis, Found
 from openant_tools.gap.native import Edit, edit
 from openant_tools.gap.robot import Reference, Robot, Seen
@@ -33,8 +34,6 @@ __all__ = ["Applied", "apply", "robot_of", "write_robot"]
 NATIVE_LAWS = ("cogging", "stribeck_friction", "viscous_nonlinear")
 #: rad: farther than any joint of a legged robot goes
 ANYWHERE_RAD = 10.0
-#: kinds of a diagnosis' calibration that are factors
-FACTORS = ("stiffness", "damping", "torque_limit", "armature", "link_mass")
 
 
 @dataclass(frozen=True)
@@ -109,18 +108,12 @@ def robot_of(
     )  # fmt: skip
     robot = Robot(n, -reach, reach)
     for kind, values in calibration.items():
-        for joint, value in values.items():
-            j = _rows(plant, (joint,), kind)
-            if kind in FACTORS:
-                robot.factor(kind)[j] *= value
-            elif kind == "coulomb_friction":
-                robot.more(kind)[j] += value
-            elif kind == "zero_offset":
-                robot.zero[j] += value
-            elif kind == "delay":
-                robot.delay[j] = np.maximum(robot.delay[j] + value, 0.0)  # nothing acts before it was sent
-            else:
-                raise BadInput(f"the diagnosis calibrates {kind!r}", remedy=f"known are {', '.join(FACTORS)}")
+        for name, value in values.items():
+            try:
+                adjust(robot, kind, [] if name == BODY else _rows(plant, (name,), kind).tolist(), value)
+            except KeyError:
+                raise BadInput(f"the diagnosis calibrates {kind!r}", remedy="make it anew with this version") from None
+    robot.delay[:] = np.maximum(robot.delay, 0.0)  # nothing acts before it was sent
     for one in selected:
         cause = catalogue().get(one.effect)
         if cause is None:

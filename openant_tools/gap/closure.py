@@ -19,13 +19,13 @@ from openant_tools.gap.features import Floats, around_switching
 from openant_tools.gap.protocol import Played, Protocol
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
-from openant_tools.gap.tolerance import COULOMB_NM, DELAY_S, FACTORS, ZERO_RAD
+from openant_tools.gap.tolerance import COULOMB_NM, DELAY_S, FACTORS, FLOOR, TILT_RAD, ZERO_RAD, torso_kg
 from openant_tools.model.floor import floors
 from openant_tools.model.gap import HORIZON_S, share_closed
 from openant_tools.model.plant import Setup
 from openant_tools.model.rollout import Rollouts
 
-__all__ = ["Closure", "Refit", "Windows", "calibration_of", "closures", "nothing"]
+__all__ = ["BODY", "Closure", "Refit", "Windows", "adjust", "calibration_of", "closures", "nothing"]
 
 Array = NDArray[np.float64]
 
@@ -44,6 +44,10 @@ FORETOLD = 1.3
 TINY = 1e-12
 #: rad: no joint is farther off than in a simulation that fell apart
 LOST_RAD = 10.0
+#: what tilts a floor along its x and y, rad
+TILTS = ("tilt_x", "tilt_y")
+#: whose calibration it is that belongs to no joint
+BODY = "body"
 #: rad, the least that a position is known to
 LEAST_SIGMA_RAD = 2e-4
 
@@ -81,20 +85,43 @@ class Closure:
 
 @dataclass(frozen=True)
 class _Nuisance:
+    """What may move within tolerance; of the body and the floor where it has no joints."""
+
     name: str
     joints: tuple[int, ...]
     tolerance: float
 
-    def enter(self, robot: Robot, u: float) -> None:
-        at = list(self.joints)
-        if self.name in FACTORS:
-            robot.factor(self.name)[at] *= np.exp(u * self.tolerance)
-        elif self.name == "coulomb_friction":
-            robot.more(self.name)[at] += u * self.tolerance
-        elif self.name == "zero_offset":
-            robot.zero[at] += u * self.tolerance
-        else:
-            robot.delay[at] += u * self.tolerance
+    def value(self, u: float) -> float:
+        """The factor, or what is added (N·m, rad, s, kg), at so many tolerances."""
+        return float(np.exp(u * self.tolerance)) if self.name in {*FACTORS, *FLOOR} else float(u * self.tolerance)
+
+
+def adjust(robot: Robot, kind: str, joints: Sequence[int], value: float) -> None:
+    """Move a robot within tolerance, by a value of `calibration_of`.
+
+    Args:
+        joints: none for what belongs to the body or the floor.
+
+    Raises:
+        KeyError: no such kind.
+    """
+    at = list(joints)
+    if kind in FACTORS:
+        robot.factor(kind)[at] *= value
+    elif kind == "coulomb_friction":
+        robot.more(kind)[at] += value
+    elif kind == "zero_offset":
+        robot.zero[at] += value
+    elif kind == "delay":
+        robot.delay[at] += value
+    elif kind in FLOOR:
+        setattr(robot, kind, getattr(robot, kind) * value)
+    elif kind == "torso_kg":
+        robot.torso_kg += value
+    elif kind in TILTS:
+        robot.tilt = robot.tilt + value * np.eye(2)[TILTS.index(kind)]
+    else:
+        raise KeyError(kind)
 
 
 class Windows:
@@ -120,6 +147,7 @@ class Windows:
         ]
         self.floor = floors([one.run for one in protocol.runs], protocol.joints)[0]
         self._sigma = np.maximum(self.floor, LEAST_SIGMA_RAD)
+        self._learnt: dict[int, Floats] = {}
 
     def robot(self, refit: Refit | None) -> Robot:
         reference = self.protocol.reference
@@ -129,7 +157,7 @@ class Windows:
         enter(robot, reference, [(p.cause, p.joints, x) for p, x in zip(refit.hypothesis, refit.x, strict=True)])
         for one, u in zip(self.names, refit.nuisance, strict=True):
             if u:
-                one.enter(robot, float(u))
+                adjust(robot, one.name, one.joints, one.value(float(u)))
         return robot
 
     def errors(self, k: int, refits: Sequence[Refit | None], *, quick: bool = False) -> Array:
@@ -147,11 +175,9 @@ class Windows:
     def refit(self, start: Refit, training: Sequence[int], leave_out: Sequence[int]) -> tuple[Refit, list[Refit]]:
         """Fit within tolerance, and polish sizes: on all the runs to train on, and without each of some of them.
 
-        All share one linearisation, at what is found on all of the training runs. On the floor small causes make large
-        differences, so that only runs on the stand are fitted where there are any.
+        All share one linearisation, at what is found on all of the training runs.
         """
-        runs = self.protocol.runs
-        fitted = [k for k in training if runs[k].plant.setup is Setup.STAND] or list(training)
+        runs, fitted = self.protocol.runs, list(training)
         centre = _vector(start)
         shares = np.array([q.share for q in _quantities(start)], bool)
         sizes = np.where(shares, POLISH, np.maximum(POLISH * np.abs(centre), 1e-3))
@@ -159,7 +185,13 @@ class Windows:
         u: Array = np.concatenate([centre, start.nuisance])
         prior = np.concatenate([centre, np.zeros(len(self.names))])
         blocks: dict[int, tuple[Array, Array]] = {}
-        slopes: dict[int, Floats] = {}
+        causes = len(centre)
+        # On the floor legs move each other, and slopes cost the most: what was learnt without causes does until it fails.
+        slopes = {
+            k: np.concatenate([np.zeros((causes, *known.shape[1:]), np.float32), known])
+            for k, known in self._learnt.items()
+            if k in fitted
+        }
         at, least, expected = u, np.inf, np.inf
 
         def linear() -> tuple[dict[int, tuple[Array, Array]], float]:
@@ -184,6 +216,8 @@ class Windows:
             moved = u - at
             expected = least + float(np.sum((u - prior) ** 2 / scale**2) - np.sum((at - prior) ** 2 / scale**2))
             expected += sum(float(2 * slope @ moved + moved @ more @ moved) for more, slope in blocks.values())
+        if not causes:
+            self._learnt = {k: found for k, found in slopes.items() if runs[k].plant.setup is Setup.FLOOR}
         folds = [[block for k, block in blocks.items() if k != out] for out in leave_out]
         return _from(start, u), [_from(start, self._solve(start, at, prior, scale, fold)) for fold in folds]
 
@@ -250,6 +284,10 @@ class Windows:
         used: list[tuple[set[int], list[tuple[int, NDArray[np.bool_]]]]] = []
         for k, nuisance in enumerate(self.names):
             mine = {int(tree[j]) for j in nuisance.joints} if one.plant.setup is Setup.STAND else set(tree.tolist())
+            if not mine:  # of the floor, which does nothing to who hangs on a stand, unless it turns both
+                if nuisance.name not in TILTS:
+                    continue
+                mine = set(tree.tolist())
             mask = np.isin(tree, list(mine))
             for trees, members in used:
                 if not trees & mine:
@@ -316,7 +354,7 @@ def _interval(before: Array, after: Array, counts: Array, floor: float) -> tuple
 
 
 def _nuisances(protocol: Protocol) -> list[_Nuisance]:
-    """What may move within tolerance: per joint what is a joint's, per servo model what is a servo's."""
+    """What may move within tolerance: per joint what is a joint's, per servo model what is a servo's; and floor and body."""
     out = []
     joints = range(len(protocol.joints))
     for kind in ("stiffness", "damping", "torque_limit"):
@@ -331,16 +369,19 @@ def _nuisances(protocol: Protocol) -> list[_Nuisance]:
         out.append(_Nuisance("armature", tuple(group), FACTORS["armature"]))
         out.append(_Nuisance("link_mass", tuple(group), FACTORS["link_mass"]))
     out.append(_Nuisance("delay", tuple(joints), DELAY_S))
+    if protocol.reference.floor:
+        out += [_Nuisance(kind, (), tolerance) for kind, tolerance in FLOOR.items()]
+        out.append(_Nuisance("torso_kg", (), torso_kg(protocol.reference)))
+        out += [_Nuisance(kind, (), TILT_RAD / np.sqrt(2)) for kind in TILTS]
     return out
 
 
 def calibration_of(windows: Windows, refit: Refit) -> dict[str, dict[str, float]]:
-    """What moved within tolerance: kind → joint → factor, or amount where the kind is one that is added (N·m, rad, s)."""
+    """What moved within tolerance: kind → joint or `BODY` → factor, or what is added (N·m, rad, s, kg), see `adjust`."""
     out: dict[str, dict[str, float]] = {}
     for one, u in zip(windows.names, refit.nuisance, strict=True):
-        value = float(np.exp(u * one.tolerance)) if one.name in FACTORS else float(u * one.tolerance)
-        for j in one.joints:
-            out.setdefault(one.name, {})[windows.protocol.joints[j]] = float(f"{value:.6g}")
+        for name in [windows.protocol.joints[j] for j in one.joints] or [BODY]:
+            out.setdefault(one.name, {})[name] = float(f"{one.value(float(u)):.6g}")
     return out
 
 

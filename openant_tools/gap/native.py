@@ -367,8 +367,10 @@ def _body(root: Element, plant: Plant, robot: Robot, done: Edit) -> None:
         )  # fmt: skip
         body.tail = "\n    "
     if robot.tilt.any():
-        option = _last(root, "option")
-        option.set("gravity", numbers(tilted(plant.model.opt.gravity, robot.tilt)))
+        _last(root, "option").set("gravity", numbers(tilted(plant.model.opt.gravity, robot.tilt)))
+    if robot.impratio != 1:
+        # Of the compiled variant, which had it too, only its elements are written.
+        _last(root, "option").set("impratio", number(float(plant.model.opt.impratio) * robot.impratio))
     _cable(root, torso, plant, robot)
 
 

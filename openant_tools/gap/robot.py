@@ -152,8 +152,8 @@ class Robot:
             begins; warming_c: more from run to run.
         laws: (effect, parameter) → values of the effects that act between steps (`openant_tools.effects`).
         payload_kg, payload_m: (3,) in the torso's frame. torso_kg: added to it.
-        floor_friction, softness: factors. adhesion_n: force of each foot. tilt: (2,) rad, how far downhill
-            lies along the floor's x and y.
+        floor_friction, softness, contact_damping, impratio: factors; the last on how much stiffer friction is than contact.
+        adhesion_n: force of each foot. tilt: (2,) rad, how far downhill lies along the floor's x and y.
         jitter_s: deviation of when a command acts. dropout: share of commands lost, (joints,); longest_s: at a stretch.
         shared_dropout: all joints lose the same commands.
         late: s by which a signal's log lags: "pos", "vel", "imu", "base".
@@ -189,6 +189,8 @@ class Robot:
     torso_kg: float = 0.0
     floor_friction: float = 1.0
     softness: float = 1.0
+    contact_damping: float = 1.0
+    impratio: float = 1.0
     adhesion_n: float = 0.0
     tilt: Array = field(default_factory=lambda: np.zeros(2))
     cable: Cable = field(default_factory=Cable)
@@ -262,8 +264,10 @@ class Robot:
         contacts = floor_contacts(model)
         model.geom_friction[contacts.geoms, 0] *= self.floor_friction
         model.pair_friction[contacts.pairs, :2] *= self.floor_friction
-        model.geom_solref[contacts.geoms, 0] *= np.where(model.geom_solref[contacts.geoms, 0] > 0, self.softness, 1.0)
-        model.pair_solref[contacts.pairs, 0] *= np.where(model.pair_solref[contacts.pairs, 0] > 0, self.softness, 1.0)
+        for solref, at in ((model.geom_solref, contacts.geoms), (model.pair_solref, contacts.pairs)):
+            standard = solref[at, :1] > 0  # else it holds stiffness and damping themselves
+            solref[at] *= np.where(standard, [self.softness, self.contact_damping], 1.0)
+        model.opt.impratio *= self.impratio
         if self.form is not None:
             self._contact_form(model, contacts.geoms)
         if self.adhesion_n:

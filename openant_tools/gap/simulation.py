@@ -20,7 +20,7 @@ from openant_tools.effects.rollout import laws_of
 from openant_tools.effects.servos import batch_of
 from openant_tools.effects.step import Law, Step
 from openant_tools.gap.laws import Fields, back_emf, first_laws, last_laws
-from openant_tools.gap.robot import Cable, Robot, tilted
+from openant_tools.gap.robot import Cable, Form, Robot, tilted
 from openant_tools.model.body import torso_body
 from openant_tools.model.plant import Plant, Setup
 from openant_tools.model.rollout import Rollouts, Segment
@@ -114,25 +114,24 @@ class _Batch:
         self._laws = self._make_laws(warm[[segment.run for segment in self._segments]].repeat(self._n, axis=0))
 
     def _take_forms(self) -> None:
-        if any(robot.tilt.any() for robot in self._robots):
-            # What a batch takes from its models are their arrays; gravity is an option.
-            given = self._plant.model.opt.gravity
-            down = np.array([tilted(given, robot.tilt) if robot.tilt.any() else given for robot in self._robots])
-            self._batch.expand("opt.gravity")[:] = np.tile(down, (len(self._segments), 1))
-        forms = [robot.form for robot in self._robots]
-        if not any(forms):
-            return
+        """What a batch takes from its models are their arrays; these are options."""
         given = self._plant.model.opt
-        for name, value in (
-            ("opt.integrator", lambda form: form.integrator),
-            ("opt.cone", lambda form: int(mujoco.mjtCone.mjCONE_ELLIPTIC if form.elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL)),
-            ("opt.impratio", lambda form: form.impratio),
-        ):  # fmt: skip
-            own = getattr(given, name.partition(".")[2])
-            field = self._batch.expand(name)
-            field[:] = np.tile([own if form is None else value(form) for form in forms], len(self._segments)).reshape(
-                field.shape
-            )
+        if any(robot.tilt.any() for robot in self._robots):
+            down = [tilted(given.gravity, robot.tilt) if robot.tilt.any() else given.gravity for robot in self._robots]
+            self._take("opt.gravity", down)
+        own = Form(given.integrator, given.cone == int(mujoco.mjtCone.mjCONE_ELLIPTIC), given.impratio)
+        forms = [robot.form or own for robot in self._robots]
+        if any(form is not own for form in forms):
+            cones = int(mujoco.mjtCone.mjCONE_PYRAMIDAL), int(mujoco.mjtCone.mjCONE_ELLIPTIC)
+            self._take("opt.integrator", [form.integrator for form in forms])
+            self._take("opt.cone", [cones[form.elliptic] for form in forms])
+        ratios = [form.impratio * robot.impratio for form, robot in zip(forms, self._robots, strict=True)]
+        if any(ratio != given.impratio for ratio in ratios):
+            self._take("opt.impratio", ratios)
+
+    def _take(self, option: str, values: Sequence[object]) -> None:
+        field = self._batch.expand(option)
+        field[:] = np.tile(np.array(values).reshape(len(values), -1), (len(self._segments), 1)).reshape(field.shape)
 
     def _make_laws(self, warm_c: Array) -> list[Law]:
         plant, copies = self._plant, len(self._segments)

@@ -10,14 +10,16 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.robot import USUAL_NOISE, Form, Reference, Robot
 
-__all__ = ["FACTORS", "random_form", "resting", "scatter"]
+__all__ = ["FACTORS", "FLOOR", "random_form", "resting", "scatter", "torso_kg"]
 
 Array = NDArray[np.float64]
 
 #: kind → how far the logarithm of a robot's factor may lie from 0
 FACTORS = {"stiffness": 0.15, "torque_limit": 0.15, "damping": 0.25, "armature": 0.30, "link_mass": 0.05}
 COULOMB_NM, ZERO_RAD, DELAY_S = 0.02, math.radians(0.5), 0.002
-TORSO_KG, FLOOR_FRICTION, SOFTNESS, TILT_RAD = 0.03, 0.15, 0.30, math.radians(0.5)
+TORSO_KG, TILT_RAD = 0.03, math.radians(0.5)
+#: the same of the floor's contacts; of what only says how their simulation is made, how far it is from any contact's
+FLOOR = {"floor_friction": 0.15, "softness": 0.30, "contact_damping": 0.4, "impratio": math.log(10.0)}
 IMU_RAD, GYRO_RAD_S, ACC_M_S2 = math.radians(1.0), 0.01, 0.1
 #: share of its length by which a link may be longer; Ω of a supply and its cables
 LENGTH, SUPPLY_OHM = 0.01, 0.05
@@ -59,9 +61,9 @@ def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width:
     robot.delay += DELAY_S * spread()
     robot.length *= 1 + width * LENGTH * rng.uniform(-1, 1, n)
     robot.law("voltage_sag", "resistance_ohm")[:] += float(rng.uniform(0, SUPPLY_OHM))
-    robot.torso_kg += width * rng.uniform(-1, 1) * min(TORSO_KG, TORSO_SHARE * reference.robot_kg)
-    robot.floor_friction *= math.exp(width * FLOOR_FRICTION * rng.uniform(-1, 1))
-    robot.softness *= math.exp(width * SOFTNESS * rng.uniform(-1, 1))
+    robot.torso_kg += width * rng.uniform(-1, 1) * torso_kg(reference)
+    robot.floor_friction *= math.exp(width * FLOOR["floor_friction"] * rng.uniform(-1, 1))
+    robot.softness *= math.exp(width * FLOOR["softness"] * rng.uniform(-1, 1))
     robot.tilt += width * TILT_RAD * rng.uniform(-1, 1, 2) / math.sqrt(2)
     robot.imu_rotation += width * IMU_RAD * rng.uniform(-1, 1, 3)
     robot.gyro_bias += width * GYRO_RAD_S * rng.uniform(-1, 1, 3)
@@ -75,6 +77,11 @@ def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width:
         robot.noise[signal] = noise * float(np.exp(rng.uniform(*NOISE)))
     robot.noise["torque_zero"] = float(TORQUE_ZERO * rng.uniform(0, 1))
     robot.noise["torque_scale"] = float(np.exp(TORQUE_SCALE * rng.normal()))
+
+
+def torso_kg(reference: Reference) -> float:
+    """How far from the model a torso's mass may be."""
+    return min(TORSO_KG, TORSO_SHARE * reference.robot_kg)
 
 
 def random_form(rng: np.random.Generator, encoder_rad: float) -> Form:

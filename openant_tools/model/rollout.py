@@ -11,7 +11,9 @@ Contract
   and time stamps instead of by whole steps. (A servo that limits its setpoint's rate takes the command of the middle of
   each step: to a limiter a part of a change is as good as the whole.) A missing command leaves the one before in force.
 * **Start of a segment.** Setpoint filters and slew limiters hold the first command, as do the delay buffers; all other
-  activations are zero (formats, section 5). Without a measured base, a robot on the floor starts settled on its feet.
+  activations are zero (formats, section 5). Without a measured base, a robot on the floor starts a run settled on its
+  feet; a later segment starts where the base has come to and as fast as it moves when the joints are led along their
+  measured positions from there. (Started at rest amid a gait, it would first have to catch up with its own feet.)
 * **Torque off** (`torque.J` = 0) disables that joint's actuator from its row to the next; what stands in the joint
   stays.
 * **Gaps.** A row with a missing sample is simulated all the same; what to compare is the caller's choice. Rows before
@@ -35,6 +37,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, position_servos
@@ -56,6 +59,8 @@ CHUNK_BYTES = 16 * 2**20
 SLEW_RATE = {int(mujoco.mjtDyn.mjDYN_PID): 1, int(mujoco.mjtDyn.mjDYN_DCMOTOR): 7}
 #: how long a robot without a measured base is left to settle on its feet before a floor run
 SETTLE_S = 1.0
+#: cosine of how far from its attitude at the start a base may lean that is led along
+FALLEN = 0.5
 
 
 @dataclass(frozen=True)
@@ -302,8 +307,9 @@ def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | 
     commands = Staircase.of(run.command_times, cmd)
     slewing = np.array([_limits_slew(model, int(i)) for i in plant.actuator])
     rest = _at_rest(model)
+    bases = _led(plant, run, starts, pos, commands)
     segments = []
-    for first, stop in zip(starts, [*starts[1:], len(t)], strict=True):
+    for n, (first, stop) in enumerate(zip(starts, [*starts[1:], len(t)], strict=True)):
         # The row at which the next segment starts belongs to that one.
         rows = np.arange(first, stop)
         at = (t[rows] - t[first]) / h
@@ -323,7 +329,7 @@ def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | 
             Segment(
                 run=index,
                 first=first,
-                state=_initial_state(plant, run, first, pos[first], velocity, setpoint[0]),
+                state=_initial_state(plant, run, first, pos[first], velocity, setpoint[0], bases[n] if n else None),
                 control=control,
                 step=step,
                 fraction=np.clip(at - step, 0.0, 1.0),
@@ -414,13 +420,57 @@ class Staircase:
         return mean
 
 
-def _initial_state(plant: Plant, run: Run, row: int, pos: Array, vel: Array, command: Array) -> Array:
-    """(nstate,) integration state at a row: measured joints, settled or measured base, filled setpoints and buffers."""
+def _led(
+    plant: Plant, run: Run, rows: Sequence[int], pos: Array, commands: Staircase
+) -> list[tuple[Array, Array] | None]:
+    """Pose (7,) and velocity (6,) of a free base at rows, the joints led along their measured positions (rows, joints).
+
+    None where there is no free base, and where it fell over on its way.
+    """
+    if len(rows) < 2 or plant.setup is not Setup.FLOOR or plant.free_joint is None:
+        return [None] * len(rows)
+    model, t, h = plant.model, run.t, plant.timestep
+    adr, dof = int(model.jnt_qposadr[plant.free_joint]), int(model.jnt_dofadr[plant.free_joint])
+    path = [PchipInterpolator(t[there], column[there]) for column, there in zip(pos.T, np.isfinite(pos).T, strict=True)]
+    first, last = float(t[rows[0]]), float(t[rows[-1]])
+    edges: Array = first + h * np.arange(round((last - first) / h) + 2, dtype=np.float64)
+    where = np.stack([curve(edges) for curve in path], axis=1)
+    speed = np.stack([curve(edges, 1) for curve in path], axis=1)
+    setpoint = commands.mean(edges)
+    data = mujoco.MjData(model)
+    state = _initial_state(plant, run, rows[0], pos[rows[0]], speed[0], setpoint[0])
+    mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+    upright = _upright(data.qpos[adr + 3 : adr + 7])
+    at = {round((float(t[row]) - first) / h): n for n, row in enumerate(rows)}
+    out: list[tuple[Array, Array] | None] = [None] * len(rows)
+    for step in range(len(edges) - 1):
+        if step in at and np.isfinite(data.qpos).all() and _upright(data.qpos[adr + 3 : adr + 7]) @ upright > FALLEN:
+            out[at[step]] = data.qpos[adr : adr + 7].copy(), data.qvel[dof : dof + 6].copy()
+        data.ctrl[plant.ctrl] = setpoint[step]
+        mujoco.mj_step(model, data)
+        data.qpos[plant.qpos], data.qvel[plant.dof] = where[step + 1], speed[step + 1]
+    return out
+
+
+def _upright(quat: Array) -> Array:
+    """(3,) the body's z in the world."""
+    axis = np.empty(3)
+    mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, 1.0]), quat)
+    return axis
+
+
+def _initial_state(
+    plant: Plant, run: Run, row: int, pos: Array, vel: Array, command: Array, led: tuple[Array, Array] | None = None
+) -> Array:
+    """(nstate,) integration state at a row: measured joints, base, filled setpoints and buffers.
+
+    The base is where it was measured, else as it was `led` (pose and velocity), else settled.
+    """
     model = plant.model
     data = mujoco.MjData(model)
     data.qpos[plant.qpos] = pos
     if plant.setup is Setup.FLOOR and plant.free_joint is not None:
-        _place_base(plant, data, run, row, command)
+        _place_base(plant, data, run, row, command, led)
         data.qpos[plant.qpos] = pos
     data.qvel[plant.dof] = vel
     fill_setpoints(plant, data, command)
@@ -455,8 +505,10 @@ def _limits_slew(model: mujoco.MjModel, actuator: int) -> bool:
     return where is not None and bool(model.actuator_dynprm[actuator, where] > 0)
 
 
-def _place_base(plant: Plant, data: mujoco.MjData, run: Run, row: int, command: Array) -> None:
-    """Put the free base where it was measured, else settled on the floor with the run's heading."""
+def _place_base(
+    plant: Plant, data: mujoco.MjData, run: Run, row: int, command: Array, led: tuple[Array, Array] | None
+) -> None:
+    """Put the free base where it was measured, else where it was led to, else settled on the floor with the run's heading."""
     model, joint = plant.model, plant.free_joint
     assert joint is not None
     adr, dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
@@ -473,6 +525,11 @@ def _place_base(plant: Plant, data: mujoco.MjData, run: Run, row: int, command: 
         gyro = np.array([run.column(f"gyro.{axis}")[row] for axis in "xyz"])
         data.qvel[dof + 3 : dof + 6] = np.where(np.isfinite(gyro), gyro, 0.0)
         return
+    seen = np.isfinite(place)
+    if led is not None:
+        data.qpos[adr : adr + 7], data.qvel[dof : dof + 6] = led
+        data.qpos[adr : adr + 3][seen] = place[seen]
+        return
     # Let the robot find its own height and attitude, then turn it to the heading and move it to where it was seen.
     settling = copy.copy(model)
     rest = mujoco.MjData(settling)
@@ -484,7 +541,6 @@ def _place_base(plant: Plant, data: mujoco.MjData, run: Run, row: int, command: 
         rest.qpos[plant.qpos] = data.qpos[plant.qpos]
         mujoco.mj_step(settling, rest)
     data.qpos[adr : adr + 7] = rest.qpos[adr : adr + 7]
-    seen = np.isfinite(place)
     data.qpos[adr : adr + 3][seen] = place[seen]
 
 
