@@ -166,6 +166,31 @@ def test_body_and_floor_are_in_the_file(name: str, walk: tuple[Plant, Run], tmp_
     assert float(np.sqrt(np.mean(off**2))) < 0.25 * effect + 2e-4
 
 
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        ("impratio", 0.1),
+        ("contact_damping", 1.5),
+        ("softness", 1.3),
+        ("floor_friction", 0.85),
+        ("torso_kg", 0.1),
+        ("tilt_y", 0.02),
+    ],
+)
+def test_what_contacts_are_like_is_in_the_file(
+    kind: str, value: float, walk: tuple[Plant, Run], tmp_path: Path
+) -> None:
+    plant, run = walk
+    robot = robot_of(plant, [], {kind: {"body": value}})
+    rollouts = Rollouts(plant, [run])
+    given, simulated = simulate(rollouts, [Robot(8), robot], signals=["pos"]).signals["pos"].astype(float)
+    write_robot(ANT, robot, tmp_path / "improved.xml", note="a test")
+    off = replayed(tmp_path / "improved.xml", run, Setup.FLOOR) - simulated
+    effect = float(np.sqrt(np.mean((simulated - given) ** 2)))
+    assert effect > 3e-5
+    assert float(np.sqrt(np.mean(off**2))) < 0.25 * effect + 2e-5
+
+
 def test_feet_stick_by_what_decides_at_the_floor(walk: tuple[Plant, Run], tmp_path: Path) -> None:
     robot = with_cause(walk[0], catalogue()["foot_adhesion"])
     write_robot(ANT, robot, tmp_path / "improved.xml", note="a test")

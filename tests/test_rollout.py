@@ -376,7 +376,7 @@ def test_steps_are_counted_once_a_variant(pendulum: Plant) -> None:
 # --- the floor ---------------------------------------------------------------------------------------------------------
 
 
-def on_the_floor(plant: Plant, seconds: float = 2.0, heading: float = 0.0) -> Run:
+def on_the_floor(plant: Plant, seconds: float = 2.0, heading: float = 0.0, rate: float = 4.0) -> Run:
     """An Ant that shifts its weight on the floor, with its base measured."""
     model = plain.on_floor(plant.path)
     data = mujoco.MjData(model)
@@ -385,7 +385,7 @@ def on_the_floor(plant: Plant, seconds: float = 2.0, heading: float = 0.0) -> Ru
     mujoco.mj_step(model, data, 1500)
     t = 3.0 + np.arange(round(100 * seconds)) / 100
     home = np.array(home_angles())
-    sway = np.clip((t - t[0] - 0.2) / 0.4, 0, 1) * np.sin(4 * (t - t[0] - 0.2))
+    sway = np.clip((t - t[0] - 0.2) / 0.4, 0, 1) * np.sin(rate * (t - t[0] - 0.2))
     command = home + sway[:, None] * np.array([0.15, 0.1, -0.15, 0.1, 0.15, -0.1, -0.15, -0.1])
     place = ("x", "y", "z", "qw", "qx", "qy", "qz")
     columns = {f"base.{name}": np.empty(len(t)) for name in place}
@@ -430,6 +430,19 @@ def test_a_floor_run_without_its_attitude_starts_settled_on_its_feet(known: str,
     simulated = Rollouts(ant_on_floor, [settled])().pos[0]
     assert gap(measured[:20], simulated[:20]) < 1e-3, "it stands before it sways, and does not drop first"
     assert gap(measured, simulated) < 5e-3
+
+
+@pytest.mark.parametrize("rate", [4.0, 8.0])
+def test_a_horizon_on_the_floor_starts_with_the_base_in_motion(
+    rate: float, ant_on_floor: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = without(on_the_floor(ant_on_floor, rate=rate), *PLACE)
+    whole = Rollouts(ant_on_floor, [run])().pos[0]
+    again = with_columns(run, **{f"pos__{joint}": whole[:, j] for j, joint in enumerate(ant_on_floor.joints)})
+    led = gap(whole, Rollouts(ant_on_floor, [again], 0.5)().pos[0])
+    # As if it had fallen over each time: then it starts settled, at rest.
+    monkeypatch.setattr("openant_tools.model.rollout.FALLEN", 1.1)
+    assert led < 0.5 * gap(whole, Rollouts(ant_on_floor, [again], 0.5)().pos[0])
 
 
 def test_a_settled_robot_faces_where_the_run_says(ant_on_floor: Plant) -> None:
