@@ -91,25 +91,9 @@ class Servos:
             supply: (n, joints) shares of the nominal voltage; None for all of it.
         """
         plant, rest, fields = self.plant, self._rest, self._fields
-        share = 1.0 if supply is None else supply
         setpoint = fields.ctrl[:, plant.ctrl]
-        view = Step(
-            dt=plant.timestep,
-            time=time,
-            position=state[0],
-            velocity=state[1],
-            load=fields.qfrc_bias[:, plant.dof],
-            on=self._on,
-            setpoint=np.where(self._filtered, fields.act[:, self._act], setpoint) if self._filtered.any() else setpoint,
-            stiffness=rest["stiffness"] * share,
-            velocity_gain=rest["velocity_gain"] * share,
-            limit=rest["limit"] * share,
-            back_emf=rest["back_emf"],
-            damping=rest["damping"],
-            friction=rest["friction"].copy(),
-            torque=np.zeros(rest["friction"].shape),
-            supply=np.broadcast_to(share, rest["friction"].shape),
-        )
+        told = np.where(self._filtered, fields.act[:, self._act], setpoint) if self._filtered.any() else setpoint
+        view = self.view(plant.timestep, time, state, told, supply=supply)
         for law in laws:
             law(view)
         fields.ctrl[:, plant.ctrl] = np.where(self._filtered, setpoint, view.setpoint)
@@ -120,6 +104,41 @@ class Servos:
             if self._changed[name] or not np.array_equal(value, rest[name]):
                 self._changed[name] = True
                 self._put(name, value)
+
+    def view(
+        self,
+        dt: float,
+        time: Array,
+        state: tuple[Array, Array],
+        setpoint: Array,
+        *,
+        supply: Array | None = None,
+        rows: slice = slice(None),
+    ) -> Step:
+        """These simulations' servos as laws see them, before any has acted.
+
+        Args:
+            dt: s, of the step. setpoint: (rows, joints) rad. rows: which simulations; the others as in `prepare`.
+        """
+        rest = {name: values[rows] for name, values in self._rest.items()}
+        share = 1.0 if supply is None else supply
+        return Step(
+            dt=dt,
+            time=time,
+            position=state[0],
+            velocity=state[1],
+            load=self._fields.qfrc_bias[rows, self.plant.dof],
+            on=self._on[rows],
+            setpoint=setpoint,
+            stiffness=rest["stiffness"] * share,
+            velocity_gain=rest["velocity_gain"] * share,
+            limit=rest["limit"] * share,
+            back_emf=rest["back_emf"],
+            damping=rest["damping"],
+            friction=rest["friction"].copy(),
+            torque=np.zeros(rest["friction"].shape),
+            supply=np.broadcast_to(share, rest["friction"].shape),
+        )
 
     def _read(self) -> dict[str, Array]:
         i, motor, fields = self.plant.actuator, self._motor, self._fields

@@ -190,7 +190,7 @@ class Windows:
         slopes = {
             k: np.concatenate([np.zeros((causes, *known.shape[1:]), np.float32), known])
             for k, known in self._learnt.items()
-            if k in fitted
+            if k in fitted and runs[k].plant.setup is Setup.FLOOR
         }
         at, least, expected = u, np.inf, np.inf
 
@@ -217,9 +217,35 @@ class Windows:
             expected = least + float(np.sum((u - prior) ** 2 / scale**2) - np.sum((at - prior) ** 2 / scale**2))
             expected += sum(float(2 * slope @ moved + moved @ more @ moved) for more, slope in blocks.values())
         if not causes:
-            self._learnt = {k: found for k, found in slopes.items() if runs[k].plant.setup is Setup.FLOOR}
+            self._learnt = dict(slopes)
         folds = [[block for k, block in blocks.items() if k != out] for out in leave_out]
         return _from(start, u), [_from(start, self._solve(start, at, prior, scale, fold)) for fold in folds]
+
+    def left(self, refits: Sequence[Refit], seen: Sequence[int]) -> Array:
+        """(refits,) the cost that each would leave, re-fitted within tolerance by the slopes that were learnt without causes.
+
+        A first look at many causes, after a re-fit of `nothing` on these runs.
+        """
+        n, normal = len(self.names), np.diag(np.full(len(self.names), 1 / SPREAD**2))
+        gradients, cost = np.zeros((len(refits), n)), np.zeros(len(refits))
+        for k in seen:
+            errors = (np.nan_to_num(self.errors(k, refits, quick=True)) * self._weight(k)).reshape(len(refits), -1)
+            slopes = self._learnt[k].astype(np.float64)
+            normal += slopes @ slopes.T
+            gradients += errors @ slopes.T
+            cost += np.square(errors).sum(axis=1)
+        root = np.linalg.cholesky(normal)
+        out = np.empty(len(refits))
+        for r, gradient in enumerate(gradients):
+            u = lsq_linear(root.T, -np.linalg.solve(root, gradient), bounds=(-END, END)).x
+            out[r] = cost[r] + 2 * gradient @ u + u @ normal @ u
+        return out
+
+    def _weight(self, k: int) -> Array:
+        """(joints,) that errors of a run are multiplied by: its rows go together."""
+        period = float(np.median(np.diff(self.protocol.runs[k].run.t)))
+        out: Array = 1 / (self._sigma * np.sqrt(max(1.0, INDEPENDENT_S / period)))
+        return out
 
     def _solve(
         self, start: Refit, u: Array, prior: Array, scale: Array, blocks: Iterable[tuple[Array, Array]]
@@ -261,8 +287,7 @@ class Windows:
                 moved[p] += steps[p]
             refits.append(_from(start, moved))
         errors = self.errors(k, refits, quick=True)
-        period = float(np.median(np.diff(one.run.t)))
-        weight = 1 / (self._sigma * np.sqrt(max(1.0, INDEPENDENT_S / period)))
+        weight = self._weight(k)
         base = np.nan_to_num(errors[0]) * weight
         slopes = np.zeros((len(u), base.size), np.float32) if known is None else known.copy()
         for row, members in enumerate(columns, 1):

@@ -56,6 +56,8 @@ SUSPECTS, LIKELIEST, PUZZLED = 5, 3, 7
 SECOND = 0.35
 #: places at which each of them is tried
 PLACES = 2
+#: and of which the runs say where it sits
+ELSEWHERE = 8
 #: held-out closure that an addition must bring; that one cause must bring beyond what tolerances do, where the judge doubts;
 #: and below which a set explains nothing
 ADDS, ADDS_ALONE, EXPLAINS = 0.02, 0.2, 0.35
@@ -77,10 +79,14 @@ PREPARE_S = 1080.0
 FEW_JOINTS = 2
 #: nothing is surer
 SURELY = 0.99
+#: share of what a re-fit leaves that a cause leaves of it where closure alone proves it
+PROVES = 0.6
+#: share of what the best cause leaves that others at its place are looked at for, how many, and their sizes (0 … 1)
+RIVALS_LEAVE, RIVALS, STRENGTHS = 0.9, 2, (0.15, 0.4, 0.65, 0.9)
 #: effects in a set that is not told from others, at most
 TOGETHER = 3
 #: how what is left of the gap counts beside the judge's probability
-LEFT_COUNTS = 5.0
+LEFT_COUNTS = 8.0
 
 
 def diagnose(
@@ -317,9 +323,16 @@ def _decide(
     held_out = list(range(len(case.training), len(case.protocol.runs)))
     probability = dict(ranked)
     names = list(explained)
-    starts = [nothing(windows), *(_start(windows, [explained[name]]) for name in names)]
-    before, floor, (refit, *singles) = closures(windows, starts, held_out, case.training)
+    before, floor, (refit,) = closures(windows, [nothing(windows)], held_out, case.training)
+    explained = {name: _placed(windows, case, judgement, one) for name, one in explained.items()}
+    _, _, singles = closures(windows, [_start(windows, [explained[name]]) for name in names], held_out, case.training)
     alone = dict(zip(names, singles, strict=True))
+    if judgement.energy > 1:
+        found = _rivals(windows, case, explained, alone, scenes)
+        _, _, singles = closures(windows, [_start(windows, [one]) for one in found.values()], held_out, case.training)
+        explained = {**explained, **found}
+        alone |= dict(zip(found, singles, strict=True))
+        names += found
     for name in list(names):
         simpler = catalogue()[name].simpler(alone[name].refit.x[0])
         if simpler in alone:
@@ -340,12 +353,16 @@ def _decide(
     beyond = {best: whole.closed - refit.closed}
     # Joint positions say little of the body: there closure alone proves nothing that the judge does not half believe.
     beside = catalogue()[best].beside_joints
-    proved = beyond[best] > ADDS_ALONE and (not beside or probability[best] > SECOND) and not catalogue()[best].random
+    proves = beyond[best] > ADDS_ALONE or 1 - whole.closed < PROVES * (1 - refit.closed)
+    proved = proves and (not beside or probability[best] > SECOND) and not catalogue()[best].random
     if proved:
         # What none of the others closes speaks for a cause whatever the judge thought of it.
         scores = np.array([score[name] for name in names])
         share = float(1 / np.exp(scores - scores[0]).sum())
         probability[best] = max(probability[best], share * min(beyond[best], 1.0))
+        # What the judge took for another cause at the same place was this one.
+        taken = [probability[name] for name in names if explained[name].part.joints == explained[best].part.joints]
+        probability[best] = max(probability[best], share * max(taken))
     left, eased = None, False
     if probability[best] > MAYBE or proved:
         left = _without(case, explained[best])
@@ -427,6 +444,58 @@ def _decide(
         case, verdict, confidence, (*effects, *_rest(ranked, order)), selected, ambiguous, gap, removal, judgement,
         None if verdict == NONE else calibration_of(windows, whole.refit),
     )  # fmt: skip
+
+
+def _placed(windows: Windows, case: _Case, judgement: Judgement, one: Explained) -> Explained:
+    """The same cause where the runs, on the stand and on the floor, say that it sits: at a place that the judge names, or wider.
+
+    What was fitted on the stand alone knows nothing of a joint that carries its load on the floor.
+    """
+    named = [(one.part.joints, one.x), *judgement.places[one.part.cause][:ELSEWHERE]]
+    scopes = one.part.definition.scopes
+    wider = [tuple(group) for group in case.protocol.servos()] if Scope.SERVO in scopes else []
+    wider += [tuple(range(len(case.protocol.joints)))] if Scope.ALL in scopes else []
+    places = {(where, tuple(x.items())): x for where, x in named}
+    places |= {(where, tuple(x.items())): x for where in wider for _, x in named[:PLACES]}
+    tried = [dataclasses.replace(one, part=Part(one.part.cause, where), x=x) for (where, _), x in places.items()]
+    left = windows.left([_start(windows, [other]) for other in tried], case.training)
+    return tried[int(np.argmin(left))]
+
+
+def _rivals(
+    windows: Windows, case: _Case, explained: dict[str, Explained], alone: dict[str, Closure], scenes: dict[Setup, Scene]
+) -> dict[str, Explained]:  # fmt: skip
+    """Causes that the judge did not suspect, and that would leave less than any suspect at the place of the best of them."""
+
+    def of_joints(name: str) -> bool:
+        return not catalogue()[name].beside_joints and not catalogue()[name].random
+
+    suspects = [name for name in explained if of_joints(name)]
+    if not suspects:
+        return {}
+    best = min(suspects, key=lambda name: alone[name].after)
+    joints = explained[best].part.joints
+    everywhere = len(joints) == len(case.protocol.joints)
+    scope = Scope.JOINT if len(joints) == 1 else Scope.ALL if everywhere else Scope.SERVO
+    others = [
+        (Part(name, joints), start)
+        for name, cause in catalogue().items()
+        if of_joints(name) and name not in suspects and scope in cause.scopes and cause.shows(case.protocol.reference)
+        for strength in STRENGTHS
+        for start in cause.starts(strength)
+    ]
+    still = np.zeros(len(windows.names))
+    known = [Refit((explained[best].part,), (explained[best].x,), still)]
+    stand = [k for k in case.training if case.protocol.runs[k].plant.setup is Setup.STAND]
+    left = windows.left([*known, *(Refit((part,), (x,), still) for part, x in others)], stand or case.training)
+    likely: dict[Part, dict[str, float]] = {}
+    for k in np.argsort(left[1:]):
+        part, start = others[k]
+        if left[1 + k] > RIVALS_LEAVE * left[0] or len(likely) == RIVALS:
+            break
+        likely.setdefault(part, start)
+    scene = _scene_of(best, scenes)
+    return {one.part.cause: one for one in fit(scene, likely)} if likely else {}
 
 
 def _vanished(refit: Refit) -> bool:

@@ -48,12 +48,12 @@ class Fields:
     damp: Callable[[Array], None]
 
 
-def first_laws(robots: Sequence[Robot], generated: Array, warm_c: Array, asked: Array) -> list[Law]:
+def first_laws(robots: Sequence[Robot], generated: Array, heat_c: Array, asked: Array) -> list[Law]:
     """The laws on what the servo is asked and may give.
 
     Args:
         generated: what `back_emf` says of them.
-        warm_c: (robots, joints) °C, by which servos are known to be warmer as the run begins.
+        heat_c: (robots, joints) °C, how warm servos are as the simulation begins.
         asked: (robots, joints) rad, where a setpoint of limited rate is as the simulation begins; NaN: where it is asked to be.
     """
     laws: list[Law] = []
@@ -66,7 +66,6 @@ def first_laws(robots: Sequence[Robot], generated: Array, warm_c: Array, asked: 
         laws.append(_rounding(steps, _table(robots, "zero")))
     if derating.any():
         seconds = np.array([[robot.derating_s] for robot in robots])
-        heat_c = np.array([[robot.heat_c] for robot in robots]) + warm_c
         laws.append(Heating({"loss_per_c": derating, "time_constant_s": seconds}, heat_c))
     if np.isfinite(no_load).any():
         laws.append(_fading(no_load))

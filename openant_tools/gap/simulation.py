@@ -20,6 +20,7 @@ from openant_tools.effects.rollout import laws_of
 from openant_tools.effects.servos import batch_of
 from openant_tools.effects.step import Law, Step
 from openant_tools.gap.laws import Fields, back_emf, first_laws, last_laws
+from openant_tools.gap.memory import heats, setpoints
 from openant_tools.gap.robot import Cable, Form, Robot, tilted
 from openant_tools.model.body import torso_body
 from openant_tools.model.plant import Plant, Setup
@@ -33,8 +34,8 @@ Array = NDArray[np.float64]
 CHUNK_BYTES = 192 * 2**20
 #: s over which velocities become an acceleration
 ACCELERATION_S = 0.01
-#: s, of which what a setpoint of limited rate did before a simulation begins is followed
-SLEW_STEP_S = 0.01
+#: s for which rotors behind play and springs are led along before a simulation begins amid a run
+LED_S = 1.0
 #: time constants of a lag after which what was commanded is forgotten
 REMEMBERS = 5.0
 #: base signals and how many columns they have
@@ -110,8 +111,10 @@ class _Batch:
         state[:, 1 + plant.qpos] += np.tile(np.array([robot.start for robot in robots]), (copies, 1)) - self._zero
         self._batch.state[:] = state
         self._batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
+        hidden = rollouts.horizon is not None and any(robot.play.any() or robot.compliance.any() for robot in robots)
+        self._led = round(LED_S / plant.timestep) if hidden else 0
         warm = np.zeros((len(rollouts.runs), len(plant.joints))) if warm_c is None else np.array(warm_c)
-        self._laws = self._make_laws(warm[[segment.run for segment in self._segments]].repeat(self._n, axis=0))
+        self._laws = self._make_laws(warm[[segment.run for segment in self._segments]][:, None])
 
     def _take_forms(self) -> None:
         """What a batch takes from its models are their arrays; these are options."""
@@ -152,36 +155,36 @@ class _Batch:
         generated = back_emf(robots, fields)
         untold = np.where(duty, generated, 0.0)
         self._untold = untold if untold.any() else None
-        first = first_laws(robots, generated, warm_c, self._asked())
+        asked, heat_c = self._begun(warm_c)
+        first = first_laws(robots, generated, heat_c, asked)
         last = last_laws(robots, generated, fields)
         for name, values in (("dof_armature", fields.armature), ("dof_damping", fields.damping)):
             self._batch.expand(name)[:, plant.dof] = values
         return [*first, *laws_of([robot.laws for robot in robots], len(plant.joints)), self._note, *last]
 
-    def _asked(self) -> Array:
-        """(segments · robots, joints) rad: how far setpoints of limited rate have come as each segment begins, else NaN."""
-        shape = (len(self._segments), self._n, len(self._plant.joints))
-        out = np.full(shape, np.nan)
-        rate, delay = (np.array([getattr(robot, name) for robot in self._robots]) for name in ("slew", "delay"))
-        limited = np.isfinite(rate)
-        if not limited.any():
-            return out.reshape(-1, shape[2])
-        for run in {segment.run for segment in self._segments}:
-            mine = [s for s, segment in enumerate(self._segments) if segment.run == run]
-            commands = self._segments[mine[0]].commands
-            starts = [self._segments[s].start for s in mine]
-            grid = np.arange(commands.times[0], max(starts) + SLEW_STEP_S, SLEW_STEP_S)
-            path = np.empty((len(grid), *shape[1:]))
-            for r, j in np.ndindex(*shape[1:]):
-                path[:, r, j] = commands.column(j).at(grid - delay[r, j])[:, 0] if limited[r, j] else 0.0
-            for k in range(1, len(grid)):
-                path[k] = path[k - 1] + np.clip(path[k] - path[k - 1], -rate * SLEW_STEP_S, rate * SLEW_STEP_S)
-            for s, start in zip(mine, starts, strict=True):
-                at = np.clip((start - grid[0]) / SLEW_STEP_S, 0, len(grid) - 1)
-                low = min(int(at), len(grid) - 2)
-                begun = path[low] + (path[low + 1] - path[low]) * (at - low) if len(grid) > 1 else path[0]
-                out[s] = np.where(limited, begun - self._zero[: self._n], np.nan)
-        return out.reshape(-1, shape[2])
+    def _begun(self, warm_c: Array) -> tuple[Array, Array]:
+        """As each simulation begins: where setpoints of limited rate are (rad), and how warm its servos are (°C)."""
+        copies, joints = len(self._segments), len(self._plant.joints)
+        asked = np.empty((copies, self._n, joints))
+        heat = np.broadcast_to(np.array([[[robot.heat_c] for robot in self._robots]]) + warm_c, asked.shape).copy()
+        warming = self._rollouts.horizon is not None and any(robot.derating.any() for robot in self._robots)
+        rows = slice(0, self._n)
+
+        def servos(dt: float, state: tuple[Array, Array], setpoint: Array) -> Step:
+            return self._servos.view(dt, np.zeros(self._n), state, setpoint, rows=rows)
+
+        for k, run in enumerate(self._rollouts.runs):
+            mine = [s for s, segment in enumerate(self._segments) if segment.run == k]
+            commands, starts = self._segments[mine[0]].commands, [self._start(self._segments[s]) for s in mine]
+            asked[mine] = setpoints(commands, starts, self._robots) - self._zero[rows]
+            if warming:
+                heat[mine] = heats(
+                    run.t, self._rollouts.measured[k], commands, starts, self._robots, heat[mine[0]], servos
+                )
+        return asked.reshape(-1, joints), heat.reshape(-1, joints)
+
+    def _start(self, segment: Segment) -> float:
+        return segment.start - self._led * self._plant.timestep
 
     def _note(self, step: Step) -> None:
         """What the motors give and get, before laws on what comes of it."""
@@ -194,7 +197,7 @@ class _Batch:
         plant, segments, n = self._plant, self._segments, self._n
         lengths = np.array([len(segment.control) for segment in segments])
         longest, sims = int(lengths[0]), n * len(segments)
-        control = self._controls(longest)
+        control = self._controls(self._led + longest)
         ctrl, time = self._batch.bind("ctrl"), np.zeros(sims)
         rest = np.repeat([segment.control[0] for segment in segments], n, axis=0)
         ctrl[:] = rest
@@ -205,12 +208,13 @@ class _Batch:
         floor = "gyro" in out or "base" in out or plant.setup is Setup.FLOOR
         states = _States(self._batch, plant, sims, longest, floor)
         cable = self._cable()
+        self._lead(control)
         before = self._servos.state
         for step in range(longest):
             active = int((lengths > step).sum()) * n
             for s in flips.get(step, ()):
                 self._servos.switch(slice(s * n, (s + 1) * n), segments[s].torque_off[step])
-            ctrl[:, plant.ctrl] = control[:, step]
+            ctrl[:, plant.ctrl] = control[:, self._led + step]
             self._servos.prepare(self._laws, time, before)
             states.keep(step, before, self._given)
             if cable is not None:
@@ -221,13 +225,31 @@ class _Batch:
         states.keep(longest, before, None)
         self._sample(states, out)
 
+    def _lead(self, control: NDArray[np.float32]) -> None:
+        """Bring rotors behind play and springs to where they are as a simulation begins: laws act, the joints go as measured."""
+        if not self._led:
+            return
+        h, zero, ctrl = self._plant.timestep, self._zero, self._batch.bind("ctrl")
+        paths = [
+            self._rollouts.measured[segment.run].at(self._start(segment) + h * np.arange(self._led, dtype=np.float64))
+            for segment in self._segments
+        ]
+        where, speed = (np.stack(of, axis=1).repeat(self._n, axis=1) for of in zip(*paths, strict=True))
+        for s, segment in enumerate(self._segments):
+            self._servos.switch(slice(s * self._n, (s + 1) * self._n), segment.torque_off[0])
+        for step in range(self._led):
+            ctrl[:, self._plant.ctrl] = control[:, step]
+            self._servos.prepare(
+                self._laws, np.full(len(zero), h * (step - self._led)), (where[step] - zero, speed[step])
+            )
+
     def _controls(self, longest: int) -> NDArray[np.float32]:
         """(segments · robots, steps, joints) rad, setpoints as they act: late, scattered, lost, filtered."""
         plant, h = self._plant, self._plant.timestep
         out = np.zeros((len(self._segments), self._n, longest, len(plant.joints)), np.float32)
         for s, segment in enumerate(self._segments):
-            steps = len(segment.control)
-            edges: Array = segment.start + h * np.arange(steps + 1, dtype=np.float64)
+            steps = self._led + len(segment.control)
+            edges: Array = self._start(segment) + h * np.arange(steps + 1, dtype=np.float64)
             for r, robot in enumerate(self._robots):
                 out[s, r, :steps] = self._control(segment, robot, edges) - robot.zero
                 out[s, r, steps:] = out[s, r, steps - 1]
@@ -238,7 +260,7 @@ class _Batch:
         commands = segment.commands
         random = robot.jitter_s > 0 or robot.dropout.any()
         if not random and not robot.delay.any():
-            mean = segment.control[:, plant.ctrl]
+            mean = np.concatenate([commands.mean(edges[: self._led + 1]), segment.control[:, plant.ctrl]])
         elif not random and (robot.delay == robot.delay[0]).all():
             mean = commands.mean(edges - robot.delay[0])
         else:

@@ -32,6 +32,7 @@ import copy
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -43,7 +44,7 @@ from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, position_servos
 from openant_tools.recording.run import Run
 
-__all__ = ["Rollouts", "Segment", "Staircase", "Trajectories", "initial_velocities"]
+__all__ = ["Measured", "Rollouts", "Segment", "Staircase", "Trajectories", "initial_velocities"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -213,6 +214,11 @@ class Rollouts:
                 for s, segment in enumerate(self._segments[: len(control)]):
                     edges = segment.start + h * np.arange(begin, begin + control.shape[2] + 1) - delay
                     control[s, late, :, self.plant.ctrl[j]] = segment.commands.column(j).mean(edges)[:, 0]
+
+    @cached_property
+    def measured(self) -> tuple[Measured, ...]:
+        """Of each run, how its joints moved."""
+        return tuple(Measured.of(run.t, run.signal("pos", self.plant.joints)) for run in self.runs)
 
     @property
     def segments(self) -> Sequence[Segment]:
@@ -431,11 +437,9 @@ def _led(
         return [None] * len(rows)
     model, t, h = plant.model, run.t, plant.timestep
     adr, dof = int(model.jnt_qposadr[plant.free_joint]), int(model.jnt_dofadr[plant.free_joint])
-    path = [PchipInterpolator(t[there], column[there]) for column, there in zip(pos.T, np.isfinite(pos).T, strict=True)]
     first, last = float(t[rows[0]]), float(t[rows[-1]])
     edges: Array = first + h * np.arange(round((last - first) / h) + 2, dtype=np.float64)
-    where = np.stack([curve(edges) for curve in path], axis=1)
-    speed = np.stack([curve(edges, 1) for curve in path], axis=1)
+    where, speed = Measured.of(t, pos).at(edges)
     setpoint = commands.mean(edges)
     data = mujoco.MjData(model)
     state = _initial_state(plant, run, rows[0], pos[rows[0]], speed[0], setpoint[0])
@@ -457,6 +461,28 @@ def _upright(quat: Array) -> Array:
     axis = np.empty(3)
     mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, 1.0]), quat)
     return axis
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Positions of joints between the samples of a run, smoothly; before the first and after the last at rest there."""
+
+    curves: tuple[PchipInterpolator, ...]
+
+    @classmethod
+    def of(cls, t: Array, pos: Array) -> Measured:
+        """Of positions (rows, joints) rad at times (s); missing samples are bridged."""
+        there = np.isfinite(pos)
+        return cls(tuple(PchipInterpolator(t[known], own[known]) for own, known in zip(pos.T, there.T, strict=True)))
+
+    def at(self, times: Array) -> tuple[Array, Array]:
+        """(times, joints) rad and rad/s."""
+        where, speed = [], []
+        for curve in self.curves:
+            held = np.clip(times, curve.x[0], curve.x[-1])
+            where.append(curve(held))
+            speed.append(np.where(held == times, curve(held, 1), 0.0))
+        return np.stack(where, axis=1), np.stack(speed, axis=1)
 
 
 def _initial_state(
