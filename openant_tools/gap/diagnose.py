@@ -82,7 +82,9 @@ SURELY = 0.99
 #: share of what a re-fit leaves that a cause leaves of it where closure alone proves it
 PROVES = 0.6
 #: share of what the best cause leaves that others at its place are looked at for, how many, and their sizes (0 … 1)
-RIVALS_LEAVE, RIVALS, STRENGTHS = 0.9, 2, (0.15, 0.4, 0.65, 0.9)
+RIVALS_LEAVE, RIVALS, STRENGTHS = 0.9, 2, (0.2, 0.5, 0.8)
+#: share of what a re-fit leaves that is little enough: no rival is looked for where the best cause leaves no more
+SETTLED = 0.35
 #: effects in a set that is not told from others, at most
 TOGETHER = 3
 #: how what is left of the gap counts beside the judge's probability
@@ -327,7 +329,7 @@ def _decide(
     explained = {name: _placed(windows, case, judgement, one) for name, one in explained.items()}
     _, _, singles = closures(windows, [_start(windows, [explained[name]]) for name in names], held_out, case.training)
     alone = dict(zip(names, singles, strict=True))
-    if judgement.energy > 1:
+    if judgement.energy > 1 and 1 - max(one.closed for one in singles) > SETTLED * (1 - refit.closed):
         found = _rivals(windows, case, explained, alone, scenes)
         _, _, singles = closures(windows, [_start(windows, [one]) for one in found.values()], held_out, case.training)
         explained = {**explained, **found}
@@ -487,7 +489,8 @@ def _rivals(
     still = np.zeros(len(windows.names))
     known = [Refit((explained[best].part,), (explained[best].x,), still)]
     stand = [k for k in case.training if case.protocol.runs[k].plant.setup is Setup.STAND]
-    left = windows.left([*known, *(Refit((part,), (x,), still) for part, x in others)], stand or case.training)
+    refits = [*known, *(Refit((part,), (x,), still) for part, x in others)]
+    left = windows.left(refits, (stand or case.training)[:1])
     likely: dict[Part, dict[str, float]] = {}
     for k in np.argsort(left[1:]):
         part, start = others[k]
