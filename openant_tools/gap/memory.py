@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 
 #: s, steps in which setpoints of limited rate are followed
 STEP_S = 0.01
+#: s, of heat: between two commands a servo's torque is not what it is as one comes
+HEAT_STEP_S = 0.005
 
 
 def setpoints(commands: Staircase, starts: Sequence[float], robots: Sequence[Robot]) -> Array:
@@ -39,7 +41,6 @@ def setpoints(commands: Staircase, starts: Sequence[float], robots: Sequence[Rob
 
 
 def heats(
-    times: Array,
     measured: Measured,
     commands: Staircase,
     starts: Sequence[float],
@@ -50,21 +51,23 @@ def heats(
     """(starts, robots, joints) °C: how warm servos have become that were commanded so and moved as measured.
 
     Args:
-        times: s, of the run's rows. start_c: (robots, joints) °C as it begins.
+        start_c: (robots, joints) °C as the run begins.
         servos: the robots' as (dt, (positions, velocities), setpoints) find them.
     """
     zero, delay = (np.array([getattr(robot, name) for robot in robots]) for name in ("zero", "delay"))
     loss, seconds = np.array([robot.derating for robot in robots]), np.array([[robot.derating_s] for robot in robots])
     heating = Heating({"loss_per_c": loss, "time_constant_s": seconds}, start_c)
+    times: Array = np.arange(measured.begin, max(*starts, measured.begin) + HEAT_STEP_S, HEAT_STEP_S, dtype=np.float64)
     setpoint = np.empty((len(times), *zero.shape))
     for j in range(zero.shape[1]):
         for late in np.unique(delay[:, j]):
             setpoint[:, delay[:, j] == late, j] = commands.column(j).at(times - late)
     position, velocity = measured.at(times)
     path = np.empty((len(times), *zero.shape))
-    for k, dt in enumerate(np.diff(times, append=times[-1])):
+    for k in range(len(times)):
         path[k] = heating.state
-        heating(servos(float(dt), (position[k] - zero, np.broadcast_to(velocity[k], zero.shape)), setpoint[k] - zero))
+        state = position[k] - zero, np.broadcast_to(velocity[k], zero.shape)
+        heating(servos(HEAT_STEP_S, state, setpoint[k] - zero))
     return _between(times, path, starts)
 
 

@@ -173,14 +173,13 @@ class _Batch:
         def servos(dt: float, state: tuple[Array, Array], setpoint: Array) -> Step:
             return self._servos.view(dt, np.zeros(self._n), state, setpoint, rows=rows)
 
-        for k, run in enumerate(self._rollouts.runs):
+        for k in range(len(self._rollouts.runs)):
             mine = [s for s, segment in enumerate(self._segments) if segment.run == k]
             commands, starts = self._segments[mine[0]].commands, [self._start(self._segments[s]) for s in mine]
             asked[mine] = setpoints(commands, starts, self._robots) - self._zero[rows]
             if warming:
-                heat[mine] = heats(
-                    run.t, self._rollouts.measured[k], commands, starts, self._robots, heat[mine[0]], servos
-                )
+                measured = self._rollouts.measured[k]
+                heat[mine] = heats(measured, commands, starts, self._robots, heat[mine[0]], servos)
         return asked.reshape(-1, joints), heat.reshape(-1, joints)
 
     def _start(self, segment: Segment) -> float:

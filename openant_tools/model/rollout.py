@@ -475,6 +475,11 @@ class Measured:
         there = np.isfinite(pos)
         return cls(tuple(PchipInterpolator(t[known], own[known]) for own, known in zip(pos.T, there.T, strict=True)))
 
+    @property
+    def begin(self) -> float:
+        """s, of the first sample of any joint."""
+        return float(min(curve.x[0] for curve in self.curves))
+
     def at(self, times: Array) -> tuple[Array, Array]:
         """(times, joints) rad and rad/s."""
         where, speed = [], []
