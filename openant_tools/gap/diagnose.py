@@ -31,6 +31,7 @@ from openant_tools.gap.measure import Measurement, measure
 from openant_tools.gap.next import suggestion
 from openant_tools.gap.prepare import Prepared, prepare
 from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.rivals import moves_joints, placed, rivals
 from openant_tools.gap.sets import SetFits, choose, motions_of
 from openant_tools.model.gap import excess
 from openant_tools.model.plant import Setup
@@ -56,8 +57,6 @@ SUSPECTS, LIKELIEST, PUZZLED = 5, 3, 7
 SECOND = 0.35
 #: places at which each of them is tried
 PLACES = 2
-#: and of which the runs say where it sits
-ELSEWHERE = 8
 #: held-out closure that an addition must bring; that one cause must bring beyond what tolerances do, where the judge doubts;
 #: and below which a set explains nothing
 ADDS, ADDS_ALONE, EXPLAINS = 0.02, 0.2, 0.35
@@ -81,8 +80,6 @@ FEW_JOINTS = 2
 SURELY = 0.99
 #: share of what a re-fit leaves that a cause leaves of it where closure alone proves it
 PROVES = 0.6
-#: share of what the best cause leaves that others at its place are looked at for, how many, and their sizes (0 … 1)
-RIVALS_LEAVE, RIVALS, STRENGTHS = 0.9, 2, (0.2, 0.5, 0.8)
 #: share of what a re-fit leaves that is little enough: no rival is looked for where the best cause leaves no more
 SETTLED = 0.35
 #: effects in a set that is not told from others, at most
@@ -326,7 +323,7 @@ def _decide(
     probability = dict(ranked)
     names = list(explained)
     before, floor, (refit,) = closures(windows, [nothing(windows)], held_out, case.training)
-    explained = {name: _placed(windows, case, judgement, one) for name, one in explained.items()}
+    explained = {name: placed(windows, judgement, one, case.training) for name, one in explained.items()}
     _, _, singles = closures(windows, [_start(windows, [explained[name]]) for name in names], held_out, case.training)
     alone = dict(zip(names, singles, strict=True))
     if judgement.energy > 1 and 1 - max(one.closed for one in singles) > SETTLED * (1 - refit.closed):
@@ -382,8 +379,7 @@ def _decide(
             if probability[name] > SUSPECT
             and alone[name].closed > refit.closed + ADDS_ALONE
             and explained[name].beyond_tolerance
-            and not catalogue()[name].beside_joints
-            and not catalogue()[name].random
+            and moves_joints(catalogue()[name])
         ]
         seconds += [(name, 0.0, ADDS_MUCH) for name in sorted(closing, key=lambda name: -alone[name].closed)[:1]]
         for name, chance, adds in seconds:
@@ -412,7 +408,7 @@ def _decide(
         sure = False
     verdict, selected = best, tuple(sorted(chosen, key=lambda name: -beyond[name]))
     ambiguous: tuple[tuple[str, ...], ...] = ()
-    rivals = [
+    equal = [
         name
         for name in names[1:3]
         if not beside
@@ -433,8 +429,8 @@ def _decide(
     elif beside and probability[best] < CERTAIN and left is not None and min(judgement.energy, left.energy) > STRANGE:
         # Strange with it, too: a foot that came off is no offset, though nothing known is more like it.
         verdict, selected = UNEXPLAINED, ()
-    elif rivals:
-        verdict, ambiguous = AMBIGUOUS, ((best, *rivals),)
+    elif equal:
+        verdict, ambiguous = AMBIGUOUS, ((best, *equal),)
     elif len(selected) > 1:
         verdict = selected[0]
     order = [*selected, *(name for name in names if name not in selected)]
@@ -448,57 +444,16 @@ def _decide(
     )  # fmt: skip
 
 
-def _placed(windows: Windows, case: _Case, judgement: Judgement, one: Explained) -> Explained:
-    """The same cause where the runs, on the stand and on the floor, say that it sits: at a place that the judge names, or wider.
-
-    What was fitted on the stand alone knows nothing of a joint that carries its load on the floor.
-    """
-    named = [(one.part.joints, one.x), *judgement.places[one.part.cause][:ELSEWHERE]]
-    scopes = one.part.definition.scopes
-    wider = [tuple(group) for group in case.protocol.servos()] if Scope.SERVO in scopes else []
-    wider += [tuple(range(len(case.protocol.joints)))] if Scope.ALL in scopes else []
-    places = {(where, tuple(x.items())): x for where, x in named}
-    places |= {(where, tuple(x.items())): x for where in wider for _, x in named[:PLACES]}
-    tried = [dataclasses.replace(one, part=Part(one.part.cause, where), x=x) for (where, _), x in places.items()]
-    left = windows.left([_start(windows, [other]) for other in tried], case.training)
-    return tried[int(np.argmin(left))]
-
-
 def _rivals(
     windows: Windows, case: _Case, explained: dict[str, Explained], alone: dict[str, Closure], scenes: dict[Setup, Scene]
 ) -> dict[str, Explained]:  # fmt: skip
-    """Causes that the judge did not suspect, and that would leave less than any suspect at the place of the best of them."""
-
-    def of_joints(name: str) -> bool:
-        return not catalogue()[name].beside_joints and not catalogue()[name].random
-
-    suspects = [name for name in explained if of_joints(name)]
+    """Causes at the place of the best suspect that would leave less than any, fitted like those."""
+    suspects = [name for name in explained if moves_joints(catalogue()[name])]
     if not suspects:
         return {}
     best = min(suspects, key=lambda name: alone[name].after)
-    joints = explained[best].part.joints
-    everywhere = len(joints) == len(case.protocol.joints)
-    scope = Scope.JOINT if len(joints) == 1 else Scope.ALL if everywhere else Scope.SERVO
-    others = [
-        (Part(name, joints), start)
-        for name, cause in catalogue().items()
-        if of_joints(name) and name not in suspects and scope in cause.scopes and cause.shows(case.protocol.reference)
-        for strength in STRENGTHS
-        for start in cause.starts(strength)
-    ]
-    still = np.zeros(len(windows.names))
-    known = [Refit((explained[best].part,), (explained[best].x,), still)]
-    stand = [k for k in case.training if case.protocol.runs[k].plant.setup is Setup.STAND]
-    refits = [*known, *(Refit((part,), (x,), still) for part, x in others)]
-    left = windows.left(refits, (stand or case.training)[:1])
-    likely: dict[Part, dict[str, float]] = {}
-    for k in np.argsort(left[1:]):
-        part, start = others[k]
-        if left[1 + k] > RIVALS_LEAVE * left[0] or len(likely) == RIVALS:
-            break
-        likely.setdefault(part, start)
-    scene = _scene_of(best, scenes)
-    return {one.part.cause: one for one in fit(scene, likely)} if likely else {}
+    likely = rivals(windows, explained[best], explained, case.training)
+    return {one.part.cause: one for one in fit(_scene_of(best, scenes), likely)} if likely else {}
 
 
 def _vanished(refit: Refit) -> bool:

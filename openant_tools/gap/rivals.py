@@ -1,0 +1,84 @@
+"""Where a suspect sits, and what else would do there: first looks at many causes on windows of the runs, without a fit of each.
+
+The judge names suspects by what a whole log looks like, and a fit to features sizes them. Neither has looked at how a joint
+moves in every window of every run, and that decides between causes that are much alike.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+
+from openant_tools.gap.cause import Cause, Scope, catalogue
+from openant_tools.gap.closure import Refit, Windows
+from openant_tools.gap.explain import Explained, Part
+from openant_tools.gap.judge import Judgement
+from openant_tools.model.plant import Setup
+
+__all__ = ["moves_joints", "placed", "rivals"]
+
+#: places that the judge names among which the runs choose, and those whose sizes are tried wider
+NAMED, WIDER = 8, 2
+#: share of what a cause leaves that a rival leaves at most; how many of them count, and the sizes (0 … 1) they are tried in
+LEAVES, COUNT, STRENGTHS = 0.9, 2, (0.2, 0.5, 0.8)
+
+
+def placed(windows: Windows, judgement: Judgement, one: Explained, training: Sequence[int]) -> Explained:
+    """The same cause where the runs, on the stand and on the floor, say that it sits: at a place that the judge names, or wider.
+
+    What was fitted on the stand alone knows nothing of a joint that carries its load on the floor.
+
+    Args:
+        windows: on which `nothing` was re-fitted. training: the runs to look at.
+    """
+    protocol, scopes = windows.protocol, one.part.definition.scopes
+    named = [(one.part.joints, one.x), *judgement.places[one.part.cause][:NAMED]]
+    wider = [tuple(group) for group in protocol.servos()] if Scope.SERVO in scopes else []
+    wider += [tuple(range(len(protocol.joints)))] if Scope.ALL in scopes else []
+    places = {(where, tuple(x.items())): x for where, x in named}
+    places |= {(where, tuple(x.items())): x for where in wider for _, x in named[:WIDER]}
+    tried = [dataclasses.replace(one, part=Part(one.part.cause, where), x=x) for (where, _), x in places.items()]
+    left = windows.left([_alone(windows, other.part, other.x) for other in tried], training)
+    return tried[int(np.argmin(left))]
+
+
+def rivals(
+    windows: Windows, best: Explained, known: Collection[str], training: Sequence[int]
+) -> dict[Part, dict[str, float]]:
+    """Causes that nobody suspected and that leave clearly less than the best suspect where that one sits; with their sizes.
+
+    Args:
+        windows: on which `nothing` was re-fitted. known: causes that are suspected already.
+        training: the runs to look at; of those on the stand, where legs do not move each other, one will do.
+    """
+    protocol, joints = windows.protocol, best.part.joints
+    everywhere = len(joints) == len(protocol.joints)
+    scope = Scope.JOINT if len(joints) == 1 else Scope.ALL if everywhere else Scope.SERVO
+    others = [
+        (Part(name, joints), start)
+        for name, cause in catalogue().items()
+        if name not in known and moves_joints(cause) and scope in cause.scopes and cause.shows(protocol.reference)
+        for strength in STRENGTHS
+        for start in cause.starts(strength)
+    ]
+    stand = [k for k in training if protocol.runs[k].plant.setup is Setup.STAND]
+    refits = [_alone(windows, part, x) for part, x in [(best.part, best.x), *others]]
+    least, *left = windows.left(refits, (stand or list(training))[:1])
+    found: dict[Part, dict[str, float]] = {}
+    for k in np.argsort(left):
+        part, start = others[k]
+        if left[k] > LEAVES * least or len(found) == COUNT:
+            break
+        found.setdefault(part, start)
+    return found
+
+
+def moves_joints(cause: Cause) -> bool:
+    """Whether windows of joint positions can tell it: it acts on joints, and the same way each time."""
+    return not cause.beside_joints and not cause.random
+
+
+def _alone(windows: Windows, part: Part, x: Mapping[str, float]) -> Refit:
+    return Refit((part,), (x,), np.zeros(len(windows.names)))

@@ -1,0 +1,66 @@
+"""First looks at causes: which of them would leave less where the best suspect sits, and where a suspect sits."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from plants import SERVO, drive, pendulum, run_of, sweep, write
+
+from openant_tools.gap.cause import catalogue
+from openant_tools.gap.closure import Windows, closures, nothing
+from openant_tools.gap.explain import Explained, Part
+from openant_tools.gap.judge import Judgement
+from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.rivals import placed, rivals
+from openant_tools.model.plant import load_plant
+
+T = 2.0 + np.arange(150) / 50
+
+
+def suspect(cause: str, joints: tuple[int, ...], strength: float) -> Explained:
+    x = catalogue()[cause].starts(strength)[0]
+    return Explained(Part(cause, joints), x, dict.fromkeys(x, 0.1), 1.0)
+
+
+@pytest.fixture(scope="module")
+def weak(tmp_path_factory: pytest.TempPathFactory) -> Windows:
+    """A servo that gives 0.6 N·m, of a model that lets it give 1.5."""
+    folder = tmp_path_factory.mktemp("weak")
+    robot, model = (
+        write(folder / f"{limit}.xml", pendulum(f'<position {SERVO} kp="8" forcerange="-{limit} {limit}"/>'))
+        for limit in (0.6, 1.5)
+    )
+    plant = load_plant(robot)
+    runs = [
+        run_of(
+            drive(plant.model, ["joint"], T, 0.6 * sweep(T, 1, reach=reach), noise=3e-4), T, ["joint"], f"run-{reach}"
+        )
+        for reach in (0.6, 0.9)
+    ]
+    windows = Windows(Protocol.of(runs, model, ["joint"], [None, None]))
+    closures(windows, [nothing(windows)], (), [0, 1])
+    return windows
+
+
+def test_what_nobody_suspected_is_found_where_the_best_suspect_sits(weak: Windows) -> None:
+    found = rivals(weak, suspect("viscous_nonlinear", (0,), 0.5), ["viscous_nonlinear"], [0, 1])
+    assert "torque_limit" in [part.cause for part in found]
+    assert all(part.joints == (0,) for part in found)
+
+
+def test_nothing_rivals_the_cause_itself(weak: Windows) -> None:
+    at = catalogue()["torque_limit"]
+    (limit,) = at.quantities
+    right = dataclasses.replace(suspect("torque_limit", (0,), 0.5), x={limit.name: limit.back(0.4, 1.0)})
+    assert rivals(weak, right, ["torque_limit"], [0, 1]) == {}
+
+
+def test_a_suspect_is_put_where_the_runs_say(weak: Windows) -> None:
+    """Of sizes that the judge and the fit to features name, the runs choose."""
+    one = suspect("torque_limit", (0,), 0.0)
+    near = {"limit": float(np.log(0.4))}
+    places = [((0,), {"limit": float(np.log(0.9))}), ((0,), near)]
+    judgement = Judgement({}, np.zeros(1), 1.0, {"torque_limit": places})
+    assert placed(weak, judgement, one, [0, 1]).x == near
