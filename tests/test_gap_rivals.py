@@ -61,6 +61,6 @@ def test_a_suspect_is_put_where_the_runs_say(weak: Windows) -> None:
     """Of sizes that the judge and the fit to features name, the runs choose."""
     one = suspect("torque_limit", (0,), 0.0)
     near = {"limit": float(np.log(0.4))}
-    places = [((0,), {"limit": float(np.log(0.9))}), ((0,), near)]
+    places: list[tuple[tuple[int, ...], dict[str, float]]] = [((0,), {"limit": float(np.log(0.9))}), ((0,), near)]
     judgement = Judgement({}, np.zeros(1), 1.0, {"torque_limit": places})
     assert placed(weak, judgement, one, [0, 1]).x == near
