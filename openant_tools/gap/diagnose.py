@@ -62,6 +62,8 @@ PLACES = 2
 ADDS, ADDS_ALONE, EXPLAINS = 0.02, 0.2, 0.35
 #: and that a second cause must bring which the judge does not expect
 ADDS_MUCH = 0.15
+#: how many of those are tried
+MORE = 2
 #: °C between runs from which heat is asked about, and its cause
 WARMED_C, HEAT = 2.5, "thermal_derating"
 #: 1/°C of torque that any motor loses: copper's resistance grows by 0.4 %, and its magnets weaken; twice that is an effect
@@ -79,7 +81,7 @@ FEW_JOINTS = 2
 #: nothing is surer
 SURELY = 0.99
 #: share of what a re-fit leaves that a cause leaves of it where closure alone proves it
-PROVES = 0.6
+PROVES = 0.72
 #: share of what a re-fit leaves that is little enough: no rival is looked for where the best cause leaves no more
 SETTLED = 0.35
 #: effects in a set that is not told from others, at most
@@ -366,7 +368,7 @@ def _decide(
     if probability[best] > MAYBE or proved:
         left = _without(case, explained[best])
         eased = probability[best] > MAYBE and judgement.energy > 1 and left.energy < EASES * judgement.energy
-    if left is not None and (probability[best] > FINDING or proved or eased):
+    if left is not None and (max(probability[name] for name in names) > FINDING or proved or eased):
         seconds = [
             (name, chance, ADDS)
             for name, chance in _shown(left, case.protocol)[:2]
@@ -376,12 +378,9 @@ def _decide(
         closing = [
             name
             for name in names[1:]
-            if probability[name] > SUSPECT
-            and alone[name].closed > refit.closed + ADDS_ALONE
-            and explained[name].beyond_tolerance
-            and moves_joints(catalogue()[name])
+            if probability[name] > SUSPECT and explained[name].beyond_tolerance and moves_joints(catalogue()[name])
         ]
-        seconds += [(name, 0.0, ADDS_MUCH) for name in sorted(closing, key=lambda name: -alone[name].closed)[:1]]
+        seconds += [(name, 0.0, ADDS_MUCH) for name in closing[:MORE]]
         for name, chance, adds in seconds:
             if name in chosen:
                 continue
@@ -393,14 +392,15 @@ def _decide(
                 windows, [_start(windows, [explained[one] for one in [*chosen, name]])], held_out, case.training
             )
             silent = catalogue()[name].beside_joints and chance > FINDING
-            if both.closed > whole.closed + adds or (silent and both.closed > whole.closed - adds):
+            much = moves_joints(catalogue()[name]) and 1 - both.closed < PROVES * (1 - whole.closed)
+            if both.closed > whole.closed + adds or much or (silent and both.closed > whole.closed - adds):
                 beyond[name] = both.closed - whole.closed
                 beyond[best] = both.closed - (alone[name].closed if name in alone else refit.closed)
                 chosen.append(name)
                 whole = both
                 probability[name] = max(probability[name], chance)
                 break
-    sure = probability[best] > FINDING or eased
+    sure = probability[best] > (SECOND if judgement.energy > STRANGE else FINDING) or eased
     sure = sure or (judgement.energy > 1 and proved and alone[best].closed > EXPLAINS)
     # Where the judge is sure of something, and the log is strange, which of its suspects it is the fits may say.
     sure = sure or (judgement.energy > STRANGE and max(probability[name] for name in names) > FINDING)
@@ -434,6 +434,10 @@ def _decide(
     elif len(selected) > 1:
         verdict = selected[0]
     order = [*selected, *(name for name in names if name not in selected)]
+    # The set was re-fitted together: these are the sizes that leave what it leaves.
+    points = dict(zip((part.cause for part in whole.refit.hypothesis), whole.refit.x, strict=True))
+    explained = {name: dataclasses.replace(one, x=points.get(name, one.x)) for name, one in explained.items()}
+    alone |= {name: dataclasses.replace(alone[name], refit=whole.refit) for name in chosen if name in alone}
     effects = tuple(_found(case, explained[name], probability[name], alone.get(name)) for name in order)
     gap = {"before": before, "after": before if verdict == NONE else whole.after, "floor": floor, "refit": refit.after}
     removal = {name: beyond[name] for name in selected}
