@@ -332,8 +332,10 @@ def test_sac_learns_on_the_robot_beside_acting_with_a_cable_that_comes_off_in_th
     done = train_beside(Tripping(walker.env), folder=tmp_path, steps=24, seed=0, settings=small)
     assert done.step == 24
     assert done.updates is not None
-    [tripped] = read_interventions(tmp_path)
+    # What it then learns in a dozen steps may well throw it on its back, where the camera loses it.
+    tripped, *later = read_interventions(tmp_path)
     assert "hip_rl" in tripped.reason
+    assert all("hip_rl" not in one.reason for one in later)
     assert 8 <= tripped.step <= 14
     rows = np.fromfile(tmp_path / "transitions.f32", np.float32).reshape(24, -1)
     assert np.isfinite(rows).all()

@@ -330,10 +330,11 @@ def _decide(
     alone = dict(zip(names, singles, strict=True))
     if judgement.energy > 1 and 1 - max(one.closed for one in singles) > SETTLED * (1 - refit.closed):
         found = _rivals(windows, case, explained, alone, scenes)
-        _, _, singles = closures(windows, [_start(windows, [one]) for one in found.values()], held_out, case.training)
-        explained = {**explained, **found}
-        alone |= dict(zip(found, singles, strict=True))
-        names += found
+        if found:
+            starts = [_start(windows, [one]) for one in found.values()]
+            alone |= dict(zip(found, closures(windows, starts, held_out, case.training)[2], strict=True))
+            explained = {**explained, **found}
+            names += found
     for name in list(names):
         simpler = catalogue()[name].simpler(alone[name].refit.x[0])
         if simpler in alone:
