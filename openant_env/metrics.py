@@ -49,7 +49,7 @@ class AverageReward:
         steps = self._steps
         steps.append((reward, duration_s))
         # Half a step of tolerance: 120 s of 0.12 s steps are 1000 steps, whatever the rounding of their sum.
-        while self._time > self.window_s + 0.5 * steps[0][1]:
+        while len(steps) > 1 and self._time > self.window_s + 0.5 * steps[0][1]:
             gone_reward, gone_duration = steps.popleft()
             self._reward -= gone_reward
             self._time -= gone_duration

@@ -186,6 +186,14 @@ def test_average_reward_is_that_of_the_window_even_when_saved_on_the_way(steps, 
     assert average.value == pytest.approx(rewards[first:].sum() / durations[first:].sum(), abs=1e-6)
 
 
+def test_a_step_as_long_as_two_windows_stays_whatever_rounding_left_of_those_before():
+    average = AverageReward(1.0)
+    for duration in (0.3, 0.3, 2.0):
+        average.add(0.5 * duration, duration)
+    assert average.seconds == pytest.approx(2.0)
+    assert average.value == pytest.approx(0.5)
+
+
 def test_average_reward_over_120_seconds_of_equal_steps_is_the_papers_mean(ant):
     average = AverageReward()
     rewards = np.random.default_rng(0).normal(size=2500)
