@@ -152,18 +152,21 @@ def walk() -> tuple[Plant, Run]:
     return plant, run
 
 
+def moved_and_off(robot: Robot, walk: tuple[Plant, Run], folder: Path) -> tuple[float, float]:
+    """rad: by how much a robot moves otherwise than the model, and its written file otherwise than it."""
+    plant, run = walk
+    given, simulated = simulate(Rollouts(plant, [run]), [Robot(8), robot], signals=["pos"]).signals["pos"].astype(float)
+    write_robot(ANT, robot, folder / "improved.xml", note="a test")
+    off = replayed(folder / "improved.xml", run, Setup.FLOOR) - simulated
+    return float(np.sqrt(np.mean((simulated - given) ** 2))), float(np.sqrt(np.mean(off**2)))
+
+
 @pytest.mark.parametrize("name", ["payload", "floor_friction", "contact_softness", "floor_tilt", "cable_drag"])
 def test_body_and_floor_are_in_the_file(name: str, walk: tuple[Plant, Run], tmp_path: Path) -> None:
-    plant, run = walk
-    robot = with_cause(plant, catalogue()[name], 0.8)
-    rollouts = Rollouts(plant, [run])
-    given, simulated = simulate(rollouts, [Robot(8), robot], signals=["pos"]).signals["pos"].astype(float)
-    write_robot(ANT, robot, tmp_path / "improved.xml", note="a test")
-    off = replayed(tmp_path / "improved.xml", run, Setup.FLOOR) - simulated
-    effect = float(np.sqrt(np.mean((simulated - given) ** 2)))
+    effect, off = moved_and_off(with_cause(walk[0], catalogue()[name], 0.8), walk, tmp_path)
     assert effect > 2e-4
     # Feet that slip and stick part ways from rounding on.
-    assert float(np.sqrt(np.mean(off**2))) < 0.25 * effect + 2e-4
+    assert off < 0.25 * effect + 2e-4
 
 
 @pytest.mark.parametrize(
@@ -180,15 +183,9 @@ def test_body_and_floor_are_in_the_file(name: str, walk: tuple[Plant, Run], tmp_
 def test_what_contacts_are_like_is_in_the_file(
     kind: str, value: float, walk: tuple[Plant, Run], tmp_path: Path
 ) -> None:
-    plant, run = walk
-    robot = robot_of(plant, [], {kind: {"body": value}})
-    rollouts = Rollouts(plant, [run])
-    given, simulated = simulate(rollouts, [Robot(8), robot], signals=["pos"]).signals["pos"].astype(float)
-    write_robot(ANT, robot, tmp_path / "improved.xml", note="a test")
-    off = replayed(tmp_path / "improved.xml", run, Setup.FLOOR) - simulated
-    effect = float(np.sqrt(np.mean((simulated - given) ** 2)))
+    effect, off = moved_and_off(robot_of(walk[0], [], {kind: {"body": value}}), walk, tmp_path)
     assert effect > 3e-5
-    assert float(np.sqrt(np.mean(off**2))) < 0.25 * effect + 2e-5
+    assert off < 0.25 * effect + 2e-5
 
 
 def test_feet_stick_by_what_decides_at_the_floor(walk: tuple[Plant, Run], tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -88,7 +87,7 @@ def test_a_servo_that_gives_all_it_has_warms_up_with_its_time_constant(protocol:
     assert warm == pytest.approx(5 + (FULL_HEAT_C - 5) * (1 - np.exp(-np.array([0.0, 1.0, 2.5]))), rel=0.02)
 
 
-def test_what_was_measured_is_bridged_and_at_rest_beyond_its_ends(tmp_path: Path) -> None:
+def test_what_was_measured_is_bridged_and_at_rest_beyond_its_ends() -> None:
     t = np.arange(50) / 50
     pos = np.stack([np.sin(3 * t), t], axis=1)
     pos[10:12, 0] = np.nan

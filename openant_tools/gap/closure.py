@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from openant_tools.gap.cause import Quantity, enter
-from openant_tools.gap.explain import Hypothesis, bounds_of
+from openant_tools.gap.explain import Hypothesis, Part, bounds_of
 from openant_tools.gap.features import Floats, around_switching
 from openant_tools.gap.protocol import Played, Protocol
 from openant_tools.gap.robot import Robot
@@ -25,7 +25,7 @@ from openant_tools.model.gap import HORIZON_S, share_closed
 from openant_tools.model.plant import Setup
 from openant_tools.model.rollout import Rollouts
 
-__all__ = ["BODY", "Closure", "Refit", "Windows", "adjust", "calibration_of", "closures", "nothing"]
+__all__ = ["BODY", "Closure", "Refit", "Windows", "adjust", "calibration_of", "closures", "nothing", "unmoved"]
 
 Array = NDArray[np.float64]
 
@@ -410,9 +410,14 @@ def calibration_of(windows: Windows, refit: Refit) -> dict[str, dict[str, float]
     return out
 
 
+def unmoved(windows: Windows, parts: Iterable[Part], x: Iterable[Mapping[str, float]]) -> Refit:
+    """Causes at these coordinates, and nothing moved within tolerance yet."""
+    return Refit(tuple(parts), tuple(x), np.zeros(len(windows.names)))
+
+
 def nothing(windows: Windows) -> Refit:
     """No cause at all, only what tolerances let move."""
-    return Refit((), (), np.zeros(len(windows.names)))
+    return unmoved(windows, (), ())
 
 
 def _limits(quantity: Quantity, at: float) -> tuple[float, float]:

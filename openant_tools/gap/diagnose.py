@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.files import atomic_writer
 from openant_tools.gap.cause import Scope, catalogue
-from openant_tools.gap.closure import Closure, Refit, Windows, calibration_of, closures, nothing
+from openant_tools.gap.closure import Closure, Refit, Windows, calibration_of, closures, nothing, unmoved
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found, Span
 from openant_tools.gap.explain import Explained, Part, Scene, fit, robot_with
 from openant_tools.gap.features import Floats
@@ -637,8 +637,7 @@ def _notes(case: _Case) -> tuple[str, ...]:
 
 
 def _start(windows: Windows, explained: Sequence[Explained]) -> Refit:
-    parts, x = tuple(one.part for one in explained), tuple(one.x for one in explained)
-    return Refit(parts, x, np.zeros(len(windows.names)))
+    return unmoved(windows, (one.part for one in explained), (one.x for one in explained))
 
 
 def _found(case: _Case, one: Explained, probability: float, closure: Closure | None) -> Found:

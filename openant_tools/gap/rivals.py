@@ -7,12 +7,12 @@ moves in every window of every run, and that decides between causes that are muc
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from openant_tools.gap.cause import Cause, Scope, catalogue
-from openant_tools.gap.closure import Refit, Windows
+from openant_tools.gap.closure import Windows, unmoved
 from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.model.plant import Setup
@@ -40,7 +40,7 @@ def placed(windows: Windows, judgement: Judgement, one: Explained, training: Seq
     places = {(where, tuple(x.items())): x for where, x in named}
     places |= {(where, tuple(x.items())): x for where in wider for _, x in named[:WIDER]}
     tried = [dataclasses.replace(one, part=Part(one.part.cause, where), x=x) for (where, _), x in places.items()]
-    left = windows.left([_alone(windows, other.part, other.x) for other in tried], training)
+    left = windows.left([unmoved(windows, [other.part], [other.x]) for other in tried], training)
     return tried[int(np.argmin(left))]
 
 
@@ -64,7 +64,7 @@ def rivals(
         for start in cause.starts(strength)
     ]
     stand = [k for k in training if protocol.runs[k].plant.setup is Setup.STAND]
-    refits = [_alone(windows, part, x) for part, x in [(best.part, best.x), *others]]
+    refits = [unmoved(windows, [part], [x]) for part, x in [(best.part, best.x), *others]]
     least, *left = windows.left(refits, (stand or list(training))[:1])
     found: dict[Part, dict[str, float]] = {}
     for k in np.argsort(left):
@@ -78,7 +78,3 @@ def rivals(
 def moves_joints(cause: Cause) -> bool:
     """Whether windows of joint positions can tell it: it acts on joints, and the same way each time."""
     return not cause.beside_joints and not cause.random
-
-
-def _alone(windows: Windows, part: Part, x: Mapping[str, float]) -> Refit:
-    return Refit((part,), (x,), np.zeros(len(windows.names)))
