@@ -9,13 +9,15 @@
 
 A checkpoint replaces the last one in one stroke, after the transitions and the curve that belong to it are on the disk;
 it says how long both files were. Whatever a killed process had appended beyond is cut off on resuming, so that a
-resumed run goes on as if it had never been stopped. Where learning runs beside acting, transitions stand in the file as
+resumed run goes on as if it had never been stopped. One process at a time trains in a folder: it holds a lock on `run.json`,
+which ends with it, however it ends. Where learning runs beside acting, transitions stand in the file as
 soon as they are made, and a run goes on with all of them, those after the last checkpoint included.
 """
 
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import json
 import math
@@ -62,7 +64,7 @@ class Run:
         facts: what `run.json` says; a folder that holds a run goes on only if its facts are the same.
 
     Raises:
-        BadInput: the folder holds another run, or files that are none.
+        BadInput: the folder holds another run, or files that are none, or another process trains in it.
         OSError: it cannot be written.
     """
 
@@ -75,6 +77,16 @@ class Run:
             _check_same(path, read_facts(folder), self.facts)
         else:
             write_text(path, json.dumps(self.facts, indent=2, ensure_ascii=False) + "\n")
+        self._claim = path.open("rb")
+        try:
+            fcntl.flock(self._claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._claim.close()
+            raise BadInput(
+                "another process trains in this folder",
+                where=folder,
+                remedy="wait for it, stop it, or name another --out",
+            ) from None
         self._saved_rows = 0
         self._curve: io.TextIOWrapper | None = None
         self._log: io.FileIO | None = None
@@ -188,7 +200,7 @@ class Run:
         self._curve.flush()
 
     def close(self) -> None:
-        for stream in (self._curve, self._log):
+        for stream in (self._curve, self._log, self._claim):
             if stream is not None:
                 stream.close()
         self._curve = self._log = None

@@ -260,6 +260,17 @@ def test_another_run_does_not_write_into_this_folder(tmp_path):
         train(ant(), folder=tmp_path, steps=10, seed=3, settings=dataclasses.replace(SMALL, batch=64))
 
 
+def test_one_process_at_a_time_trains_in_a_folder(tmp_path):
+    train(ant(), folder=tmp_path, steps=5, seed=3, settings=SMALL)
+    there = runs.Run(tmp_path, {k: v for k, v in runs.read_facts(tmp_path).items() if k != "schema"})
+    with pytest.raises(
+        BadInput, match="another process trains in this folder → wait for it, stop it, or name another --out"
+    ):
+        train(ant(), folder=tmp_path, steps=10, seed=3, settings=SMALL)
+    there.close()
+    assert train(ant(), folder=tmp_path, steps=10, seed=3, settings=SMALL).step == 10
+
+
 def test_numbers_that_are_none_stop_the_training(tmp_path):
     class Broken(Reach):
         def step(self, action):
