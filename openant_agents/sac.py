@@ -313,7 +313,8 @@ class Sac:
     def act(self, observation: Array, *, explore: bool = True) -> Array:
         """(actions,): a sample of the policy, or its mode."""
         if self._think is not None:
-            mean, spread = np.split(self._think(np.asarray(observation, np.float32)), 2)
+            thought = self._think(np.asarray(observation, np.float32))
+            mean, spread = thought[: len(thought) // 2], thought[len(thought) // 2 :]
             if explore:
                 log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (np.tanh(spread) + 1.0)
                 mean += np.exp(log_std) * self._normal(1)[0].numpy()
