@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from openant_agents.by_hand import Gradients, acting, flatten
+from openant_agents.by_hand import Gradients, acting, flatten, squashed
 from openant_agents.runs import CurvePoint, Run, load_checkpoint, read_facts
 from openant_agents.training import (
     CHECKPOINT_EVERY_S,
@@ -304,25 +304,25 @@ class Sac:
         self._by_hand = by_hand and on_processor
         self._gradients: Autograd | Gradients | None = None  # their memory is for those who learn
         self._think = acting(self.actor.network) if on_processor else None
+        if self._think is not None:
+            self.act(np.zeros(observations, np.float32))  # compiles, before a robot waits
+            self.noise.manual_seed(seed)
 
     def random_action(self) -> Array:
         """(actions,), uniform in −1…1."""
         return self.random.uniform(-1.0, 1.0, self.replay.actions).astype(np.float32)
 
-    @torch.inference_mode()
     def act(self, observation: Array, *, explore: bool = True) -> Array:
         """(actions,): a sample of the policy, or its mode."""
         if self._think is not None:
             thought = self._think(np.asarray(observation, np.float32))
-            mean, spread = thought[: len(thought) // 2], thought[len(thought) // 2 :]
             if explore:
-                log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (np.tanh(spread) + 1.0)
-                mean += np.exp(log_std) * self._normal(1)[0].numpy()
-            result: Array = np.tanh(mean)
-            return result
-        seen = torch.from_numpy(observation).to(self.device).unsqueeze(0)
-        action = self.actor(seen, self._normal(1))[0] if explore else self.actor.mode(seen)
-        result = action.squeeze(0).cpu().numpy()
+                return squashed(thought, self._normal(1)[0].numpy(), LOG_STD_MIN, LOG_STD_MAX)
+            return np.tanh(thought[: self.replay.actions])
+        with torch.inference_mode():
+            seen = torch.from_numpy(observation).to(self.device).unsqueeze(0)
+            action = self.actor(seen, self._normal(1))[0] if explore else self.actor.mode(seen)
+            result: Array = action.squeeze(0).cpu().numpy()
         return result
 
     def update(self) -> None:

@@ -104,6 +104,13 @@ def test_every_effect_comes_before_any_comes_twice_and_all_kinds_of_robots_are_t
     assert draw_answers(120, 8, Mix(virtual=0.0)) != answers
 
 
+def test_widest_effects_are_at_one_joint_only_where_they_cannot_be_at_more() -> None:
+    drawn = [one for answer in draw_answers(40, 7, Mix(two=0.65, widest=True)) for one in answer.effects]
+    at_one = [one.effect for one in drawn if isinstance(one.joints, tuple) and len(one.joints) == 1]
+    assert at_one and all(KINDS[name].scopes == "j" for name in at_one)
+    assert {one.joints for one in drawn if one.effect == "action_delay"} == {"all"}
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**31))
 def test_an_answer_survives_its_file_and_describes_a_robot(seed: int) -> None:

@@ -122,6 +122,7 @@ class Mix:
     Attributes:
         sizes: shares of small, medium and large among the robots with one effect.
         virtual: share of the robots that come from the virtual robot's bus, of those whose effect it can have.
+        widest: each effect at as many joints as it may belong to, not at one joint of eight.
     """
 
     none: float = 0.35
@@ -129,6 +130,7 @@ class Mix:
     outside: float = 0.12
     sizes: tuple[float, float, float] = (0.25, 0.4, 0.35)
     virtual: float = 0.5
+    widest: bool = False
 
     def __post_init__(self) -> None:
         shares = (self.none, self.two, self.outside)
@@ -152,9 +154,9 @@ def draw_answers(count: int, seed: int, mix: Mix | None = None) -> list[Answer]:
         answer = Answer(group, (), int(chance.integers(2**31)), "batch", bool(number % 2))
         if group == "single":
             size = SIZES[int(chance.choice(3, p=sizes))]
-            answer = replace(answer, effects=(_effect(next(singles), size, chance),))
+            answer = replace(answer, effects=(_effect(next(singles), size, chance, mix.widest),))
         elif group == "two":
-            answer = replace(answer, effects=_pair(chance))
+            answer = replace(answer, effects=_pair(chance, mix.widest))
         elif group == "outside":
             name = next(strange)
             answer = replace(answer, outside=name, parameters=_outside(chance))
@@ -178,9 +180,11 @@ def _deck(names: Sequence[str], chance: np.random.Generator) -> Any:
             yield names[k]
 
 
-def _effect(name: str, size: Size, chance: np.random.Generator) -> Drawn:
+def _effect(name: str, size: Size, chance: np.random.Generator, widest: bool) -> Drawn:
     kind = KINDS[name]
     scope = str(chance.choice(list(kind.scopes)))
+    if widest:
+        scope = max(kind.scopes, key="jbga".index)
     joints: tuple[str, ...]
     if scope == "j":
         joints = (str(chance.choice(kind.joints)),)
@@ -193,13 +197,13 @@ def _effect(name: str, size: Size, chance: np.random.Generator) -> Drawn:
     return Drawn(name, joints if scope in "jg" else "all" if scope == "a" else "body", parameters, size)
 
 
-def _pair(chance: np.random.Generator) -> tuple[Drawn, ...]:
+def _pair(chance: np.random.Generator, widest: bool) -> tuple[Drawn, ...]:
     while True:
         first, second = (str(name) for name in chance.choice(list(KINDS), 2, replace=False))
         if {first, second} not in _TWINS:
             break
     sizes: list[Size] = ["medium", "large"]
-    return tuple(_effect(name, sizes[int(chance.integers(2))], chance) for name in (first, second))
+    return tuple(_effect(name, sizes[int(chance.integers(2))], chance, widest) for name in (first, second))
 
 
 def _outside(chance: np.random.Generator) -> dict[str, Any]:
