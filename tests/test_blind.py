@@ -105,7 +105,11 @@ def test_every_effect_comes_before_any_comes_twice_and_all_kinds_of_robots_are_t
 
 
 def test_widest_effects_are_at_one_joint_only_where_they_cannot_be_at_more() -> None:
-    drawn = [one for answer in draw_answers(40, 7, Mix(none=0.0, two=0.8, outside=0.0, widest=True)) for one in answer.effects]
+    drawn = [
+        one
+        for answer in draw_answers(40, 7, Mix(none=0.0, two=0.8, outside=0.0, widest=True))
+        for one in answer.effects
+    ]
     at_one = [one.effect for one in drawn if isinstance(one.joints, tuple) and len(one.joints) == 1]
     assert at_one
     assert all(KINDS[name].scopes == "j" for name in at_one)
