@@ -82,6 +82,8 @@ def models(out: Path, only: str | None) -> None:
             )  # fmt: skip
         print(f"{folder.name}: fitted in {time.monotonic() - begun:.0f} s", flush=True)
         calibrated = place / "fit" / "calibrated.xml"
+        if not calibrated.exists():  # a robot that moves quite otherwise is not fitted: its calibration changes nothing
+            calibrated = out / "model.xml"
         _robot(place / "calibrated", calibrated)
         begun = time.monotonic()
         diagnosis = place / "diagnosis.json"

@@ -62,10 +62,8 @@ class _LearnerProcess:
     """
 
     def __init__(self, job: Job, agent: Sac) -> None:
-        self._weights = list(agent.actor.parameters())
-        count = sum(weight.numel() for weight in self._weights)
-        self._flat = np.empty(count, np.float32)
-        self._views = torch.split(torch.from_numpy(self._flat), [weight.numel() for weight in self._weights])
+        self._policy = agent.policy.detach().numpy()
+        count = len(self._policy)
         self._shared = SharedWeights(count)
         self._version = 0
         self.updates = 0
@@ -88,10 +86,7 @@ class _LearnerProcess:
             self._hear()
         if self._shared.version == self._version:
             return
-        self._version, self.updates = self._shared.take(self._flat), self._shared.updates
-        with torch.no_grad():
-            for weight, view in zip(self._weights, self._views, strict=True):
-                weight.copy_(view.view_as(weight))
+        self._version, self.updates = self._shared.take(self._policy), self._shared.updates
 
     def tell(self, state: Mapping[str, Any]) -> None:
         """How far the robot is, for the next checkpoint."""

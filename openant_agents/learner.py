@@ -123,7 +123,6 @@ class Learner:
         self._agent = Sac(job.observations, job.actions, job.settings, seed=job.seed, device=job.device)
         self._state: Mapping[str, Any] = {}
         self._log = (job.folder / "transitions.f32").open("rb", buffering=0)
-        self._flat = np.empty(sum(weight.numel() for weight in self._agent.actor.parameters()), np.float32)
         self._saved_at = time.monotonic()
         if (job.folder / "checkpoint.pt").is_file():
             checkpoint = load_checkpoint(job.folder)
@@ -187,11 +186,8 @@ class Learner:
             raise _Stopped from None
 
     def _publish(self) -> None:
-        with torch.no_grad():
-            flat = torch.cat([weight.reshape(-1) for weight in self._agent.actor.parameters()])
-        self._flat[:] = flat.cpu().numpy()
         self._agent.sound_or_raise(self._job.folder)
-        self._weights.publish(self._flat, self._agent.updates)
+        self._weights.publish(self._agent.policy.detach().cpu().numpy(), self._agent.updates)
 
     def _save(self) -> None:
         agent, folder = self._agent, self._job.folder

@@ -266,6 +266,9 @@ class Sac:
         seed: of initial weights, random actions, exploration noise and batches.
         device: where networks live.
         by_hand: whether gradients are computed as written out, where networks live on a processor, or by autograd.
+
+    Attributes:
+        policy: (weights,) of the actor, one vector of which its layers' are views.
     """
 
     def __init__(
@@ -293,10 +296,10 @@ class Sac:
         self.targets.requires_grad_(False)
         self.log_alpha = torch.tensor(math.log(settings.entropy_start), device=self.device, requires_grad=True)
         self.target_entropy = -float(actions)
-        actor_weights, self._critic_weights = flatten(self.actor), flatten(self.critics)
+        self.policy, self._critic_weights = flatten(self.actor), flatten(self.critics)
         self._target_weights = flatten(self.targets)
         self.critic_optimiser = _adam((self._critic_weights, settings.critic_step))
-        self.actor_optimiser = _adam((actor_weights, settings.actor_step), (self.log_alpha, settings.entropy_step))
+        self.actor_optimiser = _adam((self.policy, settings.actor_step), (self.log_alpha, settings.entropy_step))
         self.replay = Replay(observations, actions, settings.buffer)
         self.updates = 0
         self._critic_loss = torch.zeros(())

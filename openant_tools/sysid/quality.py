@@ -213,7 +213,8 @@ def check_model(run: Run, plant: Plant, simulated: Array) -> None:
                 f"{joint} moves otherwise than in the model altogether: it varies by {varies:.2f} rad, the model's error by "
                 f"{left:.2f} rad",
                 where=where,
-                remedy="check whether this is the model of this robot: its masses, gains, axes and zeros",
+                remedy="check whether this is the model of this robot: its masses, gains, axes and zeros; if it is, "
+                "`openant gap diagnose` says what else may move it so",
             )
 
 
