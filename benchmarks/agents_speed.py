@@ -1,7 +1,7 @@
 """What environment and agents cost, against the project's targets, in one run: python benchmarks/agents_speed.py
 
 Every ratio is taken by turns and by the processor's own clock (environment: the quickest repetition), so that a busy machine
-slows both sides alike; the last two rows are real time, and say what the machine had to do besides.
+slows both sides alike; the last three rows are real time, and say what the machine had to do besides.
 
 The other sides: a bare C loop over `mj_step`; the usual structure of SAC's update, and Stable-Baselines3's own; a tile coder
 with a dictionary in plain Python. An hour of the robot is taken from some hundred steps of acting, walking and learning, on
@@ -116,6 +116,7 @@ def main() -> None:
     row("SARSA(λ) decision against a dictionary in plain Python", "10×", "40×", f"{python / own:.1f}× ({own:.2f} ms)")
     for what, first, then, waited in (
         ("deadline to action beside a learner, 50 ms loop, p99", "2 ms", "1 ms", beside()),
+        ("the same with nobody learning: what the machine takes", "–", "–", deadlines(ours, lambda: None)),
         ("the same, an update before each action (`--learn between`)", "–", "–", deadlines(ours, ours.update)),
     ):
         here = f"{np.percentile(waited, 99):.1f} ms (median {np.median(waited):.1f})"
