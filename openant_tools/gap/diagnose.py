@@ -31,7 +31,7 @@ from openant_tools.gap.measure import Measurement, measure
 from openant_tools.gap.next import suggestion
 from openant_tools.gap.prepare import Prepared, prepare
 from openant_tools.gap.protocol import Protocol
-from openant_tools.gap.rivals import moves_joints, placed, rivals
+from openant_tools.gap.rivals import moves_joints, paired, placed, rivals
 from openant_tools.gap.sets import SetFits, choose, motions_of
 from openant_tools.model.gap import excess
 from openant_tools.model.plant import Setup
@@ -62,8 +62,8 @@ PLACES = 2
 ADDS, ADDS_ALONE, EXPLAINS = 0.02, 0.2, 0.35
 #: and that a second cause must bring which the judge does not expect
 ADDS_MUCH = 0.15
-#: how many of those are tried
-MORE = 2
+#: how many causes are looked at of what the judge sees beside the first; how many of those it expects are tried, and of others
+OTHERS, TOLD, MORE = 4, 2, 2
 #: °C between runs from which heat is asked about, and its cause
 WARMED_C, HEAT = 2.5, "thermal_derating"
 #: 1/°C of torque that any motor loses: copper's resistance grows by 0.4 %, and its magnets weaken; twice that is an effect
@@ -366,48 +366,40 @@ def _decide(
         taken = [probability[name] for name in names if explained[name].part.joints == explained[best].part.joints]
         probability[best] = max(probability[best], share * max(taken))
     left, eased = None, False
-    if probability[best] > MAYBE or proved:
+    if probability[best] > MAYBE or proved or max(probability[name] for name in names) > CERTAIN:
         left = _without(case, explained[best])
         eased = probability[best] > MAYBE and judgement.energy > 1 and left.energy < EASES * judgement.energy
     if left is not None and (max(probability[name] for name in names) > FINDING or proved or eased):
-        seconds = [
-            (name, chance, ADDS)
-            for name, chance in _shown(left, case.protocol)[:2]
-            if max(chance, probability[name] if name in explained else 0.0) > SECOND and chance > SUSPECT
-        ]
-        # And what the judge half hides behind the first, where it closes much of what the first leaves.
-        closing = [
-            name
-            for name in names[1:]
-            if probability[name] > SUSPECT and explained[name].beyond_tolerance and moves_joints(catalogue()[name])
-        ]
-        seconds += [(name, 0.0, ADDS_MUCH) for name in closing[:MORE]]
-        for name, chance, adds in seconds:
-            if name in chosen:
-                continue
-            more = explained.get(name) or _explain(scenes, [name], left).get(name)
-            if more is None:
-                continue
-            explained[name] = more
-            _, _, (both,) = closures(
-                windows, [_start(windows, [explained[one] for one in [*chosen, name]])], held_out, case.training
-            )
-            silent = catalogue()[name].beside_joints and chance > FINDING
+        second = None
+        for one, adds in _seconds(windows, case, scenes, explained, best, probability, left):
+            name, chance = one.part.cause, left.probability[one.part.cause]
+            _, _, (both,) = closures(windows, [_start(windows, [explained[best], one])], held_out, case.training)
+            # What moves no joint, or not twice alike, no closure can prove: there the judge's word is enough.
+            silent = not moves_joints(catalogue()[name]) and chance > FINDING
             much = moves_joints(catalogue()[name]) and 1 - both.closed < PROVES * (1 - whole.closed)
-            if both.closed > whole.closed + adds or much or (silent and both.closed > whole.closed - adds):
-                beyond[name] = both.closed - whole.closed
-                beyond[best] = both.closed - (alone[name].closed if name in alone else refit.closed)
-                chosen.append(name)
-                whole = both
-                probability[name] = max(probability[name], chance)
-                break
+            if both.closed > whole.closed + adds or much or (silent and both.closed > whole.closed - ADDS):
+                how = _score(max(chance, probability[name]), both)
+                if second is None or how > second[0]:
+                    second = how, one, both
+        if second is not None:
+            _, one, both = second
+            name = one.part.cause
+            explained[name] = one
+            beyond[name] = both.closed - whole.closed
+            beyond[best] = both.closed - (alone[name].closed if name in alone else refit.closed)
+            chosen.append(name)
+            whole = both
+            probability[name] = max(probability[name], left.probability[name])
     sure = probability[best] > (SECOND if judgement.energy > STRANGE else FINDING) or eased
     sure = sure or (judgement.energy > 1 and proved and alone[best].closed > EXPLAINS)
     # Where the judge is sure of something, and the log is strange, which of its suspects it is the fits may say.
     sure = sure or (judgement.energy > STRANGE and max(probability[name] for name in names) > FINDING)
     if probability[best] < CERTAIN and not explained[best].beyond_tolerance:
         sure = False
-    verdict, selected = best, tuple(sorted(chosen, key=lambda name: -beyond[name]))
+    # What is half believed does not come before what is certain, whatever it closes.
+    certain = any(probability[name] > CERTAIN for name in chosen)
+    doubted = [name for name in chosen if certain and probability[name] < SECOND]
+    verdict, selected = best, tuple(sorted(chosen, key=lambda name: (name in doubted, -beyond[name])))
     ambiguous: tuple[tuple[str, ...], ...] = ()
     equal = [
         name
@@ -416,6 +408,8 @@ def _decide(
         and abs(alone[name].closed - alone[best].closed) < APART
         and probability[name] > probability[best] / 2
     ]
+    # Nor is it a riddle what a random cause leaves beside a likely one.
+    noisy = any(catalogue()[name].random for name in chosen[1:]) and min(probability[name] for name in chosen) > FINDING
     if not sure:
         verdict, selected = (NONE if judgement.energy < ODD else UNEXPLAINED), ()
     elif (
@@ -424,10 +418,11 @@ def _decide(
         and whole.closed < EXPLAINS
         and judgement.energy > STRANGE
         and (probability[best] < CERTAIN or (_vanished(alone[best].refit) and not catalogue()[best].random))
+        and not noisy
     ):
         # However sure the judge is: what comes out as nothing at all is not what makes the gap. No fit finds what is random.
         verdict, selected = UNEXPLAINED, ()
-    elif beside and probability[best] < CERTAIN and left is not None and min(judgement.energy, left.energy) > STRANGE:
+    elif beside and not certain and left is not None and min(judgement.energy, left.energy) > STRANGE:
         # Strange with it, too: a foot that came off is no offset, though nothing known is more like it.
         verdict, selected = UNEXPLAINED, ()
     elif equal:
@@ -447,6 +442,32 @@ def _decide(
         case, verdict, confidence, (*effects, *_rest(ranked, order)), selected, ambiguous, gap, removal, judgement,
         None if verdict == NONE else calibration_of(windows, whole.refit),
     )  # fmt: skip
+
+
+def _seconds(
+    windows: Windows, case: _Case, scenes: dict[Setup, Scene], explained: dict[str, Explained], best: str,
+    probability: dict[str, float], left: Judgement,
+) -> list[tuple[Explained, float]]:  # fmt: skip
+    """Causes that may act beside the best, each with the held-out closure that it has to add.
+
+    Those that the judge expects in what the best leaves, and those it half hides behind the best, where a first look says that
+    both together leave clearly less.
+    """
+    seen = [
+        (name, chance) for name, chance in _shown(left, case.protocol)[:OTHERS] if chance > SUSPECT and name != best
+    ]
+    missing = [name for name, _ in seen if name not in explained]
+    known = {**explained, **(_explain(scenes, missing, left) if missing else {})}
+    told = [name for name, chance in seen[:TOLD] if name in known and max(chance, probability[name]) > SECOND]
+    hidden = [
+        one
+        for name, one in known.items()
+        if name not in (best, *told) and one.beyond_tolerance and moves_joints(catalogue()[name])
+    ]
+    look = paired(windows, known[best], hidden, case.training)
+    chance = {one.part.cause: max(left.probability[one.part.cause], probability[one.part.cause]) for one, _ in look}
+    look.sort(key=lambda pair: _rank(chance[pair[0].part.cause], pair[1]), reverse=True)
+    return [(known[name], ADDS) for name in told] + [(one, ADDS_MUCH) for one, _ in look[:MORE]]
 
 
 def _rivals(
@@ -573,7 +594,11 @@ def _late_register(case: _Case) -> tuple[Explained, float] | None:
 
 def _score(probability: float, closure: Closure) -> float:
     """How a cause ranks: by the judge, and by what it leaves of the gap on held-out runs."""
-    return math.log(max(probability, 1e-3)) - LEFT_COUNTS * math.log(max(1 - closure.closed, 0.0) + 0.05)
+    return _rank(probability, 1 - closure.closed)
+
+
+def _rank(probability: float, left: float) -> float:
+    return math.log(max(probability, 1e-3)) - LEFT_COUNTS * math.log(max(left, 0.0) + 0.05)
 
 
 def _rest(ranked: Sequence[tuple[str, float]], done: Sequence[str]) -> tuple[Found, ...]:

@@ -17,12 +17,14 @@ from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.model.plant import Setup
 
-__all__ = ["moves_joints", "placed", "rivals"]
+__all__ = ["moves_joints", "paired", "placed", "rivals"]
 
 #: places that the judge names among which the runs choose, and those whose sizes are tried wider
 NAMED, WIDER = 8, 2
 #: share of what a cause leaves that a rival leaves at most; how many of them count, and the sizes (0 … 1) they are tried in
 LEAVES, COUNT, STRENGTHS = 0.9, 2, (0.2, 0.5, 0.8)
+#: shares of the sizes found alone in which two causes are tried together
+PARTS = (1.0, 0.6)
 
 
 def placed(windows: Windows, judgement: Judgement, one: Explained, training: Sequence[int]) -> Explained:
@@ -73,6 +75,37 @@ def rivals(
             break
         found.setdefault(part, start)
     return found
+
+
+def paired(
+    windows: Windows, best: Explained, others: Sequence[Explained], training: Sequence[int]
+) -> list[tuple[Explained, float]]:
+    """Of causes that leave clearly less beside the best than it leaves alone: how much, as a share; at their best sizes.
+
+    Found alone, each took for its own what was the other's: both are tried at part of their sizes, too.
+
+    Args:
+        windows: on which `nothing` was re-fitted. training: the runs to look at.
+    """
+    pairs = [
+        (dataclasses.replace(one, x=_part(one, share)), _part(best, whole))
+        for one in others
+        for share in PARTS
+        for whole in PARTS
+    ]
+    refits = [unmoved(windows, [best.part], [best.x])]
+    refits += [unmoved(windows, [best.part, one.part], [x, one.x]) for one, x in pairs]
+    least, *left = windows.left(refits, training)
+    found: dict[str, tuple[Explained, float]] = {}
+    for k in np.argsort(left):
+        one, share = pairs[k][0], float(np.sqrt(left[k] / least))
+        if share < LEAVES:
+            found.setdefault(one.part.cause, (one, share))
+    return list(found.values())
+
+
+def _part(one: Explained, share: float) -> dict[str, float]:
+    return {q.name: one.x[q.name] * (1.0 if q.shape else share) for q in one.part.definition.quantities}
 
 
 def moves_joints(cause: Cause) -> bool:
