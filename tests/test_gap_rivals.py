@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from openant_tools.gap.closure import Windows, closures, nothing
 from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Protocol
-from openant_tools.gap.rivals import placed, rivals
+from openant_tools.gap.rivals import paired, placed, rivals
 from openant_tools.model.plant import load_plant
 
 T = 2.0 + np.arange(150) / 50
@@ -24,13 +25,16 @@ def suspect(cause: str, joints: tuple[int, ...], strength: float) -> Explained:
     return Explained(Part(cause, joints), x, dict.fromkeys(x, 0.1), 1.0)
 
 
-@pytest.fixture(scope="module")
-def weak(tmp_path_factory: pytest.TempPathFactory) -> Windows:
-    """A servo that gives 0.6 N·m, of a model that lets it give 1.5."""
-    folder = tmp_path_factory.mktemp("weak")
+def sized(cause: str, value: float) -> Explained:
+    (quantity,) = catalogue()[cause].quantities
+    return dataclasses.replace(suspect(cause, (0,), 0.5), x={quantity.name: quantity.back(value, 1.0)})
+
+
+def windows_of(folder: Path, stiffness: float) -> Windows:
+    """A servo of this stiffness that gives 0.6 N·m, of a model with 8 N·m/rad that lets it give 1.5."""
     robot, model = (
-        write(folder / f"{limit}.xml", pendulum(f'<position {SERVO} kp="8" forcerange="-{limit} {limit}"/>'))
-        for limit in (0.6, 1.5)
+        write(folder / f"{limit}.xml", pendulum(f'<position {SERVO} kp="{kp}" forcerange="-{limit} {limit}"/>'))
+        for kp, limit in ((stiffness, 0.6), (8, 1.5))
     )
     plant = load_plant(robot)
     runs = [
@@ -44,6 +48,11 @@ def weak(tmp_path_factory: pytest.TempPathFactory) -> Windows:
     return windows
 
 
+@pytest.fixture(scope="module")
+def weak(tmp_path_factory: pytest.TempPathFactory) -> Windows:
+    return windows_of(tmp_path_factory.mktemp("weak"), 8)
+
+
 def test_what_nobody_suspected_is_found_where_the_best_suspect_sits(weak: Windows) -> None:
     found = rivals(weak, suspect("viscous_nonlinear", (0,), 0.5), ["viscous_nonlinear"], [0, 1])
     assert "torque_limit" in [part.cause for part in found]
@@ -51,10 +60,7 @@ def test_what_nobody_suspected_is_found_where_the_best_suspect_sits(weak: Window
 
 
 def test_nothing_rivals_the_cause_itself(weak: Windows) -> None:
-    at = catalogue()["torque_limit"]
-    (limit,) = at.quantities
-    right = dataclasses.replace(suspect("torque_limit", (0,), 0.5), x={limit.name: limit.back(0.4, 1.0)})
-    assert rivals(weak, right, ["torque_limit"], [0, 1]) == {}
+    assert rivals(weak, sized("torque_limit", 0.4), ["torque_limit"], [0, 1]) == {}
 
 
 def test_a_suspect_is_put_where_the_runs_say(weak: Windows) -> None:
@@ -64,3 +70,13 @@ def test_a_suspect_is_put_where_the_runs_say(weak: Windows) -> None:
     places: list[tuple[tuple[int, ...], dict[str, float]]] = [((0,), {"limit": float(np.log(0.9))}), ((0,), near)]
     judgement = Judgement({}, np.zeros(1), 1.0, {"torque_limit": places})
     assert placed(weak, judgement, one, [0, 1]).x == near
+
+
+def test_a_second_cause_is_looked_for_beside_the_first_and_not_where_there_is_none(
+    weak: Windows, tmp_path: Path
+) -> None:
+    first, others = sized("torque_limit", 0.4), [sized("stiffness_error", 2.0), suspect("backlash", (0,), 0.8)]
+    assert paired(weak, first, others, [0, 1]) == []
+    found = paired(windows_of(tmp_path, 16), first, others, [0, 1])
+    assert [one.part.cause for one, _ in found] == ["stiffness_error"]
+    assert found[0][1] < 0.7

@@ -373,7 +373,9 @@ def _decide(
         second = None
         for one, adds in _seconds(windows, case, scenes, explained, best, probability, left):
             name, chance = one.part.cause, left.probability[one.part.cause]
-            _, _, (both,) = closures(windows, [_start(windows, [explained[best], one])], held_out, case.training)
+            both = whole
+            if not catalogue()[name].random:  # which only adds its noise to every simulation
+                _, _, (both,) = closures(windows, [_start(windows, [explained[best], one])], held_out, case.training)
             # What moves no joint, or not twice alike, no closure can prove: there the judge's word is enough.
             silent = not moves_joints(catalogue()[name]) and chance > FINDING
             much = moves_joints(catalogue()[name]) and 1 - both.closed < PROVES * (1 - whole.closed)
@@ -386,7 +388,8 @@ def _decide(
             name = one.part.cause
             explained[name] = one
             beyond[name] = both.closed - whole.closed
-            beyond[best] = both.closed - (alone[name].closed if name in alone else refit.closed)
+            without = alone[name] if name in alone and not catalogue()[name].random else refit
+            beyond[best] = both.closed - without.closed
             chosen.append(name)
             whole = both
             probability[name] = max(probability[name], left.probability[name])
@@ -433,7 +436,7 @@ def _decide(
     # The set was re-fitted together: these are the sizes that leave what it leaves.
     points = dict(zip((part.cause for part in whole.refit.hypothesis), whole.refit.x, strict=True))
     explained = {name: dataclasses.replace(one, x=points.get(name, one.x)) for name, one in explained.items()}
-    alone |= {name: dataclasses.replace(alone[name], refit=whole.refit) for name in chosen if name in alone}
+    alone |= {name: dataclasses.replace(alone[name], refit=whole.refit) for name in points if name in alone}
     effects = tuple(_found(case, explained[name], probability[name], alone.get(name)) for name in order)
     gap = {"before": before, "after": before if verdict == NONE else whole.after, "floor": floor, "refit": refit.after}
     removal = {name: beyond[name] for name in selected}
