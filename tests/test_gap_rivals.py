@@ -80,3 +80,14 @@ def test_a_second_cause_is_looked_for_beside_the_first_and_not_where_there_is_no
     found = paired(windows_of(tmp_path, 16), first, others, [0, 1])
     assert [one.part.cause for one, _ in found] == ["stiffness_error"]
     assert found[0][1] < 0.7
+
+
+def test_beside_the_best_what_had_neither_size_nor_place_alone_is_tried_where_the_best_sits(
+    weak: Windows, tmp_path: Path
+) -> None:
+    first, vanished = sized("torque_limit", 0.4), sized("stiffness_error", 1.01)
+    assert paired(weak, first, [vanished], [0, 1]) == []
+    ((found, left),) = paired(windows_of(tmp_path, 16), first, [vanished], [0, 1])
+    assert found.part == Part("stiffness_error", (0,))
+    assert found.x["scale"] > 10 * vanished.x["scale"]
+    assert left < 0.7

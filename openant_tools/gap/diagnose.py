@@ -465,7 +465,9 @@ def _seconds(
     hidden = [
         one
         for name, one in known.items()
-        if name not in (best, *told) and one.beyond_tolerance and moves_joints(catalogue()[name])
+        if name not in (best, *told)
+        and (one.beyond_tolerance or left.energy > STRANGE)
+        and moves_joints(catalogue()[name])
     ]
     look = paired(windows, known[best], hidden, case.training)
     chance = {one.part.cause: max(left.probability[one.part.cause], probability[one.part.cause]) for one, _ in look}

@@ -15,6 +15,7 @@ from openant_tools.gap.cause import Cause, Scope, catalogue
 from openant_tools.gap.closure import Windows, unmoved
 from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
+from openant_tools.gap.protocol import Protocol
 from openant_tools.model.plant import Setup
 
 __all__ = ["moves_joints", "paired", "placed", "rivals"]
@@ -56,12 +57,13 @@ def rivals(
         training: the runs to look at; of those on the stand, where legs do not move each other, one will do.
     """
     protocol, joints = windows.protocol, best.part.joints
-    everywhere = len(joints) == len(protocol.joints)
-    scope = Scope.JOINT if len(joints) == 1 else Scope.ALL if everywhere else Scope.SERVO
     others = [
         (Part(name, joints), start)
         for name, cause in catalogue().items()
-        if name not in known and moves_joints(cause) and scope in cause.scopes and cause.shows(protocol.reference)
+        if name not in known
+        and moves_joints(cause)
+        and _fits(cause, joints, protocol)
+        and cause.shows(protocol.reference)
         for strength in STRENGTHS
         for start in cause.starts(strength)
     ]
@@ -82,15 +84,16 @@ def paired(
 ) -> list[tuple[Explained, float]]:
     """Of causes that leave clearly less beside the best than it leaves alone: how much, as a share; at their best sizes.
 
-    Found alone, each took for its own what was the other's: both are tried at part of their sizes, too.
+    Found alone, each took for its own what was the other's: both are tried at part of their sizes, too. Of what nothing was left
+    for alone neither size nor place is known: it is tried in a few sizes where the best sits, too.
 
     Args:
         windows: on which `nothing` was re-fitted. training: the runs to look at.
     """
     pairs = [
-        (dataclasses.replace(one, x=_part(one, share)), _part(best, whole))
+        (there, _part(best, whole))
         for one in others
-        for share in PARTS
+        for there in _guesses(one, best, windows.protocol)
         for whole in PARTS
     ]
     refits = [unmoved(windows, [best.part], [best.x])]
@@ -102,6 +105,24 @@ def paired(
         if share < LEAVES:
             found.setdefault(one.part.cause, (one, share))
     return list(found.values())
+
+
+def _guesses(one: Explained, best: Explained, protocol: Protocol) -> list[Explained]:
+    if one.beyond_tolerance:
+        return [dataclasses.replace(one, x=_part(one, share)) for share in PARTS]
+    cause = one.part.definition
+    places = {one.part.joints} | ({best.part.joints} if _fits(cause, best.part.joints, protocol) else set())
+    return [
+        dataclasses.replace(one, part=Part(cause.name, joints), x=x)
+        for joints in sorted(places)
+        for strength in STRENGTHS
+        for x in cause.starts(strength)
+    ]
+
+
+def _fits(cause: Cause, joints: tuple[int, ...], protocol: Protocol) -> bool:
+    everywhere = len(joints) == len(protocol.joints)
+    return (Scope.JOINT if len(joints) == 1 else Scope.ALL if everywhere else Scope.SERVO) in cause.scopes
 
 
 def _part(one: Explained, share: float) -> dict[str, float]:
