@@ -10,6 +10,7 @@ import pytest
 
 from openant_tools.gap.cause import catalogue
 from openant_tools.gap.features import COLUMNS
+from openant_tools.gap.judge import metric_of
 from openant_tools.gap.population import Case, draw, play, robot_of, templates
 from openant_tools.gap.prepare import CACHE_VARIABLE, cache_folder, prepare
 from openant_tools.gap.protocol import Protocol, same
@@ -130,6 +131,26 @@ def test_what_was_prepared_in_full_serves_a_part_of_it(
     assert part.folder == whole.folder
     assert np.array_equal(part.features[0], whole.features[1])
     assert len(list(cache_folder().iterdir())) == 1
+
+
+def test_what_no_simulated_robot_showed_is_not_strange(
+    protocol: Protocol, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    monkeypatch.setattr("openant_tools.gap.prepare.PART", 16)
+    monkeypatch.setattr("openant_tools.gap.prepare.LEAST", 16)
+    monkeypatch.setattr(
+        "openant_tools.gap.prepare.templates",
+        lambda protocol: [case for case in templates(protocol) if "stiffness_error" in case.causes][:16],
+    )
+    whole = prepare(dataclasses.replace(protocol, runs=protocol.runs[:1]), seconds=0.0)
+    x, unseen, seen = whole.features[0], 100, 101
+    x[:, unseen] = 0.0  # a block that lay around a switch of torque in whose run came first
+    metric = metric_of(whole, [0], [np.ones(x.shape[1], bool)])
+    for feature, strange in ((unseen, False), (seen, True)):
+        other = x[:1].copy()
+        other[0, feature] += 0.1
+        assert (float(np.abs(metric(other) - metric(x[:1])).max()) > 1) is strange
 
 
 def test_a_robot_at_hand_is_simulated_from_where_the_first_one_began(protocol: Protocol) -> None:

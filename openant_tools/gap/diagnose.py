@@ -88,6 +88,8 @@ SETTLED = 0.35
 TOGETHER = 3
 #: how what is left of the gap counts beside the judge's probability
 LEFT_COUNTS = 8.0
+#: of what is kept beside a preparation: another where judges are taught otherwise
+FORM = 2
 
 
 def diagnose(
@@ -234,7 +236,7 @@ def _kept(
     columns: Sequence[NDArray[np.bool_]],
 ) -> Stored:
     """What follows from a preparation for some runs and signals: made once, then read again."""
-    state = hashlib.sha256(repr(([prepared.which[k] for k in which], len(prepared.cases))).encode())
+    state = hashlib.sha256(repr((FORM, [prepared.which[k] for k in which], len(prepared.cases))).encode())
     for mine in columns:
         state.update(mine.tobytes())
     path = prepared.folder / f"{kind.__name__.lower()}-{state.hexdigest()[:16]}.joblib"

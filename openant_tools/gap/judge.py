@@ -94,7 +94,7 @@ class Whitening:
     """What healthy robots do, taken out of the measure: Σ = M Mᵀ + σ², by its eigenvectors.
 
     Attributes:
-        centre, scale: (features,) of the differences. basis: (features, directions). gains: (directions,) on top of 1/rest.
+        centre, scale: (features,) of the differences; infinite of a feature that never differs. basis: (features, directions). gains: (directions,) on top of 1/rest.
         rest: σ.
     """
 
@@ -413,7 +413,8 @@ def _whiten(x: Floats, templates: Floats, bank: Sequence[Case], reference: Refer
     """Σ of healthy robots: what tolerances do, by the templates' directions, and what else healthy robots show."""
     centre = np.median(x, axis=0).astype(np.float64)
     scale = np.std(x, axis=0).astype(np.float64)
-    scale = np.maximum(scale, max(1e-3 * float(np.median(scale)), 1e-9))
+    # What no simulated robot ever showed (a block that lay beyond its run's end, or all around a switch of torque) says nothing.
+    scale = np.where(np.ptp(x, axis=0) > 0, np.maximum(scale, 1e-3 * float(np.median(scale))), np.inf)
     d = np.clip((x - centre) / scale, -CLIP, CLIP).astype(np.float32)
     tolerances = _tolerances(templates / scale, bank, reference)
     inner = np.linalg.solve(tolerances.T @ tolerances + np.eye(tolerances.shape[1]), tolerances.T @ d.T)
