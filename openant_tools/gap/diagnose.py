@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,6 +89,8 @@ SETTLED = 0.35
 TOGETHER = 3
 #: how what is left of the gap counts beside the judge's probability
 LEFT_COUNTS = 8.0
+#: s of a diagnosis after which it is not looked for causes that the judge does not expect: slow computers have to answer, too
+PATIENCE_S = 75.0
 #: of what is kept beside a preparation: another where judges are taught otherwise
 FORM = 2
 
@@ -171,6 +174,7 @@ class _Case:
 
     Attributes:
         coarse: its protocol, in the steps and from the starts of the simulated robots that it is compared with.
+        begun: when the judge had spoken, s of the clock that only goes forward. late: whether patience has ended.
     """
 
     protocol: Protocol
@@ -183,6 +187,11 @@ class _Case:
     model: Path
     runs: Sequence[Run]
     hold_out: Sequence[Run]
+    begun: float = dataclasses.field(default_factory=time.monotonic)
+
+    @property
+    def late(self) -> bool:
+        return time.monotonic() > self.begun + PATIENCE_S
 
     @property
     def features(self) -> Floats:
@@ -330,7 +339,8 @@ def _decide(
     explained = {name: placed(windows, judgement, one, case.training) for name, one in explained.items()}
     _, _, singles = closures(windows, [_start(windows, [explained[name]]) for name in names], held_out, case.training)
     alone = dict(zip(names, singles, strict=True))
-    if judgement.energy > 1 and 1 - max(one.closed for one in singles) > SETTLED * (1 - refit.closed):
+    unsettled = 1 - max(one.closed for one in singles) > SETTLED * (1 - refit.closed)
+    if judgement.energy > 1 and unsettled and not case.late:
         found = _rivals(windows, case, explained, alone, scenes)
         if found:
             starts = [_start(windows, [one]) for one in found.values()]
@@ -467,7 +477,8 @@ def _seconds(
     hidden = [
         one
         for name, one in known.items()
-        if name not in (best, *told)
+        if not case.late
+        and name not in (best, *told)
         and (one.beyond_tolerance or left.energy > STRANGE)
         and moves_joints(catalogue()[name])
     ]
@@ -653,9 +664,11 @@ def _diagnosis(
 def _notes(case: _Case) -> tuple[str, ...]:
     """What it rests on, and what more signals would add."""
     seen = {name for one in case.protocol.runs for name in one.seen}
+    short = f"slow computer: after {PATIENCE_S:.0f} s no more second causes were tried that the judge does not expect"
     notes = [
         f"judged by {len(case.prepared.cases)} simulated robots that played these commands",
         "held-out runs as given" if case.hold_out else "each run left out of the fits in turn",
+        *([short] if case.late else []),
     ]
     if not case.protocol.reference.floor:
         notes.append("no run on the floor: body, contact and environment cannot show")
