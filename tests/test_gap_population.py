@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from openant_tools.gap.cause import catalogue
 from openant_tools.gap.features import COLUMNS
 from openant_tools.gap.judge import metric_of
 from openant_tools.gap.population import Case, draw, play, robot_of, templates
-from openant_tools.gap.prepare import CACHE_VARIABLE, cache_folder, prepare
+from openant_tools.gap.prepare import CACHE_VARIABLE, Prepared, cache_folder, prepare
 from openant_tools.gap.protocol import Protocol, same
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
@@ -116,14 +117,24 @@ def test_jitter_of_time_stamps_is_no_other_protocol(protocol: Protocol) -> None:
     assert not same(first, different)
 
 
+@pytest.fixture
+def prepare_few(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Protocol, int, list[Case]], Prepared]:
+    """Prepare a protocol by so many robots and this bank, in a cache of its own."""
+
+    def few(protocol: Protocol, robots: int, bank: list[Case]) -> Prepared:
+        monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+        monkeypatch.setattr("openant_tools.gap.prepare.PART", robots)
+        monkeypatch.setattr("openant_tools.gap.prepare.LEAST", robots)
+        monkeypatch.setattr("openant_tools.gap.prepare.templates", lambda protocol: bank)
+        return prepare(protocol, seconds=0.0)
+
+    return few
+
+
 def test_what_was_prepared_in_full_serves_a_part_of_it(
-    protocol: Protocol, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    protocol: Protocol, prepare_few: Callable[[Protocol, int, list[Case]], Prepared]
 ) -> None:
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    monkeypatch.setattr("openant_tools.gap.prepare.PART", 4)
-    monkeypatch.setattr("openant_tools.gap.prepare.LEAST", 4)
-    monkeypatch.setattr("openant_tools.gap.prepare.templates", lambda protocol: [Case({}, -1)])
-    whole = prepare(protocol, seconds=0.0)
+    whole = prepare_few(protocol, 4, [Case({}, -1)])
     assert 4 <= len(whole.cases) < 2400, "the time was over at once"
     backwards = dataclasses.replace(protocol, runs=protocol.runs[::-1])
     assert len(prepare(backwards).cases) == len(whole.cases), "and stays over"
@@ -134,16 +145,10 @@ def test_what_was_prepared_in_full_serves_a_part_of_it(
 
 
 def test_what_no_simulated_robot_showed_is_not_strange(
-    protocol: Protocol, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    protocol: Protocol, prepare_few: Callable[[Protocol, int, list[Case]], Prepared]
 ) -> None:
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    monkeypatch.setattr("openant_tools.gap.prepare.PART", 16)
-    monkeypatch.setattr("openant_tools.gap.prepare.LEAST", 16)
-    monkeypatch.setattr(
-        "openant_tools.gap.prepare.templates",
-        lambda protocol: [case for case in templates(protocol) if "stiffness_error" in case.causes][:16],
-    )
-    whole = prepare(dataclasses.replace(protocol, runs=protocol.runs[:1]), seconds=0.0)
+    one = dataclasses.replace(protocol, runs=protocol.runs[:1])
+    whole = prepare_few(one, 16, [case for case in templates(one) if "stiffness_error" in case.causes][:16])
     x, unseen, seen = whole.features[0], 100, 101
     x[:, unseen] = 0.0  # a block that lay around a switch of torque in whose run came first
     metric = metric_of(whole, [0], [np.ones(x.shape[1], bool)])

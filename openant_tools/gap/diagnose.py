@@ -89,7 +89,7 @@ SETTLED = 0.35
 TOGETHER = 3
 #: how what is left of the gap counts beside the judge's probability
 LEFT_COUNTS = 8.0
-#: s of a diagnosis after which it is not looked for causes that the judge does not expect: slow computers have to answer, too
+#: s after the judge has spoken from which no causes are looked for that it does not expect: slow computers have to answer, too
 PATIENCE_S = 75.0
 #: of what is kept beside a preparation: another where judges are taught otherwise
 FORM = 2
@@ -174,7 +174,7 @@ class _Case:
 
     Attributes:
         coarse: its protocol, in the steps and from the starts of the simulated robots that it is compared with.
-        begun: when the judge had spoken, s of the clock that only goes forward. late: whether patience has ended.
+        begun: when the judge was about to speak, s of the clock that only goes forward. given_up: what there was no time for.
     """
 
     protocol: Protocol
@@ -188,10 +188,14 @@ class _Case:
     runs: Sequence[Run]
     hold_out: Sequence[Run]
     begun: float = dataclasses.field(default_factory=time.monotonic)
+    given_up: list[str] = dataclasses.field(default_factory=list)
 
-    @property
-    def late(self) -> bool:
-        return time.monotonic() > self.begun + PATIENCE_S
+    def in_time(self, wanted: str) -> bool:
+        """Whether there is time for what is wanted; if not, the diagnosis will say so."""
+        if time.monotonic() <= self.begun + PATIENCE_S:
+            return True
+        self.given_up.append(wanted)
+        return False
 
     @property
     def features(self) -> Floats:
@@ -340,7 +344,7 @@ def _decide(
     _, _, singles = closures(windows, [_start(windows, [explained[name]]) for name in names], held_out, case.training)
     alone = dict(zip(names, singles, strict=True))
     unsettled = 1 - max(one.closed for one in singles) > SETTLED * (1 - refit.closed)
-    if judgement.energy > 1 and unsettled and not case.late:
+    if judgement.energy > 1 and unsettled and case.in_time("causes that nobody suspects"):
         found = _rivals(windows, case, explained, alone, scenes)
         if found:
             starts = [_start(windows, [one]) for one in found.values()]
@@ -477,12 +481,13 @@ def _seconds(
     hidden = [
         one
         for name, one in known.items()
-        if not case.late
-        and name not in (best, *told)
+        if name not in (best, *told)
         and (one.beyond_tolerance or left.energy > STRANGE)
         and moves_joints(catalogue()[name])
     ]
-    look = paired(windows, known[best], hidden, case.training)
+    look: list[tuple[Explained, float]] = []
+    if hidden and case.in_time("second causes that the judge does not expect"):
+        look = paired(windows, known[best], hidden, case.training)
     chance = {one.part.cause: max(left.probability[one.part.cause], probability[one.part.cause]) for one, _ in look}
     look.sort(key=lambda pair: _rank(chance[pair[0].part.cause], pair[1]), reverse=True)
     return [(known[name], ADDS) for name in told] + [(one, ADDS_MUCH) for one, _ in look[:MORE]]
@@ -664,11 +669,10 @@ def _diagnosis(
 def _notes(case: _Case) -> tuple[str, ...]:
     """What it rests on, and what more signals would add."""
     seen = {name for one in case.protocol.runs for name in one.seen}
-    short = f"slow computer: after {PATIENCE_S:.0f} s no more second causes were tried that the judge does not expect"
     notes = [
         f"judged by {len(case.prepared.cases)} simulated robots that played these commands",
         "held-out runs as given" if case.hold_out else "each run left out of the fits in turn",
-        *([short] if case.late else []),
+        *(f"{wanted} were not tried: {PATIENCE_S:.0f} s were over on this computer" for wanted in case.given_up),
     ]
     if not case.protocol.reference.floor:
         notes.append("no run on the floor: body, contact and environment cannot show")

@@ -94,8 +94,8 @@ class Whitening:
     """What healthy robots do, taken out of the measure: Σ = M Mᵀ + σ², by its eigenvectors.
 
     Attributes:
-        centre, scale: (features,) of the differences; infinite of a feature that never differs. basis: (features, directions). gains: (directions,) on top of 1/rest.
-        rest: σ.
+        centre, scale: (features,) of the differences; the scale of a feature that never differs is infinite.
+        basis: (features, directions). gains: (directions,) on top of 1/rest. rest: σ.
     """
 
     centre: Array
