@@ -64,6 +64,10 @@ class Servos:
         self._group = fields.actuator_group[:, i].copy()
         self._on = np.ones((self._n, len(i)), bool)
         self._rest = self._read()
+        self._full = np.ones((self._n, len(i)))
+        self._motors, self._others = np.flatnonzero(self._motor), np.flatnonzero(~self._motor)
+        self._proportional = self._others[self._fixed[self._others]]
+        self._bounded = self._others[self._limited[self._others]]
         # Of the gain on the setpoint to that on the position; from here, so that no rounding piles up from step to step.
         stiffness = -fields.actuator_biasprm[:, i, 1]
         self._ratio = fields.actuator_gainprm[:, i, 0] / np.where(stiffness == 0.0, 1.0, stiffness)
@@ -120,8 +124,9 @@ class Servos:
         Args:
             dt: s, of the step. setpoint: (rows, joints) rad. rows: which simulations; the others as in `prepare`.
         """
-        rest = {name: values[rows] for name, values in self._rest.items()}
+        rest = self._rest if rows == slice(None) else {name: values[rows] for name, values in self._rest.items()}
         share = 1.0 if supply is None else supply
+        friction = rest["friction"].copy()
         return Step(
             dt=dt,
             time=time,
@@ -135,9 +140,9 @@ class Servos:
             limit=rest["limit"] * share,
             back_emf=rest["back_emf"],
             damping=rest["damping"],
-            friction=rest["friction"].copy(),
-            torque=np.zeros(rest["friction"].shape),
-            supply=np.broadcast_to(share, rest["friction"].shape),
+            friction=friction,
+            torque=np.zeros_like(friction),
+            supply=self._full[rows] if supply is None else np.broadcast_to(supply, friction.shape),
         )
 
     def _read(self) -> dict[str, Array]:
@@ -162,20 +167,25 @@ class Servos:
     def _put(self, name: str, value: Array) -> None:
         """Write one number of every servo, (n, joints), into the models of all simulations."""
         i, fields = self.plant.actuator, self._fields
-        motors, others = np.flatnonzero(self._motor), np.flatnonzero(~self._motor)
+        motors, others = self._motors, self._others
         gain, bias = fields.actuator_gainprm, fields.actuator_biasprm
         if name == "stiffness":
-            fixed = others[self._fixed[others]]
-            gain[:, i[motors], KP] = value[:, motors]
+            if len(motors):
+                gain[:, i[motors], KP] = value[:, motors]
+            fixed = self._proportional
             gain[:, i[fixed], 0] = self._ratio[:, fixed] * value[:, fixed]
             bias[:, i[others], 1] = -value[:, others]
         elif name == "velocity_gain":
-            gain[:, i[motors], KD] = value[:, motors] + self._rest["back_emf"][:, motors]
+            if len(motors):
+                gain[:, i[motors], KD] = value[:, motors] + self._rest["back_emf"][:, motors]
             bias[:, i[others], 2] = -value[:, others]
         else:
-            k, limited = i[motors], others[self._limited[others]]
-            gain[:, k, VMAX] = value[:, motors] * gain[:, k, RESISTANCE] / gain[:, k, MOTOR_CONSTANT]
-            fields.actuator_forcerange[:, i[limited]] = np.stack([-value[:, limited], value[:, limited]], axis=-1)
+            if len(motors):
+                k = i[motors]
+                gain[:, k, VMAX] = value[:, motors] * gain[:, k, RESISTANCE] / gain[:, k, MOTOR_CONSTANT]
+            limited = self._bounded
+            most = value[:, limited]
+            fields.actuator_forcerange[:, i[limited], 0], fields.actuator_forcerange[:, i[limited], 1] = -most, most
 
 
 def batch_of(plant: Plant, models: Sequence[mujoco.MjModel], copies: int, nthread: int = 0) -> tuple[Batch, Servos]:

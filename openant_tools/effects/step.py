@@ -59,7 +59,8 @@ class Step:
     def motor_torque(self) -> Array:
         """What the servos' motors give with everything as it stands now, N·m."""
         asked = self.stiffness * (self.setpoint - self.position) - self.velocity_gain * self.velocity
-        given = np.clip(asked, -self.limit, self.limit) - self.back_emf * self.velocity
+        # What np.clip does, in a third of its time: robots have few joints.
+        given = np.maximum(np.minimum(asked, self.limit), -self.limit) - self.back_emf * self.velocity
         return np.where(self.on, given, 0.0)
 
 

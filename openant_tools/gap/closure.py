@@ -19,7 +19,7 @@ from openant_tools.gap.features import Floats, around_switching
 from openant_tools.gap.protocol import Played, Protocol
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
-from openant_tools.gap.tolerance import COULOMB_NM, DELAY_S, FACTORS, FLOOR, TILT_RAD, ZERO_RAD, torso_kg
+from openant_tools.gap.tolerance import COPPER, COULOMB_NM, DELAY_S, FACTORS, FLOOR, TILT_RAD, ZERO_RAD, torso_kg
 from openant_tools.model.floor import floors
 from openant_tools.model.gap import HORIZON_S, share_closed
 from openant_tools.model.plant import Setup
@@ -40,12 +40,16 @@ FARTHEST = 2.5
 ITERATIONS = 3
 #: times what slopes foretold that may be left: beyond, they are looked at anew
 FORETOLD = 1.3
+#: of a tolerance by which it is varied to learn its slope
+NEARBY = 0.3
 #: by which bounds are wider than what lies on them
 TINY = 1e-12
 #: rad: no joint is farther off than in a simulation that fell apart
 LOST_RAD = 10.0
 #: what tilts a floor along its x and y, rad
 TILTS = ("tilt_x", "tilt_y")
+#: what a warm motor loses, and °C between runs from which it is asked how much; what of a servo is less by it
+HEAT_LOSS, WARMED_C, LESS = "heat_loss", 2.0, ("stiffness", "torque_limit")
 #: whose calibration it is that belongs to no joint
 BODY = "body"
 #: rad, the least that a position is known to
@@ -92,7 +96,9 @@ class _Nuisance:
     tolerance: float
 
     def value(self, u: float) -> float:
-        """The factor, or what is added (N·m, rad, s, kg), at so many tolerances."""
+        """The factor, or what is added (N·m, rad, s, kg), at so many tolerances; 1/°C of what is lost to heat."""
+        if self.name == HEAT_LOSS:
+            return self.tolerance * (1 + u)
         return float(np.exp(u * self.tolerance)) if self.name in {*FACTORS, *FLOOR} else float(u * self.tolerance)
 
 
@@ -124,6 +130,75 @@ def adjust(robot: Robot, kind: str, joints: Sequence[int], value: float) -> None
         raise KeyError(kind)
 
 
+@dataclass
+class _Descent:
+    """One hypothesis on its way to where it leaves least.
+
+    Attributes:
+        u: where it is, sizes of causes, then tolerances. prior, scale: around what, and how far it may go.
+        at, least, blocks: where it was best, what it cost there, and of each run cost, normal matrix and gradient there.
+        seen: the same where it is now.
+        slopes: of each run, weighted, (coordinates, rows).
+    """
+
+    start: Refit
+    causes: int
+    u: Array
+    prior: Array
+    scale: Array
+    steps: Array
+    slopes: dict[int, Floats]
+    at: Array
+    least: float = np.inf
+    blocks: dict[int, tuple[float, Array, Array]] = dataclasses.field(default_factory=dict)
+    seen: dict[int, tuple[float, Array, Array]] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(cls, start: Refit, tolerances: int, learnt: Mapping[int, Floats]) -> _Descent:
+        """From a start, with what slopes are known of the tolerances alone."""
+        centre = _vector(start)
+        shares = np.array([q.share for q in _quantities(start)], bool)
+        sizes = np.where(shares, POLISH, np.maximum(POLISH * np.abs(centre), 1e-3))
+        steps = np.where(shares, 0.1, np.maximum(0.05 * np.abs(centre), 1e-3))
+        u: Array = np.concatenate([centre, start.nuisance])
+        slopes = {
+            k: np.concatenate([np.zeros((len(centre), *known.shape[1:]), np.float32), known])
+            for k, known in learnt.items()
+        }
+        return cls(
+            start,
+            len(centre),
+            u,
+            np.concatenate([centre, np.zeros(tolerances)]),
+            np.concatenate([sizes, np.full(tolerances, SPREAD)]),
+            np.concatenate([steps, np.full(tolerances, NEARBY)]),
+            slopes,
+            u,
+        )
+
+    def moved(self, members: Iterable[tuple[int, NDArray[np.bool_]]]) -> Array:
+        """Where it is with some coordinates a step farther."""
+        out = self.u.copy()
+        for p, _ in members:
+            out[p] += self.steps[p]
+        return out
+
+    @property
+    def cost(self) -> float:
+        """What it costs where it is now: its prior, and what runs leave."""
+        own = float(np.sum(np.square((self.u - self.prior) / self.scale)))
+        return own + sum(cost for cost, _, _ in self.seen.values())
+
+    def failed(self, k: int) -> bool:
+        """Whether a run leaves clearly more than its slopes foretold where it was best, though all together have gained."""
+        if k not in self.blocks or self.cost > self.least:
+            return False
+        moved = self.u - self.at
+        cost, more, slope = self.blocks[k]
+        expected = max(cost + float(2 * slope @ moved + moved @ more @ moved), 0.0)
+        return self.seen[k][0] > FORETOLD * expected
+
+
 class Windows:
     """Runs cut into windows, and what of the model is re-fitted on them.
 
@@ -149,21 +224,26 @@ class Windows:
         self._sigma = np.maximum(self.floor, LEAST_SIGMA_RAD)
         self._learnt: dict[int, Floats] = {}
 
-    def robot(self, refit: Refit | None) -> Robot:
+    def robot(self, refit: Refit | None, k: int) -> Robot:
+        """As it is on run k, where its servos are as warm as they were; None: the model as it was given."""
         reference = self.protocol.reference
         robot = Robot(len(self.protocol.joints), reference.low, reference.high)
         if refit is None:
             return robot
         enter(robot, reference, [(p.cause, p.joints, x) for p, x in zip(refit.hypothesis, refit.x, strict=True)])
         for one, u in zip(self.names, refit.nuisance, strict=True):
-            if u:
+            if one.name == HEAT_LOSS:
+                left = 1 / (1 + one.value(float(u)) * self.protocol.runs[k].warm_c)
+                for kind in LESS:
+                    robot.factor(kind)[:] *= left
+            elif u:
                 adjust(robot, one.name, one.joints, one.value(float(u)))
         return robot
 
     def errors(self, k: int, refits: Sequence[Refit | None], *, quick: bool = False) -> Array:
         """(refits, rows, joints) rad, measured minus simulated on run k."""
         rollouts = (self._quick if quick else self._rollouts)[k]
-        robots = [self.robot(refit) for refit in refits]
+        robots = [self.robot(refit, k) for refit in refits]
         found = simulate(rollouts, robots, signals=("pos",), warm_c=[self.protocol.runs[k].warm_c]).signals["pos"]
         out: Array = self.measured[k][None] - found.astype(np.float64)
         begun = min(int(segment.row[0]) for segment in rollouts.segments)
@@ -172,54 +252,42 @@ class Windows:
         out[:, begun:][lost & np.isfinite(self.measured[k][begun:])[None]] = LOST_RAD
         return out
 
-    def refit(self, start: Refit, training: Sequence[int], leave_out: Sequence[int]) -> tuple[Refit, list[Refit]]:
-        """Fit within tolerance, and polish sizes: on all the runs to train on, and without each of some of them.
+    def refit(
+        self, starts: Sequence[Refit], training: Sequence[int], leave_out: Sequence[int], *, anew: bool = False
+    ) -> list[tuple[Refit, list[Refit]]]:
+        """Fit within tolerance, and polish sizes: each on all the runs to train on, and without each of some of them.
 
-        All share one linearisation, at what is found on all of the training runs.
+        All share one linearisation each, at what is found on all of the training runs; and are simulated side by side.
+
+        Args:
+            anew: look at all slopes with the causes there, too: it costs ten times as much and leaves a little less.
         """
-        runs, fitted = self.protocol.runs, list(training)
-        centre = _vector(start)
-        shares = np.array([q.share for q in _quantities(start)], bool)
-        sizes = np.where(shares, POLISH, np.maximum(POLISH * np.abs(centre), 1e-3))
-        scale = np.concatenate([sizes, np.full(len(self.names), SPREAD)])
-        u: Array = np.concatenate([centre, start.nuisance])
-        prior = np.concatenate([centre, np.zeros(len(self.names))])
-        blocks: dict[int, tuple[Array, Array]] = {}
-        causes = len(centre)
-        # On the floor legs move each other, and slopes cost the most: what was learnt without causes does until it fails.
-        slopes = {
-            k: np.concatenate([np.zeros((causes, *known.shape[1:]), np.float32), known])
-            for k, known in self._learnt.items()
-            if k in fitted and runs[k].plant.setup is Setup.FLOOR
-        }
-        at, least, expected = u, np.inf, np.inf
-
-        def linear() -> tuple[dict[int, tuple[Array, Array]], float]:
-            found, cost = {}, float(np.sum(np.square((u - prior) / scale)))
-            for k in fitted:
-                slopes[k], left = self._linear(k, start, u, slopes.get(k))
-                found[k] = (slopes[k] @ slopes[k].T).astype(np.float64), (slopes[k] @ left).astype(np.float64)
-                cost += float(left.astype(np.float64) @ left)
-            return found, cost
-
+        fitted = list(training)
+        # Slopes cost the most: what was learnt without causes does until it fails.
+        learnt = {} if anew else {k: known for k, known in self._learnt.items() if k in fitted}
+        descents = [_Descent.of(start, len(self.names), learnt) for start in starts]
         for _ in range(ITERATIONS):
-            found, cost = linear()
-            if cost > least:
-                # Farther than the slopes hold.
-                u = (at + u) / 2
-                continue
-            if cost > FORETOLD * expected:
-                slopes.clear()
-                found, cost = linear()
-            at, least, blocks = u, cost, found
-            u = self._solve(start, at, prior, scale, blocks.values())
-            moved = u - at
-            expected = least + float(np.sum((u - prior) ** 2 / scale**2) - np.sum((at - prior) ** 2 / scale**2))
-            expected += sum(float(2 * slope @ moved + moved @ more @ moved) for more, slope in blocks.values())
-        if not causes:
-            self._learnt = dict(slopes)
-        folds = [[block for k, block in blocks.items() if k != out] for out in leave_out]
-        return _from(start, u), [_from(start, self._solve(start, at, prior, scale, fold)) for fold in folds]
+            self._linearize(descents, fitted)
+            for k in fitted:
+                if poor := [one for one in descents if one.failed(k)]:
+                    for one in poor:
+                        del one.slopes[k]
+                    self._linearize(poor, [k])
+            for one in descents:
+                if one.cost > one.least:
+                    # Farther than the slopes hold.
+                    one.u = (one.at + one.u) / 2
+                    continue
+                one.at, one.least, one.blocks = one.u, one.cost, dict(one.seen)
+                one.u = self._solve(one, [block for _, *block in one.blocks.values()])
+        out = []
+        for one in descents:
+            if not one.causes:
+                self._learnt = dict(one.slopes)
+            folds = [[block for k, (_, *block) in one.blocks.items() if k != left] for left in leave_out]
+            whole = _from(one.start, one.u)
+            out.append((whole, [_from(one.start, self._solve(one, fold)) for fold in folds]))
+        return out
 
     def left(self, refits: Sequence[Refit], seen: Sequence[int]) -> Array:
         """(refits,) the cost that each would leave, re-fitted within tolerance by the slopes that were learnt without causes.
@@ -247,14 +315,13 @@ class Windows:
         out: Array = 1 / (self._sigma * np.sqrt(max(1.0, INDEPENDENT_S / period)))
         return out
 
-    def _solve(
-        self, start: Refit, u: Array, prior: Array, scale: Array, blocks: Iterable[tuple[Array, Array]]
-    ) -> Array:
-        """Where the runs' blocks, made at u, lead."""
+    def _solve(self, descent: _Descent, blocks: Iterable[Sequence[Array]]) -> Array:
+        """Where the runs' blocks lead, made where the descent is at."""
+        u, prior, scale = descent.at, descent.prior, descent.scale
         normal, gradient = np.diag(1 / scale**2), (u - prior) / scale**2
         for more, slope in blocks:
             normal, gradient = normal + more, gradient + slope
-        ends = [_limits(q, float(at)) for q, at in zip(_quantities(start), prior, strict=False)]
+        ends = [_limits(q, float(at)) for q, at in zip(_quantities(descent.start), prior, strict=False)]
         low, high = np.array([*ends, *[(-END, END)] * len(self.names)]).T
         # What ends at a bound leaves its part to the others: clipped afterwards it would leave it undone.
         root = np.linalg.cholesky(normal)
@@ -266,35 +333,40 @@ class Windows:
         found: Array = np.clip(u + inside.x, low, high)
         return found
 
-    def _linear(self, k: int, start: Refit, u: Array, known: Floats | None) -> tuple[Floats, Floats]:
-        """Weighted slopes (coordinates, rows) of run k at a point, and errors (rows,).
+    def _linearize(self, descents: Sequence[_Descent], fitted: Sequence[int]) -> None:
+        """Look at runs from where descents have come to: what they cost there, and their blocks."""
+        for k in fitted:
+            weight = self._weight(k)
+            columns = [self._columns(k, one) for one in descents]
+            refits = [
+                refit
+                for one, mine in zip(descents, columns, strict=True)
+                for refit in [_from(one.start, one.u), *(_from(one.start, one.moved(members)) for members in mine)]
+            ]
+            errors = self.errors(k, refits, quick=True)
+            at = 0
+            for one, mine in zip(descents, columns, strict=True):
+                base = np.nan_to_num(errors[at]) * weight
+                slopes = np.zeros((len(one.u), base.size), np.float32)
+                if k in one.slopes:
+                    slopes[:] = one.slopes[k]
+                for row, members in enumerate(mine, at + 1):
+                    change = np.nan_to_num(errors[row] - errors[at]) * weight
+                    for p, mask in members:
+                        slopes[p] = (np.where(mask, change, 0.0) / one.steps[p]).ravel()
+                at += 1 + len(mine)
+                left = base.ravel().astype(np.float32)
+                one.slopes[k] = slopes
+                one.seen[k] = (
+                    float(left.astype(np.float64) @ left),
+                    (slopes @ slopes.T).astype(np.float64),
+                    (slopes @ left).astype(np.float64),
+                )
 
-        Args:
-            known: slopes nearby. What moves within tolerance moves little: only those of the causes are looked at again.
-        """
-        one = self.protocol.runs[k]
-        causes = len(u) - len(self.names)
-        columns = self._colours(one, start)
-        if known is not None:
-            columns = columns[:causes]
-        shares = np.array([q.share for q in _quantities(start)], bool)
-        sizes = np.where(shares, 0.1, np.maximum(0.05 * np.abs(u[:causes]), 1e-3))
-        steps = np.concatenate([sizes, np.full(len(self.names), 0.3)])
-        refits = [_from(start, u)]
-        for members in columns:
-            moved = u.copy()
-            for p, _ in members:
-                moved[p] += steps[p]
-            refits.append(_from(start, moved))
-        errors = self.errors(k, refits, quick=True)
-        weight = self._weight(k)
-        base = np.nan_to_num(errors[0]) * weight
-        slopes = np.zeros((len(u), base.size), np.float32) if known is None else known.copy()
-        for row, members in enumerate(columns, 1):
-            change = np.nan_to_num(errors[row] - errors[0]) * weight
-            for p, mask in members:
-                slopes[p] = (np.where(mask, change, 0.0) / steps[p]).ravel()
-        return slopes, base.ravel().astype(np.float32)
+    def _columns(self, k: int, descent: _Descent) -> list[list[tuple[int, NDArray[np.bool_]]]]:
+        """What is varied on a run. What moves within tolerance moves little: slopes once known are not looked at again."""
+        columns = self._colours(self.protocol.runs[k], descent.start)
+        return columns[: descent.causes] if k in descent.slopes else columns
 
     def _colours(self, one: Played, start: Refit) -> list[list[tuple[int, NDArray[np.bool_]]]]:
         """Coordinates that one simulation can vary, because on the stand legs do not move each other."""
@@ -325,16 +397,16 @@ class Windows:
 
 
 def closures(
-    windows: Windows, starts: Sequence[Refit], held_out: Sequence[int], training: Sequence[int]
+    windows: Windows, starts: Sequence[Refit], held_out: Sequence[int], training: Sequence[int], *, anew: bool = False
 ) -> tuple[float, float, list[Closure]]:
     """The gap before, the floor (rad), and what each hypothesis leaves.
 
     Args:
         held_out: runs that nothing was fitted on; empty to leave out each in turn.
-        training: the runs to fit on.
+        training: the runs to fit on. anew: as `Windows.refit` takes it.
     """
     judged = list(held_out or training)
-    fits = [windows.refit(start, training, () if held_out else judged) for start in starts]
+    fits = windows.refit(starts, training, () if held_out else judged, anew=anew)
     squares = np.zeros((len(starts) + 1, len(judged)))
     counts = np.zeros(len(judged))
     for n, k in enumerate(judged):
@@ -394,6 +466,8 @@ def _nuisances(protocol: Protocol) -> list[_Nuisance]:
         out.append(_Nuisance("armature", tuple(group), FACTORS["armature"]))
         out.append(_Nuisance("link_mass", tuple(group), FACTORS["link_mass"]))
     out.append(_Nuisance("delay", tuple(joints), DELAY_S))
+    if max(float(one.warm_c.max()) for one in protocol.runs) > WARMED_C:
+        out.append(_Nuisance(HEAT_LOSS, tuple(joints), COPPER))
     if protocol.reference.floor:
         out += [_Nuisance(kind, (), tolerance) for kind, tolerance in FLOOR.items()]
         out.append(_Nuisance("torso_kg", (), torso_kg(protocol.reference)))
@@ -401,13 +475,26 @@ def _nuisances(protocol: Protocol) -> list[_Nuisance]:
     return out
 
 
-def calibration_of(windows: Windows, refit: Refit) -> dict[str, dict[str, float]]:
-    """What moved within tolerance: kind → joint or `BODY` → factor, or what is added (N·m, rad, s, kg), see `adjust`."""
+def calibration_of(windows: Windows, refit: Refit, judged: Sequence[int]) -> dict[str, dict[str, float]]:
+    """What moved within tolerance: kind → joint or `BODY` → factor, or what is added (N·m, rad, s, kg), see `adjust`.
+
+    Args:
+        judged: runs on which servos were as warm as those of the model are to be.
+    """
     out: dict[str, dict[str, float]] = {}
+    joints = windows.protocol.joints
     for one, u in zip(windows.names, refit.nuisance, strict=True):
-        for name in [windows.protocol.joints[j] for j in one.joints] or [BODY]:
-            out.setdefault(one.name, {})[name] = float(f"{one.value(float(u)):.6g}")
-    return out
+        value = one.value(float(u))
+        if one.name == HEAT_LOSS:
+            warm = np.mean([windows.protocol.runs[k].warm_c for k in judged], axis=0)
+            for kind in LESS:
+                for joint, left in zip(joints, 1 / (1 + value * warm), strict=True):
+                    if kind in out:
+                        out[kind][joint] *= float(left)
+            continue
+        for name in [joints[j] for j in one.joints] or [BODY]:
+            out.setdefault(one.name, {})[name] = value
+    return {kind: {name: float(f"{value:.6g}") for name, value in values.items()} for kind, values in out.items()}
 
 
 def unmoved(windows: Windows, parts: Iterable[Part], x: Iterable[Mapping[str, float]]) -> Refit:

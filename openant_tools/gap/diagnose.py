@@ -54,6 +54,8 @@ CERTAIN = 0.8
 VANISHED = 0.1
 #: how many causes are looked at, at most and at least; and at least where the log is strange and no cause likely
 SUSPECTS, LIKELIEST, PUZZLED = 5, 3, 7
+#: how many of the likeliest are fitted on the runs whatever they leave; times the least cost beyond which others are not
+LIKELIEST_FITTED, FAR_WORSE = 2, 4.0
 #: probability of a second cause, once the first is taken into account
 SECOND = 0.35
 #: places at which each of them is tried
@@ -340,7 +342,9 @@ def _decide(
     probability = dict(ranked)
     names = list(explained)
     before, floor, (refit,) = closures(windows, [nothing(windows)], held_out, case.training)
-    explained = {name: placed(windows, judgement, one, case.training) for name, one in explained.items()}
+    sited = placed(windows, judgement, explained, case.training)
+    names = _worth_fitting(names, {name: cost for name, (_, cost) in sited.items()})
+    explained = {name: sited[name][0] for name in names}
     _, _, singles = closures(windows, [_start(windows, [explained[name]]) for name in names], held_out, case.training)
     alone = dict(zip(names, singles, strict=True))
     unsettled = 1 - max(one.closed for one in singles) > SETTLED * (1 - refit.closed)
@@ -459,7 +463,7 @@ def _decide(
     confidence = 1 - probability[best] if verdict == NONE else probability[best]
     return _diagnosis(
         case, verdict, confidence, (*effects, *_rest(ranked, order)), selected, ambiguous, gap, removal, judgement,
-        None if verdict == NONE else calibration_of(windows, whole.refit),
+        None if verdict == NONE else calibration_of(windows, whole.refit, held_out or case.training),
     )  # fmt: skip
 
 
@@ -491,6 +495,12 @@ def _seconds(
     chance = {one.part.cause: max(left.probability[one.part.cause], probability[one.part.cause]) for one, _ in look}
     look.sort(key=lambda pair: _rank(chance[pair[0].part.cause], pair[1]), reverse=True)
     return [(known[name], ADDS) for name in told] + [(one, ADDS_MUCH) for one, _ in look[:MORE]]
+
+
+def _worth_fitting(names: Sequence[str], cost: dict[str, float]) -> list[str]:
+    """Of suspects, the most probable first, those that are likely or do not leave far more than the best of them."""
+    least = min(cost.values())
+    return [name for n, name in enumerate(names) if n < LIKELIEST_FITTED or cost[name] < FAR_WORSE * least]
 
 
 def _rivals(
@@ -527,7 +537,8 @@ def _decide_together(
 ) -> Diagnosis:
     """Real servos have several causes at once: where all can be fitted together they are, and what can be spared goes."""
     windows = Windows(case.protocol)
-    fits = SetFits(windows, case.training, list(range(len(case.training), len(case.protocol.runs))))
+    held_out = list(range(len(case.training), len(case.protocol.runs)))
+    fits = SetFits(windows, case.training, held_out)
     probability = dict(ranked)
     late = _late_register(case)
     moving = [name for name in explained if not catalogue()[name].beside_joints]
@@ -597,7 +608,7 @@ def _decide_together(
     return _diagnosis(
         case, verdict, confidence, (*effects, *_rest(ranked, order)), selected, ambiguous, gap,
         {name: choice.removal[name] for name in selected if name in choice.removal}, judgement,
-        None if verdict == NONE else calibration_of(windows, chosen.refit), notes,
+        None if verdict == NONE else calibration_of(windows, chosen.refit, held_out or case.training), notes,
     )  # fmt: skip
 
 

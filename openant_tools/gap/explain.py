@@ -7,6 +7,7 @@ causes are simulated side by side.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -113,14 +114,14 @@ class Scene:
 
 @dataclass
 class _Search:
-    """One cause on its way; u: its coordinates in the order of its quantities."""
+    """One cause on its way; u: its coordinates in the order of its quantities; tangent: how the residual moves with each."""
 
     part: Part
     u: Array
     cost: float = np.inf
     residual: Floats | None = None
     done: bool = False
-    covariance: Array | None = None
+    tangent: Floats | None = None
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
@@ -140,19 +141,18 @@ def fit(scene: Scene, starts: Mapping[Part, Mapping[str, float]]) -> list[Explai
         starts: coordinates from which each of them starts.
     """
     best = [_Search(part, np.array([x[q.name] for q in part.definition.quantities])) for part, x in starts.items()]
-    _evaluate(scene, best)
+    _begin(scene, best)
     damping = np.full(len(best), 1e-3)
     for _ in range(ITERATIONS):
         going = [k for k, search in enumerate(best) if not search.done]
         if not going:
             break
-        tangents = _tangents(scene, [best[k] for k in going])
         tries = []
-        for k, tangent in zip(going, tangents, strict=True):
+        for k in going:
             search = best[k]
             assert search.residual is not None
-            normal, gradient = tangent @ tangent.T, tangent @ search.residual
-            search.covariance = np.linalg.pinv(normal)
+            assert search.tangent is not None
+            normal, gradient = search.tangent @ search.tangent.T, search.tangent @ search.residual
             low, high = _bounds(search)
             moved = []
             for scale in (1.0, 30.0):
@@ -163,17 +163,33 @@ def fit(scene: Scene, starts: Mapping[Part, Mapping[str, float]]) -> list[Explai
             tries.append(moved)
         _evaluate(scene, [one for moved in tries for one in moved])
         for k, moved in zip(going, tries, strict=True):
-            found = min(moved, key=lambda one: one.cost)
+            found, other = sorted(moved, key=lambda one: one.cost)
             search = best[k]
+            tangent = _learnt(_learnt(search, other), found)
             if found.cost < search.cost:
-                found.covariance = search.covariance
                 found.done = (search.cost - found.cost) < ENOUGH * search.cost
                 best[k] = found
                 damping[k] = max(damping[k] / 5, 1e-6)
             else:
                 damping[k] *= 20
                 search.done = damping[k] > 10
+            best[k].tangent = tangent.tangent
     return [_explained(search) for search in best]
+
+
+def _learnt(search: _Search, tried: _Search) -> _Search:
+    """The same with a tangent that foretells what was seen where it was tried, too (Broyden 1965)."""
+    assert search.tangent is not None
+    assert search.residual is not None
+    assert tried.residual is not None
+    # In steps of equal meaning: units differ.
+    scale = np.maximum(np.linalg.norm(search.tangent, axis=1), 1e-12)
+    step = (tried.u - search.u) * scale
+    if not step @ step > 0:
+        return search
+    missed = tried.residual - search.residual - (tried.u - search.u) @ search.tangent
+    tangent = search.tangent + np.outer(step * scale / (step @ step), missed).astype(np.float32)
+    return dataclasses.replace(search, tangent=tangent)
 
 
 def _bounds(search: _Search) -> tuple[Array, Array]:
@@ -195,16 +211,23 @@ def bounds_of(q: Quantity) -> tuple[float, float]:
 def _evaluate(scene: Scene, searches: Sequence[_Search]) -> None:
     residuals = scene.residuals([search.robot(scene.protocol.reference, search.u) for search in searches])
     for search, residual in zip(searches, residuals, strict=True):
-        search.residual, search.cost = residual, float(np.mean(np.square(residual)))
+        _take(search, residual)
 
 
-def _tangents(scene: Scene, searches: Sequence[_Search]) -> list[Floats]:
-    """Of each search (coordinates, features): how the residual moves with each coordinate."""
-    robots, steps = [], []
+def _take(search: _Search, residual: Floats) -> None:
+    search.residual, search.cost = residual, float(np.mean(np.square(residual)))
+
+
+def _begin(scene: Scene, searches: Sequence[_Search]) -> None:
+    """Evaluate searches where they start, and around: (coordinates, features) how the residual moves with each coordinate."""
+    reference = scene.protocol.reference
     floor = any(one.plant.setup is Setup.FLOOR for one in scene.runs)
     share, least = (FLOOR_STEP, FLOOR_LEAST_STEP) if floor else (STEP, LEAST_STEP)
+    robots, steps = [], []
     for search in searches:
         _low, high = _bounds(search)
+        robots.append(search.robot(reference, search.u))
+        mine = []
         for k, q in enumerate(search.quantities):
             # A shape may be small; a share that only says how an effect acts may be nothing.
             smallest = LEAST_SHARE if q.share else 0.0 if q.shape else least * q.small
@@ -213,22 +236,20 @@ def _tangents(scene: Scene, searches: Sequence[_Search]) -> list[Floats]:
                 step = -step
             u = search.u.copy()
             u[k] += step
-            robots.append(search.robot(scene.protocol.reference, u))
-            steps.append(step)
+            robots.append(search.robot(reference, u))
+            mine.append(step)
+        steps.append(mine)
     residuals = scene.residuals(robots)
-    out, at = [], 0
-    for search in searches:
-        n = len(search.u)
-        assert search.residual is not None
-        rows = (residuals[at : at + n] - search.residual) / np.array(steps[at : at + n], np.float32)[:, None]
-        out.append(rows)
-        at += n
-    return out
+    at = 0
+    for search, mine in zip(searches, steps, strict=True):
+        _take(search, residuals[at])
+        around = residuals[at + 1 : at + 1 + len(mine)]
+        search.tangent = (around - residuals[at]) / np.array(mine, np.float32)[:, None]
+        at += 1 + len(mine)
 
 
 def _explained(search: _Search) -> Explained:
-    spread = {}
-    for k, q in enumerate(search.quantities):
-        variance = 0.0 if search.covariance is None else float(search.covariance[k, k]) * max(search.cost, 1.0)
-        spread[q.name] = float(np.sqrt(max(variance, 0.0)))
-    return Explained(search.part, search.point(search.u), spread, search.cost)
+    assert search.tangent is not None
+    covariance = np.linalg.pinv((search.tangent @ search.tangent.T).astype(np.float64)) * max(search.cost, 1.0)
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return Explained(search.part, search.point(search.u), search.point(spread), search.cost)

@@ -7,7 +7,7 @@ moves in every window of every run, and that decides between causes that are muc
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -28,23 +28,35 @@ LEAVES, COUNT, STRENGTHS = 0.9, 2, (0.2, 0.5, 0.8)
 PARTS = (1.0, 0.6)
 
 
-def placed(windows: Windows, judgement: Judgement, one: Explained, training: Sequence[int]) -> Explained:
-    """The same cause where the runs, on the stand and on the floor, say that it sits: at a place that the judge names, or wider.
+def placed(
+    windows: Windows, judgement: Judgement, explained: Mapping[str, Explained], training: Sequence[int]
+) -> dict[str, tuple[Explained, float]]:
+    """The same causes where the runs, on the stand and on the floor, say that they sit: where the judge names, or wider.
 
     What was fitted on the stand alone knows nothing of a joint that carries its load on the floor.
 
     Args:
         windows: on which `nothing` was re-fitted. training: the runs to look at.
+
+    Returns:
+        of each cause where it sits, and the cost that it leaves there.
     """
-    protocol, scopes = windows.protocol, one.part.definition.scopes
+    tried = [other for one in explained.values() for other in _places(windows.protocol, judgement, one)]
+    left = windows.left([unmoved(windows, [other.part], [other.x]) for other in tried], training)
+    out: dict[str, tuple[Explained, float]] = {}
+    for k in np.argsort(left):
+        out.setdefault(tried[k].part.cause, (tried[k], float(left[k])))
+    return {name: out[name] for name in explained}
+
+
+def _places(protocol: Protocol, judgement: Judgement, one: Explained) -> list[Explained]:
+    scopes = one.part.definition.scopes
     named = [(one.part.joints, one.x), *judgement.places[one.part.cause][:NAMED]]
     wider = [tuple(group) for group in protocol.servos()] if Scope.SERVO in scopes else []
     wider += [tuple(range(len(protocol.joints)))] if Scope.ALL in scopes else []
     places = {(where, tuple(x.items())): x for where, x in named}
     places |= {(where, tuple(x.items())): x for where in wider for _, x in named[:WIDER]}
-    tried = [dataclasses.replace(one, part=Part(one.part.cause, where), x=x) for (where, _), x in places.items()]
-    left = windows.left([unmoved(windows, [other.part], [other.x]) for other in tried], training)
-    return tried[int(np.argmin(left))]
+    return [dataclasses.replace(one, part=Part(one.part.cause, where), x=x) for (where, _), x in places.items()]
 
 
 def rivals(

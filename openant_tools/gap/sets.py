@@ -185,7 +185,7 @@ class SetFits:
         if exact:
             errors = self.windows.errors(k, refits)
         else:
-            robots = [self.windows.robot(refit) for refit in refits]
+            robots = [self.windows.robot(refit, k) for refit in refits]
             errors = (
                 self.windows.measured[k][None] - simulate(self._rollouts[k], robots, signals=("pos",)).signals["pos"]
             )
@@ -344,17 +344,17 @@ class SetFits:
 
         Nothing where it moves the joints: there positions judge.
         """
-        robots = []
+        sized = []
         for size in SIZES:
             own = {q.name: x[q.name] * (1.0 if q.shape else size) for q in part.definition.quantities}
-            more = dataclasses.replace(refit, hypothesis=(*refit.hypothesis, part), x=(*refit.x, own))
-            robots.append(self.windows.robot(more))
+            sized.append(dataclasses.replace(refit, hypothesis=(*refit.hypothesis, part), x=(*refit.x, own)))
         runs = sorted({*self.training, *(k for fold in self.folds for k in fold.out)})
         left: dict[str, Array] = {}
         moved = gap = 0.0
         for n, k in enumerate(runs):
             seen = self.windows.protocol.runs[k].seen
             names = [name for name in seen if name != "torque"]  # its scale is not known: it would follow
+            robots = [self.windows.robot(one, k) for one in sized]
             found = simulate(self._rollouts[k], robots, signals=names).signals
             moved += float(np.nansum(np.square(found["pos"][SIZES.index(1.0)] - found["pos"][0])))
             gap += float(np.nansum(np.square(seen["pos"] - found["pos"][:1])))

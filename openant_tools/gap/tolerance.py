@@ -20,6 +20,8 @@ COULOMB_NM, ZERO_RAD, DELAY_S = 0.02, math.radians(0.5), 0.002
 TORSO_KG, TILT_RAD = 0.03, math.radians(0.5)
 #: the same of the floor's contacts; of what only says how their simulation is made, how far it is from any contact's
 FLOOR = {"floor_friction": 0.15, "softness": 0.30, "contact_damping": 0.4, "impratio": math.log(10.0)}
+#: 1/°C by which copper's resistance grows, and with it a motor's torque falls; a case's thermometer is not its winding's
+COPPER = 0.0039
 IMU_RAD, GYRO_RAD_S, ACC_M_S2 = math.radians(1.0), 0.01, 0.1
 #: share of its length by which a link may be longer; Ω of a supply and its cables
 LENGTH, SUPPLY_OHM = 0.01, 0.05
