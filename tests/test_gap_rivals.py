@@ -54,13 +54,13 @@ def weak(tmp_path_factory: pytest.TempPathFactory) -> Windows:
 
 
 def test_what_nobody_suspected_is_found_where_the_best_suspect_sits(weak: Windows) -> None:
-    found = rivals(weak, suspect("viscous_nonlinear", (0,), 0.5), ["viscous_nonlinear"], [0, 1])
+    found = rivals(weak, [suspect("viscous_nonlinear", (0,), 0.5)], ["viscous_nonlinear"], [0, 1])
     assert "torque_limit" in [part.cause for part in found]
     assert all(part.joints == (0,) for part in found)
 
 
 def test_nothing_rivals_the_cause_itself(weak: Windows) -> None:
-    assert rivals(weak, sized("torque_limit", 0.4), ["torque_limit"], [0, 1]) == {}
+    assert rivals(weak, [sized("torque_limit", 0.4)], ["torque_limit"], [0, 1]) == {}
 
 
 def test_a_suspect_is_put_where_the_runs_say(weak: Windows) -> None:

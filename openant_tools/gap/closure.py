@@ -40,6 +40,8 @@ FARTHEST = 2.5
 ITERATIONS = 3
 #: times what slopes foretold that may be left: beyond, they are looked at anew
 FORETOLD = 1.3
+#: of so many windows a first look takes one
+GLANCE = 3
 #: of a tolerance by which it is varied to learn its slope
 NEARBY = 0.3
 #: by which bounds are wider than what lies on them
@@ -215,6 +217,7 @@ class Windows:
         self._rollouts = [Rollouts(one.plant, [one.run], HORIZON_S) for one in protocol.runs]
         coarse = protocol.coarse()
         self._quick = [Rollouts(one.plant, [one.run], HORIZON_S) for one in coarse.runs]
+        self._glance = [Rollouts(one.plant, [one.run], HORIZON_S, every=GLANCE) for one in coarse.runs]
         unsure = [around_switching(one.run, protocol.joints) for one in protocol.runs]
         self.measured = [
             np.where(there, np.nan, one.run.signal("pos", protocol.joints))
@@ -241,15 +244,19 @@ class Windows:
         return robot
 
     def errors(self, k: int, refits: Sequence[Refit | None], *, quick: bool = False) -> Array:
-        """(refits, rows, joints) rad, measured minus simulated on run k."""
-        rollouts = (self._quick if quick else self._rollouts)[k]
+        """(refits, rows, joints) rad, measured minus simulated on run k; `quick`: in larger steps."""
+        return self._errors(k, refits, (self._quick if quick else self._rollouts)[k])
+
+    def _errors(self, k: int, refits: Sequence[Refit | None], rollouts: Rollouts) -> Array:
         robots = [self.robot(refit, k) for refit in refits]
         found = simulate(rollouts, robots, signals=("pos",), warm_c=[self.protocol.runs[k].warm_c]).signals["pos"]
         out: Array = self.measured[k][None] - found.astype(np.float64)
-        begun = min(int(segment.row[0]) for segment in rollouts.segments)
+        there = np.zeros(found.shape[1], bool)
+        for segment in rollouts.segments:
+            there[segment.row] = True
         # A robot that no step holds together is as wrong as can be: neither right nor unknown.
-        lost = ~(np.abs(found[:, begun:]) < LOST_RAD)
-        out[:, begun:][lost & np.isfinite(self.measured[k][begun:])[None]] = LOST_RAD
+        lost = there[:, None] & np.isfinite(self.measured[k]) & ~(np.abs(found) < LOST_RAD)
+        out[lost] = LOST_RAD
         return out
 
     def refit(
@@ -292,13 +299,15 @@ class Windows:
     def left(self, refits: Sequence[Refit], seen: Sequence[int]) -> Array:
         """(refits,) the cost that each would leave, re-fitted within tolerance by the slopes that were learnt without causes.
 
-        A first look at many causes, after a re-fit of `nothing` on these runs.
+        A first look at many causes, at some of the windows, after a re-fit of `nothing` on these runs.
         """
         n, normal = len(self.names), np.diag(np.full(len(self.names), 1 / SPREAD**2))
         gradients, cost = np.zeros((len(refits), n)), np.zeros(len(refits))
         for k in seen:
-            errors = (np.nan_to_num(self.errors(k, refits, quick=True)) * self._weight(k)).reshape(len(refits), -1)
-            slopes = self._learnt[k].astype(np.float64)
+            errors = self._errors(k, refits, self._glance[k])
+            looked = np.isfinite(errors).any(axis=0).ravel()
+            errors = (np.nan_to_num(errors) * self._weight(k)).reshape(len(refits), -1)[:, looked]
+            slopes = self._learnt[k][:, looked].astype(np.float64)
             normal += slopes @ slopes.T
             gradients += errors @ slopes.T
             cost += np.square(errors).sum(axis=1)

@@ -349,7 +349,7 @@ def _decide(
     alone = dict(zip(names, singles, strict=True))
     unsettled = 1 - max(one.closed for one in singles) > SETTLED * (1 - refit.closed)
     if judgement.energy > 1 and unsettled and case.in_time("causes that nobody suspects"):
-        found = _rivals(windows, case, explained, alone, scenes)
+        found = _rivals(windows, case, explained, alone, scenes, probability)
         if found:
             starts = [_start(windows, [one]) for one in found.values()]
             alone |= dict(zip(found, closures(windows, starts, held_out, case.training)[2], strict=True))
@@ -504,15 +504,18 @@ def _worth_fitting(names: Sequence[str], cost: dict[str, float]) -> list[str]:
 
 
 def _rivals(
-    windows: Windows, case: _Case, explained: dict[str, Explained], alone: dict[str, Closure], scenes: dict[Setup, Scene]
+    windows: Windows, case: _Case, explained: dict[str, Explained], alone: dict[str, Closure], scenes: dict[Setup, Scene],
+    probability: dict[str, float],
 ) -> dict[str, Explained]:  # fmt: skip
-    """Causes at the place of the best suspect that would leave less than any, fitted like those."""
+    """Causes that would leave less than any where the suspect sits that leaves least, or the likeliest; fitted like those."""
     suspects = [name for name in explained if moves_joints(catalogue()[name])]
     if not suspects:
         return {}
-    best = min(suspects, key=lambda name: alone[name].after)
-    likely = rivals(windows, explained[best], explained, case.training)
-    return {one.part.cause: one for one in fit(_scene_of(best, scenes), likely)} if likely else {}
+    least = min(suspects, key=lambda name: alone[name].after)
+    likeliest = max(suspects, key=lambda name: _score(probability[name], alone[name]))
+    best = [explained[name] for name in dict.fromkeys((least, likeliest))]
+    found = rivals(windows, best, explained, case.training)
+    return {one.part.cause: one for one in fit(_scene_of(least, scenes), found)} if found else {}
 
 
 def _vanished(refit: Refit) -> bool:

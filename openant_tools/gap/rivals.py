@@ -16,14 +16,13 @@ from openant_tools.gap.closure import Windows, unmoved
 from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Protocol
-from openant_tools.model.plant import Setup
 
 __all__ = ["moves_joints", "paired", "placed", "rivals"]
 
 #: places that the judge names among which the runs choose, and those whose sizes are tried wider
 NAMED, WIDER = 8, 2
 #: share of what a cause leaves that a rival leaves at most; how many of them count, and the sizes (0 … 1) they are tried in
-LEAVES, COUNT, STRENGTHS = 0.9, 2, (0.2, 0.5, 0.8)
+LEAVES, COUNT, STRENGTHS = 0.9, 2, (0.3, 0.7)
 #: shares of the sizes found alone in which two causes are tried together
 PARTS = (1.0, 0.6)
 
@@ -60,34 +59,36 @@ def _places(protocol: Protocol, judgement: Judgement, one: Explained) -> list[Ex
 
 
 def rivals(
-    windows: Windows, best: Explained, known: Collection[str], training: Sequence[int]
+    windows: Windows, best: Sequence[Explained], known: Collection[str], training: Sequence[int]
 ) -> dict[Part, dict[str, float]]:
-    """Causes that nobody suspected and that leave clearly less than the best suspect where that one sits; with their sizes.
+    """Causes that nobody suspected and that leave clearly less than the best suspects where those sit; with their sizes.
 
     Args:
         windows: on which `nothing` was re-fitted. known: causes that are suspected already.
-        training: the runs to look at; of those on the stand, where legs do not move each other, one will do.
+        training: the runs to look at.
     """
-    protocol, joints = windows.protocol, best.part.joints
+    protocol = windows.protocol
     others = [
         (Part(name, joints), start)
+        for joints in dict.fromkeys(one.part.joints for one in best)
         for name, cause in catalogue().items()
         if name not in known
         and moves_joints(cause)
         and _fits(cause, joints, protocol)
         and cause.shows(protocol.reference)
-        for strength in STRENGTHS
-        for start in cause.starts(strength)
+        for turn, strength in enumerate(STRENGTHS)
+        for start in cause.starts(strength, turn, len(STRENGTHS))
     ]
-    stand = [k for k in training if protocol.runs[k].plant.setup is Setup.STAND]
-    refits = [unmoved(windows, [part], [x]) for part, x in [(best.part, best.x), *others]]
-    least, *left = windows.left(refits, (stand or list(training))[:1])
+    tried = [*((one.part, one.x) for one in best), *others]
+    left = windows.left([unmoved(windows, [part], [x]) for part, x in tried], training)
+    least, rest = left[: len(best)].min(), left[len(best) :]
     found: dict[Part, dict[str, float]] = {}
-    for k in np.argsort(left):
+    for k in np.argsort(rest):
         part, start = others[k]
-        if left[k] > LEAVES * least or len(found) == COUNT:
+        if rest[k] > LEAVES * least or len(found) == COUNT:
             break
-        found.setdefault(part, start)
+        if part.cause not in [other.cause for other in found]:
+            found[part] = start
     return found
 
 

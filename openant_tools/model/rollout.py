@@ -103,19 +103,24 @@ class Rollouts:
         runs: recorded runs that command every joint of the plant.
         horizon: seconds between re-initialisations from measurement; None simulates each run from its start.
         nthread: threads; 0 takes all cores.
+        every: of the segments, which are simulated: each so many-th.
 
     Raises:
         BadInput: a run has no row in which all joints were measured, or no commands.
     """
 
-    def __init__(self, plant: Plant, runs: Sequence[Run], horizon: float | None = None, nthread: int = 0) -> None:
+    def __init__(
+        self, plant: Plant, runs: Sequence[Run], horizon: float | None = None, nthread: int = 0, every: int = 1
+    ) -> None:
         self.runs = tuple(runs)
         self.horizon = horizon
         self.nthread = nthread
         ends = np.cumsum([0, *(len(run.t) for run in runs)])
         self.rows = tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(ends))
         segments = [
-            segment for k, run in enumerate(runs) for segment in _segments(plant, run, k, self.rows[k].start, horizon)
+            segment
+            for k, run in enumerate(runs)
+            for segment in _segments(plant, run, k, self.rows[k].start, horizon)[::every]
         ]
         # The longest first, so that those still running are always the first simulations of the batch.
         self._segments = sorted(segments, key=lambda segment: -len(segment.control))
