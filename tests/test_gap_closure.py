@@ -13,7 +13,7 @@ from plants import BENCH, ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, wr
 
 import openant_tools.gap.closure as closure
 from openant_tools.gap.cause import catalogue
-from openant_tools.gap.closure import Refit, Windows, calibration_of, closures, nothing
+from openant_tools.gap.closure import Refit, Windows, calibration_of, closures, heat_loss_of, nothing
 from openant_tools.gap.explain import Part
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.simulation import Log
@@ -77,6 +77,10 @@ def test_a_warm_motor_is_weaker_and_the_refit_says_by_how_much(tmp_path: Path) -
     warmest = calibration_of(windows, left.refit, [2])["stiffness"]["joint"]
     assert warmest == pytest.approx(1 / (1 + loss * 50), rel=0.03)
     assert calibration_of(windows, left.refit, [0])["stiffness"]["joint"] == pytest.approx(1.0, rel=0.03)
+    assert heat_loss_of(windows, left.refit) == pytest.approx(loss, rel=0.15)
+    # One model for the warmest run alone is as good as knowing how warm it was; one for all three is not.
+    assert windows.written(left.refit, [2]) == pytest.approx(left.after, rel=1e-6)
+    assert windows.written(left.refit, [0, 1, 2]) > 2 * left.after
     unmeasured = [
         dataclasses.replace(run, columns={k: v for k, v in run.columns.items() if k != "temp.joint"}) for run in runs
     ]

@@ -25,7 +25,9 @@ from openant_tools.model.gap import HORIZON_S, share_closed
 from openant_tools.model.plant import Setup
 from openant_tools.model.rollout import Rollouts
 
-__all__ = ["BODY", "Closure", "Refit", "Windows", "adjust", "calibration_of", "closures", "nothing", "unmoved"]
+__all__ = [
+    "BODY", "Closure", "Refit", "Windows", "adjust", "calibration_of", "closures", "heat_loss_of", "nothing", "unmoved",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -227,8 +229,12 @@ class Windows:
         self._sigma = np.maximum(self.floor, LEAST_SIGMA_RAD)
         self._learnt: dict[int, Floats] = {}
 
-    def robot(self, refit: Refit | None, k: int) -> Robot:
-        """As it is on run k, where its servos are as warm as they were; None: the model as it was given."""
+    def robot(self, refit: Refit | None, k: int, warm_c: Array | None = None) -> Robot:
+        """As it is on run k; None: the model as it was given.
+
+        Args:
+            warm_c: (joints,) °C above the coolest run; default as warm as its servos were then.
+        """
         reference = self.protocol.reference
         robot = Robot(len(self.protocol.joints), reference.low, reference.high)
         if refit is None:
@@ -236,7 +242,7 @@ class Windows:
         enter(robot, reference, [(p.cause, p.joints, x) for p, x in zip(refit.hypothesis, refit.x, strict=True)])
         for one, u in zip(self.names, refit.nuisance, strict=True):
             if one.name == HEAT_LOSS:
-                left = 1 / (1 + one.value(float(u)) * self.protocol.runs[k].warm_c)
+                left = 1 / (1 + one.value(float(u)) * (self.protocol.runs[k].warm_c if warm_c is None else warm_c))
                 for kind in LESS:
                     robot.factor(kind)[:] *= left
             elif u:
@@ -245,10 +251,21 @@ class Windows:
 
     def errors(self, k: int, refits: Sequence[Refit | None], *, quick: bool = False) -> Array:
         """(refits, rows, joints) rad, measured minus simulated on run k; `quick`: in larger steps."""
-        return self._errors(k, refits, (self._quick if quick else self._rollouts)[k])
+        rollouts = (self._quick if quick else self._rollouts)[k]
+        return self._errors(k, [self.robot(refit, k) for refit in refits], rollouts)
 
-    def _errors(self, k: int, refits: Sequence[Refit | None], rollouts: Rollouts) -> Array:
-        robots = [self.robot(refit, k) for refit in refits]
+    def written(self, refit: Refit, judged: Sequence[int]) -> float:
+        """The gap, rad, on these runs of the one model that can be written: its servos are always as warm as on average there."""
+        warm = self.warmth(judged)
+        errors = np.concatenate([self._errors(k, [self.robot(refit, k, warm)], self._rollouts[k])[0] for k in judged])
+        return float(np.sqrt(np.mean(np.square(errors[np.isfinite(errors)]))))
+
+    def warmth(self, judged: Sequence[int]) -> Array:
+        """(joints,) °C above the coolest run, mean of some runs."""
+        mean: Array = np.mean([self.protocol.runs[k].warm_c for k in judged], axis=0)
+        return mean
+
+    def _errors(self, k: int, robots: Sequence[Robot], rollouts: Rollouts) -> Array:
         found = simulate(rollouts, robots, signals=("pos",), warm_c=[self.protocol.runs[k].warm_c]).signals["pos"]
         out: Array = self.measured[k][None] - found.astype(np.float64)
         there = np.zeros(found.shape[1], bool)
@@ -304,7 +321,7 @@ class Windows:
         n, normal = len(self.names), np.diag(np.full(len(self.names), 1 / SPREAD**2))
         gradients, cost = np.zeros((len(refits), n)), np.zeros(len(refits))
         for k in seen:
-            errors = self._errors(k, refits, self._glance[k])
+            errors = self._errors(k, [self.robot(refit, k) for refit in refits], self._glance[k])
             looked = np.isfinite(errors).any(axis=0).ravel()
             errors = (np.nan_to_num(errors) * self._weight(k)).reshape(len(refits), -1)[:, looked]
             slopes = self._learnt[k][:, looked].astype(np.float64)
@@ -495,15 +512,22 @@ def calibration_of(windows: Windows, refit: Refit, judged: Sequence[int]) -> dic
     for one, u in zip(windows.names, refit.nuisance, strict=True):
         value = one.value(float(u))
         if one.name == HEAT_LOSS:
-            warm = np.mean([windows.protocol.runs[k].warm_c for k in judged], axis=0)
             for kind in LESS:
-                for joint, left in zip(joints, 1 / (1 + value * warm), strict=True):
+                for joint, left in zip(joints, 1 / (1 + value * windows.warmth(judged)), strict=True):
                     if kind in out:
                         out[kind][joint] *= float(left)
             continue
         for name in [joints[j] for j in one.joints] or [BODY]:
             out.setdefault(one.name, {})[name] = value
     return {kind: {name: float(f"{value:.6g}") for name, value in values.items()} for kind, values in out.items()}
+
+
+def heat_loss_of(windows: Windows, refit: Refit) -> float | None:
+    """1/°C of torque that warm servos lose; None where none was warmer in one run than in another."""
+    return next(
+        (one.value(float(u)) for one, u in zip(windows.names, refit.nuisance, strict=True) if one.name == HEAT_LOSS),
+        None,
+    )
 
 
 def unmoved(windows: Windows, parts: Iterable[Part], x: Iterable[Mapping[str, float]]) -> Refit:

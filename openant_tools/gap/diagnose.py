@@ -22,7 +22,16 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.files import atomic_writer
 from openant_tools.gap.cause import Scope, catalogue
-from openant_tools.gap.closure import Closure, Refit, Windows, calibration_of, closures, nothing, unmoved
+from openant_tools.gap.closure import (
+    Closure,
+    Refit,
+    Windows,
+    calibration_of,
+    closures,
+    heat_loss_of,
+    nothing,
+    unmoved,
+)
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found, Span
 from openant_tools.gap.explain import Explained, Part, Scene, fit, robot_with
 from openant_tools.gap.features import Floats
@@ -461,10 +470,25 @@ def _decide(
     gap = {"before": before, "after": before if verdict == NONE else whole.after, "floor": floor, "refit": refit.after}
     removal = {name: beyond[name] for name in selected}
     confidence = 1 - probability[best] if verdict == NONE else probability[best]
+    calibration, notes = None, []
+    if verdict != NONE:
+        calibration = calibration_of(windows, whole.refit, held_out or case.training)
+        notes = _warmth(windows, whole.refit, held_out or case.training)
     return _diagnosis(
         case, verdict, confidence, (*effects, *_rest(ranked, order)), selected, ambiguous, gap, removal, judgement,
-        None if verdict == NONE else calibration_of(windows, whole.refit, held_out or case.training),
+        calibration, notes,
     )  # fmt: skip
+
+
+def _warmth(windows: Windows, refit: Refit, judged: Sequence[int]) -> list[str]:
+    """What a diagnosis that knows how warm servos were has to say to whom a model of one warmth is written."""
+    loss = heat_loss_of(windows, refit)
+    if loss is None:
+        return []
+    return [
+        f"servos lose {100 * loss:.2f} % of their torque per °C; a written model is always as warm as on average here, "
+        f"and leaves {1000 * windows.written(refit, judged):.2f} mrad"
+    ]
 
 
 def _seconds(
@@ -608,6 +632,8 @@ def _decide_together(
         "refit": choice.nothing.after,
     }  # fmt: skip
     confidence = 1 - likely if verdict == NONE else max((probability[name] for name in selected[:1]), default=likely)
+    if verdict != NONE:
+        notes += _warmth(windows, chosen.refit, held_out or case.training)
     return _diagnosis(
         case, verdict, confidence, (*effects, *_rest(ranked, order)), selected, ambiguous, gap,
         {name: choice.removal[name] for name in selected if name in choice.removal}, judgement,
