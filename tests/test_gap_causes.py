@@ -81,6 +81,15 @@ def test_delay_in_the_log_or_in_the_command_is_no_matter_of_motion(model: Path) 
     assert answer.experiments[0].apart < 0.1
 
 
+def test_joint_positions_do_not_show_that_another_sensor_is_late() -> None:
+    late = catalogue()["sensor_delay"]
+    assert late.beside_joints_at({"pos": 0.001, "vel": 0.0, "imu": 0.02})
+    assert not late.beside_joints_at({"pos": 0.02, "vel": 0.0, "imu": 0.02})
+    assert not late.beside_joints_at({"pos": 0.001, "vel": 0.0, "imu": 0.001})
+    assert catalogue()["payload"].beside_joints_at(catalogue()["payload"].starts(0.5)[0])
+    assert not catalogue()["backlash"].beside_joints_at(catalogue()["backlash"].starts(0.5)[0])
+
+
 def test_a_large_motion_tells_a_limit_from_stiffness(model: Path) -> None:
     open_ = diagnosis(
         model, found("stiffness_error", "all", scale=0.6), found("torque_limit", "all", limit=0.3),

@@ -140,6 +140,7 @@ class Cause:
         signal: the signal of the log that it acts on, where that is not the motion itself.
         witness: a signal that shows it beside the motion, and nothing else does.
         silent: whether command and encoder shift alike, so that joint positions hardly show it.
+        unseen: names of quantities that joint positions do not show.
         simpler: the cause that it is no more than at coordinates like these, if it is.
         random: whether it acts at random times: no simulation repeats what happened, and what one closes says little.
         stated: from the quantities to the catalogue's parameters, where those are not the same.
@@ -158,6 +159,7 @@ class Cause:
     signal: str | None = None
     witness: str | None = None
     silent: bool = False
+    unseen: frozenset[str] = frozenset()
     simpler: Callable[[Mapping[str, float]], str | None] = lambda x: None
     random: bool = False
     stated: Callable[[Values, Reference, Ints], dict[str, float]] = lambda values, reference, joints: dict(values)
@@ -174,6 +176,11 @@ class Cause:
     def beside_joints(self) -> bool:
         """Whether joint positions say little of it: it acts on the body, or on another signal of the log."""
         return self.of_body or self.signal is not None or self.silent
+
+    def beside_joints_at(self, x: Mapping[str, float]) -> bool:
+        """Whether joint positions say little of it at these coordinates: what they would show is within tolerance there."""
+        beyond = {q.name for q in self.quantities if not q.shape and abs(x[q.name]) >= q.small}
+        return self.beside_joints or (bool(beyond) and beyond <= self.unseen)
 
     def values(self, x: Mapping[str, float], reference: Reference, joints: Ints) -> dict[str, float]:
         """The parameters at a point of the coordinates."""

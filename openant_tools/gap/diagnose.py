@@ -383,7 +383,7 @@ def _decide(
         refit = min(refit, again, key=lambda one: one.after)
     beyond = {best: whole.closed - refit.closed}
     # Joint positions say little of the body: there closure alone proves nothing that the judge does not half believe.
-    beside = catalogue()[best].beside_joints
+    beside = catalogue()[best].beside_joints_at(alone[best].refit.x[0])
     proves = beyond[best] > ADDS_ALONE or 1 - whole.closed < PROVES * (1 - refit.closed)
     proved = proves and (not beside or probability[best] > SECOND) and not catalogue()[best].random
     if proved:
@@ -400,14 +400,19 @@ def _decide(
         eased = probability[best] > MAYBE and judgement.energy > 1 and left.energy < EASES * judgement.energy
     if left is not None and (max(probability[name] for name in names) > FINDING or proved or eased):
         second = None
-        for one, adds in _seconds(windows, case, scenes, explained, best, probability, left):
+        tried = _seconds(windows, case, scenes, explained, best, probability, left)
+        # What is random only adds its noise to every simulation.
+        fitted = [one for one, _ in tried if not catalogue()[one.part.cause].random]
+        starts = [_start(windows, [explained[best], one]) for one in fitted]
+        pairs = closures(windows, starts, held_out, case.training)[2] if starts else []
+        together = {one.part: both for one, both in zip(fitted, pairs, strict=True)}
+        for one, adds in tried:
             name, chance = one.part.cause, left.probability[one.part.cause]
-            both = whole
-            if not catalogue()[name].random:  # which only adds its noise to every simulation
-                _, _, (both,) = closures(windows, [_start(windows, [explained[best], one])], held_out, case.training)
+            both = together.get(one.part, whole)
             # What moves no joint, or not twice alike, no closure can prove: there the judge's word is enough.
-            silent = not moves_joints(catalogue()[name]) and chance > FINDING
-            much = moves_joints(catalogue()[name]) and 1 - both.closed < PROVES * (1 - whole.closed)
+            moves = moves_joints(catalogue()[name]) and not catalogue()[name].beside_joints_at(both.refit.x[-1])
+            silent = not moves and chance > FINDING
+            much = moves and 1 - both.closed < PROVES * (1 - whole.closed)
             if both.closed > whole.closed + adds or much or (silent and both.closed > whole.closed - ADDS):
                 how = _score(max(chance, probability[name]), both)
                 if second is None or how > second[0]:

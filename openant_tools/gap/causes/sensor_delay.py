@@ -26,6 +26,7 @@ CAUSE = Cause(
     enter=_enter,
     native=True,
     together=True,
+    unseen=frozenset({"vel", "imu"}),
     stated=lambda values, reference, joints: {
         f"{signal}.delay_s": value for signal, value in values.items() if value > 0
     },
