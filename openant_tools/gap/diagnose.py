@@ -454,10 +454,15 @@ def _decide(
         and excess(before, floor) > LARGE * floor
         and whole.closed < EXPLAINS
         and judgement.energy > STRANGE
-        and (probability[best] < CERTAIN or (_vanished(alone[best].refit) and not catalogue()[best].random))
+        and (
+            probability[best] < CERTAIN
+            or (_vanished(alone[best].refit) and not catalogue()[best].random)
+            or (left is not None and left.energy > ODD)
+        )
         and not noisy
     ):
-        # However sure the judge is: what comes out as nothing at all is not what makes the gap. No fit finds what is random.
+        # However sure the judge is: what comes out as nothing at all, or leaves a robot as odd as it was, is not what makes the
+        # gap. No fit finds what is random.
         verdict, selected = UNEXPLAINED, ()
     elif beside and not certain and left is not None and min(judgement.energy, left.energy) > STRANGE:
         # Strange with it, too: a foot that came off is no offset, though nothing known is more like it.
