@@ -59,6 +59,17 @@ def test_a_robot_as_the_model_says_moves_as_its_rollout(setup: Setup) -> None:
     assert set(found) == {"pos", "vel", "torque", "volt", *(COLUMNS if setup is Setup.FLOOR else ())}
 
 
+def test_commands_that_come_by_chance_come_so_to_no_other_robot() -> None:
+    rollouts = Rollouts(load_plant(MODEL, JOINT_NAMES, Setup.STAND), [commanded("stand", 1.0)])
+    late, losing = Robot(8), Robot(8)
+    late.jitter_s = 0.03
+    losing.dropout[:], losing.longest_s = 0.3, 0.1
+    plain, scattered, lost, again = simulate(rollouts, [Robot(8), late, losing, Robot(8)]).signals["pos"]
+    assert np.abs(scattered - plain).max() > 1e-3
+    assert np.abs(lost - plain).max() > 1e-3
+    assert np.array_equal(again, plain)
+
+
 def test_every_cause_of_the_catalogue_shows(protocol: Protocol) -> None:
     strongest: dict[str, Case] = {}
     for case in templates(protocol):

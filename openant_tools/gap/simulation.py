@@ -273,7 +273,9 @@ class _Batch:
                 alike = robot.delay.tobytes(), robot.lag.tobytes()
                 mean = None if _scatters(robot) else known.get(alike)
                 if mean is None:
-                    mean = known[alike] = self._control(segment, robot, edges)
+                    mean = self._control(segment, robot, edges)
+                if not _scatters(robot):
+                    known[alike] = mean
                 out[s, r, :steps] = mean - robot.zero
                 out[s, r, steps:] = out[s, r, steps - 1]
         return out.reshape(-1, longest, len(plant.joints))
