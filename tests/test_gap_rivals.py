@@ -71,12 +71,8 @@ def test_a_suspect_is_put_where_the_runs_say(weak: Windows) -> None:
     judgement = Judgement({}, np.zeros(1), 1.0, {"torque_limit": places})
     there, cost = placed(weak, judgement, {"torque_limit": one}, [0, 1])["torque_limit"]
     assert there.x == near
-    assert (
-        cost
-        < placed(weak, Judgement({}, np.zeros(1), 1.0, {"torque_limit": []}), {"torque_limit": one}, [0, 1])[
-            "torque_limit"
-        ][1]
-    )
+    unnamed = Judgement({}, np.zeros(1), 1.0, {"torque_limit": []})
+    assert cost < placed(weak, unnamed, {"torque_limit": one}, [0, 1])["torque_limit"][1]
 
 
 def test_a_second_cause_is_looked_for_beside_the_first_and_not_where_there_is_none(

@@ -219,7 +219,7 @@ class Windows:
         self._rollouts = [Rollouts(one.plant, [one.run], HORIZON_S) for one in protocol.runs]
         coarse = protocol.coarse()
         self._quick = [Rollouts(one.plant, [one.run], HORIZON_S) for one in coarse.runs]
-        self._glance = [Rollouts(one.plant, [one.run], HORIZON_S, every=GLANCE) for one in coarse.runs]
+        self._glance = [rollouts.thinned(GLANCE) for rollouts in self._quick]
         unsure = [around_switching(one.run, protocol.joints) for one in protocol.runs]
         self.measured = [
             np.where(there, np.nan, one.run.signal("pos", protocol.joints))
@@ -277,18 +277,15 @@ class Windows:
         return out
 
     def refit(
-        self, starts: Sequence[Refit], training: Sequence[int], leave_out: Sequence[int], *, anew: bool = False
+        self, starts: Sequence[Refit], training: Sequence[int], leave_out: Sequence[int]
     ) -> list[tuple[Refit, list[Refit]]]:
         """Fit within tolerance, and polish sizes: each on all the runs to train on, and without each of some of them.
 
         All share one linearisation each, at what is found on all of the training runs; and are simulated side by side.
-
-        Args:
-            anew: look at all slopes with the causes there, too: it costs ten times as much and leaves a little less.
         """
         fitted = list(training)
         # Slopes cost the most: what was learnt without causes does until it fails.
-        learnt = {} if anew else {k: known for k, known in self._learnt.items() if k in fitted}
+        learnt = {k: known for k, known in self._learnt.items() if k in fitted}
         descents = [_Descent.of(start, len(self.names), learnt) for start in starts]
         for _ in range(ITERATIONS):
             self._linearize(descents, fitted)
@@ -423,16 +420,16 @@ class Windows:
 
 
 def closures(
-    windows: Windows, starts: Sequence[Refit], held_out: Sequence[int], training: Sequence[int], *, anew: bool = False
+    windows: Windows, starts: Sequence[Refit], held_out: Sequence[int], training: Sequence[int]
 ) -> tuple[float, float, list[Closure]]:
     """The gap before, the floor (rad), and what each hypothesis leaves.
 
     Args:
         held_out: runs that nothing was fitted on; empty to leave out each in turn.
-        training: the runs to fit on. anew: as `Windows.refit` takes it.
+        training: the runs to fit on.
     """
     judged = list(held_out or training)
-    fits = windows.refit(starts, training, () if held_out else judged, anew=anew)
+    fits = windows.refit(starts, training, () if held_out else judged)
     squares = np.zeros((len(starts) + 1, len(judged)))
     counts = np.zeros(len(judged))
     for n, k in enumerate(judged):
@@ -492,7 +489,7 @@ def _nuisances(protocol: Protocol) -> list[_Nuisance]:
         out.append(_Nuisance("armature", tuple(group), FACTORS["armature"]))
         out.append(_Nuisance("link_mass", tuple(group), FACTORS["link_mass"]))
     out.append(_Nuisance("delay", tuple(joints), DELAY_S))
-    if max(float(one.warm_c.max()) for one in protocol.runs) > WARMED_C:
+    if protocol.warmed_c > WARMED_C:
         out.append(_Nuisance(HEAT_LOSS, tuple(joints), COPPER))
     if protocol.reference.floor:
         out += [_Nuisance(kind, (), tolerance) for kind, tolerance in FLOOR.items()]

@@ -150,7 +150,7 @@ def diagnose(
     judgement = judge.say(case.features)
     first = _shown(judgement, protocol)
     # No template was as warm as this robot was in each run: what a thermometer shows is asked about wherever it may sit.
-    warmed = [HEAT] if max(float(one.warm_c.max()) for one in protocol.runs) > WARMED_C else []
+    warmed = [HEAT] if protocol.warmed_c > WARMED_C else []
     if first[0][1] < DOUBT and judgement.energy < STRANGE and not warmed:
         tell(1.0, "done")
         return _healthy(case, judgement, first)
@@ -349,7 +349,7 @@ def _decide(
     windows = Windows(case.protocol)
     held_out = list(range(len(case.training), len(case.protocol.runs)))
     probability = dict(ranked)
-    names = list(explained)
+    names = sorted(explained, key=lambda name: -probability[name])
     before, floor, (refit,) = closures(windows, [nothing(windows)], held_out, case.training)
     sited = placed(windows, judgement, explained, case.training)
     names = _worth_fitting(names, {name: cost for name, (_, cost) in sited.items()})
@@ -482,8 +482,9 @@ def _decide(
     confidence = 1 - probability[best] if verdict == NONE else probability[best]
     calibration, notes = None, []
     if verdict != NONE:
-        calibration = calibration_of(windows, whole.refit, held_out or case.training)
-        notes = _warmth(windows, whole.refit, held_out or case.training)
+        judged = held_out or case.training
+        calibration = calibration_of(windows, whole.refit, judged)
+        notes = _warmth(windows, whole.refit, judged)
     return _diagnosis(
         case, verdict, confidence, (*effects, *_rest(ranked, order)), selected, ambiguous, gap, removal, judgement,
         calibration, notes,
@@ -758,7 +759,9 @@ def _found(case: _Case, one: Explained, probability: float, closure: Closure | N
             moved = {**x, q.name: x[q.name] + sign * std[q.name]}
             if not q.signed:
                 moved[q.name] = max(moved[q.name], 1e-6)
-            for key, value in stated(moved).items():
+            with np.errstate(over="ignore"):  # of what no run says, an end may be infinite
+                ends = stated(moved)
+            for key, value in ends.items():
                 if key in centre:
                     low[key], high[key] = min(low[key], value), max(high[key], value)
     everything = len(part.joints) == len(case.protocol.joints)

@@ -156,6 +156,11 @@ class Protocol:
         )
         return cls(model, tuple(joints), tuple(played), reference)
 
+    @property
+    def warmed_c(self) -> float:
+        """°C by which any servo was warmer in any run than in its coolest one."""
+        return max(float(one.warm_c.max()) for one in self.runs)
+
     def servos(self) -> list[list[int]]:
         """Groups of joints with servos of one model: as the runs say, else those that the MJCF makes alike."""
         motors = next((one.run.facts.motors for one in self.runs if one.run.facts.motors), {})

@@ -103,24 +103,19 @@ class Rollouts:
         runs: recorded runs that command every joint of the plant.
         horizon: seconds between re-initialisations from measurement; None simulates each run from its start.
         nthread: threads; 0 takes all cores.
-        every: of the segments, which are simulated: each so many-th.
 
     Raises:
         BadInput: a run has no row in which all joints were measured, or no commands.
     """
 
-    def __init__(
-        self, plant: Plant, runs: Sequence[Run], horizon: float | None = None, nthread: int = 0, every: int = 1
-    ) -> None:
+    def __init__(self, plant: Plant, runs: Sequence[Run], horizon: float | None = None, nthread: int = 0) -> None:
         self.runs = tuple(runs)
         self.horizon = horizon
         self.nthread = nthread
         ends = np.cumsum([0, *(len(run.t) for run in runs)])
         self.rows = tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(ends))
         segments = [
-            segment
-            for k, run in enumerate(runs)
-            for segment in _segments(plant, run, k, self.rows[k].start, horizon)[::every]
+            segment for k, run in enumerate(runs) for segment in _segments(plant, run, k, self.rows[k].start, horizon)
         ]
         # The longest first, so that those still running are always the first simulations of the batch.
         self._segments = sorted(segments, key=lambda segment: -len(segment.control))
@@ -131,6 +126,12 @@ class Rollouts:
             self._disable |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
         #: whoever makes variants of this one's model saves a copy of each
         self.plant = replace(plant, model=self.lean(plant.model))
+
+    def thinned(self, every: int) -> Rollouts:
+        """The same with each so many-th of the segments alone: rows of the others are not simulated."""
+        few = copy.copy(self)
+        few._segments, few._batches = self._segments[::every], {}
+        return few
 
     @property
     def steps(self) -> int:
