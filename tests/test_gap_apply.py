@@ -173,7 +173,10 @@ def test_body_and_floor_are_in_the_file(name: str, walk: tuple[Plant, Run], tmp_
     ("kind", "value"),
     [
         ("impratio", 0.1),
+        ("pyramidal_cones", 1.0),
         ("contact_damping", 1.5),
+        ("contact_give", 0.6),
+        ("contact_depth", 1.8),
         ("softness", 1.3),
         ("floor_friction", 0.85),
         ("torso_kg", 0.1),

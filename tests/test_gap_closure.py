@@ -16,8 +16,12 @@ from openant_tools.gap.cause import catalogue
 from openant_tools.gap.closure import Refit, Windows, calibration_of, closures, heat_loss_of, nothing
 from openant_tools.gap.explain import Part
 from openant_tools.gap.protocol import Protocol
-from openant_tools.gap.simulation import Log
-from openant_tools.model.plant import load_plant
+from openant_tools.gap.robot import Robot
+from openant_tools.gap.simulation import Log, simulate
+from openant_tools.model.plant import Setup, load_plant
+from openant_tools.model.rollout import Rollouts
+from openant_tools.recording.run import Facts, Run
+from openant_tools.robot.mjcf import nominal_mjcf
 
 T = 2.0 + np.arange(150) / 50
 
@@ -113,3 +117,62 @@ def test_a_simulation_that_falls_apart_is_wrong_and_not_unknown(
     right, wrong = windows.errors(0, [None, None])
     assert np.nanmax(np.abs(right)) < 0.1
     assert np.nanmin(np.abs(wrong[len(T) // 2 :])) == pytest.approx(closure.LOST_RAD)
+
+
+def walks(folder: Path, robot: Robot) -> Protocol:
+    """Three runs of 3 s of a robot that scrubs its feet over the floor and lifts them, without a measured base."""
+    plant = load_plant(write(folder / "given.xml", nominal_mjcf("standard")), None, Setup.FLOOR)
+    home = np.array([0.0 if joint.startswith("hip") else -0.6 for joint in plant.joints])
+    t = np.arange(150) / 50
+    runs = []
+    for n, speed in enumerate((1.1, 1.4, 1.25)):
+        phase = np.arange(8) * (1.3 + 0.7 * n)
+        reach = np.array([0.35 if joint.startswith("hip") else 0.25 for joint in plant.joints])
+        commands = home + np.minimum(1.0, 2 * t)[:, None] * reach * np.sin(2 * np.pi * speed * t[:, None] + phase)
+        columns = {f"cmd.{joint}": commands[:, j] for j, joint in enumerate(plant.joints)}
+        columns |= {f"pos.{joint}": np.full(len(t), home[j]) for j, joint in enumerate(plant.joints)}
+        run = Run(f"walk-{n}", Facts(joints=plant.joints, setup="floor"), t, columns)
+        seen = simulate(Rollouts(plant, [run]), [robot], signals=["pos"]).signals["pos"][0].astype(float)
+        columns = {**columns, **{f"pos.{joint}": seen[:, j] for j, joint in enumerate(plant.joints)}}
+        runs.append(dataclasses.replace(run, columns=columns))
+    return Protocol.of(runs, plant.path, plant.joints, [None] * 3)
+
+
+def left_of(windows: Windows) -> float:
+    """rad, of the last run, after a re-fit on the others."""
+    *_, (left,) = closures(windows, [nothing(windows)], [2], [0, 1])
+    return left.after
+
+
+@pytest.mark.parametrize("cone", [None, int(mujoco.mjtCone.mjCONE_PYRAMIDAL)])
+def test_feet_meet_the_floor_as_the_runs_say(cone: int | None, tmp_path: Path) -> None:
+    """Contacts are found, and which of MuJoCo's cones they slip by; bases that nobody measured are led by what was found."""
+    robot = Robot(8)
+    robot.contact_give, robot.softness, robot.floor_friction, robot.contact_damping = 0.6, 0.85, 0.9, 0.8
+    robot.cone, robot.impratio = cone, 1.0 if cone is None else 0.15
+    windows = Windows(walks(tmp_path, robot))
+    windows.refit([nothing(windows)], [0, 1], ())
+    before = left_of(windows)
+    windows.settle(nothing(windows), [0, 1])
+    after = left_of(windows)
+    assert windows.cone == cone
+    assert after < 0.8 * before
+    stated = calibration_of(windows, nothing(windows), [2])
+    assert ("pyramidal_cones" in stated) == (cone is not None)
+    assert stated["floor_friction"]["body"] == pytest.approx(0.9, rel=0.05)
+
+
+def test_what_falls_apart_leaves_no_word_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """MuJoCo would write MUJOCO_LOG.TXT wherever a builder happens to be."""
+    monkeypatch.chdir(tmp_path)
+    one = protocol(tmp_path, kp=8.0, dry=0.03).runs[0]
+    wild = Robot(1)
+    wild.factor("armature")[:] = 1e-12
+    wild.factor("stiffness")[:] = 1e15
+    wild.factor("torque_limit")[:] = 1e15
+    sound, found = simulate(Rollouts(one.plant, [one.run]), [Robot(1), wild], signals=["pos"]).signals["pos"]
+    assert np.abs(found - sound).max() > 0.1  # MuJoCo begins such a one anew, again and again
+    assert not list(tmp_path.glob("MUJOCO*"))
+    assert "WARNING" not in "".join(capfd.readouterr())

@@ -15,7 +15,12 @@ from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.rivals import paired, placed, rivals
-from openant_tools.model.plant import load_plant
+from openant_tools.gap.robot import Robot
+from openant_tools.gap.simulation import simulate
+from openant_tools.model.plant import Setup, load_plant
+from openant_tools.model.rollout import Rollouts
+from openant_tools.recording.run import Facts, Run
+from openant_tools.robot.mjcf import nominal_mjcf
 
 T = 2.0 + np.arange(150) / 50
 
@@ -94,3 +99,27 @@ def test_beside_the_best_what_had_neither_size_nor_place_alone_is_tried_where_th
     assert found.part == Part("stiffness_error", (0,))
     assert found.x["scale"] > 10 * vanished.x["scale"]
     assert left < 0.7
+
+
+def test_a_joint_that_is_strained_is_asked_whatever_the_judge_says(tmp_path: Path) -> None:
+    """One hip of the Ant brakes three times as much as the others; the judge knows of all joints alone."""
+    plant = load_plant(write(tmp_path / "given.xml", nominal_mjcf("standard")), None, Setup.STAND)
+    home = np.array([0.0 if joint.startswith("hip") else -0.6 for joint in plant.joints])
+    robot = Robot(8)
+    robot.factor("damping")[2] = 3.0
+    runs = []
+    for n in range(2):
+        commands = home + 0.5 * np.sin(2 * np.pi * (1.5 + n) * (T - T[0])[:, None] + np.arange(8))
+        columns = {f"cmd.{joint}": commands[:, j] for j, joint in enumerate(plant.joints)}
+        columns |= {f"pos.{joint}": np.full(len(T), home[j]) for j, joint in enumerate(plant.joints)}
+        run = Run(f"run-{n}", Facts(joints=plant.joints, setup="stand"), T, columns)
+        seen = simulate(Rollouts(plant, [run]), [robot], signals=["pos"]).signals["pos"][0].astype(float)
+        columns |= {f"pos.{joint}": seen[:, j] for j, joint in enumerate(plant.joints)}
+        runs.append(dataclasses.replace(run, columns=columns))
+    windows = Windows(Protocol.of(runs, plant.path, plant.joints, [None, None]))
+    windows.refit([nothing(windows)], [0, 1], ())
+    assert windows.strained([0, 1]) == [2]
+    everywhere = suspect("damping_error", tuple(range(8)), 0.6)
+    judgement = Judgement({}, np.zeros(1), 1.0, {"damping_error": [(everywhere.part.joints, everywhere.x)]})
+    one, _ = placed(windows, judgement, {"damping_error": everywhere}, [0, 1])["damping_error"]
+    assert one.part.joints == (2,)

@@ -6,9 +6,10 @@ Everything is judged as the gap is defined (formats, section 3): re-initialised 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
@@ -39,17 +40,29 @@ INDEPENDENT_S = 0.5
 POLISH = 0.3
 #: times what it was found to be that a size may become
 FARTHEST = 2.5
-ITERATIONS = 3
+#: and how often slopes are followed; while contacts are found, so often with one base, and how often it is led anew
+ITERATIONS, SETTLES, LED = 3, 2, 2
 #: times what slopes foretold that may be left: beyond, they are looked at anew
 FORETOLD = 1.3
 #: of so many windows a first look takes one
 GLANCE = 3
 #: of a tolerance by which it is varied to learn its slope
 NEARBY = 0.3
+#: times what a re-fit leaves of a servo's other joints that it leaves of a joint which is strained
+STRAINED = 1.5
 #: by which bounds are wider than what lies on them
 TINY = 1e-12
 #: rad: no joint is farther off than in a simulation that fell apart
 LOST_RAD = 10.0
+#: how the kinds of friction cone are called, and the impratio about which it is sought with each: a pyramid needs none of the
+#: stiffness that keeps feet in an elliptic cone from creeping
+CONES = {
+    "pyramidal_cones": int(mujoco.mjtCone.mjCONE_PYRAMIDAL), "elliptic_cones": int(mujoco.mjtCone.mjCONE_ELLIPTIC),
+}  # fmt: skip
+USUAL_IMPRATIO = {CONES["pyramidal_cones"]: 2.0, CONES["elliptic_cones"]: 5.0}
+#: squares of tolerances by which a floor has to be bent before another cone is looked at, and times what is left that it may
+#: leave at first sight; squares of what a position is known to that may be left of a joint and window: more is no foot's
+BENT, ANSWERS, MUCH = 4.0, 2.5, 40.0
 #: what tilts a floor along its x and y, rad
 TILTS = ("tilt_x", "tilt_y")
 #: what a warm motor loses, and °C between runs from which it is asked how much; what of a servo is less by it
@@ -128,6 +141,8 @@ def adjust(robot: Robot, kind: str, joints: Sequence[int], value: float) -> None
         setattr(robot, kind, getattr(robot, kind) * value)
     elif kind == "torso_kg":
         robot.torso_kg += value
+    elif kind in CONES:
+        robot.cone = CONES[kind]
     elif kind in TILTS:
         robot.tilt = robot.tilt + value * np.eye(2)[TILTS.index(kind)]
     else:
@@ -142,7 +157,7 @@ class _Descent:
         u: where it is, sizes of causes, then tolerances. prior, scale: around what, and how far it may go.
         at, least, blocks: where it was best, what it cost there, and of each run cost, normal matrix and gradient there.
         seen: the same where it is now.
-        slopes: of each run, weighted, (coordinates, rows).
+        slopes: of each run, weighted, (coordinates, rows). bends: which of them are other ones wherever it comes to.
     """
 
     start: Refit
@@ -153,6 +168,7 @@ class _Descent:
     steps: Array
     slopes: dict[int, Floats]
     at: Array
+    bends: NDArray[np.bool_]
     least: float = np.inf
     blocks: dict[int, tuple[float, Array, Array]] = dataclasses.field(default_factory=dict)
     seen: dict[int, tuple[float, Array, Array]] = dataclasses.field(default_factory=dict)
@@ -178,6 +194,7 @@ class _Descent:
             np.concatenate([steps, np.full(tolerances, NEARBY)]),
             slopes,
             u,
+            np.array([True] * len(centre) + [False] * tolerances),
         )
 
     def moved(self, members: Iterable[tuple[int, NDArray[np.bool_]]]) -> Array:
@@ -211,14 +228,17 @@ class Windows:
 
     Attributes:
         measured: of each run, (rows, joints) rad; NaN where nobody knows what a servo had in mind (`around_switching`).
+        found: where the last re-fit of `nothing` came to, or `settle`, in tolerances as `names`; 0 before.
+        cone: mjtCone by which feet were found to slip, None as given.
     """
 
     def __init__(self, protocol: Protocol) -> None:
         self.protocol = protocol
         self.names = _nuisances(protocol)
-        self._rollouts = [Rollouts(one.plant, [one.run], HORIZON_S) for one in protocol.runs]
-        coarse = protocol.coarse()
-        self._quick = [Rollouts(one.plant, [one.run], HORIZON_S) for one in coarse.runs]
+        self._coarse = protocol.coarse()
+        self._given = [Rollouts(one.plant, [one.run], HORIZON_S) for one in protocol.runs]
+        self._rollouts = self._given.copy()
+        self._quick = [Rollouts(one.plant, [one.run], HORIZON_S) for one in self._coarse.runs]
         self._glance = [rollouts.thinned(GLANCE) for rollouts in self._quick]
         unsure = [around_switching(one.run, protocol.joints) for one in protocol.runs]
         self.measured = [
@@ -228,6 +248,10 @@ class Windows:
         self.floor = floors([one.run for one in protocol.runs], protocol.joints)[0]
         self._sigma = np.maximum(self.floor, LEAST_SIGMA_RAD)
         self._learnt: dict[int, Floats] = {}
+        self._plain: dict[int, Array] = {}
+        self.found = np.zeros(len(self.names))
+        self.cone: int | None = None
+        self._of_floor = np.array([not one.joints for one in self.names])
 
     def robot(self, refit: Refit | None, k: int, warm_c: Array | None = None) -> Robot:
         """As it is on run k; None: the model as it was given.
@@ -239,6 +263,9 @@ class Windows:
         robot = Robot(len(self.protocol.joints), reference.low, reference.high)
         if refit is None:
             return robot
+        if self.cone is not None:
+            robot.cone = self.cone
+            robot.impratio = self.usual_ratio()
         enter(robot, reference, [(p.cause, p.joints, x) for p, x in zip(refit.hypothesis, refit.x, strict=True)])
         for one, u in zip(self.names, refit.nuisance, strict=True):
             if one.name == HEAT_LOSS:
@@ -252,7 +279,26 @@ class Windows:
     def errors(self, k: int, refits: Sequence[Refit | None], *, quick: bool = False) -> Array:
         """(refits, rows, joints) rad, measured minus simulated on run k; `quick`: in larger steps."""
         rollouts = (self._quick if quick else self._rollouts)[k]
-        return self._errors(k, [self.robot(refit, k) for refit in refits], rollouts)
+        out = self._errors(k, [self.robot(refit, k) for refit in refits], rollouts)
+        if rollouts is not self._given[k] and None in refits:
+            # By a model that is not re-fitted the base comes to somewhere else.
+            out[[refit is None for refit in refits]] = self._errors(k, [self.robot(None, k)], self._given[k])
+        return out
+
+    def lead(self, refit: Refit, *, quick: bool = False) -> None:
+        """Let a base that nobody measured come, at the beginning of each window, to where a re-fitted model takes it.
+
+        Args:
+            quick: only where simulations take larger steps.
+        """
+        for k, (one, coarse) in enumerate(zip(self.protocol.runs, self._coarse.runs, strict=True)):
+            if one.plant.setup is not Setup.FLOOR:
+                continue
+            robot = self.robot(refit, k)
+            self._quick[k] = Rollouts(coarse.plant, [coarse.run], HORIZON_S, leader=robot.model(coarse.plant))
+            self._glance[k] = self._quick[k].thinned(GLANCE)
+            if not quick:
+                self._rollouts[k] = Rollouts(one.plant, [one.run], HORIZON_S, leader=robot.model(one.plant))
 
     def written(self, refit: Refit, judged: Sequence[int]) -> float:
         """The gap, rad, on these runs of the one model that can be written: its servos are always as warm as on average there."""
@@ -284,10 +330,27 @@ class Windows:
         All share one linearisation each, at what is found on all of the training runs; and are simulated side by side.
         """
         fitted = list(training)
+        descents = self._descend(starts, fitted)
+        for one in descents:
+            if not one.causes:
+                self._keep(one)
+        out = []
+        for one in descents:
+            folds = [[block for k, (_, *block) in one.blocks.items() if k != left] for left in leave_out]
+            whole = _from(one.start, one.u)
+            out.append((whole, [_from(one.start, self._solve(one, fold)) for fold in folds]))
+        return out
+
+    def _descend(
+        self, starts: Sequence[Refit], fitted: Sequence[int], turns: int = ITERATIONS, *, settles: bool = False
+    ) -> list[_Descent]:
+        """Follow each start to where it leaves least on these runs; `settles`: contacts bend on their way."""
         # Slopes cost the most: what was learnt without causes does until it fails.
         learnt = {k: known for k, known in self._learnt.items() if k in fitted}
         descents = [_Descent.of(start, len(self.names), learnt) for start in starts]
-        for _ in range(ITERATIONS):
+        for one in descents:
+            one.bends[one.causes :] = settles & self._of_floor
+        for _ in range(turns):
             self._linearize(descents, fitted)
             for k in fitted:
                 if poor := [one for one in descents if one.failed(k)]:
@@ -301,22 +364,82 @@ class Windows:
                     continue
                 one.at, one.least, one.blocks = one.u, one.cost, dict(one.seen)
                 one.u = self._solve(one, [block for _, *block in one.blocks.values()])
-        out = []
-        for one in descents:
-            if not one.causes:
-                self._learnt = dict(one.slopes)
-            folds = [[block for k, (_, *block) in one.blocks.items() if k != left] for left in leave_out]
-            whole = _from(one.start, one.u)
-            out.append((whole, [_from(one.start, self._solve(one, fold)) for fold in folds]))
+        return descents
+
+    def _keep(self, found: _Descent) -> None:
+        """Remember what was learnt of tolerances."""
+        self._learnt = {k: slopes[found.causes :] for k, slopes in found.slopes.items()}
+        self.found = found.u[found.causes :]
+
+    @property
+    def contacts(self) -> Array:
+        """(names,) where floor and body were found to be; 0 of joints."""
+        out: Array = np.where(self._of_floor, self.found, 0.0)
         return out
+
+    def usual_ratio(self) -> float:
+        """The factor on the given impratio that belongs to the cones which were found."""
+        if self.cone is None:
+            return 1.0
+        given = next(one.plant.model.opt.impratio for one in self.protocol.runs if one.plant.setup is Setup.FLOOR)
+        return USUAL_IMPRATIO[self.cone] / float(given)
+
+    def look(self, training: Sequence[int]) -> None:
+        """Learn what tolerances do on these runs, as first looks (`left`) need to know it."""
+        (found,) = self._descend([nothing(self)], training, SETTLES)
+        self._keep(found)
+
+    def settle(self, best: Refit, training: Sequence[int], in_time: Callable[[], bool] = lambda: True) -> None:
+        """Find how feet meet the floor: everything else starts from there, and bases are led by it.
+
+        Feet may slip by the other of MuJoCo's friction cones, too, whatever the given model has.
+
+        Args:
+            best: what leaves least so far; contacts that had to do for a cause would be none of this floor's.
+            in_time: whether there is time to try other cones, asked where they might do better.
+        """
+        floor = [k for k in training if self.protocol.runs[k].plant.setup is Setup.FLOOR]
+        if not floor:
+            return
+        found = self._settled(best, training)
+        (own,) = self.left([found], floor)
+        much = own > MUCH * len(self.protocol.joints) * sum(len(self._glance[k].segments) for k in floor)
+        if much or float(np.square(found.nuisance[self._of_floor]).sum()) < BENT:
+            self.lead(found)
+            return
+        given = int(self.protocol.runs[floor[0]].plant.model.opt.cone)
+        before = self._learnt, self._plain.copy(), self.found
+        self.cone = next(cone for cone in CONES.values() if cone != given)
+        start = dataclasses.replace(found, nuisance=np.where(self._of_floor, 0.0, found.nuisance))
+        self.lead(start, quick=True)
+        if self.left([start], floor)[0] < ANSWERS * own and in_time():
+            self._learnt = {k: known for k, known in self._learnt.items() if k not in floor}
+            other = self._settled(start, training)
+            (others,) = self.left([other], floor)
+            if others < own:
+                self.lead(other)
+                return
+        self.cone = None
+        self._learnt, self._plain, self.found = before
+        self.lead(found)
+
+    def _settled(self, start: Refit, training: Sequence[int]) -> Refit:
+        """Where contacts are found to be, with a base that is led by what was found."""
+        for _ in range(LED):
+            (descent,) = self._descend([start], list(training), SETTLES, settles=True)
+            self._keep(descent)
+            start = _from(start, descent.u)
+            self.lead(start, quick=True)
+        return start
 
     def left(self, refits: Sequence[Refit], seen: Sequence[int]) -> Array:
         """(refits,) the cost that each would leave, re-fitted within tolerance by the slopes that were learnt without causes.
 
         A first look at many causes, at some of the windows, after a re-fit of `nothing` on these runs.
         """
-        n, normal = len(self.names), np.diag(np.full(len(self.names), 1 / SPREAD**2))
-        gradients, cost = np.zeros((len(refits), n)), np.zeros(len(refits))
+        normal = np.diag(np.full(len(self.names), 1 / SPREAD**2))
+        at = np.array([refit.nuisance for refit in refits])
+        gradients, cost = at / SPREAD**2, np.square(at / SPREAD).sum(axis=1)
         for k in seen:
             errors = self._errors(k, [self.robot(refit, k) for refit in refits], self._glance[k])
             looked = np.isfinite(errors).any(axis=0).ravel()
@@ -328,9 +451,24 @@ class Windows:
         root = np.linalg.cholesky(normal)
         out = np.empty(len(refits))
         for r, gradient in enumerate(gradients):
-            u = lsq_linear(root.T, -np.linalg.solve(root, gradient), bounds=(-END, END)).x
+            ends = np.minimum(-END - at[r], 0) - TINY, np.maximum(END - at[r], 0) + TINY
+            u = lsq_linear(root.T, -np.linalg.solve(root, gradient), bounds=ends).x
             out[r] = cost[r] + 2 * gradient @ u + u @ normal @ u
         return out
+
+    def strained(self, seen: Sequence[int]) -> list[int]:
+        """The joint of which the model leaves far more than of others with the same servo, if there is one.
+
+        After a re-fit of `nothing` on these runs.
+        """
+        left = np.sqrt(np.mean([np.square(self._plain[k]) for k in seen], axis=0))
+        share = np.ones(len(left))
+        for group in self.protocol.servos():
+            for j in group:
+                others = [left[i] for i in group if i != j]
+                share[j] = left[j] / np.median(others) if others else 1.0
+        worst = int(np.argmax(share))
+        return [worst] if share[worst] > STRAINED else []
 
     def _weight(self, k: int) -> Array:
         """(joints,) that errors of a run are multiplied by: its rows go together."""
@@ -380,6 +518,8 @@ class Windows:
                 at += 1 + len(mine)
                 left = base.ravel().astype(np.float32)
                 one.slopes[k] = slopes
+                if not one.causes:
+                    self._plain[k] = np.sqrt(np.mean(np.square(base.reshape(-1, base.shape[-1])), axis=0)) / weight
                 one.seen[k] = (
                     float(left.astype(np.float64) @ left),
                     (slopes @ slopes.T).astype(np.float64),
@@ -387,9 +527,11 @@ class Windows:
                 )
 
     def _columns(self, k: int, descent: _Descent) -> list[list[tuple[int, NDArray[np.bool_]]]]:
-        """What is varied on a run. What moves within tolerance moves little: slopes once known are not looked at again."""
+        """What is varied on a run. A joint within tolerance moves little: slopes once known are not looked at again."""
         columns = self._colours(self.protocol.runs[k], descent.start)
-        return columns[: descent.causes] if k in descent.slopes else columns
+        if k not in descent.slopes:
+            return columns
+        return [members for members in columns if descent.bends[members[0][0]]]
 
     def _colours(self, one: Played, start: Refit) -> list[list[tuple[int, NDArray[np.bool_]]]]:
         """Coordinates that one simulation can vary, because on the stand legs do not move each other."""
@@ -474,10 +616,10 @@ def _interval(before: Array, after: Array, counts: Array, floor: float) -> tuple
 
 
 def _nuisances(protocol: Protocol) -> list[_Nuisance]:
-    """What may move within tolerance: per joint what is a joint's, per servo model what is a servo's; and floor and body."""
+    """What may move within tolerance: of each joint, of floor and body."""
     out = []
     joints = range(len(protocol.joints))
-    for kind in ("stiffness", "damping", "torque_limit"):
+    for kind in ("stiffness", "damping", "torque_limit", "armature", "link_mass"):
         if kind != "torque_limit" or np.isfinite(protocol.reference.limit).all():
             out += [_Nuisance(kind, (j,), FACTORS[kind]) for j in joints]
     out += [
@@ -485,9 +627,6 @@ def _nuisances(protocol: Protocol) -> list[_Nuisance]:
         for j in joints
     ]
     out += [_Nuisance("zero_offset", (j,), ZERO_RAD) for j in joints]
-    for group in protocol.servos():
-        out.append(_Nuisance("armature", tuple(group), FACTORS["armature"]))
-        out.append(_Nuisance("link_mass", tuple(group), FACTORS["link_mass"]))
     out.append(_Nuisance("delay", tuple(joints), DELAY_S))
     if protocol.warmed_c > WARMED_C:
         out.append(_Nuisance(HEAT_LOSS, tuple(joints), COPPER))
@@ -506,6 +645,7 @@ def calibration_of(windows: Windows, refit: Refit, judged: Sequence[int]) -> dic
     """
     out: dict[str, dict[str, float]] = {}
     joints = windows.protocol.joints
+    out |= {kind: {BODY: 1.0} for kind, cone in CONES.items() if cone == windows.cone}
     for one, u in zip(windows.names, refit.nuisance, strict=True):
         value = one.value(float(u))
         if one.name == HEAT_LOSS:
@@ -514,6 +654,8 @@ def calibration_of(windows: Windows, refit: Refit, judged: Sequence[int]) -> dic
                     if kind in out:
                         out[kind][joint] *= float(left)
             continue
+        if one.name == "impratio":
+            value *= windows.usual_ratio()
         for name in [joints[j] for j in one.joints] or [BODY]:
             out.setdefault(one.name, {})[name] = value
     return {kind: {name: float(f"{value:.6g}") for name, value in values.items()} for kind, values in out.items()}
@@ -528,13 +670,13 @@ def heat_loss_of(windows: Windows, refit: Refit) -> float | None:
 
 
 def unmoved(windows: Windows, parts: Iterable[Part], x: Iterable[Mapping[str, float]]) -> Refit:
-    """Causes at these coordinates, and nothing moved within tolerance yet."""
-    return Refit(tuple(parts), tuple(x), np.zeros(len(windows.names)))
+    """Causes at these coordinates, and no joint moved within tolerance yet; contacts are where `nothing` left them."""
+    return Refit(tuple(parts), tuple(x), windows.contacts)
 
 
 def nothing(windows: Windows) -> Refit:
-    """No cause at all, only what tolerances let move."""
-    return unmoved(windows, (), ())
+    """No cause at all, only what tolerances let move, from where it was last found to be."""
+    return Refit((), (), windows.found)
 
 
 def _limits(quantity: Quantity, at: float) -> tuple[float, float]:

@@ -101,7 +101,9 @@ TOGETHER = 3
 #: how what is left of the gap counts beside the judge's probability
 LEFT_COUNTS = 8.0
 #: s after the judge has spoken from which no causes are looked for that it does not expect: slow computers have to answer, too
-PATIENCE_S = 75.0
+PATIENCE_S = 65.0
+#: share of that by which what takes long has to be begun
+EARLY = 0.5
 #: of what is kept beside a preparation: another where judges are taught otherwise
 FORM = 2
 
@@ -201,9 +203,13 @@ class _Case:
     begun: float = dataclasses.field(default_factory=time.monotonic)
     given_up: list[str] = dataclasses.field(default_factory=list)
 
-    def in_time(self, wanted: str) -> bool:
-        """Whether there is time for what is wanted; if not, the diagnosis will say so."""
-        if time.monotonic() <= self.begun + PATIENCE_S:
+    def in_time(self, wanted: str, share: float = 1.0) -> bool:
+        """Whether there is time for what is wanted; if not, the diagnosis will say so.
+
+        Args:
+            share: of the time there is, by which it has to be begun.
+        """
+        if time.monotonic() <= self.begun + share * PATIENCE_S:
             return True
         self.given_up.append(wanted)
         return False
@@ -350,17 +356,22 @@ def _decide(
     held_out = list(range(len(case.training), len(case.protocol.runs)))
     probability = dict(ranked)
     names = sorted(explained, key=lambda name: -probability[name])
-    before, floor, (refit,) = closures(windows, [nothing(windows)], held_out, case.training)
+    windows.look(case.training)
     sited = placed(windows, judgement, explained, case.training)
     names = _worth_fitting(names, {name: cost for name, (_, cost) in sited.items()})
+    most = min(sited.values(), key=lambda one: one[1])[0]
+    windows.settle(
+        _start(windows, [most], case.training), case.training, lambda: case.in_time("other friction cones", EARLY)
+    )
     explained = {name: sited[name][0] for name in names}
-    _, _, singles = closures(windows, [_start(windows, [explained[name]]) for name in names], held_out, case.training)
+    starts = [nothing(windows), *(_start(windows, [explained[name]], case.training) for name in names)]
+    before, floor, (refit, *singles) = closures(windows, starts, held_out, case.training)
     alone = dict(zip(names, singles, strict=True))
     unsettled = 1 - max(one.closed for one in singles) > SETTLED * (1 - refit.closed)
     if judgement.energy > 1 and unsettled and case.in_time("causes that nobody suspects"):
         found = _rivals(windows, case, explained, alone, scenes, probability)
         if found:
-            starts = [_start(windows, [one]) for one in found.values()]
+            starts = [_start(windows, [one], case.training) for one in found.values()]
             alone |= dict(zip(found, closures(windows, starts, held_out, case.training)[2], strict=True))
             explained = {**explained, **found}
             names += found
@@ -403,7 +414,7 @@ def _decide(
         tried = _seconds(windows, case, scenes, explained, best, probability, left)
         # What is random only adds its noise to every simulation.
         fitted = [one for one, _ in tried if not catalogue()[one.part.cause].random]
-        starts = [_start(windows, [explained[best], one]) for one in fitted]
+        starts = [_start(windows, [explained[best], one], case.training) for one in fitted]
         pairs = closures(windows, starts, held_out, case.training)[2] if starts else []
         together = {one.part: both for one, both in zip(fitted, pairs, strict=True)}
         for one, adds in tried:
@@ -736,8 +747,13 @@ def _notes(case: _Case) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _start(windows: Windows, explained: Sequence[Explained]) -> Refit:
-    return unmoved(windows, (one.part for one in explained), (one.x for one in explained))
+def _start(windows: Windows, explained: Sequence[Explained], seen: Sequence[int]) -> Refit:
+    """Where a re-fit with causes starts: contacts as without any, or as given where causes of the body leave less so."""
+    start = unmoved(windows, (one.part for one in explained), (one.x for one in explained))
+    if not any(one.part.definition.of_body for one in explained):
+        return start
+    both = [start, dataclasses.replace(start, nuisance=np.zeros_like(start.nuisance))]
+    return both[int(np.argmin(windows.left(both, seen)))]
 
 
 def _found(case: _Case, one: Explained, probability: float, closure: Closure | None) -> Found:

@@ -371,6 +371,9 @@ def _body(root: Element, plant: Plant, robot: Robot, done: Edit) -> None:
     if robot.impratio != 1:
         # Of the compiled variant, which had it too, only its elements are written.
         _last(root, "option").set("impratio", number(float(plant.model.opt.impratio) * robot.impratio))
+    if robot.cone is not None:
+        elliptic = robot.cone == int(mujoco.mjtCone.mjCONE_ELLIPTIC)
+        _last(root, "option").set("cone", "elliptic" if elliptic else "pyramidal")
     _cable(root, torso, plant, robot)
 
 

@@ -239,8 +239,15 @@ def worst(found: Diagnosis, runs: Sequence[Run], model: Path) -> MatplotlibFigur
     best: tuple[float, Run, int, int, Array] | None = None
     for run in runs:
         plant = load_plant(own_model(run) or model, joints, setup_of(run.facts.setup))
-        robots = [Robot(len(joints)), robot_of(plant, selected, found.calibration)]
-        both = simulate(Rollouts(plant, [run], HORIZON_S), robots, signals=["pos"]).signals["pos"].astype(np.float64)
+        improved = robot_of(plant, selected, found.calibration)
+        # Each is led by itself to where a window begins.
+        leads = (Robot(len(joints)), None), (improved, improved.model(plant))
+        both = np.concatenate(
+            [
+                simulate(Rollouts(plant, [run], HORIZON_S, leader=leader), [robot], signals=["pos"]).signals["pos"]
+                for robot, leader in leads
+            ]
+        ).astype(np.float64)
         error = np.abs(np.nan_to_num(run.signal("pos", joints) - both[0]))
         row, j = divmod(int(error.argmax()), len(joints))
         if best is None or error[row, j] > best[0]:

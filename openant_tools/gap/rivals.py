@@ -21,6 +21,8 @@ __all__ = ["moves_joints", "paired", "placed", "rivals"]
 
 #: places that the judge names among which the runs choose, and those whose sizes are tried wider
 NAMED, WIDER = 8, 2
+#: times the least cost at all its places that a body's cause may leave where it was fitted: there windows of joints say little
+UNDECIDED = 1.5
 #: share of what a cause leaves that a rival leaves at most; how many of them count, and the sizes (0 … 1) they are tried in
 LEAVES, COUNT, STRENGTHS = 0.9, 2, (0.3, 0.7)
 #: shares of the sizes found alone in which two causes are tried together
@@ -40,37 +42,50 @@ def placed(
     Returns:
         of each cause where it sits, and the cost that it leaves there.
     """
-    tried = [other for one in explained.values() for other in _places(windows.protocol, judgement, one)]
+    strained = windows.strained(training)
+    tried = [
+        other for one in explained.values() for other in [one, *_places(windows.protocol, judgement, one, strained)]
+    ]
     left = windows.left([unmoved(windows, [other.part], [other.x]) for other in tried], training)
     out: dict[str, tuple[Explained, float]] = {}
     for k in np.argsort(left):
         out.setdefault(tried[k].part.cause, (tried[k], float(left[k])))
+    for one, cost in zip(tried, left, strict=True):
+        name = one.part.cause
+        if one is explained[name] and catalogue()[name].beside_joints and cost < UNDECIDED * out[name][1]:
+            out[name] = one, float(cost)
     return {name: out[name] for name in explained}
 
 
-def _places(protocol: Protocol, judgement: Judgement, one: Explained) -> list[Explained]:
+def _places(protocol: Protocol, judgement: Judgement, one: Explained, strained: Sequence[int]) -> list[Explained]:
+    """Where else it may sit than where it was fitted."""
     scopes = one.part.definition.scopes
     named = [(one.part.joints, one.x), *judgement.places[one.part.cause][:NAMED]]
     wider = [tuple(group) for group in protocol.servos()] if Scope.SERVO in scopes else []
+    wider += [(j,) for j in strained] if Scope.JOINT in scopes else []
     wider += [tuple(range(len(protocol.joints)))] if Scope.ALL in scopes else []
     places = {(where, tuple(x.items())): x for where, x in named}
     places |= {(where, tuple(x.items())): x for where in wider for _, x in named[:WIDER]}
+    del places[one.part.joints, tuple(one.x.items())]
     return [dataclasses.replace(one, part=Part(one.part.cause, where), x=x) for (where, _), x in places.items()]
 
 
 def rivals(
     windows: Windows, best: Sequence[Explained], known: Collection[str], training: Sequence[int]
 ) -> dict[Part, dict[str, float]]:
-    """Causes that nobody suspected and that leave clearly less than the best suspects where those sit; with their sizes.
+    """Causes that nobody suspected and that leave clearly less than the best suspects, where those sit or a joint is strained.
 
     Args:
         windows: on which `nothing` was re-fitted. known: causes that are suspected already.
         training: the runs to look at.
+
+    Returns:
+        their sizes.
     """
     protocol = windows.protocol
     others = [
         (Part(name, joints), start)
-        for joints in dict.fromkeys(one.part.joints for one in best)
+        for joints in dict.fromkeys([one.part.joints for one in best] + [(j,) for j in windows.strained(training)])
         for name, cause in catalogue().items()
         if name not in known
         and moves_joints(cause)

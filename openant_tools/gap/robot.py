@@ -152,7 +152,8 @@ class Robot:
             begins; warming_c: more from run to run.
         laws: (effect, parameter) → values of the effects that act between steps (`openant_tools.effects`).
         payload_kg, payload_m: (3,) in the torso's frame. torso_kg: added to it.
-        floor_friction, softness, contact_damping, impratio: factors; the last on how much stiffer friction is than contact.
+        floor_friction, softness, contact_damping, contact_give, contact_depth, impratio: factors; `give` on how far from rigid
+            contacts are (solimp), the last on how much stiffer friction is than contact. cone: mjtCone, None as given.
         adhesion_n: force of each foot. tilt: (2,) rad, how far downhill lies along the floor's x and y.
         jitter_s: deviation of when a command acts. dropout: share of commands lost, (joints,); longest_s: at a stretch.
         shared_dropout: all joints lose the same commands.
@@ -190,7 +191,10 @@ class Robot:
     floor_friction: float = 1.0
     softness: float = 1.0
     contact_damping: float = 1.0
+    contact_give: float = 1.0
+    contact_depth: float = 1.0
     impratio: float = 1.0
+    cone: int | None = None
     adhesion_n: float = 0.0
     tilt: Array = field(default_factory=lambda: np.zeros(2))
     cable: Cable = field(default_factory=Cable)
@@ -267,7 +271,14 @@ class Robot:
         for solref, at in ((model.geom_solref, contacts.geoms), (model.pair_solref, contacts.pairs)):
             standard = solref[at, :1] > 0  # else it holds stiffness and damping themselves
             solref[at] *= np.where(standard, [self.softness, self.contact_damping], 1.0)
+        for solimp, at in ((model.geom_solimp, contacts.geoms), (model.pair_solimp, contacts.pairs)):
+            if self.contact_give == self.contact_depth == 1.0:
+                break
+            solimp[at, :2] = 1 - (1 - solimp[at, :2]) * self.contact_give
+            solimp[at, 2] *= self.contact_depth
         model.opt.impratio *= self.impratio
+        if self.cone is not None:
+            model.opt.cone = self.cone
         if self.form is not None:
             self._contact_form(model, contacts.geoms)
         if self.adhesion_n:

@@ -19,7 +19,10 @@ FACTORS = {"stiffness": 0.15, "torque_limit": 0.15, "damping": 0.25, "armature":
 COULOMB_NM, ZERO_RAD, DELAY_S = 0.02, math.radians(0.5), 0.002
 TORSO_KG, TILT_RAD = 0.03, math.radians(0.5)
 #: the same of the floor's contacts; of what only says how their simulation is made, how far it is from any contact's
-FLOOR = {"floor_friction": 0.15, "softness": 0.30, "contact_damping": 0.4, "impratio": math.log(10.0)}
+FLOOR = {
+    "floor_friction": 0.15, "softness": 0.30, "contact_damping": 0.4, "contact_give": 0.6, "contact_depth": 0.6,
+    "impratio": math.log(10.0),
+}  # fmt: skip
 #: 1/°C by which copper's resistance grows, and with it a motor's torque falls; a case's thermometer is not its winding's
 COPPER = 0.0039
 IMU_RAD, GYRO_RAD_S, ACC_M_S2 = math.radians(1.0), 0.01, 0.1

@@ -103,19 +103,26 @@ class Rollouts:
         runs: recorded runs that command every joint of the plant.
         horizon: seconds between re-initialisations from measurement; None simulates each run from its start.
         nthread: threads; 0 takes all cores.
+        leader: a variant of the plant's model by which a base that nobody measured is led along; default that model.
 
     Raises:
         BadInput: a run has no row in which all joints were measured, or no commands.
     """
 
-    def __init__(self, plant: Plant, runs: Sequence[Run], horizon: float | None = None, nthread: int = 0) -> None:
+    def __init__(
+        self, plant: Plant, runs: Sequence[Run], horizon: float | None = None, nthread: int = 0,
+        leader: mujoco.MjModel | None = None,
+    ) -> None:  # fmt: skip
         self.runs = tuple(runs)
         self.horizon = horizon
         self.nthread = nthread
         ends = np.cumsum([0, *(len(run.t) for run in runs)])
         self.rows = tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(ends))
+        leads = plant if leader is None else replace(plant, model=leader)
         segments = [
-            segment for k, run in enumerate(runs) for segment in _segments(plant, run, k, self.rows[k].start, horizon)
+            segment
+            for k, run in enumerate(runs)
+            for segment in _segments(plant, leads, run, k, self.rows[k].start, horizon)
         ]
         # The longest first, so that those still running are always the first simulations of the batch.
         self._segments = sorted(segments, key=lambda segment: -len(segment.control))
@@ -296,7 +303,7 @@ def _measured_around(t: Array, pos: Array, row: int, span: float, neighbours: in
     return rows
 
 
-def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | None) -> list[Segment]:
+def _segments(plant: Plant, leads: Plant, run: Run, index: int, offset: int, horizon: float | None) -> list[Segment]:
     t, pos = run.t, run.signal("pos", plant.joints)
     cmd = _held(run.signal("cmd", plant.joints))
     if cmd is None:
@@ -319,7 +326,7 @@ def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | 
     commands = Staircase.of(run.command_times, cmd)
     slewing = np.array([_limits_slew(model, int(i)) for i in plant.actuator])
     rest = _at_rest(model)
-    bases = _led(plant, run, starts, pos, commands)
+    bases = _led(leads, run, starts, pos, commands)
     segments = []
     for n, (first, stop) in enumerate(zip(starts, [*starts[1:], len(t)], strict=True)):
         # The row at which the next segment starts belongs to that one.
@@ -341,7 +348,7 @@ def _segments(plant: Plant, run: Run, index: int, offset: int, horizon: float | 
             Segment(
                 run=index,
                 first=first,
-                state=_initial_state(plant, run, first, pos[first], velocity, setpoint[0], bases[n] if n else None),
+                state=_initial_state(leads, run, first, pos[first], velocity, setpoint[0], bases[n] if n else None),
                 control=control,
                 step=step,
                 fraction=np.clip(at - step, 0.0, 1.0),
