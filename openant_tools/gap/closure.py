@@ -61,7 +61,7 @@ CONES = {
 }  # fmt: skip
 USUAL_IMPRATIO = {CONES["pyramidal_cones"]: 2.0, CONES["elliptic_cones"]: 5.0}
 #: squares of tolerances by which a floor has to be bent before another cone is looked at, and times what is left that it may
-#: leave at first sight; squares of what a position is known to that may be left of a joint and window: more is no foot's
+#: leave at first sight; squares of what a position is known to beyond which what is left of a joint and window is seldom a foot's
 BENT, ANSWERS, MUCH = 4.0, 2.5, 40.0
 #: what tilts a floor along its x and y, rad
 TILTS = ("tilt_x", "tilt_y")
@@ -228,7 +228,7 @@ class Windows:
 
     Attributes:
         measured: of each run, (rows, joints) rad; NaN where nobody knows what a servo had in mind (`around_switching`).
-        found: where the last re-fit of `nothing` came to, or `settle`, in tolerances as `names`; 0 before.
+        found: where `settle` came to, before that a re-fit of `nothing`, in tolerances as `names`; 0 before either.
         cone: mjtCone by which feet were found to slip, None as given.
     """
 
@@ -251,6 +251,7 @@ class Windows:
         self._plain: dict[int, Array] = {}
         self.found = np.zeros(len(self.names))
         self.cone: int | None = None
+        self._settled_once = False
         self._of_floor = np.array([not one.joints for one in self.names])
 
     def robot(self, refit: Refit | None, k: int, warm_c: Array | None = None) -> Robot:
@@ -332,7 +333,7 @@ class Windows:
         fitted = list(training)
         descents = self._descend(starts, fitted)
         for one in descents:
-            if not one.causes:
+            if not one.causes and not self._settled_once:
                 self._keep(one)
         out = []
         for one in descents:
@@ -401,18 +402,19 @@ class Windows:
         floor = [k for k in training if self.protocol.runs[k].plant.setup is Setup.FLOOR]
         if not floor:
             return
+        self._settled_once = True
         found = self._settled(best, training)
         (own,) = self.left([found], floor)
-        much = own > MUCH * len(self.protocol.joints) * sum(len(self._glance[k].segments) for k in floor)
-        if much or float(np.square(found.nuisance[self._of_floor]).sum()) < BENT:
+        if float(np.square(found.nuisance[self._of_floor]).sum()) < BENT:
             self.lead(found)
             return
+        much = own > MUCH * len(self.protocol.joints) * sum(len(self._glance[k].segments) for k in floor)
         given = int(self.protocol.runs[floor[0]].plant.model.opt.cone)
         before = self._learnt, self._plain.copy(), self.found
         self.cone = next(cone for cone in CONES.values() if cone != given)
         start = dataclasses.replace(found, nuisance=np.where(self._of_floor, 0.0, found.nuisance))
         self.lead(start, quick=True)
-        if self.left([start], floor)[0] < ANSWERS * own and in_time():
+        if self.left([start], floor)[0] < (1 if much else ANSWERS) * own and in_time():
             self._learnt = {k: known for k, known in self._learnt.items() if k not in floor}
             other = self._settled(start, training)
             (others,) = self.left([other], floor)
@@ -670,7 +672,7 @@ def heat_loss_of(windows: Windows, refit: Refit) -> float | None:
 
 
 def unmoved(windows: Windows, parts: Iterable[Part], x: Iterable[Mapping[str, float]]) -> Refit:
-    """Causes at these coordinates, and no joint moved within tolerance yet; contacts are where `nothing` left them."""
+    """Causes at these coordinates, and no joint moved within tolerance yet; contacts are where they were found."""
     return Refit(tuple(parts), tuple(x), windows.contacts)
 
 

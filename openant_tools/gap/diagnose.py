@@ -10,7 +10,7 @@ import dataclasses
 import hashlib
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -63,6 +63,8 @@ CERTAIN = 0.8
 VANISHED = 0.1
 #: how many causes are looked at, at most and at least; and at least where the log is strange and no cause likely
 SUSPECTS, LIKELIEST, PUZZLED = 5, 3, 7
+#: share of what is left without any cause that a first look leaves with one which contacts are fitted beside
+CLEARLY = 0.75
 #: how many of the likeliest are fitted on the runs whatever they leave; times the least cost beyond which others are not
 LIKELIEST_FITTED, FAR_WORSE = 2, 4.0
 #: probability of a second cause, once the first is taken into account
@@ -359,10 +361,10 @@ def _decide(
     windows.look(case.training)
     sited = placed(windows, judgement, explained, case.training)
     names = _worth_fitting(names, {name: cost for name, (_, cost) in sited.items()})
-    most = min(sited.values(), key=lambda one: one[1])[0]
     windows.settle(
-        _start(windows, [most], case.training), case.training, lambda: case.in_time("other friction cones", EARLY)
-    )
+        _beside(windows, sited.values(), case.training), case.training,
+        lambda: case.in_time("other friction cones", EARLY),
+    )  # fmt: skip
     explained = {name: sited[name][0] for name in names}
     starts = [nothing(windows), *(_start(windows, [explained[name]], case.training) for name in names)]
     before, floor, (refit, *singles) = closures(windows, starts, held_out, case.training)
@@ -745,6 +747,13 @@ def _notes(case: _Case) -> tuple[str, ...]:
     if "volt" not in seen:
         notes.append("no voltage: a sagging supply looks like weak motors")
     return tuple(notes)
+
+
+def _beside(windows: Windows, sited: Iterable[tuple[Explained, float]], seen: Sequence[int]) -> Refit:
+    """What is there while it is found out how feet meet the floor: the cause that leaves least, if it leaves clearly less."""
+    least, cost = min(sited, key=lambda one: one[1])
+    (plain,) = windows.left([nothing(windows)], seen)
+    return _start(windows, [least], seen) if cost < CLEARLY * plain else nothing(windows)
 
 
 def _start(windows: Windows, explained: Sequence[Explained], seen: Sequence[int]) -> Refit:
