@@ -268,19 +268,15 @@ class Robot:
         contacts = floor_contacts(model)
         model.geom_friction[contacts.geoms, 0] *= self.floor_friction
         model.pair_friction[contacts.pairs, :2] *= self.floor_friction
-        for solref, at in ((model.geom_solref, contacts.geoms), (model.pair_solref, contacts.pairs)):
-            standard = solref[at, :1] > 0  # else it holds stiffness and damping themselves
-            solref[at] *= np.where(standard, [self.softness, self.contact_damping], 1.0)
-        for solimp, at in ((model.geom_solimp, contacts.geoms), (model.pair_solimp, contacts.pairs)):
-            if self.contact_give == self.contact_depth == 1.0:
-                break
-            solimp[at, :2] = 1 - (1 - solimp[at, :2]) * self.contact_give
-            solimp[at, 2] *= self.contact_depth
+        mine = self.softness, self.contact_damping, self.contact_give, self.contact_depth
+        _soften(model.geom_solref, model.geom_solimp, contacts.geoms, *mine)
+        _soften(model.pair_solref, model.pair_solimp, contacts.pairs, *mine)
         model.opt.impratio *= self.impratio
         if self.cone is not None:
             model.opt.cone = self.cone
-        if self.form is not None:
-            self._contact_form(model, contacts.geoms)
+        if (form := self.form) is not None:
+            like = 1.0, form.contact_damping, form.contact_give, form.contact_depth
+            _soften(model.geom_solref, model.geom_solimp, contacts.geoms, *like)
         if self.adhesion_n:
             # Where the floor has priority, it alone decides what its contacts are like.
             model.flg_adhesion = True
@@ -288,12 +284,16 @@ class Robot:
         if self.tilt.any():
             model.opt.gravity[:] = tilted(plant.model.opt.gravity, self.tilt)
 
-    def _contact_form(self, model: mujoco.MjModel, geoms: NDArray[np.int64]) -> None:
-        assert self.form is not None
-        standard = model.geom_solref[geoms, 0] > 0  # else it holds stiffness and damping themselves
-        model.geom_solref[geoms, 1] *= np.where(standard, self.form.contact_damping, 1.0)
-        model.geom_solimp[geoms, :2] = 1 - (1 - model.geom_solimp[geoms, :2]) * self.form.contact_give
-        model.geom_solimp[geoms, 2] *= self.form.contact_depth
+
+def _soften(
+    solref: Array, solimp: Array, at: NDArray[np.int64], softness: float, damping: float, give: float, depth: float
+) -> None:
+    """Multiply what contacts are like, in place: time constant, damping ratio, how far from rigid, and how deep that is reached."""
+    standard = solref[at, :1] > 0  # else it holds stiffness and damping themselves
+    solref[at] *= np.where(standard, [softness, damping], 1.0)
+    if give != 1:  # else nothing is rounded
+        solimp[at, :2] = 1 - (1 - solimp[at, :2]) * give
+    solimp[at, 2] *= depth
 
 
 def _stretch(model: mujoco.MjModel, bodies: NDArray[np.int64], factor: float) -> None:
