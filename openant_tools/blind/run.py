@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -78,7 +79,9 @@ def run_set(
     if not todo:
         return 0
     # Who is to help is asked for first: the first robot may take half an hour.
-    with _fan_out(backend, jobs, scheduler):
+    with _fan_out(backend, jobs, scheduler), warnings.catch_warnings():
+        # That a process which has grown is replaced is no one's concern.
+        warnings.filterwarnings("ignore", "A worker stopped", UserWarning)
         progress(todo[0].name, 0.0)
         _judge(folder, todo[0], diagnose, True)
         progress(todo[0].name, 1 / len(todo))
