@@ -27,7 +27,7 @@ from openant_tools.model.plant import Setup
 from openant_tools.model.rollout import Rollouts
 
 __all__ = [
-    "BODY", "Closure", "Refit", "Windows", "adjust", "calibration_of", "closures", "heat_loss_of", "nothing", "unmoved",
+    "BODY", "Closure", "ClosureByJoint", "Refit", "Windows", "adjust", "calibration_of", "closures", "heat_loss_of", "nothing", "unmoved",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -44,8 +44,10 @@ FARTHEST = 2.5
 ITERATIONS, SETTLES, LED = 3, 2, 2
 #: times what slopes foretold that may be left: beyond, they are looked at anew
 FORETOLD = 1.3
-#: of so many windows a first look takes one
-GLANCE = 3
+#: of so many windows fits follow one, on the stand and on the floor, where each takes long and all joints move each; and of so
+#: many a first look takes one
+FOLLOWED = {Setup.STAND: 1, Setup.FLOOR: 2}
+GLANCE = {Setup.STAND: 3, Setup.FLOOR: 4}
 #: of a tolerance by which it is varied to learn its slope
 NEARBY = 0.3
 #: times what a re-fit leaves of a servo's other joints that it leaves of a joint which is strained
@@ -102,6 +104,23 @@ class Closure:
     high: float
     worst: float
     refit: Refit
+
+
+@dataclass(frozen=True)
+class ClosureByJoint(Closure):
+    """The same where it is known of each joint.
+
+    Attributes:
+        joints: (2, joints) rad², mean squares before and after. floor: rad.
+    """
+
+    joints: Array
+    floor: float
+
+    def closed_at(self, joints: Sequence[int]) -> float:
+        """The share that is gone of the excess of some joints."""
+        before, after = np.sqrt(self.joints[:, list(joints)].mean(axis=1))
+        return _closed(float(before), float(after), self.floor)
 
 
 @dataclass(frozen=True)
@@ -238,8 +257,9 @@ class Windows:
         self._coarse = protocol.coarse()
         self._given = [Rollouts(one.plant, [one.run], HORIZON_S) for one in protocol.runs]
         self._rollouts = self._given.copy()
-        self._quick = [Rollouts(one.plant, [one.run], HORIZON_S) for one in self._coarse.runs]
-        self._glance = [rollouts.thinned(GLANCE) for rollouts in self._quick]
+        whole = [Rollouts(one.plant, [one.run], HORIZON_S) for one in self._coarse.runs]
+        self._quick = [rollouts.thinned(FOLLOWED[rollouts.plant.setup]) for rollouts in whole]
+        self._glance = [rollouts.thinned(GLANCE[rollouts.plant.setup]) for rollouts in whole]
         unsure = [around_switching(one.run, protocol.joints) for one in protocol.runs]
         self.measured = [
             np.where(there, np.nan, one.run.signal("pos", protocol.joints))
@@ -278,7 +298,7 @@ class Windows:
         return robot
 
     def errors(self, k: int, refits: Sequence[Refit | None], *, quick: bool = False) -> Array:
-        """(refits, rows, joints) rad, measured minus simulated on run k; `quick`: in larger steps."""
+        """(refits, rows, joints) rad, measured minus simulated on run k; `quick`: in larger steps, where fits follow it."""
         rollouts = (self._quick if quick else self._rollouts)[k]
         out = self._errors(k, [self.robot(refit, k) for refit in refits], rollouts)
         if rollouts is not self._given[k] and None in refits:
@@ -296,8 +316,9 @@ class Windows:
             if one.plant.setup is not Setup.FLOOR:
                 continue
             robot = self.robot(refit, k)
-            self._quick[k] = Rollouts(coarse.plant, [coarse.run], HORIZON_S, leader=robot.model(coarse.plant))
-            self._glance[k] = self._quick[k].thinned(GLANCE)
+            whole = Rollouts(coarse.plant, [coarse.run], HORIZON_S, leader=robot.model(coarse.plant))
+            self._quick[k] = whole.thinned(FOLLOWED[Setup.FLOOR])
+            self._glance[k] = whole.thinned(GLANCE[Setup.FLOOR])
             if not quick:
                 self._rollouts[k] = Rollouts(one.plant, [one.run], HORIZON_S, leader=robot.model(one.plant))
 
@@ -408,7 +429,8 @@ class Windows:
         if float(np.square(found.nuisance[self._of_floor]).sum()) < BENT:
             self.lead(found)
             return
-        much = own > MUCH * len(self.protocol.joints) * sum(len(self._glance[k].segments) for k in floor)
+        looked = FOLLOWED[Setup.FLOOR] * sum(len(self._glance[k].segments) for k in floor)
+        much = own > MUCH * len(self.protocol.joints) * looked
         given = int(self.protocol.runs[floor[0]].plant.model.opt.cone)
         before = self._learnt, self._plain.copy(), self.found
         self.cone = next(cone for cone in CONES.values() if cone != given)
@@ -458,11 +480,17 @@ class Windows:
             out[r] = cost[r] + 2 * gradient @ u + u @ normal @ u
         return out
 
-    def strained(self, seen: Sequence[int]) -> list[int]:
-        """The joint of which the model leaves far more than of others with the same servo, if there is one.
+    def strained(self, seen: Sequence[int], times: float = STRAINED) -> list[int]:
+        """Joints of which the model leaves so many times what it leaves of others with the same servo.
 
-        After a re-fit of `nothing` on these runs.
+        Of all runs one at most, and one of the stand's: on the floor what one leg does wrong shows in all. After a re-fit of
+        `nothing` on these runs.
         """
+        stand = [k for k in seen if self.protocol.runs[k].plant.setup is Setup.STAND]
+        found = [self._outlier(runs, times) for runs in (seen, stand) if len(runs)]
+        return sorted({joint for joint in found if joint is not None})
+
+    def _outlier(self, seen: Sequence[int], times: float) -> int | None:
         left = np.sqrt(np.mean([np.square(self._plain[k]) for k in seen], axis=0))
         share = np.ones(len(left))
         for group in self.protocol.servos():
@@ -470,12 +498,13 @@ class Windows:
                 others = [left[i] for i in group if i != j]
                 share[j] = left[j] / np.median(others) if others else 1.0
         worst = int(np.argmax(share))
-        return [worst] if share[worst] > STRAINED else []
+        return worst if share[worst] > times else None
 
     def _weight(self, k: int) -> Array:
-        """(joints,) that errors of a run are multiplied by: its rows go together."""
-        period = float(np.median(np.diff(self.protocol.runs[k].run.t)))
-        out: Array = 1 / (self._sigma * np.sqrt(max(1.0, INDEPENDENT_S / period)))
+        """(joints,) that errors of a run are multiplied by: its rows go together, and windows stand for those not followed."""
+        played = self.protocol.runs[k]
+        period = float(np.median(np.diff(played.run.t)))
+        out: Array = np.sqrt(FOLLOWED[played.plant.setup] / max(1.0, INDEPENDENT_S / period)) / self._sigma
         return out
 
     def _solve(self, descent: _Descent, blocks: Iterable[Sequence[Array]]) -> Array:
@@ -509,6 +538,7 @@ class Windows:
             errors = self.errors(k, refits, quick=True)
             at = 0
             for one, mine in zip(descents, columns, strict=True):
+                followed = np.isfinite(errors[at]).any(axis=-1)
                 base = np.nan_to_num(errors[at]) * weight
                 slopes = np.zeros((len(one.u), base.size), np.float32)
                 if k in one.slopes:
@@ -521,7 +551,7 @@ class Windows:
                 left = base.ravel().astype(np.float32)
                 one.slopes[k] = slopes
                 if not one.causes:
-                    self._plain[k] = np.sqrt(np.mean(np.square(base.reshape(-1, base.shape[-1])), axis=0)) / weight
+                    self._plain[k] = np.sqrt(np.mean(np.square(base[followed]), axis=0)) / weight
                 one.seen[k] = (
                     float(left.astype(np.float64) @ left),
                     (slopes @ slopes.T).astype(np.float64),
@@ -565,7 +595,7 @@ class Windows:
 
 def closures(
     windows: Windows, starts: Sequence[Refit], held_out: Sequence[int], training: Sequence[int]
-) -> tuple[float, float, list[Closure]]:
+) -> tuple[float, float, list[ClosureByJoint]]:
     """The gap before, the floor (rad), and what each hypothesis leaves.
 
     Args:
@@ -574,27 +604,28 @@ def closures(
     """
     judged = list(held_out or training)
     fits = windows.refit(starts, training, () if held_out else judged)
-    squares = np.zeros((len(starts) + 1, len(judged)))
-    counts = np.zeros(len(judged))
+    joints = len(windows.protocol.joints)
+    each, known = np.zeros((len(starts) + 1, len(judged), joints)), np.zeros((len(judged), joints))
     for n, k in enumerate(judged):
         errors = windows.errors(k, [None, *(whole if held_out else folds[n] for whole, folds in fits)])
         good = np.isfinite(errors).all(axis=0)
-        squares[:, n] = np.square(errors[:, good]).sum(axis=1)
-        counts[n] = good.sum()
+        each[:, n] = np.square(np.where(good, errors, 0.0)).sum(axis=1)
+        known[n] = good.sum(axis=0)
+    squares, counts = each.sum(axis=2), known.sum(axis=1)
+    means = each.sum(axis=1) / np.maximum(known.sum(axis=0), 1)
     floor = float(np.sqrt(np.mean(windows.floor**2)))
     before = float(np.sqrt(squares[0].sum() / counts.sum()))
     out = []
     for s in range(len(starts)):
         after = float(np.sqrt(squares[s + 1].sum() / counts.sum()))
         low, high = _interval(squares[0], squares[s + 1], counts, floor)
-        each = [
+        runs = [
             _closed(float(np.sqrt(a / c)), float(np.sqrt(b / c)), floor)
             for a, b, c in zip(squares[0], squares[s + 1], counts, strict=True)
             if np.sqrt(a / c) > 1.5 * floor
         ]
-        out.append(
-            Closure(after, _closed(before, after, floor), low, high, min(each, default=float("nan")), fits[s][0])
-        )
+        closed, worst = _closed(before, after, floor), min(runs, default=float("nan"))
+        out.append(ClosureByJoint(after, closed, low, high, worst, fits[s][0], means[[0, s + 1]], floor))
     return before, floor, out
 
 

@@ -16,25 +16,31 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.cause import Cause, Quantity, catalogue, enter
 from openant_tools.gap.features import Floats, differences
-from openant_tools.gap.judge import Metric
+from openant_tools.gap.judge import Judgement, Metric
 from openant_tools.gap.protocol import Played, Players, Protocol
 from openant_tools.gap.robot import Reference, Robot
 from openant_tools.model.plant import Setup
 
-__all__ = ["Explained", "Hypothesis", "Part", "Scene", "bounds_of", "fit", "robot_with"]
+__all__ = ["Explained", "Hypothesis", "Part", "Scene", "bounds_of", "explain", "fit", "robot_with", "scene_of"]
 
 Array = NDArray[np.float64]
 
 #: iterations of Gauss and Newton, and the least improvement (share) that goes on
 ITERATIONS, ENOUGH = 3, 0.015
+#: of Levenberg and Marquardt: at the beginning, and above which a shorter step is tried beside each
+DAMPING, CAUTIOUS = 1e-3, 1e-3
 #: share of a size by which it is varied, and the least variation in units of `small`; where feet touch the floor less says how
 #: contacts chatter, not what the size does
 STEP, LEAST_STEP = 0.08, 0.25
 FLOOR_STEP, FLOOR_LEAST_STEP = 0.5, 1.0
 #: how much shares that only say how an effect acts are varied by
 LEAST_SHARE = 0.2
+#: times the misfit of the same cause elsewhere beyond which a place is given up
+BEHIND = 1.1
 #: how far beyond `large` a size may go
 BEYOND = 2.5
+#: places at which each cause is tried
+PLACES = 2
 #: the largest share that anything may take
 WHOLE = 0.98
 
@@ -112,6 +118,34 @@ class Scene:
         return out
 
 
+def scene_of(cause: str, scenes: Mapping[Setup, Scene]) -> Scene:
+    """Where a cause shows."""
+    # What shifts command and encoder alike shows where feet stand, and hardly anywhere else.
+    floor = catalogue()[cause].of_body or catalogue()[cause].silent
+    first = Setup.FLOOR if floor else Setup.STAND
+    return scenes.get(first) or next(iter(scenes.values()))
+
+
+def explain(
+    scenes: Mapping[Setup, Scene], suspects: Sequence[str], judgement: Judgement, thorough: Sequence[str] = ()
+) -> dict[str, Explained]:
+    """The best place and size of each suspect by itself, of those to be `thorough` about of all places."""
+    out: dict[str, Explained] = {}
+    for scene in {id(s): s for s in scenes.values()}.values():
+        known = {
+            Part(name, where): x
+            for name in suspects
+            if scene_of(name, scenes) is scene
+            for where, x in judgement.places[name][: None if name in thorough else PLACES]
+        }
+        if known:
+            for one in fit(scene, known):
+                name = one.part.cause
+                if name not in out or one.misfit < out[name].misfit:
+                    out[name] = one
+    return out
+
+
 @dataclass
 class _Search:
     """One cause on its way; u: its coordinates in the order of its quantities; tangent: how the residual moves with each."""
@@ -142,8 +176,8 @@ def fit(scene: Scene, starts: Mapping[Part, Mapping[str, float]]) -> list[Explai
     """
     best = [_Search(part, np.array([x[q.name] for q in part.definition.quantities])) for part, x in starts.items()]
     _begin(scene, best)
-    damping = np.full(len(best), 1e-3)
-    for _ in range(ITERATIONS):
+    damping = np.full(len(best), DAMPING)
+    for first in [True] + [False] * (ITERATIONS - 1):
         going = [k for k, search in enumerate(best) if not search.done]
         if not going:
             break
@@ -155,7 +189,8 @@ def fit(scene: Scene, starts: Mapping[Part, Mapping[str, float]]) -> list[Explai
             normal, gradient = search.tangent @ search.tangent.T, search.tangent @ search.residual
             low, high = _bounds(search)
             moved = []
-            for scale in (1.0, 30.0):
+            # At first nobody knows how far tangents hold; later only where they did not.
+            for scale in (1.0, 30.0) if first or damping[k] > CAUTIOUS else (1.0,):
                 step = np.linalg.solve(
                     normal + damping[k] * scale * np.diag(np.diag(normal) + 1e-9), -gradient.astype(np.float64)
                 )
@@ -163,9 +198,10 @@ def fit(scene: Scene, starts: Mapping[Part, Mapping[str, float]]) -> list[Explai
             tries.append(moved)
         _evaluate(scene, [one for moved in tries for one in moved])
         for k, moved in zip(going, tries, strict=True):
-            found, other = sorted(moved, key=lambda one: one.cost)
-            search = best[k]
-            tangent = _learnt(_learnt(search, other), found)
+            found, *others = sorted(moved, key=lambda one: one.cost)
+            search = tangent = best[k]
+            for tried in (*others, found):
+                tangent = _learnt(tangent, tried)
             if found.cost < search.cost:
                 found.done = (search.cost - found.cost) < ENOUGH * search.cost
                 best[k] = found
@@ -174,6 +210,9 @@ def fit(scene: Scene, starts: Mapping[Part, Mapping[str, float]]) -> list[Explai
                 damping[k] *= 20
                 search.done = damping[k] > 10
             best[k].tangent = tangent.tangent
+        for search in best:
+            least = min(other.cost for other in best if other.part.cause == search.part.cause)
+            search.done |= search.cost > BEHIND * least
     return [_explained(search) for search in best]
 
 

@@ -71,21 +71,29 @@ def _places(protocol: Protocol, judgement: Judgement, one: Explained, strained: 
 
 
 def rivals(
-    windows: Windows, best: Sequence[Explained], known: Collection[str], training: Sequence[int]
+    windows: Windows,
+    best: Sequence[Explained],
+    known: Collection[str],
+    training: Sequence[int],
+    *,
+    anywhere: bool = False,
 ) -> dict[Part, dict[str, float]]:
     """Causes that nobody suspected and that leave clearly less than the best suspects, where those sit or a joint is strained.
 
     Args:
         windows: on which `nothing` was re-fitted. known: causes that are suspected already.
-        training: the runs to look at.
+        training: the runs to look at. anywhere: look at servos and at all joints, too, since nothing likely is known.
 
     Returns:
         their sizes.
     """
     protocol = windows.protocol
+    places = [one.part.joints for one in best] + [(j,) for j in windows.strained(training)]
+    if anywhere:
+        places += [tuple(group) for group in protocol.servos()] + [tuple(range(len(protocol.joints)))]
     others = [
         (Part(name, joints), start)
-        for joints in dict.fromkeys([one.part.joints for one in best] + [(j,) for j in windows.strained(training)])
+        for joints in dict.fromkeys(places)
         for name, cause in catalogue().items()
         if name not in known
         and moves_joints(cause)

@@ -1,0 +1,424 @@
+"""The verdict on a robot of many joints: which cause leads, whether a second acts beside it, and whether either is believed."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from openant_tools.gap.cause import catalogue
+from openant_tools.gap.closure import ClosureByJoint, Refit, Windows, calibration_of, closures, nothing, unmoved
+from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis
+from openant_tools.gap.explain import Explained, Scene, explain, fit, robot_with, scene_of
+from openant_tools.gap.judge import Judgement
+from openant_tools.gap.patient import Patient, diagnosis_of, found_of, shown, unfitted, warmth
+from openant_tools.gap.rivals import moves_joints, paired, placed, rivals
+from openant_tools.gap.thresholds import (
+    ADDS,
+    ADDS_ALONE,
+    ADDS_MUCH,
+    APART,
+    CERTAIN,
+    CLEARLY,
+    EARLY,
+    EASES,
+    EXPLAINS,
+    FAR_WORSE,
+    FINDING,
+    LARGE,
+    LEFT_COUNTS,
+    LIKELIEST_FITTED,
+    MAYBE,
+    MORE,
+    ODD,
+    OTHERS,
+    PROVES,
+    SECOND,
+    SETTLED,
+    STANDS_OUT,
+    STRANGE,
+    SURELY,
+    SUSPECT,
+    TOLD,
+    VANISHED,
+)
+from openant_tools.model.gap import excess
+from openant_tools.model.plant import Setup
+
+__all__ = ["decide"]
+
+
+@dataclass
+class _Evidence:
+    """What has been found of each suspect.
+
+    Attributes:
+        ranked: what the judge thought of all causes. probability: what is believed of them by now.
+        explained: where each suspect sits, and how large it is. alone: what it leaves by itself.
+        plain: what a re-fit leaves without any. before, floor: the gap, rad.
+        where: the joints that stand out of what a re-fit leaves, where suspects are compared: among all of a robot's joints what
+            one of them does is soon lost. All, where none does.
+    """
+
+    patient: Patient
+    judgement: Judgement
+    scenes: Mapping[Setup, Scene]
+    windows: Windows
+    ranked: Sequence[tuple[str, float]]
+    probability: dict[str, float]
+    explained: dict[str, Explained]
+    alone: dict[str, ClosureByJoint]
+    plain: ClosureByJoint
+    before: float
+    floor: float
+    where: Sequence[int]
+
+    @property
+    def names(self) -> list[str]:
+        """The suspects, first the one for which most speaks."""
+        return sorted(self.explained, key=lambda name: -self.score(name))
+
+    def score(self, name: str) -> float:
+        """How a suspect ranks: by the judge, and by what it leaves of the gap on held-out runs."""
+        closure = self.plain if catalogue()[name].random else self.alone[name]
+        return _rank(self.probability[name], 1 - self.closed(closure))
+
+    def closed(self, closure: ClosureByJoint) -> float:
+        """The share of the excess that is gone where suspects are compared."""
+        return closure.closed_at(self.where)
+
+    def closures(self, starts: Sequence[Refit]) -> tuple[float, float, list[ClosureByJoint]]:
+        return _closures(self.windows, self.patient, starts)
+
+
+@dataclass(frozen=True)
+class _Leader:
+    """The suspect for which most speaks.
+
+    Attributes:
+        gained: closed beyond what tolerances do. beside: whether positions of joints say little of it.
+        proved: whether closure alone proves it. left: what the judge says of what it leaves, if it was asked.
+        eased: whether that is far less strange.
+    """
+
+    name: str
+    gained: float
+    beside: bool
+    proved: bool
+    left: Judgement | None
+    eased: bool
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """The causes that go into the improved model; what they leave together, and what the removal of each costs."""
+
+    names: tuple[str, ...]
+    closure: ClosureByJoint
+    removal: Mapping[str, float]
+
+
+def decide(
+    patient: Patient,
+    judgement: Judgement,
+    ranked: Sequence[tuple[str, float]],
+    explained: dict[str, Explained],
+    scenes: Mapping[Setup, Scene],
+) -> Diagnosis:
+    """Which of the suspects explain the gap, if any.
+
+    Args:
+        ranked: every cause that can show, with its probability. explained: the suspects, fitted on simulated robots.
+    """
+    evidence = _heard(patient, judgement, ranked, explained, scenes)
+    names = evidence.names
+    leader = _led(evidence, names)
+    whole = evidence.alone[leader.name]
+    chosen = _Chosen((leader.name,), whole, {leader.name: whole.closed - evidence.plain.closed})
+    if leader.left is not None and (
+        max(evidence.probability[name] for name in names) > FINDING or leader.proved or leader.eased
+    ):
+        chosen = _joined(evidence, leader, leader.left, chosen)
+    verdict, selected, ambiguous = _verdict(evidence, names, leader, chosen)
+    return _put_down(evidence, names, leader, chosen, (verdict, selected, ambiguous))
+
+
+def _heard(
+    patient: Patient, judgement: Judgement, ranked: Sequence[tuple[str, float]], explained: dict[str, Explained],
+    scenes: Mapping[Setup, Scene],
+) -> _Evidence:  # fmt: skip
+    """Each suspect where the runs say that it sits, and what it leaves; rivals that nobody suspected, too."""
+    windows, training, probability = Windows(patient.protocol), patient.training, dict(ranked)
+    windows.look(training)
+    where = windows.strained(training, STANDS_OUT) or range(len(patient.protocol.joints))
+    sited = placed(windows, judgement, explained, training)
+    windows.settle(
+        _beside(windows, sited.values(), training), training, lambda: patient.in_time("other friction cones", EARLY)
+    )
+    likely_first = sorted(explained, key=lambda name: -probability[name])
+    names = _worth_fitting(likely_first, {name: cost for name, (_, cost) in sited.items()})
+    explained = {name: sited[name][0] for name in names}
+    starts = [nothing(windows), *(_start(windows, [explained[name]], training) for name in names)]
+    before, floor, (plain, *singles) = _closures(windows, patient, starts)
+    evidence = _Evidence(
+        patient, judgement, scenes, windows, ranked, probability, explained,
+        dict(zip(names, singles, strict=True)), plain, before, floor, where,
+    )  # fmt: skip
+    unsettled = 1 - max(map(evidence.closed, singles)) > SETTLED * (1 - evidence.closed(plain))
+    if judgement.energy > 1 and unsettled and patient.in_time("causes that nobody suspects"):
+        found = _rivals(evidence)
+        if found:
+            starts = [_start(windows, [one], training) for one in found.values()]
+            evidence.alone |= dict(zip(found, evidence.closures(starts)[2], strict=True))
+            evidence.explained |= found
+    _simplify(evidence)
+    return evidence
+
+
+def _simplify(evidence: _Evidence) -> None:
+    """Where a suspect is no more than another one, it is that one."""
+    probability = evidence.probability
+    for name in list(evidence.explained):
+        simpler = catalogue()[name].simpler(evidence.alone[name].refit.x[0])
+        if simpler in evidence.alone:
+            del evidence.explained[name]
+            probability[simpler] = min(probability[simpler] + probability[name], SURELY)
+            evidence.ranked = [(other, 0.0 if other == name else chance) for other, chance in evidence.ranked]
+
+
+def _led(evidence: _Evidence, names: Sequence[str]) -> _Leader:
+    """What speaks for the first suspect: the judge, what it closes, and what is left of what is strange."""
+    patient, probability, best = evidence.patient, evidence.probability, names[0]
+    score = {name: evidence.score(name) for name in names}
+    whole = evidence.alone[best]
+    if probability[best] < FINDING:
+        # A comparison that counts has to be fair: without the cause, too, from where the fit with it ended.
+        warm = dataclasses.replace(nothing(evidence.windows), nuisance=whole.refit.nuisance)
+        _, _, (again,) = evidence.closures([warm])
+        evidence.plain = max(evidence.plain, again, key=evidence.closed)
+    closed, without = evidence.closed(whole), evidence.closed(evidence.plain)
+    gained = closed - without
+    # Joint positions say little of the body: there closure alone proves nothing that the judge does not half believe.
+    beside = catalogue()[best].beside_joints_at(whole.refit.x[0])
+    proves = gained > ADDS_ALONE or 1 - closed < PROVES * (1 - without)
+    proved = proves and (not beside or probability[best] > SECOND) and not catalogue()[best].random
+    if proved:
+        # What none of the others closes speaks for a cause whatever the judge thought of it.
+        scores = np.array([score[name] for name in names])
+        share = float(1 / np.exp(scores - scores[0]).sum())
+        probability[best] = max(probability[best], share * min(gained, 1.0))
+        # What the judge took for another cause at the same place was this one.
+        here = evidence.explained[best].part.joints
+        taken = [probability[name] for name in names if evidence.explained[name].part.joints == here]
+        probability[best] = max(probability[best], share * max(taken))
+    left, eased, energy = None, False, evidence.judgement.energy
+    if probability[best] > MAYBE or proved or max(probability[name] for name in names) > CERTAIN:
+        left = _without(patient, evidence.explained[best])
+        eased = probability[best] > MAYBE and energy > 1 and left.energy < EASES * energy
+    return _Leader(best, gained, beside, proved, left, eased)
+
+
+def _without(patient: Patient, explained: Explained) -> Judgement:
+    """What the judge says of what is left once a cause is taken into account: against the model that has it."""
+    robot = robot_with(patient.coarse.reference, (explained.part,), (explained.x,))
+    left = patient.coarse.features(robot)
+    return patient.judge.say(np.concatenate([left[k][0][left[k][1]] for k in patient.training]))
+
+
+def _joined(evidence: _Evidence, leader: _Leader, left: Judgement, chosen: _Chosen) -> _Chosen:
+    """The leader with the cause that acts beside it, if there is one."""
+    windows, training = evidence.windows, evidence.patient.training
+    explained, probability, whole = evidence.explained, evidence.probability, chosen.closure
+    tried = _seconds(evidence, leader.name, left)
+    # What is random only adds its noise to every simulation.
+    fitted = [one for one, _ in tried if not catalogue()[one.part.cause].random]
+    starts = [_start(windows, [explained[leader.name], one], training) for one in fitted]
+    pairs = evidence.closures(starts)[2] if starts else []
+    together = {one.part: both for one, both in zip(fitted, pairs, strict=True)}
+    second: tuple[float, Explained, ClosureByJoint] | None = None
+    for one, adds in tried:
+        name, chance = one.part.cause, left.probability[one.part.cause]
+        both = together.get(one.part, whole)
+        # What moves no joint, or not twice alike, no closure can prove: there the judge's word is enough.
+        moves = moves_joints(catalogue()[name]) and not catalogue()[name].beside_joints_at(both.refit.x[-1])
+        silent = not moves and chance > FINDING
+        much = moves and 1 - both.closed < PROVES * (1 - whole.closed)
+        if both.closed > whole.closed + adds or much or (silent and both.closed > whole.closed - ADDS):
+            how = _rank(max(chance, probability[name]), 1 - both.closed)
+            if second is None or how > second[0]:
+                second = how, one, both
+    if second is None:
+        return chosen
+    _, one, both = second
+    name = one.part.cause
+    explained[name] = one
+    known = name in evidence.alone and not catalogue()[name].random
+    without = evidence.alone[name] if known else evidence.plain
+    probability[name] = max(probability[name], left.probability[name])
+    removal = {leader.name: both.closed - without.closed, name: both.closed - whole.closed}
+    return _Chosen((leader.name, name), both, removal)
+
+
+def _seconds(evidence: _Evidence, best: str, left: Judgement) -> list[tuple[Explained, float]]:
+    """Causes that may act beside the best, each with the held-out closure that it has to add.
+
+    Those that the judge expects in what the best leaves, and those it half hides behind the best, where a first look says that
+    both together leave clearly less.
+    """
+    patient, explained, probability = evidence.patient, evidence.explained, evidence.probability
+    seen = [
+        (name, chance) for name, chance in shown(left, patient.protocol)[:OTHERS] if chance > SUSPECT and name != best
+    ]
+    missing = [name for name, _ in seen if name not in explained]
+    known = {**explained, **(explain(evidence.scenes, missing, left) if missing else {})}
+    told = [name for name, chance in seen[:TOLD] if name in known and max(chance, probability[name]) > SECOND]
+    hidden = [
+        one
+        for name, one in known.items()
+        if name not in (best, *told)
+        and (one.beyond_tolerance or left.energy > STRANGE)
+        and moves_joints(catalogue()[name])
+    ]
+    look: list[tuple[Explained, float]] = []
+    if hidden and patient.in_time("second causes that the judge does not expect"):
+        look = paired(evidence.windows, known[best], hidden, patient.training)
+    chance = {one.part.cause: max(left.probability[one.part.cause], probability[one.part.cause]) for one, _ in look}
+    look.sort(key=lambda pair: _rank(chance[pair[0].part.cause], pair[1]), reverse=True)
+    return [(known[name], ADDS) for name in told] + [(one, ADDS_MUCH) for one, _ in look[:MORE]]
+
+
+def _verdict(
+    evidence: _Evidence, names: Sequence[str], leader: _Leader, chosen: _Chosen
+) -> tuple[str, tuple[str, ...], tuple[tuple[str, ...], ...]]:
+    """The verdict, the causes selected, and those that these runs cannot tell apart."""
+    probability, energy, best, left = evidence.probability, evidence.judgement.energy, leader.name, leader.left
+    if not _sure(evidence, names, leader):
+        return NONE if energy < ODD else UNEXPLAINED, (), ()
+    # What is half believed does not come before what is certain, whatever it closes.
+    certain = any(probability[name] > CERTAIN for name in chosen.names)
+    # Nor is it a riddle what a random cause leaves beside a likely one.
+    noisy = any(catalogue()[name].random for name in chosen.names[1:])
+    noisy = noisy and min(probability[name] for name in chosen.names) > FINDING
+    little = excess(evidence.before, evidence.floor) > LARGE * evidence.floor and chosen.closure.closed < EXPLAINS
+    vanished = _vanished(evidence.alone[best].refit) and not catalogue()[best].random
+    as_odd = left is not None and left.energy > ODD
+    doubtful = probability[best] < CERTAIN or vanished or as_odd
+    if not leader.beside and little and energy > STRANGE and doubtful and not noisy:
+        # However sure the judge is: what comes out as nothing at all, or leaves a robot as odd as it was, is not what makes the
+        # gap. No fit finds what is random.
+        return UNEXPLAINED, (), ()
+    if leader.beside and not certain and left is not None and min(energy, left.energy) > STRANGE:
+        # Strange with it, too: a foot that came off is no offset, though nothing known is more like it.
+        return UNEXPLAINED, (), ()
+    doubted = [name for name in chosen.names if certain and probability[name] < SECOND]
+    selected = tuple(sorted(chosen.names, key=lambda name: (name in doubted, -chosen.removal[name])))
+    equal = [
+        name
+        for name in names[1:3]
+        if not leader.beside
+        and abs(evidence.closed(evidence.alone[name]) - evidence.closed(evidence.alone[best])) < APART
+        and probability[name] > probability[best] / 2
+    ]
+    if equal:
+        return AMBIGUOUS, selected, ((best, *equal),)
+    return selected[0], selected, ()
+
+
+def _sure(evidence: _Evidence, names: Sequence[str], leader: _Leader) -> bool:
+    """Whether there is any finding at all."""
+    probability, energy, best = evidence.probability, evidence.judgement.energy, leader.name
+    if probability[best] < CERTAIN and not evidence.explained[best].beyond_tolerance:
+        return False
+    return (
+        probability[best] > (SECOND if energy > STRANGE else FINDING)
+        or leader.eased
+        or (energy > 1 and leader.proved and evidence.closed(evidence.alone[best]) > EXPLAINS)
+        # Where the judge is sure of something, and the log is strange, which of its suspects it is the fits may say.
+        or (energy > STRANGE and max(probability[name] for name in names) > FINDING)
+    )
+
+
+def _put_down(
+    evidence: _Evidence, names: Sequence[str], leader: _Leader, chosen: _Chosen,
+    said: tuple[str, tuple[str, ...], tuple[tuple[str, ...], ...]],
+) -> Diagnosis:  # fmt: skip
+    verdict, selected, ambiguous = said
+    patient, probability, whole = evidence.patient, evidence.probability, chosen.closure
+    order = [*selected, *(name for name in names if name not in selected)]
+    # The set was re-fitted together: these are the sizes that leave what it leaves.
+    points = dict(zip((part.cause for part in whole.refit.hypothesis), whole.refit.x, strict=True))
+    effects = []
+    for name in order:
+        one, alone = evidence.explained[name], evidence.alone.get(name)
+        if name in points:
+            one = dataclasses.replace(one, x=points[name])
+            alone = alone and dataclasses.replace(alone, refit=whole.refit)
+        effects.append(found_of(patient, one, probability[name], alone))
+    gap = {
+        "before": evidence.before, "after": evidence.before if verdict == NONE else whole.after,
+        "floor": evidence.floor, "refit": evidence.plain.after,
+    }  # fmt: skip
+    chance = probability[leader.name]
+    calibration, notes = None, []
+    if verdict != NONE:
+        judged = patient.held_out or patient.training
+        calibration = calibration_of(evidence.windows, whole.refit, judged)
+        notes = warmth(evidence.windows, whole.refit, judged)
+    return diagnosis_of(
+        patient, verdict, 1 - chance if verdict == NONE else chance,
+        (*effects, *unfitted(evidence.ranked, order)), selected, ambiguous, gap,
+        {name: chosen.removal[name] for name in selected}, evidence.judgement, calibration, notes,
+    )  # fmt: skip
+
+
+def _closures(windows: Windows, patient: Patient, starts: Sequence[Refit]) -> tuple[float, float, list[ClosureByJoint]]:
+    return closures(windows, starts, patient.held_out, patient.training)
+
+
+def _worth_fitting(names: Sequence[str], cost: dict[str, float]) -> list[str]:
+    """Of suspects, the most probable first, those that are likely or do not leave far more than the best of them."""
+    least = min(cost.values())
+    return [name for n, name in enumerate(names) if n < LIKELIEST_FITTED or cost[name] < FAR_WORSE * least]
+
+
+def _rivals(evidence: _Evidence) -> dict[str, Explained]:
+    """Causes that would leave less than any where the suspect sits that leaves least, or the likeliest; fitted like those."""
+    explained, alone, training = evidence.explained, evidence.alone, evidence.patient.training
+    suspects = [name for name in explained if moves_joints(catalogue()[name])]
+    if not suspects:
+        return {}
+    least = max(suspects, key=lambda name: evidence.closed(alone[name]))
+    likeliest = max(suspects, key=evidence.score)
+    best = [explained[name] for name in dict.fromkeys((least, likeliest))]
+    lost = evidence.judgement.energy > STRANGE and max(evidence.probability.values()) < FINDING
+    found = rivals(evidence.windows, best, explained, training, anywhere=lost)
+    return {one.part.cause: one for one in fit(scene_of(least, evidence.scenes), found)} if found else {}
+
+
+def _vanished(refit: Refit) -> bool:
+    """Whether of a cause by itself nothing is left, once it was re-fitted on the runs."""
+    (part,), (x,) = refit.hypothesis, refit.x
+    return all(abs(x[q.name]) < VANISHED * q.small for q in part.definition.quantities if not q.shape)
+
+
+def _beside(windows: Windows, sited: Iterable[tuple[Explained, float]], seen: Sequence[int]) -> Refit:
+    """What is there while it is found out how feet meet the floor: the cause that leaves least, if it leaves clearly less."""
+    least, cost = min(sited, key=lambda one: one[1])
+    (plain,) = windows.left([nothing(windows)], seen)
+    return _start(windows, [least], seen) if cost < CLEARLY * plain else nothing(windows)
+
+
+def _start(windows: Windows, explained: Sequence[Explained], seen: Sequence[int]) -> Refit:
+    """Where a re-fit with causes starts: contacts as without any, or as given where causes of the body leave less so."""
+    start = unmoved(windows, (one.part for one in explained), (one.x for one in explained))
+    if not any(one.part.definition.of_body for one in explained):
+        return start
+    both = [start, dataclasses.replace(start, nuisance=np.zeros_like(start.nuisance))]
+    return both[int(np.argmin(windows.left(both, seen)))]
+
+
+def _rank(probability: float, left: float) -> float:
+    return math.log(max(probability, 1e-3)) - LEFT_COUNTS * math.log(max(left, 0.0) + 0.05)
