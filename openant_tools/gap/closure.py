@@ -255,11 +255,12 @@ class Windows:
         self.protocol = protocol
         self.names = _nuisances(protocol)
         self._coarse = protocol.coarse()
+        self._before: dict[int, Array] = {}
         self._given = [Rollouts(one.plant, [one.run], HORIZON_S) for one in protocol.runs]
         self._rollouts = self._given.copy()
         whole = [Rollouts(one.plant, [one.run], HORIZON_S) for one in self._coarse.runs]
-        self._quick = [rollouts.thinned(FOLLOWED[rollouts.plant.setup]) for rollouts in whole]
-        self._glance = [rollouts.thinned(GLANCE[rollouts.plant.setup]) for rollouts in whole]
+        self._quick = [one.thinned(FOLLOWED[one.plant.setup]) for one in whole]
+        self._glance = [one.thinned(GLANCE[one.plant.setup]) for one in whole]
         unsure = [around_switching(one.run, protocol.joints) for one in protocol.runs]
         self.measured = [
             np.where(there, np.nan, one.run.signal("pos", protocol.joints))
@@ -299,28 +300,30 @@ class Windows:
 
     def errors(self, k: int, refits: Sequence[Refit | None], *, quick: bool = False) -> Array:
         """(refits, rows, joints) rad, measured minus simulated on run k; `quick`: in larger steps, where fits follow it."""
-        rollouts = (self._quick if quick else self._rollouts)[k]
-        out = self._errors(k, [self.robot(refit, k) for refit in refits], rollouts)
-        if rollouts is not self._given[k] and None in refits:
-            # By a model that is not re-fitted the base comes to somewhere else.
-            out[[refit is None for refit in refits]] = self._errors(k, [self.robot(None, k)], self._given[k])
-        return out
+        return self._errors(
+            k, [self.robot(refit, k) for refit in refits], (self._quick if quick else self._rollouts)[k]
+        )
 
-    def lead(self, refit: Refit, *, quick: bool = False) -> None:
+    def before(self, k: int) -> Array:
+        """(rows, joints) rad, the same of the model as it was given, with a base that it led itself."""
+        if k not in self._before:
+            self._before[k] = self._errors(k, [self.robot(None, k)], self._given[k])[0]
+        return self._before[k]
+
+    def _lead(self, refit: Refit, *, quick: bool) -> None:
         """Let a base that nobody measured come, at the beginning of each window, to where a re-fitted model takes it.
 
         Args:
-            quick: only where simulations take larger steps.
+            quick: where simulations take larger steps; else where they do not.
         """
-        for k, (one, coarse) in enumerate(zip(self.protocol.runs, self._coarse.runs, strict=True)):
+        for k, one in enumerate((self._coarse if quick else self.protocol).runs):
             if one.plant.setup is not Setup.FLOOR:
                 continue
-            robot = self.robot(refit, k)
-            whole = Rollouts(coarse.plant, [coarse.run], HORIZON_S, leader=robot.model(coarse.plant))
-            self._quick[k] = whole.thinned(FOLLOWED[Setup.FLOOR])
-            self._glance[k] = whole.thinned(GLANCE[Setup.FLOOR])
-            if not quick:
-                self._rollouts[k] = Rollouts(one.plant, [one.run], HORIZON_S, leader=robot.model(one.plant))
+            led = Rollouts(one.plant, [one.run], HORIZON_S, leader=self.robot(refit, k).model(one.plant))
+            if quick:
+                self._quick[k], self._glance[k] = led.thinned(FOLLOWED[Setup.FLOOR]), led.thinned(GLANCE[Setup.FLOOR])
+            else:
+                self._rollouts[k] = led
 
     def written(self, refit: Refit, judged: Sequence[int]) -> float:
         """The gap, rad, on these runs of the one model that can be written: its servos are always as warm as on average there."""
@@ -345,14 +348,17 @@ class Windows:
         return out
 
     def refit(
-        self, starts: Sequence[Refit], training: Sequence[int], leave_out: Sequence[int]
+        self, starts: Sequence[Refit], training: Sequence[int], leave_out: Sequence[int], *, anew: bool = False
     ) -> list[tuple[Refit, list[Refit]]]:
         """Fit within tolerance, and polish sizes: each on all the runs to train on, and without each of some of them.
 
         All share one linearisation each, at what is found on all of the training runs; and are simulated side by side.
+
+        Args:
+            anew: learn there what tolerances do, whatever was learnt without causes.
         """
         fitted = list(training)
-        descents = self._descend(starts, fitted)
+        descents = self._descend(starts, fitted, anew=anew)
         for one in descents:
             if not one.causes and not self._settled_once:
                 self._keep(one)
@@ -364,11 +370,12 @@ class Windows:
         return out
 
     def _descend(
-        self, starts: Sequence[Refit], fitted: Sequence[int], turns: int = ITERATIONS, *, settles: bool = False
-    ) -> list[_Descent]:
+        self, starts: Sequence[Refit], fitted: Sequence[int], turns: int = ITERATIONS, *,
+        settles: bool = False, anew: bool = False,
+    ) -> list[_Descent]:  # fmt: skip
         """Follow each start to where it leaves least on these runs; `settles`: contacts bend on their way."""
         # Slopes cost the most: what was learnt without causes does until it fails.
-        learnt = {k: known for k, known in self._learnt.items() if k in fitted}
+        learnt = {k: known for k, known in self._learnt.items() if k in fitted and not anew}
         descents = [_Descent.of(start, len(self.names), learnt) for start in starts]
         for one in descents:
             one.bends[one.causes :] = settles & self._of_floor
@@ -427,7 +434,7 @@ class Windows:
         found = self._settled(best, training)
         (own,) = self.left([found], floor)
         if float(np.square(found.nuisance[self._of_floor]).sum()) < BENT:
-            self.lead(found)
+            self._lead(found, quick=False)
             return
         looked = FOLLOWED[Setup.FLOOR] * sum(len(self._glance[k].segments) for k in floor)
         much = own > MUCH * len(self.protocol.joints) * looked
@@ -435,17 +442,18 @@ class Windows:
         before = self._learnt, self._plain.copy(), self.found
         self.cone = next(cone for cone in CONES.values() if cone != given)
         start = dataclasses.replace(found, nuisance=np.where(self._of_floor, 0.0, found.nuisance))
-        self.lead(start, quick=True)
+        self._lead(start, quick=True)
         if self.left([start], floor)[0] < (1 if much else ANSWERS) * own and in_time():
             self._learnt = {k: known for k, known in self._learnt.items() if k not in floor}
             other = self._settled(start, training)
             (others,) = self.left([other], floor)
             if others < own:
-                self.lead(other)
+                self._lead(other, quick=False)
                 return
         self.cone = None
         self._learnt, self._plain, self.found = before
-        self.lead(found)
+        self._lead(found, quick=True)
+        self._lead(found, quick=False)
 
     def _settled(self, start: Refit, training: Sequence[int]) -> Refit:
         """Where contacts are found to be, with a base that is led by what was found."""
@@ -453,7 +461,7 @@ class Windows:
             (descent,) = self._descend([start], list(training), SETTLES, settles=True)
             self._keep(descent)
             start = _from(start, descent.u)
-            self.lead(start, quick=True)
+            self._lead(start, quick=True)
         return start
 
     def left(self, refits: Sequence[Refit], seen: Sequence[int]) -> Array:
@@ -594,20 +602,21 @@ class Windows:
 
 
 def closures(
-    windows: Windows, starts: Sequence[Refit], held_out: Sequence[int], training: Sequence[int]
+    windows: Windows, starts: Sequence[Refit], held_out: Sequence[int], training: Sequence[int], *, anew: bool = False
 ) -> tuple[float, float, list[ClosureByJoint]]:
     """The gap before, the floor (rad), and what each hypothesis leaves.
 
     Args:
         held_out: runs that nothing was fitted on; empty to leave out each in turn.
-        training: the runs to fit on.
+        training: the runs to fit on. anew: see `Windows.refit`.
     """
     judged = list(held_out or training)
-    fits = windows.refit(starts, training, () if held_out else judged)
+    fits = windows.refit(starts, training, () if held_out else judged, anew=anew)
     joints = len(windows.protocol.joints)
     each, known = np.zeros((len(starts) + 1, len(judged), joints)), np.zeros((len(judged), joints))
     for n, k in enumerate(judged):
-        errors = windows.errors(k, [None, *(whole if held_out else folds[n] for whole, folds in fits)])
+        refits = [whole if held_out else folds[n] for whole, folds in fits]
+        errors = np.concatenate([windows.before(k)[None], windows.errors(k, refits)])
         good = np.isfinite(errors).all(axis=0)
         each[:, n] = np.square(np.where(good, errors, 0.0)).sum(axis=1)
         known[n] = good.sum(axis=0)

@@ -26,7 +26,7 @@ __all__ = ["Explained", "Hypothesis", "Part", "Scene", "bounds_of", "explain", "
 Array = NDArray[np.float64]
 
 #: iterations of Gauss and Newton, and the least improvement (share) that goes on
-ITERATIONS, ENOUGH = 3, 0.015
+ITERATIONS, ENOUGH = 2, 0.015
 #: of Levenberg and Marquardt: at the beginning, and above which a shorter step is tried beside each
 DAMPING, CAUTIOUS = 1e-3, 1e-3
 #: share of a size by which it is varied, and the least variation in units of `small`; where feet touch the floor less says how
@@ -39,8 +39,8 @@ LEAST_SHARE = 0.2
 BEHIND = 1.1
 #: how far beyond `large` a size may go
 BEYOND = 2.5
-#: places at which each cause is tried
-PLACES = 2
+#: places at which each cause is tried; and of those of which nobody knows which are likely
+PLACES, PROMISING = 2, 3
 #: the largest share that anything may take
 WHOLE = 0.98
 
@@ -138,6 +138,12 @@ def explain(
             if scene_of(name, scenes) is scene
             for where, x in judgement.places[name][: None if name in thorough else PLACES]
         }
+        for name in set(thorough) & {part.cause for part in known}:
+            mine = [part for part in known if part.cause == name]
+            robots = [robot_with(scene.protocol.reference, (part,), (known[part],)) for part in mine]
+            misfit = np.square(scene.residuals(robots)).mean(axis=1)
+            for n in np.argsort(misfit)[PROMISING:]:
+                del known[mine[n]]
         if known:
             for one in fit(scene, known):
                 name = one.part.cause

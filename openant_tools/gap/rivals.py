@@ -17,7 +17,7 @@ from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Protocol
 
-__all__ = ["moves_joints", "paired", "placed", "rivals"]
+__all__ = ["everywhere", "moves_joints", "paired", "placed", "rivals"]
 
 #: places that the judge names among which the runs choose, and those whose sizes are tried wider
 NAMED, WIDER = 8, 2
@@ -76,24 +76,22 @@ def rivals(
     known: Collection[str],
     training: Sequence[int],
     *,
-    anywhere: bool = False,
+    places: Sequence[tuple[int, ...]] = (),
 ) -> dict[Part, dict[str, float]]:
     """Causes that nobody suspected and that leave clearly less than the best suspects, where those sit or a joint is strained.
 
     Args:
         windows: on which `nothing` was re-fitted. known: causes that are suspected already.
-        training: the runs to look at. anywhere: look at servos and at all joints, too, since nothing likely is known.
+        training: the runs to look at. places: where else to look.
 
     Returns:
         their sizes.
     """
     protocol = windows.protocol
-    places = [one.part.joints for one in best] + [(j,) for j in windows.strained(training)]
-    if anywhere:
-        places += [tuple(group) for group in protocol.servos()] + [tuple(range(len(protocol.joints)))]
+    anywhere = [*(one.part.joints for one in best), *((j,) for j in windows.strained(training)), *places]
     others = [
         (Part(name, joints), start)
-        for joints in dict.fromkeys(places)
+        for joints in dict.fromkeys(anywhere)
         for name, cause in catalogue().items()
         if name not in known
         and moves_joints(cause)
@@ -113,6 +111,11 @@ def rivals(
         if part.cause not in [other.cause for other in found]:
             found[part] = start
     return found
+
+
+def everywhere(protocol: Protocol) -> list[tuple[int, ...]]:
+    """The servos of each model, and all joints."""
+    return [*(tuple(group) for group in protocol.servos()), tuple(range(len(protocol.joints)))]
 
 
 def paired(

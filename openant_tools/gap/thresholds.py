@@ -34,6 +34,8 @@ SETTLED = 0.35
 #: gaps that are so many floors, of robots whose energy is so many gates, ask for an explanation; beyond ODD gates no robot of
 #: the build is healthy, whatever the judge says
 LARGE, STRANGE, ODD = 3.0, 3.0, 20.0
+#: floors that a re-fit of a healthy robot does not leave
+STRAYS = 4.0
 #: times what a re-fit leaves of a servo's other joints that it leaves of a joint where alone suspects are compared
 STANDS_OUT = 2.0
 #: sets whose closures differ by less are not told apart; effects in a set that is not told from others, at most
@@ -48,5 +50,5 @@ COPPER = 0.01
 FEW_JOINTS = 2
 #: s after the judge has spoken from which no causes are looked for that it does not expect: slow computers have to answer, too
 PATIENCE_S = 65.0
-#: share of that by which what takes long has to be begun
-EARLY = 0.5
+#: shares of that by which what takes long has to be begun, and what only makes the model better
+EARLY, LATE = 0.65, 1.2

@@ -15,7 +15,7 @@ from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis
 from openant_tools.gap.explain import Explained, Scene, explain, fit, robot_with, scene_of
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.patient import Patient, diagnosis_of, found_of, shown, unfitted, warmth
-from openant_tools.gap.rivals import moves_joints, paired, placed, rivals
+from openant_tools.gap.rivals import everywhere, moves_joints, paired, placed, rivals
 from openant_tools.gap.thresholds import (
     ADDS,
     ADDS_ALONE,
@@ -29,6 +29,7 @@ from openant_tools.gap.thresholds import (
     FAR_WORSE,
     FINDING,
     LARGE,
+    LATE,
     LEFT_COUNTS,
     LIKELIEST_FITTED,
     MAYBE,
@@ -40,6 +41,7 @@ from openant_tools.gap.thresholds import (
     SETTLED,
     STANDS_OUT,
     STRANGE,
+    STRAYS,
     SURELY,
     SUSPECT,
     TOLD,
@@ -90,8 +92,8 @@ class _Evidence:
         """The share of the excess that is gone where suspects are compared."""
         return closure.closed_at(self.where)
 
-    def closures(self, starts: Sequence[Refit]) -> tuple[float, float, list[ClosureByJoint]]:
-        return _closures(self.windows, self.patient, starts)
+    def closures(self, starts: Sequence[Refit], *, anew: bool = False) -> tuple[float, float, list[ClosureByJoint]]:
+        return _closures(self.windows, self.patient, starts, anew=anew)
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,8 @@ def decide(
     ):
         chosen = _joined(evidence, leader, leader.left, chosen)
     verdict, selected, ambiguous = _verdict(evidence, names, leader, chosen)
+    if selected and patient.in_time("slopes where the causes were found", LATE):
+        chosen = _polished(evidence, chosen)
     return _put_down(evidence, names, leader, chosen, (verdict, selected, ambiguous))
 
 
@@ -290,6 +294,14 @@ def _seconds(evidence: _Evidence, best: str, left: Judgement) -> list[tuple[Expl
     return [(known[name], ADDS) for name in told] + [(one, ADDS_MUCH) for one, _ in look[:MORE]]
 
 
+def _polished(evidence: _Evidence, chosen: _Chosen) -> _Chosen:
+    """The same causes, fitted once more: near them tolerances do something else than they did without."""
+    _, _, (closure,) = evidence.closures([chosen.closure.refit], anew=True)
+    if len(chosen.names) == 1:
+        evidence.alone[chosen.names[0]] = closure
+    return dataclasses.replace(chosen, closure=closure)
+
+
 def _verdict(
     evidence: _Evidence, names: Sequence[str], leader: _Leader, chosen: _Chosen
 ) -> tuple[str, tuple[str, ...], tuple[tuple[str, ...], ...]]:
@@ -335,7 +347,11 @@ def _sure(evidence: _Evidence, names: Sequence[str], leader: _Leader) -> bool:
     return (
         probability[best] > (SECOND if energy > STRANGE else FINDING)
         or leader.eased
-        or (energy > 1 and leader.proved and evidence.closed(evidence.alone[best]) > EXPLAINS)
+        or (
+            (energy > 1 or evidence.plain.after > STRAYS * evidence.floor)
+            and leader.proved
+            and evidence.closed(evidence.alone[best]) > EXPLAINS
+        )
         # Where the judge is sure of something, and the log is strange, which of its suspects it is the fits may say.
         or (energy > STRANGE and max(probability[name] for name in names) > FINDING)
     )
@@ -374,8 +390,10 @@ def _put_down(
     )  # fmt: skip
 
 
-def _closures(windows: Windows, patient: Patient, starts: Sequence[Refit]) -> tuple[float, float, list[ClosureByJoint]]:
-    return closures(windows, starts, patient.held_out, patient.training)
+def _closures(
+    windows: Windows, patient: Patient, starts: Sequence[Refit], *, anew: bool = False
+) -> tuple[float, float, list[ClosureByJoint]]:
+    return closures(windows, starts, patient.held_out, patient.training, anew=anew)
 
 
 def _worth_fitting(names: Sequence[str], cost: dict[str, float]) -> list[str]:
@@ -394,7 +412,8 @@ def _rivals(evidence: _Evidence) -> dict[str, Explained]:
     likeliest = max(suspects, key=evidence.score)
     best = [explained[name] for name in dict.fromkeys((least, likeliest))]
     lost = evidence.judgement.energy > STRANGE and max(evidence.probability.values()) < FINDING
-    found = rivals(evidence.windows, best, explained, training, anywhere=lost)
+    places = everywhere(evidence.patient.protocol) if lost else ()
+    found = rivals(evidence.windows, best, explained, training, places=places)
     return {one.part.cause: one for one in fit(scene_of(least, evidence.scenes), found)} if found else {}
 
 
