@@ -91,6 +91,17 @@ def test_a_warm_motor_is_weaker_and_the_refit_says_by_how_much(tmp_path: Path) -
     assert "heat_loss" not in [one.name for one in Windows(Protocol.of(unmeasured, model, ["joint"], [None] * 3)).names]
 
 
+def test_slopes_learnt_where_a_cause_was_found_leave_less(tmp_path: Path) -> None:
+    """What tolerances do was learnt without any cause: of a servo half as strong again that is not what they do with it."""
+    windows = Windows(protocol(tmp_path, kp=16.0, dry=0.05))
+    closures(windows, [nothing(windows)], [1], [0])
+    stiff = Refit((Part("stiffness_error", (0,)),), (catalogue()["stiffness_error"].starts(0.5)[0],), windows.contacts)
+    _, _, (found,) = closures(windows, [stiff], [1], [0])
+    before, _, (again,) = closures(windows, [found.refit], [1], [0], anew=True)
+    assert again.after < found.after
+    assert before == float(np.sqrt(np.nanmean(np.square(windows.before(1)))))
+
+
 @pytest.mark.parametrize("name", ["actuator_lag", "action_delay", "load_friction", "backlash"])
 def test_a_cause_that_is_not_there_ends_at_nothing_and_not_beyond(name: str, tmp_path: Path) -> None:
     windows = Windows(protocol(tmp_path, kp=8.0, dry=0.03))
