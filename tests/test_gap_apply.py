@@ -23,9 +23,10 @@ from openant_tools.gap.apply import apply, robot_of, write_robot
 from openant_tools.gap.cause import Cause, Scope, catalogue
 from openant_tools.gap.diagnosis import Diagnosis, Found, Span, read_diagnosis
 from openant_tools.gap.native import BRISTLE_RAD
-from openant_tools.gap.report import diagnosis_report, sentence
+from openant_tools.gap.report import diagnosis_report
 from openant_tools.gap.robot import Form, Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
+from openant_tools.gap.words import sentence
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run

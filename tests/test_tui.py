@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import datetime
+import json
 import os
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
+import mujoco
 import numpy as np
 import pytest
 from rich.text import Text
@@ -23,6 +25,8 @@ from openant_tools.comms import messages
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.ring import columns
+from openant_tools.files import write_text
+from openant_tools.gap.diagnosis import Diagnosis, Found, Span
 from openant_tools.procedure.finding import Evidence, Finding, keep
 from openant_tools.procedure.step import Bench, Event, Hands, Intent, Live, Procedure, RegisterChange, Say, Step
 from openant_tools.recording.run import Facts, Run
@@ -91,6 +95,27 @@ def a_run(folder: Path, seconds: float = 12.0) -> Run:
     run = Run("walk", Facts(tuple(JOINT_NAMES)), t, columns)
     write_table(run, folder / "walk.parquet")
     return read_run(folder / "walk.parquet")
+
+
+def a_diagnosis(robot: RobotFolder) -> Path:
+    """One knee's servo is softer than its model; friction was asked, too."""
+    found = Diagnosis(
+        model=str(robot.model_path()), runs=("stand-1", "floor-1"), held_out=("stand-2",), verdict="stiffness_error",
+        confidence=0.93, selected=("stiffness_error",), ambiguous_with=(), next_experiment=None,
+        effects=(
+            Found("stiffness_error", ("knee_fl",), {"scale": Span(0.62, 0.6, 0.64)}, 0.93, 0.81, 0.7, 0.9, True, {"scale": -0.478}),
+            Found("coulomb_friction", "all", {"torque_nm": Span(0.02, 0.0, 0.04)}, 0.11, 0.04, -0.1, 0.1, True, {"torque_nm": 0.1}),
+        ),
+        gap={"before": 0.0065, "after": 0.0013, "floor": 0.0004},
+        where=[
+            {"signal": "pos", "joint": "knee_fl", "regime": "fast", "share": 0.61},
+            {"signal": "pos", "joint": "hip_fl", "regime": "slow", "share": 0.12},
+        ],
+        removal={"stiffness_error": 0.52}, notes=("judged by 3360 simulated robots that played these commands",),
+    )  # fmt: skip
+    path = robot.diagnoses / "20261124T031500Z.json"
+    write_text(path, json.dumps(found.as_json()))
+    return path
 
 
 def frozen(app: OpenAnt, run: Run, at_s: float) -> ReplayFeed:
@@ -177,6 +202,7 @@ def test_every_screen_looks_as_it_did(
     curve.parent.mkdir(parents=True)
     rows = [f"{step},{0.12 * step:.2f},{0.04 * (1 - np.exp(-step / 8000)):.5f}" for step in range(100, 12_001, 100)]
     curve.write_text("\n".join(["step,seconds,average_reward_m_s", *rows]) + "\n")
+    a_diagnosis(robot)
     app = OpenAnt(Path("my-ant"), ticking=False)
 
     async def before(pilot: Pilot[int]) -> None:
@@ -201,6 +227,7 @@ def test_every_screen_looks_as_it_did(
 def test_without_unicode_every_screen_is_ascii(robot: RobotFolder) -> None:
     plain(True)
     run = a_run(robot.path.parent)
+    a_diagnosis(robot)
 
     async def look() -> None:
         app = OpenAnt(robot.path, ticking=False)
@@ -383,6 +410,74 @@ def test_a_replay_shows_what_was_outside_the_bounds_of_this_robot(robot: RobotFo
             frozen(app, run, 7.0)
             await pilot.pause()
             assert any(line.startswith("hip_fl") and "outside" in line for line in screen_text(app).splitlines())
+
+    asyncio.run(look())
+
+
+# ---- the gap ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_model_is_written_from_a_diagnosis_once_the_builder_has_said_so(robot: RobotFolder) -> None:
+    a_diagnosis(robot)
+    given = robot.model_path()
+
+    async def look() -> None:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(120, 40)) as pilot:
+            await pilot.press("g")
+            await pilot.pause()
+            assert "(knee_fl): stiffness is not what the model" in " ".join(screen_text(app).replace("│", " ").split())
+            await pilot.press("w")
+            await pilot.pause()
+            await pilot.press("down", "enter")
+            assert app.session.diagnosing is None
+            await pilot.press("w")
+            await pilot.pause()
+            await pilot.press("enter")
+            await until(pilot, lambda: "✓ done" in screen_text(app))
+            assert f"openant gap apply {robot.diagnoses / '20261124T031500Z.json'}"[:60] in screen_text(app)
+        app.session.close()
+
+    asyncio.run(look())
+    assert robot.model_path() == robot.path / "improved.xml" != given
+    knee, before = (mujoco.MjModel.from_xml_path(str(path)).actuator("knee_fl") for path in (robot.model_path(), given))
+    assert knee.gainprm[0] / before.gainprm[0] == pytest.approx(0.62, abs=0.01)
+
+
+def test_runs_that_cannot_be_diagnosed_are_refused_in_words(robot: RobotFolder) -> None:
+    """Two are wanted; the process says what is wrong with them, and the screen says it on."""
+    run = a_run(robot.path.parent, seconds=3.0)
+    still = {name: np.zeros(len(run.t)) for name in run.columns}
+    for name in ("a", "b"):
+        write_table(replace(run, columns=still), robot.recordings / f"{name}.csv")
+
+    async def look() -> None:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(120, 40)) as pilot:
+            await pilot.press("g")
+            await pilot.pause()
+            assert "No diagnosis yet" in screen_text(app)
+            await pilot.press("enter", "d")
+            await pilot.pause()
+            assert app.session.diagnosing is None
+            await pilot.press("down", "enter", "d")
+            assert app.session.diagnosing is not None
+            assert app.session.diagnosing.arguments[:2] == ("gap", "diagnose")
+            await until(pilot, lambda: "nothing moves" in screen_text(app))
+        app.session.close()
+
+    asyncio.run(look())
+
+
+def test_a_diagnosis_that_is_none_is_said_to_be_none(robot: RobotFolder) -> None:
+    a_diagnosis(robot).write_text('{"schema": "something else"}')
+
+    async def look() -> None:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(120, 40)) as pilot:
+            await pilot.press("g")
+            await pilot.pause()
+            assert "is no diagnosis" in " ".join(screen_text(app).replace("│", " ").split())
 
     asyncio.run(look())
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +21,8 @@ __all__ = ["apply", "diagnose", "next_experiment", "prepare"]
 
 #: effects shown in the terminal; the JSON has all
 SHOWN = 6
+#: lines of progress at most
+TOLD = 20
 
 runs_argument = click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN…")
 model_option = click.option(
@@ -169,7 +172,18 @@ def next_experiment(diagnosis: Path, model: Path | None, json_file: Path | None)
 
 @contextlib.contextmanager
 def progress() -> Iterator[Callable[[float, str], None]]:
-    """A bar on stderr, told a share and words."""
+    """A bar on stderr, told a share and words; where that is no terminal, a line for every twentieth."""
+    if not sys.stderr.isatty():
+        said = -1
+
+        def say(share: float, words: str) -> None:
+            nonlocal said
+            if int(share * TOLD) > said:
+                said = int(share * TOLD)
+                click.echo(f"{100 * share:3.0f} %  {words}", err=True)
+
+        yield say
+        return
     with progress_bar("reading") as tell:
         yield lambda share, words: tell(words, share)
 
@@ -191,7 +205,7 @@ def _model(model: Path | None, robot: Path | None, runs: tuple[Path, ...]) -> Pa
 
 
 def _print(found: Diagnosis) -> None:
-    from openant_tools.gap.report import sentence, where_words
+    from openant_tools.gap.words import sentence, where_words
 
     click.echo(sentence(found))
     click.echo("effect               where               present  closes  parameters")

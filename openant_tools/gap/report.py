@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.gap.apply import robot_of
-from openant_tools.gap.cause import catalogue
-from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
+from openant_tools.gap.diagnosis import NONE, Diagnosis, Found
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
+from openant_tools.gap.words import closed, sentence, standing, what_next, where_words
 from openant_tools.model.gap import HORIZON_S
 from openant_tools.model.plant import load_plant, setup_of
 from openant_tools.model.rollout import Rollouts
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as MatplotlibFigure
 
-__all__ = ["diagnosis_report", "sentence", "where_words"]
+__all__ = ["diagnosis_report"]
 
 Array = NDArray[np.float64]
 
@@ -37,37 +37,6 @@ WINDOW_S = 3.0
 CANDIDATES, PLACES = 6, 8
 #: of the excess, below which a place is not worth a line
 LEAST_SHARE = 0.005
-#: probability below which an effect is refuted rather than a runner-up
-REFUTED = 0.2
-
-
-def sentence(found: Diagnosis) -> str:
-    """The verdict, with its confidence."""
-    sure = f"confidence {100 * found.confidence:.0f} %"
-    if found.verdict == NONE:
-        return f"Nothing beyond the floor and the tolerance of robots of one build ({sure})."
-    by_name = {one.effect: one for one in reversed(found.effects)}
-    if found.verdict == AMBIGUOUS:
-        sets = "; ".join(" or ".join(group) for group in found.ambiguous_with)
-        candidates = sets or " or ".join(one.effect for one in found.effects[:2])
-        return f"The gap is real, but these runs cannot tell its causes apart: {candidates} ({sure})."
-    if found.verdict == UNEXPLAINED:
-        best = found.effects[0] if found.effects else None
-        closest = "" if best is None else f"; closest is {best.effect}" + (
-            "" if best.gap_closed is None else f", which closes {100 * best.gap_closed:.0f} % of it"
-        )  # fmt: skip
-        return f"The gap is real, and nothing known here explains it{closest} ({sure})."
-    one = by_name[found.verdict]
-    words = f"{one.effect} ({where_words(one.joints)}): {catalogue()[one.effect].words}"
-    closed = _closed(found)
-    beside = [name for name in found.selected if name != found.verdict]
-    more = f", with {' and '.join(beside)} beside it" if beside else ""
-    return f"{words}{more}; the improved model closes {100 * closed:.0f} % of the gap on held-out runs ({sure})."
-
-
-def where_words(joints: tuple[str, ...] | str) -> str:
-    """`all`, `body` or the joints."""
-    return joints if isinstance(joints, str) else ", ".join(joints)
 
 
 def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[Run], model: Path) -> Report:
@@ -81,14 +50,14 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
         made_by="openant gap diagnose",
     )  # fmt: skip
     report.text(f"**{sentence(found)}**")
-    gap, closed = found.gap, _closed(found)
+    gap, share = found.gap, closed(found)
     healthy = found.verdict == NONE
     report.key_figures(
         KeyFigure("verdict", found.verdict, f"confidence {100 * found.confidence:.0f} %", "good" if healthy else ""),
         KeyFigure("gap before", f"{1e3 * gap['before']:.2f} mrad", "the model as given"),
         KeyFigure("gap after", f"{1e3 * gap['after']:.2f} mrad", "the improved model"),
         KeyFigure("floor", f"{1e3 * gap['floor']:.2f} mrad", "what no model could beat"),
-        KeyFigure("closed", f"{100 * closed:.0f} %", "of the excess, on held-out runs", "good" if closed > 0.7 else ""),
+        KeyFigure("closed", f"{100 * share:.0f} %", "of the excess, on held-out runs", "good" if share > 0.7 else ""),
     )
     report.section("Where")
     if found.where:
@@ -103,7 +72,7 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
         ["effect", "where", "present", "closes alone", "parameters", "stands"],
         [
             [one.effect, where_words(one.joints), f"{100 * one.probability:.0f} %", _percent(one.gap_closed),
-             _parameters(one), _standing(found, one)]
+             _parameters(one), standing(found, one)]
             for one in found.effects[:CANDIDATES]
         ],
     )  # fmt: skip
@@ -113,15 +82,9 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
         f"Measured and simulated around the moment at which the given model is farthest off, re-initialised every "
         f"{HORIZON_S:g} s; of {'the held-out runs' if held_out else 'all runs'}.",
     )
-    report.section("What next").text(found.next_experiment or _what_next(found))
+    report.section("What next").text(what_next(found))
     _details(report, found)
     return report
-
-
-def _what_next(found: Diagnosis) -> str:
-    if found.verdict == NONE:
-        return "Nothing: the model is as good as these runs can tell."
-    return "Write the improved model with `openant gap apply`, and record another motion to hold out against it."
 
 
 def _details(report: Report, found: Diagnosis) -> None:
@@ -272,13 +235,6 @@ def worst(found: Diagnosis, runs: Sequence[Run], model: Path) -> MatplotlibFigur
     return figure
 
 
-def _closed(found: Diagnosis) -> float:
-    """1 − excess after / excess before (formats, section 3)."""
-    before, after, floor = (float(found.gap[name]) for name in ("before", "after", "floor"))
-    excess = math.sqrt(max(before**2 - floor**2, 0.0))
-    return 1 - math.sqrt(max(after**2 - floor**2, 0.0)) / excess if excess > 0 else 0.0
-
-
 def _percent(value: float | None) -> str | None:
     return None if value is None else f"{100 * value:.0f} %".replace("-", "−")
 
@@ -288,17 +244,3 @@ def _parameters(one: Found) -> str:
         f"{name} {span.value:.3g} [{span.low:.3g}, {span.high:.3g}]".replace("-", "−")
         for name, span in one.parameters.items()
     )
-
-
-def _standing(found: Diagnosis, one: Found) -> str:
-    """Why it is in the answer, or not."""
-    if one.effect in found.selected:
-        lost = found.removal.get(one.effect)
-        return "selected" + (f"; without it {100 * lost:.0f} % less closes" if lost is not None else "")
-    if any(one.effect in group for group in found.ambiguous_with):
-        return "these runs cannot tell"
-    if one.probability < REFUTED:
-        return "unlike what simulated robots with it show"
-    if one.gap_closed is not None and one.gap_closed < 0.1:
-        return "closes nothing by itself on held-out runs"
-    return "not needed beside what was selected"

@@ -93,6 +93,11 @@ class RobotFolder:
         return self.path / "runs"
 
     @property
+    def diagnoses(self) -> Path:
+        """Of the gap between the robot and its simulation."""
+        return self.path / "gap"
+
+    @property
     def backups(self) -> Path:
         return self.path / "backups"
 

@@ -27,6 +27,7 @@ from openant_tools.tui.jump import Jump
 from openant_tools.tui.marks import BLUE, GREEN, ORANGE, VERMILION, plain
 from openant_tools.tui.page import Page
 from openant_tools.tui.screens.findings import FindingsScreen
+from openant_tools.tui.screens.gap import GapScreen
 from openant_tools.tui.screens.learn import LearnScreen
 from openant_tools.tui.screens.live import LiveScreen
 from openant_tools.tui.screens.recordings import RecordingsScreen
@@ -81,6 +82,7 @@ SCREENS: Mapping[str, tuple[type[Page], str]] = {
     "live": (LiveScreen, "All joints live, torque off"),
     "findings": (FindingsScreen, "What was found out about this robot; its passport"),
     "recordings": (RecordingsScreen, "Recordings, and their replay on any screen"),
+    "gap": (GapScreen, "Why the simulation is not as the robot, and how far it can be mended"),
     "learn": (LearnScreen, "Train an agent, see it learn"),
     "settings": (SettingsScreen, "The robot's folder, how it looks, what this machine has"),
 }
@@ -198,10 +200,13 @@ class OpenAnt(App[int]):
 
     def action_leave(self) -> None:
         """Quit; asks first where something is going on."""
-        if self._running_step is None and not self.session.learning:
+        if self._running_step is None and not self.session.learning and not self.session.computing:
             self._quit(0)
             return
-        words = "Something is still running. Quit all the same? Torque goes off; training is saved and can go on later."
+        words = (
+            "Something is still running. Quit all the same? Torque goes off; training and what a diagnosis simulated are "
+            "saved and can go on later."
+        )
         self.push_screen(Question(words, "Quit", "Stay"), self._answered_quit)
 
     def _answered_quit(self, choice: int | None) -> None:

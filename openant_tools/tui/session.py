@@ -20,6 +20,7 @@ from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.faults import Faults
 from openant_tools.tui.feeds import Feed, History, LiveFeed, ReplayFeed
+from openant_tools.tui.process import Process
 from openant_tools.tui.training import Training
 from openant_tools.virtual.process import VIRTUAL_DEFAULT, virtual_robot
 
@@ -38,6 +39,7 @@ class Session:
         notices: what the engine had to say, until somebody takes it.
         doing: what takes its time in the background; "" for nothing.
         training: the run that was started last, which goes on whatever is on the screen.
+        diagnosing: the diagnosis that was started last, or the model that is being improved by one.
     """
 
     def __init__(self, path: Path) -> None:
@@ -50,6 +52,7 @@ class Session:
         self.notices: list[str] = []
         self.doing = ""
         self.training: Training | None = None
+        self.diagnosing: Process | None = None
         self._engine: EngineProcess | None = None
         self._virtual_process = contextlib.ExitStack()
         #: one thread connects or starts a robot at a time
@@ -243,10 +246,16 @@ class Session:
     def learning(self) -> bool:
         return self.training is not None and self.training.running
 
+    @property
+    def computing(self) -> bool:
+        """Whether a diagnosis is under way."""
+        return self.diagnosing is not None and self.diagnosing.running
+
     def close(self) -> None:
         """Torque off, training saved, processes gone."""
         self._show(None)
         self.disconnect()
-        if self.training is not None:
-            self.training.close()
+        for process in (self.training, self.diagnosing):
+            if process is not None:
+                process.close()
         self._virtual_process.close()

@@ -15,13 +15,22 @@ from textual.widgets import Input, OptionList, Static
 from textual.widgets.option_list import Option
 
 from openant_tools.errors import OpenAntError
+from openant_tools.robot.folder import RobotFolder
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.feeds import ReplayFeed
 from openant_tools.tui.page import Page
 
-__all__ = ["RecordingsScreen"]
+__all__ = ["RecordingsScreen", "runs_of"]
 
 SUFFIXES = (".mcap", ".parquet", ".csv")
+
+
+def runs_of(folder: RobotFolder | None) -> list[Path]:
+    """All that was recorded of a robot, newest first."""
+    if folder is None or not folder.recordings.is_dir():
+        return []
+    found = [path for path in folder.recordings.rglob("*") if path.suffix in SUFFIXES]
+    return sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)
 
 
 class RecordingsScreen(Page):
@@ -47,7 +56,7 @@ that has the columns of docs/recordings.md.
 
     def on_mount(self) -> None:
         super().on_mount()
-        self._files = self._find()
+        self._files = runs_of(self.session.folder)
         chooser = self.query_one("#list", Choices)
         for number, path in enumerate(self._files):
             stat = path.stat()
@@ -58,13 +67,6 @@ that has the columns of docs/recordings.md.
         else:
             self.note("No recordings yet: `openant sysid record` and the steps of the walk make them.")
         chooser.focus()
-
-    def _find(self) -> list[Path]:
-        folder = self.session.folder
-        if folder is None or not folder.recordings.is_dir():
-            return []
-        found = [path for path in folder.recordings.rglob("*") if path.suffix in SUFFIXES]
-        return sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)
 
     def action_name(self) -> None:
         self.query_one("#path", Input).focus()

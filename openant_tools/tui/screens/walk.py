@@ -59,9 +59,10 @@ class WalkScreen(Page):
         Binding("k", "app.step('check')", "Check", show=False),
         Binding("u", "app.step('undo')", "Undo", show=False),
         Binding("f", "app.go('findings')", "Findings"),
-        Binding("r", "app.go('recordings')", "Replay"),
+        Binding("r", "app.go('recordings')", "Play"),
+        Binding("g", "app.go('gap')", "Gap"),
         Binding("t", "app.go('learn')", "Learn"),
-        Binding("s", "app.go('settings')", "Settings"),
+        Binding("s", "app.go('settings')", "Setup"),
         Binding("escape,q", "app.leave", "Quit", key_display="q"),
     ]
 

@@ -1,0 +1,72 @@
+"""A diagnosis in words: for the terminal, the report and the terminal program."""
+
+from __future__ import annotations
+
+import math
+
+from openant_tools.gap.cause import catalogue
+from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
+from openant_tools.model.gap import share_closed
+
+__all__ = ["closed", "sentence", "standing", "what_next", "where_words"]
+
+#: probability below which an effect is refuted rather than a runner-up
+REFUTED = 0.2
+
+
+def sentence(found: Diagnosis) -> str:
+    """The verdict, with its confidence."""
+    sure = f"confidence {100 * found.confidence:.0f} %"
+    if found.verdict == NONE:
+        return f"Nothing beyond the floor and the tolerance of robots of one build ({sure})."
+    by_name = {one.effect: one for one in reversed(found.effects)}
+    if found.verdict == AMBIGUOUS:
+        sets = "; ".join(" or ".join(group) for group in found.ambiguous_with)
+        candidates = sets or " or ".join(one.effect for one in found.effects[:2])
+        return f"The gap is real, but these runs cannot tell its causes apart: {candidates} ({sure})."
+    if found.verdict == UNEXPLAINED:
+        best = found.effects[0] if found.effects else None
+        closest = "" if best is None else f"; closest is {best.effect}" + (
+            "" if best.gap_closed is None else f", which closes {100 * best.gap_closed:.0f} % of it"
+        )  # fmt: skip
+        return f"The gap is real, and nothing known here explains it{closest} ({sure})."
+    one = by_name[found.verdict]
+    words = f"{one.effect} ({where_words(one.joints)}): {catalogue()[one.effect].words}"
+    share = closed(found)
+    beside = [name for name in found.selected if name != found.verdict]
+    more = f", with {' and '.join(beside)} beside it" if beside else ""
+    return f"{words}{more}; the improved model closes {100 * share:.0f} % of the gap on held-out runs ({sure})."
+
+
+def where_words(joints: tuple[str, ...] | str) -> str:
+    """`all`, `body` or the joints."""
+    return joints if isinstance(joints, str) else ", ".join(joints)
+
+
+def closed(found: Diagnosis) -> float:
+    """The share of the excess gap that the improved model closes; 0 where there is none."""
+    share = share_closed(*(float(found.gap[name]) for name in ("before", "after", "floor")))
+    return share if math.isfinite(share) else 0.0
+
+
+def standing(found: Diagnosis, one: Found) -> str:
+    """Why it is in the answer, or not."""
+    if one.effect in found.selected:
+        lost = found.removal.get(one.effect)
+        return "selected" + (f"; without it {100 * lost:.0f} % less closes" if lost is not None else "")
+    if any(one.effect in group for group in found.ambiguous_with):
+        return "these runs cannot tell"
+    if one.probability < REFUTED:
+        return "unlike what simulated robots with it show"
+    if one.gap_closed is not None and one.gap_closed < 0.1:
+        return "closes nothing by itself on held-out runs"
+    return "not needed beside what was selected"
+
+
+def what_next(found: Diagnosis) -> str:
+    """What to do now."""
+    if found.next_experiment:
+        return found.next_experiment
+    if found.verdict == NONE:
+        return "Nothing: the model is as good as these runs can tell."
+    return "Write the improved model with `openant gap apply`, and record another motion to hold out against it."

@@ -1,0 +1,267 @@
+"""The gap: choose runs, have them diagnosed, read the verdict, write the improved model."""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from rich.text import Text
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal, Vertical, VerticalScroll
+from textual.widgets import OptionList, Static
+from textual.widgets.option_list import Option
+
+from openant_tools.errors import OpenAntError
+from openant_tools.robot.folder import RobotFolder
+from openant_tools.robot.joints import JOINT_NAMES
+from openant_tools.tui.choices import Choices
+from openant_tools.tui.dialogs import Question
+from openant_tools.tui.marks import BLUE, GREEN, ORANGE, Name, mark, marked, plain, spelled
+from openant_tools.tui.page import Page
+from openant_tools.tui.process import Process
+from openant_tools.tui.screens.recordings import runs_of
+
+if TYPE_CHECKING:
+    from openant_tools.gap.diagnosis import Diagnosis, Found
+
+__all__ = ["GapScreen"]
+
+REFRESH_S = 1.0
+#: columns of a bar
+BAR = 12
+#: places and candidates shown; the report has all
+PLACES, CANDIDATES = 5, 5
+STAMP = "%Y%m%dT%H%M%SZ"
+IMPROVED = "improved.xml"
+NONE_YET = (
+    "No diagnosis yet.\n\nChoose at least two runs of different motions in the list on the left (Enter), on the stand and "
+    "on the floor if you can, then press d. A diagnosis says where the simulation differs from the robot, which unmodelled "
+    "effect causes it, and how far the gap closes once that effect is added.\n\nOf commands that were never seen thousands "
+    "of robots are simulated first: a quarter of an hour, once."
+)
+
+
+class GapScreen(Page):
+    """Diagnoses and runs on the left, the chosen verdict on the right."""
+
+    TITLE = "Gap"
+    HELP = """\
+# The gap between the robot and its simulation
+
+Above on the left stand the diagnoses so far, below them the robot's recordings. `Enter` on a recording chooses it, `d`
+diagnoses what is chosen: a process of its own with the command that stands on the screen; you may leave the screen
+meanwhile, and what it simulated is kept where it is stopped (`k`).
+
+A verdict names an effect, or says `none` (nothing beyond what robots of one build differ by), `ambiguous` (these runs cannot
+tell its causes apart) or `unexplained` (the gap is real, and nothing known closes it). What is marked `✓` goes into the
+improved model, which `w` writes beside the robot's own. The full report with pictures lies in the robot's `gap/`.
+"""
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("d", "diagnose", "Diagnose"),
+        Binding("w", "write", "Write model"),
+        Binding("k", "stop", "Stop it"),
+    ]
+
+    def body(self) -> ComposeResult:
+        with Horizontal():
+            with Vertical(id="sources"):
+                yield Static("Diagnoses", classes="title")
+                yield Choices(id="diagnoses")
+                yield Static("Runs", classes="title")
+                yield Choices(id="runs")
+            with VerticalScroll(can_focus=True):
+                yield Static(id="verdict")
+        yield Static(id="process")
+
+    def on_mount(self) -> None:
+        super().on_mount()
+        self._chosen: set[Path] = set()
+        self._shown: Path | None = None
+        self._was_running = self.session.computing
+        self._runs = runs_of(self.session.folder)
+        runs = self.query_one("#runs", Choices)
+        for number, path in enumerate(self._runs):
+            runs.add_option(Option(self._line(path), id=str(number)))
+        self._list()
+        (self.query_one("#diagnoses", Choices) if self._files else runs).focus()
+        if self._runs:
+            runs.highlighted = 0
+        self.set_interval(REFRESH_S, self.draw_process)
+        self.draw_process()
+
+    def _line(self, path: Path) -> Text:
+        return Text(f"[{'x' if path in self._chosen else ' '}] {path.name}", no_wrap=True, overflow="ellipsis")
+
+    def _list(self) -> None:
+        """Read which diagnoses there are."""
+        folder = self.session.folder
+        self._files = sorted(folder.diagnoses.glob("*.json"), reverse=True) if folder is not None else []
+        chooser = self.query_one("#diagnoses", Choices)
+        chooser.clear_options()
+        for path in self._files:
+            chooser.add_option(Option(Text(_when(path), no_wrap=True, overflow="ellipsis")))
+        if self._files:
+            chooser.highlighted = 0
+        else:
+            self.query_one("#verdict", Static).update(spelled(NONE_YET))
+
+    def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
+        if event.option_list.id == "diagnoses" and event.option_index < len(self._files):
+            self._shown = self._files[event.option_index]
+            self._show(self._shown)
+
+    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+        if event.option_list.id == "runs":
+            path = self._runs[event.option_index]
+            self._chosen ^= {path}
+            event.option_list.replace_option_prompt_at_index(event.option_index, self._line(path))
+            self.draw_process()
+
+    def on_resize(self) -> None:
+        if self._shown is not None:
+            self._show(self._shown)
+
+    def _show(self, path: Path) -> None:
+        from openant_tools.gap.diagnosis import read_diagnosis  # all causes are loaded with it
+
+        verdict = self.query_one("#verdict", Static)
+        try:
+            verdict.update(_page(read_diagnosis(path)))
+        except OpenAntError as error:
+            verdict.update(marked("fail", str(error)))
+
+    # ---- processes -----------------------------------------------------------------------------------------------
+
+    def action_diagnose(self) -> None:
+        """Diagnose the chosen runs."""
+        folder = self.session.folder
+        if folder is None or len(self._chosen) < 2:
+            self.notify("choose at least two runs of different motions first: Enter on them", severity="warning")
+            return
+        out = folder.diagnoses / datetime.datetime.now(datetime.UTC).strftime(STAMP)
+        runs = [str(path) for path in self._runs if path in self._chosen]
+        self._start(
+            folder, "diagnose", *runs, "--robot", str(folder.path), "--json", f"{out}.json", "--report", str(out)
+        )
+
+    def action_write(self) -> None:
+        """Write the model without the gap, once the builder has said so."""
+        folder, shown = self.session.folder, self._shown
+        if folder is None or shown is None:
+            self.notify("there is no diagnosis yet", severity="warning")
+            return
+
+        def answered(choice: int | None) -> None:
+            if choice == 0:
+                out = str(folder.path / IMPROVED)
+                self._start(folder, "apply", str(shown), "--robot", str(folder.path), "--out", out)
+
+        words = (
+            f"Write what this diagnosis found into {IMPROVED}, and let robot.toml name it? The model as it is now stays where "
+            "it is; the robot.toml before goes into backups/."
+        )
+        self.app.push_screen(Question(words, "Yes, write", "No"), answered)
+
+    def action_stop(self) -> None:
+        if self.session.diagnosing is not None:
+            self.session.diagnosing.stop()
+
+    def _start(self, folder: RobotFolder, *arguments: str) -> None:
+        if self.session.computing:
+            self.notify("one at a time: k stops what runs, and keeps what it simulated", severity="warning")
+            return
+        self.session.diagnosing = Process(("gap", *arguments), folder.diagnoses / "gap.log")
+        self.session.diagnosing.start()
+        self.draw_process()
+
+    def draw_process(self) -> None:
+        """What runs, and how far it is."""
+        process = self.session.diagnosing
+        text = Text(f"{len(self._chosen)} runs chosen", no_wrap=True, overflow="ellipsis")
+        if process is not None:
+            if process.running:
+                text = marked("wait", process.last_words or "begun")
+            elif process.exit_code == 0:
+                text = marked("ok", "done")
+            elif process.exit_code == 130:
+                text = marked("warn", "stopped; what was simulated is kept")
+            else:
+                text = marked("fail", process.last_words)
+            text.append(f"\n{process.command}", "dim" if not plain() else "")
+        self.query_one("#process", Static).update(text)
+        if self._was_running and not self.session.computing:
+            self._list()
+        self._was_running = self.session.computing
+
+
+def _when(path: Path) -> str:
+    try:
+        return datetime.datetime.strptime(path.stem, STAMP).strftime("%d.%m.%Y %H:%M UTC")
+    except ValueError:
+        return path.stem
+
+
+def _page(found: Diagnosis) -> Text:
+    """The verdict in the order in which one asks: what, where, which, how far, what next."""
+    from openant_tools.gap.words import closed, sentence, what_next
+
+    text = Text.assemble((spelled(sentence(found)), "bold"), "\n")
+    text.append("\nWhere\n", "bold")
+    for place in found.where[:PLACES]:
+        share = float(place["share"])
+        text.append(f" {place['signal']:6.6}{place['joint']:9.9}{place['regime']:10.10}")
+        text.append_text(_bar(share, ORANGE)).append(f" {100 * share:3.0f} %\n")
+    text.append_text(_by_leg(found))
+    text.append("\nWhich, and how likely\n", "bold")
+    for one in found.effects[:CANDIDATES]:
+        text.append_text(_candidate(found, one))
+    gap, share = found.gap, closed(found)
+    text.append("\nHow far\n", "bold")
+    before, after, floor = (1e3 * float(gap[name]) for name in ("before", "after", "floor"))
+    text.append(f" {before:.2f} {spelled('→')} {after:.2f} mrad of position, floor {floor:.2f}\n closed ")
+    text.append_text(_bar(share, GREEN)).append(f" {100 * share:3.0f} % on runs left out\n")
+    text.append("\nNext\n", "bold")
+    text.append(f" {spelled(what_next(found))}\n")
+    for note in found.notes:
+        text.append(f" {mark('info')} {spelled(note)}\n", "" if plain() else "dim")
+    return text
+
+
+def _candidate(found: Diagnosis, one: Found) -> Text:
+    from openant_tools.gap.words import standing, where_words
+
+    unsure = any(one.effect in group for group in found.ambiguous_with)
+    state: Name = "ok" if one.effect in found.selected else "warn" if unsure else "todo"
+    text = Text.assemble(" ", marked(state, one.effect, 21))
+    text.append_text(_bar(one.probability, BLUE)).append(f" {100 * one.probability:3.0f} %\n")
+    values = ", ".join(f"{name} {span.value:.3g}" for name, span in one.parameters.items())
+    alone = "" if one.gap_closed is None else f"closes {100 * one.gap_closed:.0f} % alone; "
+    text.append(
+        spelled(f"   {where_words(one.joints)}{': ' if values else ''}{values}\n   {alone}{standing(found, one)}\n")
+    )
+    return text
+
+
+def _bar(share: float, colour: str) -> Text:
+    full, empty = ("=", "-") if plain() else ("━", "─")
+    done = min(max(round(share * BAR), 0), BAR)
+    return Text.assemble((full * done, colour), empty * (BAR - done))
+
+
+def _by_leg(found: Diagnosis) -> Text:
+    """Shares of the position's excess by joint, as legs lie from above; nothing for another robot."""
+    share = dict.fromkeys(JOINT_NAMES, 0.0)
+    for place in found.where:
+        if place["signal"] == "pos" and place["joint"] in share:
+            share[str(place["joint"])] += float(place["share"])
+    text = Text()
+    if any(share.values()):
+        text.append(" position by leg, front above: hip, knee\n")
+        for left, right in (("fl", "fr"), ("rl", "rr")):
+            both = (
+                f"{leg} {100 * share[f'hip_{leg}']:3.0f} {100 * share[f'knee_{leg}']:3.0f} %" for leg in (left, right)
+            )
+            text.append(f"   {'      '.join(both)}\n")
+    return text
