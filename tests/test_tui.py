@@ -460,7 +460,9 @@ def test_runs_that_cannot_be_diagnosed_are_refused_in_words(robot: RobotFolder) 
             await pilot.press("enter", "d")
             await pilot.pause()
             assert app.session.diagnosing is None
-            await pilot.press("down", "enter", "d")
+            await pilot.press("a", "a")
+            assert "0 runs chosen" in screen_text(app)
+            await pilot.press("a", "d")
             assert app.session.diagnosing is not None
             assert app.session.diagnosing.arguments[:2] == ("gap", "diagnose")
             await until(pilot, lambda: "nothing moves" in screen_text(app))

@@ -50,15 +50,16 @@ class GapScreen(Page):
     HELP = """\
 # The gap between the robot and its simulation
 
-Above on the left stand the diagnoses so far, below them the robot's recordings. `Enter` on a recording chooses it, `d`
-diagnoses what is chosen: a process of its own with the command that stands on the screen; you may leave the screen
-meanwhile, and what it simulated is kept where it is stopped (`k`).
+Above on the left stand the diagnoses so far, below them the robot's recordings. `Enter` on a recording chooses it (`a` all
+of them), `d` diagnoses what is chosen: a process of its own with the command that stands on the screen; you may leave the
+screen meanwhile, and what it simulated is kept where it is stopped (`k`).
 
 A verdict names an effect, or says `none` (nothing beyond what robots of one build differ by), `ambiguous` (these runs cannot
 tell its causes apart) or `unexplained` (the gap is real, and nothing known closes it). What is marked `✓` goes into the
 improved model, which `w` writes beside the robot's own. The full report with pictures lies in the robot's `gap/`.
 """
     BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("a", "all", "All runs"),
         Binding("d", "diagnose", "Diagnose"),
         Binding("w", "write", "Write model"),
         Binding("k", "stop", "Stop it"),
@@ -114,10 +115,18 @@ improved model, which `w` writes beside the robot's own. The full report with pi
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         if event.option_list.id == "runs":
-            path = self._runs[event.option_index]
-            self._chosen ^= {path}
-            event.option_list.replace_option_prompt_at_index(event.option_index, self._line(path))
-            self.draw_process()
+            self._choose(self._chosen ^ {self._runs[event.option_index]})
+
+    def _choose(self, chosen: set[Path]) -> None:
+        self._chosen = chosen
+        runs = self.query_one("#runs", Choices)
+        for number, path in enumerate(self._runs):
+            runs.replace_option_prompt_at_index(number, self._line(path))
+        self.draw_process()
+
+    def action_all(self) -> None:
+        """Choose all runs, or none where all are."""
+        self._choose(set() if len(self._chosen) == len(self._runs) else set(self._runs))
 
     def on_resize(self) -> None:
         if self._shown is not None:
