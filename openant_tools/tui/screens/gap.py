@@ -188,7 +188,7 @@ improved model, which `w` writes beside the robot's own. The full report with pi
     def draw_process(self) -> None:
         """What runs, and how far it is."""
         process = self.session.diagnosing
-        text = Text(f"{len(self._chosen)} runs chosen", no_wrap=True, overflow="ellipsis")
+        text = Text(f"{len(self._chosen)} runs chosen")
         if process is not None:
             if process.running:
                 text = marked("wait", process.last_words or "begun")
