@@ -62,6 +62,25 @@ def test_a_robot_that_begins_anew_amid_its_run_goes_on_as_it_did(
     assert knowing < 0.4 * anew(protocol, robot)
 
 
+@pytest.mark.parametrize(
+    ("cause", "x"), [("joint_compliance", {"stiffness_nm_rad": 2.0}), ("backlash", {"gap_rad": 0.02})]
+)
+def test_a_joint_that_rests_stays_where_it_is_however_its_zero_is_off(
+    cause: str, x: dict[str, float], protocol: Protocol
+) -> None:
+    """What the servo asks for at rest says little of the spring behind it: its friction takes any part."""
+    given = protocol.runs[0]
+    still = run_of({"cmd.joint": np.full(len(T), 0.5), "pos.joint": np.full(len(T), 0.46)}, T, ["joint"])
+    robot = Robot(1, protocol.reference.low, protocol.reference.high)
+    enter(robot, protocol.reference, [(cause, [0], x)])
+    robot.more("coulomb_friction")[:] = 0.15
+    (whole,) = simulate(Rollouts(given.plant, [still]), [robot], signals=["pos"]).signals["pos"][..., 0].astype(float)
+    rests = still.columns | {"pos.joint": np.full(len(T), whole[-1] + 0.008)}
+    rollouts = Rollouts(given.plant, [dataclasses.replace(still, columns=rests)], 0.5)
+    (again,) = simulate(rollouts, [robot], signals=["pos"]).signals["pos"][..., 0]
+    assert np.abs(again - rests["pos.joint"]).max() < 0.006
+
+
 def test_a_setpoint_of_limited_rate_is_under_way() -> None:
     robot = Robot(1)
     robot.slew[:] = 0.5

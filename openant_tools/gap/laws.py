@@ -16,7 +16,7 @@ from openant_tools.effects.step import Law, Step
 from openant_tools.effects.thermal_derating import Heating
 from openant_tools.gap.robot import Robot
 
-__all__ = ["Fields", "back_emf", "first_laws", "last_laws"]
+__all__ = ["Fields", "Transmission", "back_emf", "first_laws", "last_laws"]
 
 Array = NDArray[np.float64]
 
@@ -93,7 +93,7 @@ def last_laws(robots: Sequence[Robot], generated: Array, fields: Fields) -> list
     play, compliance = _table(robots, "play"), _table(robots, "compliance")
     if play.any() or compliance.any():
         before = np.array([[robot.form is not None and not robot.form.loop_behind] for robot in robots])
-        laws.append(_transmitting(play, compliance, fields, before))
+        laws.append(Transmission(play, compliance, fields, before))
     return laws
 
 
@@ -197,58 +197,71 @@ def _bending(bristle: Array, inertia: Array) -> Law:
     return act
 
 
-def _transmitting(play: Array, compliance: Array, fields: Fields, before: NDArray[np.bool_]) -> Law:
+class Transmission:
     """A rotor behind play or a spring; the servo's loop closes over both, as the encoder sits on the output, or `before` them.
 
     The rotor is integrated here, the link by MuJoCo. Both take what passes between them implicitly, as teeth are far too stiff
     for steps that long: a spring k that is seen where it will be at the step's end is a spring and a damper k·dt.
-    """
-    mine = (play > 0) | (compliance > 0)
-    output = np.where(mine, np.where(before, BARE, OUTPUT), 1.0)
-    rotor, damping = np.where(mine, (1 - output) * fields.armature, 1.0), np.where(mine, fields.damping, 0.0)
-    fields.armature[:] *= output
-    fields.damping[mine] = 0.0
-    spring = np.where(compliance > 0, 1 / np.maximum(compliance, 1 / TEETH), TEETH)
-    damper = 2 * DAMPED * np.sqrt(spring * np.minimum(fields.link + fields.armature, rotor))
-    half = play / 2
-    angle: list[Array] = []
-    speed, before_that = np.zeros(play.shape), np.zeros(play.shape)
 
-    def act(step: Step) -> None:
-        h = step.dt
-        if not angle:
-            before_that[:] = step.velocity
+    Args:
+        play: (robots, joints) rad. compliance: the same in rad per N·m. before: (robots, 1).
+    """
+
+    def __init__(self, play: Array, compliance: Array, fields: Fields, before: NDArray[np.bool_]) -> None:
+        self._mine, self._before, self._fields = (play > 0) | (compliance > 0), before, fields
+        output = np.where(self._mine, np.where(before, BARE, OUTPUT), 1.0)
+        self._rotor = np.where(self._mine, (1 - output) * fields.armature, 1.0)
+        self._damping = np.where(self._mine, fields.damping, 0.0)
+        fields.armature[:] *= output
+        fields.damping[self._mine] = 0.0
+        self._spring = np.where(compliance > 0, 1 / np.maximum(compliance, 1 / TEETH), TEETH)
+        inertia = np.minimum(fields.link + fields.armature, self._rotor)
+        self._damper = 2 * DAMPED * np.sqrt(self._spring * inertia)
+        self._half = play / 2
+        self._angle: Array | None = None
+        self._speed, self._link_speed = np.zeros(play.shape), np.zeros(play.shape)
+
+    def carry(self, position: Array, velocity: Array, load: Array) -> None:
+        """Put rotors where they carry a load.
+
+        Args:
+            position, velocity: (robots, joints) rad and rad/s of the links. load: N·m that these get.
+        """
+        held = np.clip(load, -HELD, HELD)
+        self._angle = position + np.where(self._mine, self._half * np.sign(held) + held / self._spring, 0.0)
+        self._speed, self._link_speed = velocity.copy(), velocity.copy()
+
+    def __call__(self, step: Step) -> None:
+        h, mine, half, spring, rotor = step.dt, self._mine, self._half, self._spring, self._rotor
+        if self._angle is None:
             # At rest the teeth that carry the load are the ones that touch.
-            held = np.clip(step.motor_torque, -HELD, HELD)
-            angle.append(step.position + np.where(mine, half * np.sign(held) + held / spring, 0.0))
-            speed[:] = step.velocity
-        position, velocity = step.position, step.velocity
-        step.position, step.velocity = np.where(before, angle[0], position), np.where(before, speed, velocity)
+            self.carry(step.position, step.velocity, step.motor_torque)
+        assert self._angle is not None
+        angle, speed, position, velocity = self._angle, self._speed, step.position, step.velocity
+        step.position, step.velocity = np.where(self._before, angle, position), np.where(self._before, speed, velocity)
         driven = step.motor_torque + step.torque
         step.position, step.velocity = position, velocity
         # The link goes on as it did: what it gets and what the rotor loses are then the same to the second order.
-        going = 2 * velocity - before_that
-        before_that[:] = velocity
+        going = 2 * velocity - self._link_speed
+        self._link_speed = velocity.copy()
         velocity = going
-        twist = angle[0] - position
+        twist = angle - position
         ahead = twist + h * (speed - velocity)
         side = np.where(half > 0, np.sign(ahead), 1.0)
         touching = (np.abs(ahead) > half) | (half == 0)
         for _ in range(2):
-            k, c = np.where(touching, spring, 0.0), np.where(touching, damper, 0.0)
-            heavy = rotor + h * (damping + c + h * k)
+            k, c = np.where(touching, spring, 0.0), np.where(touching, self._damper, 0.0)
+            heavy = rotor + h * (self._damping + c + h * k)
             faster = (rotor * speed + h * (driven - k * (twist - h * velocity - side * half) + c * velocity)) / heavy
             slowed = np.sign(faster) * np.maximum(np.abs(faster) - h * step.friction / heavy, 0.0)
             pushed = k * (twist + h * (slowed - velocity) - side * half) + c * (slowed - velocity)
             # Teeth push and never pull.
             touching &= (half == 0) | (pushed * side > 0)
-        speed[:] = np.where(mine, slowed, step.velocity)
-        angle[0] = np.where(mine, angle[0] + h * speed, position)
-        passed = k * (angle[0] - position - side * half) + c * speed
+        self._speed = np.where(mine, slowed, step.velocity)
+        self._angle = np.where(mine, angle + h * self._speed, position)
+        passed = k * (self._angle - position - side * half) + c * self._speed
         step.torque = np.where(mine, passed, step.torque)
-        fields.damp(np.where(mine, c + h * k, fields.damping))
+        self._fields.damp(np.where(mine, c + h * k, self._fields.damping))
         step.friction = np.where(mine, 0.0, step.friction)
         step.stiffness = np.where(mine, TINY, step.stiffness)
         step.velocity_gain = np.where(mine, TINY, step.velocity_gain)
-
-    return act

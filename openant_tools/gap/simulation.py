@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 from openant_tools.effects.rollout import laws_of
 from openant_tools.effects.servos import batch_of
 from openant_tools.effects.step import Law, Step
-from openant_tools.gap.laws import Fields, back_emf, first_laws, last_laws
+from openant_tools.gap.laws import Fields, Transmission, back_emf, first_laws, last_laws
 from openant_tools.gap.memory import heats, setpoints
 from openant_tools.gap.robot import Cable, Form, Robot, tilted
 from openant_tools.model.body import torso_body
@@ -279,6 +279,30 @@ class _Batch:
             self._servos.prepare(
                 self._laws, np.full(len(zero), h * (step - self._led)), (where[step] - zero, speed[step])
             )
+        if self._plant.setup is Setup.STAND:
+            self._carry()
+
+    def _carry(self) -> None:
+        """Put rotors where they carry what the links that they move were measured to need; on the floor feet carry some of it.
+
+        What a servo that stands still gives says little of it: its friction takes any part.
+        """
+        model, dof = self._plant.model, self._plant.dof
+        data, loads = mujoco.MjData(model), []
+        for segment in self._segments:
+            mujoco.mj_setState(model, data, segment.state, mujoco.mjtState.mjSTATE_INTEGRATION)
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            ends: Array = segment.start + ACCELERATION_S * np.array([-1.0, 1.0])
+            speed = self._rollouts.measured[segment.run].at(ends)[1]
+            acceleration, moves = np.zeros(model.nv), np.zeros(model.nv)
+            acceleration[dof] = (speed[1] - speed[0]) / (2 * ACCELERATION_S)
+            mujoco.mj_mulM(model, data, moves, acceleration)
+            loads.append((moves + data.qfrc_bias - model.dof_armature * acceleration)[dof])
+        load = np.repeat(loads, self._n, axis=0)
+        for law in self._laws:
+            if isinstance(law, Transmission):
+                law.carry(*self._servos.state, load)
 
     def _controls(self, longest: int) -> NDArray[np.float32]:
         """(segments · robots, steps, joints) rad, setpoints as they act: late, scattered, lost, filtered."""
