@@ -14,7 +14,7 @@ from openant_tools.gap.closure import Windows, closures, nothing, unmoved
 from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Protocol
-from openant_tools.gap.rivals import paired, placed, rivals
+from openant_tools.gap.rivals import bodily, paired, placed, rivals
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.plant import Setup, load_plant
@@ -101,12 +101,10 @@ def test_beside_the_best_what_had_neither_size_nor_place_alone_is_tried_where_th
     assert left < 0.7
 
 
-def test_a_joint_that_is_strained_is_asked_whatever_the_judge_says(tmp_path: Path) -> None:
-    """One hip of the Ant brakes three times as much as the others; the judge knows of all joints alone."""
-    plant = load_plant(write(tmp_path / "given.xml", nominal_mjcf("standard")), None, Setup.STAND)
+def on_the_stand(folder: Path, robot: Robot) -> Windows:
+    """Two runs of an Ant whose legs hang free."""
+    plant = load_plant(write(folder / "given.xml", nominal_mjcf("standard")), None, Setup.STAND)
     home = np.array([0.0 if joint.startswith("hip") else -0.6 for joint in plant.joints])
-    robot = Robot(8)
-    robot.factor("damping")[2] = 3.0
     runs = []
     for n in range(2):
         commands = home + 0.5 * np.sin(2 * np.pi * (1.5 + n) * (T - T[0])[:, None] + np.arange(8))
@@ -116,11 +114,18 @@ def test_a_joint_that_is_strained_is_asked_whatever_the_judge_says(tmp_path: Pat
         seen = simulate(Rollouts(plant, [run]), [robot], signals=["pos"]).signals["pos"][0].astype(float)
         columns |= {f"pos.{joint}": seen[:, j] for j, joint in enumerate(plant.joints)}
         runs.append(dataclasses.replace(run, columns=columns))
-    windows = Windows(Protocol.of(runs, plant.path, plant.joints, [None, None]))
+    return Windows(Protocol.of(runs, plant.path, plant.joints, [None, None]))
+
+
+def test_a_joint_that_is_strained_is_asked_whatever_the_judge_says(tmp_path: Path) -> None:
+    """One hip of the Ant brakes three times as much as the others; the judge knows of all joints alone."""
+    robot = Robot(8)
+    robot.factor("damping")[2] = 3.0
+    windows = on_the_stand(tmp_path, robot)
     windows.refit([nothing(windows)], [0, 1], ())
     assert windows.strained([0, 1]) == [2]
     everywhere = suspect("damping_error", tuple(range(8)), 0.6)
-    judgement = Judgement({}, np.zeros(1), 1.0, {"damping_error": [(everywhere.part.joints, everywhere.x)]})
+    judgement = Judgement({}, np.zeros(1), 1.0, {"damping_error": [(everywhere.part.joints, dict(everywhere.x))]})
     one, _ = placed(windows, judgement, {"damping_error": everywhere}, [0, 1])["damping_error"]
     assert one.part.joints == (2,)
     # Among eight joints two causes at one of them are hard to tell apart; at that one they are not.
@@ -129,3 +134,26 @@ def test_a_joint_that_is_strained_is_asked_whatever_the_judge_says(tmp_path: Pat
     _, _, (brakes, heavy) = closures(windows, starts, [1], [0])
     assert brakes.closed_at([2]) - heavy.closed_at([2]) > brakes.closed - heavy.closed > 0
     assert brakes.closed_at(range(8)) == pytest.approx(brakes.closed)
+
+
+def test_what_one_joint_does_is_not_lost_among_what_others_do(tmp_path: Path) -> None:
+    """A knee brakes a little more than it should, while all hips are far stiffer: where the knee alone counts, that is seen."""
+    robot = Robot(8)
+    robot.factor("stiffness")[::2] = 2.5
+    robot.factor("damping")[3] = 1.35
+    windows = on_the_stand(tmp_path, robot)
+    windows.look([0, 1])
+    braked = suspect("damping_error", (3,), 0.0)
+    braked = dataclasses.replace(braked, x={"scale": float(np.log(1.35))})
+    refits = [unmoved(windows, [], []), unmoved(windows, [braked.part], [braked.x])]
+    everywhere, here = (windows.left(refits, [0, 1], joints) for joints in (None, [3]))
+    assert here[1] / here[0] < 0.5 * everywhere[1] / everywhere[0]
+    assert (here < everywhere).all()
+
+
+def test_causes_of_the_body_are_asked_where_there_is_a_floor(weak: Windows, tmp_path: Path) -> None:
+    assert bodily(weak.protocol, ()) == []
+    on_floor = dataclasses.replace(weak.protocol, reference=dataclasses.replace(weak.protocol.reference, floor=True))
+    names = [one.part.cause for one in bodily(on_floor, ["payload"])]
+    assert {"foot_adhesion", "contact_softness", "floor_tilt"} <= set(names)
+    assert not {"payload", "imu_bias", "zero_offset"} & set(names)

@@ -464,16 +464,22 @@ class Windows:
             self._lead(start, quick=True)
         return start
 
-    def left(self, refits: Sequence[Refit], seen: Sequence[int]) -> Array:
+    def left(self, refits: Sequence[Refit], seen: Sequence[int], joints: Sequence[int] | None = None) -> Array:
         """(refits,) the cost that each would leave, re-fitted within tolerance by the slopes that were learnt without causes.
 
         A first look at many causes, at some of the windows, after a re-fit of `nothing` on these runs.
+
+        Args:
+            joints: of which it counts what is left; default all.
         """
+        others = np.ones(len(self.protocol.joints), bool)
+        others[list(range(len(others)) if joints is None else joints)] = False
         normal = np.diag(np.full(len(self.names), 1 / SPREAD**2))
         at = np.array([refit.nuisance for refit in refits])
         gradients, cost = at / SPREAD**2, np.square(at / SPREAD).sum(axis=1)
         for k in seen:
             errors = self._errors(k, [self.robot(refit, k) for refit in refits], self._glance[k])
+            errors[..., others] = np.nan
             looked = np.isfinite(errors).any(axis=0).ravel()
             errors = (np.nan_to_num(errors) * self._weight(k)).reshape(len(refits), -1)[:, looked]
             slopes = self._learnt[k][:, looked].astype(np.float64)

@@ -17,7 +17,7 @@ from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Protocol
 
-__all__ = ["everywhere", "moves_joints", "paired", "placed", "rivals"]
+__all__ = ["bodily", "carries", "everywhere", "moves_joints", "paired", "placed", "rivals"]
 
 #: places that the judge names among which the runs choose, and those whose sizes are tried wider
 NAMED, WIDER = 8, 2
@@ -77,18 +77,22 @@ def rivals(
     training: Sequence[int],
     *,
     places: Sequence[tuple[int, ...]] = (),
+    where: Sequence[int] | None = None,
 ) -> dict[Part, dict[str, float]]:
     """Causes that nobody suspected and that leave clearly less than the best suspects, where those sit or a joint is strained.
 
     Args:
         windows: on which `nothing` was re-fitted. known: causes that are suspected already.
-        training: the runs to look at. places: where else to look.
+        training: the runs to look at. places: where else to look. where: joints of which it counts what is left; default all.
 
     Returns:
         their sizes.
     """
     protocol = windows.protocol
     anywhere = [*(one.part.joints for one in best), *((j,) for j in windows.strained(training)), *places]
+    if where is not None:
+        # What acts on others, too, does as much there: only they would tell.
+        anywhere = [joints for joints in anywhere if set(joints) <= set(where)]
     others = [
         (Part(name, joints), start)
         for joints in dict.fromkeys(anywhere)
@@ -101,7 +105,7 @@ def rivals(
         for start in cause.starts(strength, turn, len(STRENGTHS))
     ]
     tried = [*((one.part, one.x) for one in best), *others]
-    left = windows.left([unmoved(windows, [part], [x]) for part, x in tried], training)
+    left = windows.left([unmoved(windows, [part], [x]) for part, x in tried], training, where)
     least, rest = left[: len(best)].min(), left[len(best) :]
     found: dict[Part, dict[str, float]] = {}
     for k in np.argsort(rest):
@@ -116,6 +120,17 @@ def rivals(
 def everywhere(protocol: Protocol) -> list[tuple[int, ...]]:
     """The servos of each model, and all joints."""
     return [*(tuple(group) for group in protocol.servos()), tuple(range(len(protocol.joints)))]
+
+
+def bodily(protocol: Protocol, known: Collection[str]) -> list[Explained]:
+    """Causes of the body and the floor of which no size is known yet."""
+    joints = tuple(range(len(protocol.joints)))
+    return [
+        Explained(Part(name, joints), nowhere, nowhere, np.inf)
+        for name, cause in catalogue().items()
+        if name not in known and cause.of_body and carries(cause) and cause.shows(protocol.reference)
+        for nowhere in [{q.name: 0.0 for q in cause.quantities}]
+    ]
 
 
 def paired(
@@ -166,6 +181,11 @@ def _fits(cause: Cause, joints: tuple[int, ...], protocol: Protocol) -> bool:
 
 def _part(one: Explained, share: float) -> dict[str, float]:
     return {q.name: one.x[q.name] * (1.0 if q.shape else share) for q in one.part.definition.quantities}
+
+
+def carries(cause: Cause) -> bool:
+    """Whether it changes how a robot stands and what its joints carry: on the floor all positions show that a little."""
+    return (cause.of_body or cause.silent) and cause.signal is None
 
 
 def moves_joints(cause: Cause) -> bool:

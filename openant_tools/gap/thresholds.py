@@ -25,6 +25,10 @@ CLEARLY = 0.75
 #: held-out closure that an addition must bring; that one cause must bring beyond what tolerances do, where the judge doubts;
 #: and below which a set explains nothing
 ADDS, ADDS_ALONE, EXPLAINS = 0.02, 0.2, 0.35
+#: that one cause must bring beyond what tolerances do where those leave as little as of a healthy robot
+BARELY = 0.05
+#: beyond which what closes is no riddle, however odd what is left may be
+CLOSES_MOST = 0.75
 #: and that a second cause must bring which the judge does not expect
 ADDS_MUCH = 0.15
 #: share of what a re-fit leaves that a cause leaves of it where closure alone proves it

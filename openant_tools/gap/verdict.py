@@ -12,17 +12,19 @@ import numpy as np
 from openant_tools.gap.cause import catalogue
 from openant_tools.gap.closure import ClosureByJoint, Refit, Windows, calibration_of, closures, nothing, unmoved
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis
-from openant_tools.gap.explain import Explained, Scene, explain, fit, robot_with, scene_of
+from openant_tools.gap.explain import Explained, Part, Scene, explain, fit, robot_with, scene_of
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.patient import Patient, diagnosis_of, found_of, shown, unfitted, warmth
-from openant_tools.gap.rivals import everywhere, moves_joints, paired, placed, rivals
+from openant_tools.gap.rivals import bodily, carries, everywhere, moves_joints, paired, placed, rivals
 from openant_tools.gap.thresholds import (
     ADDS,
     ADDS_ALONE,
     ADDS_MUCH,
     APART,
+    BARELY,
     CERTAIN,
     CLEARLY,
+    CLOSES_MOST,
     EARLY,
     EASES,
     EXPLAINS,
@@ -249,8 +251,10 @@ def _joined(evidence: _Evidence, leader: _Leader, left: Judgement, chosen: _Chos
         # What moves no joint, or not twice alike, no closure can prove: there the judge's word is enough.
         moves = moves_joints(catalogue()[name]) and not catalogue()[name].beside_joints_at(both.refit.x[-1])
         silent = not moves and chance > FINDING
-        much = moves and 1 - both.closed < PROVES * (1 - whole.closed)
-        if both.closed > whole.closed + adds or much or (silent and both.closed > whole.closed - ADDS):
+        # Unless it takes away so much of what is strange that nothing within tolerance does.
+        much = (moves or carries(catalogue()[name])) and 1 - both.closed < PROVES * (1 - whole.closed)
+        enough = both.closed > whole.closed + adds and (moves or adds == ADDS)
+        if enough or much or (silent and both.closed > whole.closed - ADDS):
             how = _rank(max(chance, probability[name]), 1 - both.closed)
             if second is None or how > second[0]:
                 second = how, one, both
@@ -278,14 +282,24 @@ def _seconds(evidence: _Evidence, best: str, left: Judgement) -> list[tuple[Expl
     ]
     missing = [name for name, _ in seen if name not in explained]
     known = {**explained, **(explain(evidence.scenes, missing, left) if missing else {})}
-    told = [name for name, chance in seen[:TOLD] if name in known and max(chance, probability[name]) > SECOND]
+    told = [
+        name
+        for name, chance in seen[:TOLD]
+        if name in known
+        and max(chance, probability[name]) > SECOND
+        and not (moves_joints(catalogue()[name]) and _vanished(known[name].part, known[name].x))
+    ]
+    odd = left.energy > STRANGE
     hidden = [
         one
         for name, one in known.items()
         if name not in (best, *told)
-        and (one.beyond_tolerance or left.energy > STRANGE)
-        and moves_joints(catalogue()[name])
+        and (one.beyond_tolerance or odd)
+        and (moves_joints(catalogue()[name]) or (odd and carries(catalogue()[name])))
     ]
+    if odd:
+        # What carries or holds the body shows in every joint, and the judge of joints takes it for anything.
+        hidden += bodily(patient.protocol, known)
     look: list[tuple[Explained, float]] = []
     if hidden and patient.in_time("second causes that the judge does not expect"):
         look = paired(evidence.windows, known[best], hidden, patient.training)
@@ -297,6 +311,8 @@ def _seconds(evidence: _Evidence, best: str, left: Judgement) -> list[tuple[Expl
 def _polished(evidence: _Evidence, chosen: _Chosen) -> _Chosen:
     """The same causes, fitted once more: near them tolerances do something else than they did without."""
     _, _, (closure,) = evidence.closures([chosen.closure.refit], anew=True)
+    if closure.closed < chosen.closure.closed:
+        return chosen
     if len(chosen.names) == 1:
         evidence.alone[chosen.names[0]] = closure
     return dataclasses.replace(chosen, closure=closure)
@@ -315,17 +331,21 @@ def _verdict(
     noisy = any(catalogue()[name].random for name in chosen.names[1:])
     noisy = noisy and min(probability[name] for name in chosen.names) > FINDING
     little = excess(evidence.before, evidence.floor) > LARGE * evidence.floor and chosen.closure.closed < EXPLAINS
-    vanished = _vanished(evidence.alone[best].refit) and not catalogue()[best].random
-    as_odd = left is not None and left.energy > ODD
+    refit = evidence.alone[best].refit
+    vanished = _vanished(refit.hypothesis[0], refit.x[0]) and not catalogue()[best].random
+    as_odd = left is not None and left.energy > ODD and leader.gained < ADDS_ALONE
     doubtful = probability[best] < CERTAIN or vanished or as_odd
     if not leader.beside and little and energy > STRANGE and doubtful and not noisy:
-        # However sure the judge is: what comes out as nothing at all, or leaves a robot as odd as it was, is not what makes the
-        # gap. No fit finds what is random.
+        # However sure the judge is: what comes out as nothing at all, or closes little and leaves a robot as odd as it was, is not
+        # what makes the gap. No fit finds what is random.
         return UNEXPLAINED, (), ()
-    if leader.beside and not certain and left is not None and min(energy, left.energy) > STRANGE:
+    odd = left is not None and min(energy, left.energy) > STRANGE
+    if leader.beside and not certain and odd and chosen.closure.closed < CLOSES_MOST:
         # Strange with it, too: a foot that came off is no offset, though nothing known is more like it.
         return UNEXPLAINED, (), ()
-    doubted = [name for name in chosen.names if certain and probability[name] < SECOND]
+    doubted = [
+        name for name in chosen.names if certain and (probability[name] < SECOND or _idle(evidence, chosen, name))
+    ]
     selected = tuple(sorted(chosen.names, key=lambda name: (name in doubted, -chosen.removal[name])))
     equal = [
         name
@@ -339,10 +359,19 @@ def _verdict(
     return selected[0], selected, ()
 
 
+def _idle(evidence: _Evidence, chosen: _Chosen, name: str) -> bool:
+    """Whether only the judge's word speaks for a cause, and that is not certain."""
+    return evidence.probability[name] < CERTAIN and chosen.removal[name] < ADDS
+
+
 def _sure(evidence: _Evidence, names: Sequence[str], leader: _Leader) -> bool:
     """Whether there is any finding at all."""
     probability, energy, best = evidence.probability, evidence.judgement.energy, leader.name
     if probability[best] < CERTAIN and not evidence.explained[best].beyond_tolerance:
+        return False
+    healthy = evidence.plain.after < LARGE * evidence.floor and energy < STRANGE
+    if healthy and moves_joints(catalogue()[best]) and leader.gained < BARELY:
+        # Tolerances do what it does, and leave no more than of a healthy robot.
         return False
     return (
         probability[best] > (SECOND if energy > STRANGE else FINDING)
@@ -413,13 +442,12 @@ def _rivals(evidence: _Evidence) -> dict[str, Explained]:
     best = [explained[name] for name in dict.fromkeys((least, likeliest))]
     lost = evidence.judgement.energy > STRANGE and max(evidence.probability.values()) < FINDING
     places = everywhere(evidence.patient.protocol) if lost else ()
-    found = rivals(evidence.windows, best, explained, training, places=places)
+    found = rivals(evidence.windows, best, explained, training, places=places, where=evidence.where)
     return {one.part.cause: one for one in fit(scene_of(least, evidence.scenes), found)} if found else {}
 
 
-def _vanished(refit: Refit) -> bool:
-    """Whether of a cause by itself nothing is left, once it was re-fitted on the runs."""
-    (part,), (x,) = refit.hypothesis, refit.x
+def _vanished(part: Part, x: Mapping[str, float]) -> bool:
+    """Whether of a cause nothing is left where a fit ended."""
     return all(abs(x[q.name]) < VANISHED * q.small for q in part.definition.quantities if not q.shape)
 
 
