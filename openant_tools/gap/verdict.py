@@ -221,6 +221,10 @@ def _led(evidence: _Evidence, names: Sequence[str]) -> _Leader:
         taken = [probability[name] for name in names if evidence.explained[name].part.joints == here]
         probability[best] = max(probability[best], share * max(taken))
     left, eased, energy = None, False, evidence.judgement.energy
+    healthy = evidence.plain.after < LARGE * evidence.floor and energy < STRANGE
+    if healthy and moves_joints(catalogue()[best]) and gained < BARELY:
+        # Tolerances do what it does, and leave no more than of a healthy robot.
+        probability[best] *= max(gained, 0.0) / BARELY
     if probability[best] > MAYBE or proved or max(probability[name] for name in names) > CERTAIN:
         left = _without(patient, evidence.explained[best])
         eased = probability[best] > MAYBE and energy > 1 and left.energy < EASES * energy
@@ -368,10 +372,6 @@ def _sure(evidence: _Evidence, names: Sequence[str], leader: _Leader) -> bool:
     """Whether there is any finding at all."""
     probability, energy, best = evidence.probability, evidence.judgement.energy, leader.name
     if probability[best] < CERTAIN and not evidence.explained[best].beyond_tolerance:
-        return False
-    healthy = evidence.plain.after < LARGE * evidence.floor and energy < STRANGE
-    if healthy and moves_joints(catalogue()[best]) and leader.gained < BARELY:
-        # Tolerances do what it does, and leave no more than of a healthy robot.
         return False
     return (
         probability[best] > (SECOND if energy > STRANGE else FINDING)
