@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from openant_tools.gap.cause import catalogue
 from openant_tools.gap.features import COLUMNS
-from openant_tools.gap.judge import metric_of
+from openant_tools.gap.judge import Judge, metric_of
+from openant_tools.gap.kept import judge_of
 from openant_tools.gap.population import Case, draw, play, robot_of, templates
 from openant_tools.gap.prepare import CACHE_VARIABLE, Prepared, cache_folder, prepare
 from openant_tools.gap.protocol import Protocol, same
@@ -153,6 +155,31 @@ def test_what_was_prepared_in_full_serves_a_part_of_it(
     assert part.folder == whole.folder
     assert np.array_equal(part.features[0], whole.features[1])
     assert len(list(cache_folder().iterdir())) == 1
+
+
+def test_the_first_judge_brings_that_of_robots_with_other_sensors(
+    protocol: Protocol,
+    prepare_few: Callable[[Protocol, int, list[Case]], Prepared],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    taught: list[int] = []
+
+    def train(prepared: Prepared, which: Sequence[int], columns: Sequence[NDArray[np.bool_]]) -> Judge:
+        taught.append(sum(int(mine.sum()) for mine in columns))
+        return object.__new__(Judge)
+
+    def seeing(*signals: str) -> Protocol:
+        known = dict.fromkeys(signals, np.zeros((1, 1, 1), np.float32))
+        runs = [dataclasses.replace(one, seen={**one.seen, **known}) for one in protocol.runs]
+        return dataclasses.replace(protocol, runs=tuple(runs))
+
+    monkeypatch.setattr("openant_tools.gap.kept.train", train)
+    few, told = prepare_few(protocol, 4, [Case({}, -1)]), lambda share, words: None
+    for signals, judges in [((), 2), ((), 2), (("base", "yaw"), 2), (("gyro",), 3), (("gyro", "base", "yaw"), 4)]:
+        judge_of(few, seeing(*signals), progress=told)
+        assert len(taught) == judges, f"with {signals}"
+    assert len(set(taught)) == len(taught)
+    assert taught[0] == min(taught), "what saw positions alone"
 
 
 def test_what_no_simulated_robot_showed_is_not_strange(

@@ -9,24 +9,24 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeVar
 
-import joblib
 import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
-from openant_tools.files import atomic_writer
 from openant_tools.gap.diagnosis import NONE, Diagnosis
 from openant_tools.gap.explain import Scene, explain
-from openant_tools.gap.judge import Judge, Judgement, Metric, metric_of, train
+from openant_tools.gap.judge import Judgement
+from openant_tools.gap.kept import judge_of, kept_metric
 from openant_tools.gap.measure import measure
 from openant_tools.gap.patient import Patient, diagnosis_of, shown, unfitted
 from openant_tools.gap.prepare import Prepared, prepare
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.thresholds import (
+    BEFOREHAND_S,
     COPPER,
     DOUBT,
     FEW_JOINTS,
@@ -48,13 +48,10 @@ from openant_tools.sysid.identify import joints_in_common, own_model
 __all__ = ["diagnose"]
 
 Progress = Callable[[float, str], None]
-Stored = TypeVar("Stored")
 
 #: s that a diagnosis gives to simulated robots where the protocol was never seen; `prepare` by itself takes what it needs. On two
 #: usual cores they are there before; on slow ones it is better to wait than to judge by few
 PREPARE_S = 1080.0
-#: of what is kept beside a preparation: another where judges are taught otherwise
-FORM = 2
 
 
 def diagnose(
@@ -77,7 +74,7 @@ def diagnose(
     Raises:
         BadInput: runs from which no diagnosis can be made.
     """
-    tell = progress or (lambda share, words: None)
+    tell, began = progress or (lambda share, words: None), time.monotonic()
     everything = [*runs, *hold_out]
     _check(runs, hold_out)
     wanted = joints_in_common(everything, model, joints)
@@ -92,12 +89,11 @@ def diagnose(
         protocol = Protocol.of(everything, model, wanted, [own_model(run) for run in everything])
     protocol = dataclasses.replace(protocol, reference=coarse.reference)
     found = coarse.features()
-    # In the order in which they were prepared, in whatever order they are named: so one judge serves them all.
-    training = sorted(range(len(runs)), key=lambda k: prepared.which[k])
-    tell(0.63, "the judge")
-    judge = _kept(Judge, train, prepared, training, [found[k][1] for k in training])
+    judge = judge_of(prepared, played, progress=lambda share, words: tell(0.63 + 0.07 * share, words))
+    training = prepared.ordered
     tell(0.7, "causes")
-    patient = Patient(protocol, coarse, prepared, measured, judge, found, training, model, runs, hold_out)
+    began = max(began, time.monotonic() - BEFOREHAND_S)
+    patient = Patient(protocol, coarse, prepared, measured, judge, found, training, model, runs, hold_out, began)
     judgement = judge.say(patient.features)
     first = shown(judgement, protocol)
     # No template was as warm as this robot was in each run: what a thermometer shows is asked about wherever it may sit.
@@ -162,31 +158,6 @@ def _check_motion(runs: Sequence[Run], joints: Sequence[str]) -> None:
         )  # fmt: skip
 
 
-def _kept(
-    kind: type[Stored],
-    make: Callable[[Prepared, Sequence[int], Sequence[NDArray[np.bool_]]], Stored],
-    prepared: Prepared,
-    which: Sequence[int],
-    columns: Sequence[NDArray[np.bool_]],
-) -> Stored:
-    """What follows from a preparation for some runs and signals: made once, then read again."""
-    state = hashlib.sha256(repr((FORM, [prepared.which[k] for k in which], len(prepared.cases))).encode())
-    for mine in columns:
-        state.update(mine.tobytes())
-    path = prepared.folder / f"{kind.__name__.lower()}-{state.hexdigest()[:16]}.joblib"
-    if path.is_file():
-        try:
-            found = joblib.load(path)
-            if isinstance(found, kind):
-                return found
-        except Exception:  # whatever an interrupted or foreign file does, it is made anew
-            path.unlink(missing_ok=True)
-    made = make(prepared, which, columns)
-    with atomic_writer(path) as file:
-        joblib.dump(made, file)
-    return made
-
-
 def _scenes(
     prepared: Prepared,
     coarse: Protocol,
@@ -199,7 +170,7 @@ def _scenes(
         mine = [k for k in training if coarse.runs[k].plant.setup is setup]
         if not mine:
             continue
-        metric = _kept(Metric, metric_of, prepared, mine, [found[k][1] for k in mine])
+        metric = kept_metric(prepared, mine, [found[k][1] for k in mine])
         seen = np.concatenate([found[k][0] for k in mine])
         scenes[setup] = Scene(coarse, [coarse.runs[k] for k in mine], metric, seen)
     return scenes

@@ -34,7 +34,7 @@ class Patient:
 
     Attributes:
         coarse: its protocol, in the steps and from the starts of the simulated robots that it is compared with.
-        begun: when the judge was about to speak, s of the clock that only goes forward. given_up: what there was no time for.
+        began: when its diagnosis did, s of the clock that only goes forward. given_up: what there was no time for.
     """
 
     protocol: Protocol
@@ -47,7 +47,7 @@ class Patient:
     model: Path
     runs: Sequence[Run]
     hold_out: Sequence[Run]
-    begun: float = dataclasses.field(default_factory=time.monotonic)
+    began: float = dataclasses.field(default_factory=time.monotonic)
     given_up: list[str] = dataclasses.field(default_factory=list)
 
     def in_time(self, wanted: str, share: float = 1.0) -> bool:
@@ -56,7 +56,7 @@ class Patient:
         Args:
             share: of the time there is, by which it has to be begun.
         """
-        if time.monotonic() <= self.begun + share * PATIENCE_S:
+        if time.monotonic() <= self.began + share * PATIENCE_S:
             return True
         self.given_up.append(wanted)
         return False

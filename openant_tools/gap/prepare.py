@@ -81,6 +81,11 @@ class Prepared:
                     mine.append(stored[f"run{k}"].astype(np.float32))
         return tuple(np.concatenate(mine) for mine in found)
 
+    @property
+    def ordered(self) -> list[int]:
+        """The runs at hand in the order in which they were prepared, in whatever they are named: so one judge serves them all."""
+        return sorted(range(len(self.which)), key=lambda k: self.which[k])
+
     def healthy(self) -> NDArray[np.bool_]:
         """(robots,) which have no cause."""
         return np.array([not case.causes for case in self.cases])
@@ -119,6 +124,8 @@ def prepare(
         _simulate(kept, coarse, range(-banks, parts), size, seconds, progress)
     os.utime(kept.folder)
     there = [part for part in range(parts) if _part(kept.folder, part).is_file()]
+    if len(there) * size >= robots_of(protocol) and not (kept.folder / CLOSED).exists():
+        write_text(kept.folder / CLOSED, "")
     causes = applicable(coarse)
     cases = [draw(coarse, part * size + k, causes) for part in there for k in range(size)]
     return Prepared(

@@ -8,7 +8,7 @@ import hashlib
 import json
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -41,6 +41,8 @@ BEGIN_S, ELSEWHERE_RAD = 0.1, 0.05
 OFTEN, LEAST_OF_MOST = 0.9, 0.2
 #: smaller changes of a supply's share are rounding of numbers
 LEAST_CHANGE = 1e-6
+#: signals of a tracker
+TRACKED = ("base", "yaw")
 #: s, steps of simulated populations, in which they cost the least that does not show beside tolerances
 STAND_STEP_S, FLOOR_STEP_S = 0.0025, 0.004
 
@@ -82,9 +84,11 @@ class Played:
     def features(self, nominal: Mapping[str, Floats]) -> tuple[Floats, NDArray[np.bool_]]:
         """(features,) of the run itself against what the model does, and which of them its log has."""
         seen = {name: self.seen.get(name, nominal[name]) for name in self.signals}
-        x = self.layout.features(differences(seen, nominal, self.signals))[0]
-        there = [np.full(len(names), name in self.seen) for name, names in self.layout.groups().items()]
-        return x, np.concatenate(there)
+        return self.layout.features(differences(seen, nominal, self.signals))[0], self.there(self.seen)
+
+    def there(self, seen: Collection[str]) -> NDArray[np.bool_]:
+        """(features,) which of them a log of these signals has."""
+        return np.concatenate([np.full(len(names), name in seen) for name, names in self.layout.groups().items()])
 
 
 @dataclass(frozen=True)
@@ -222,6 +226,16 @@ class Protocol:
     def features(self, robot: Robot | None = None) -> list[tuple[Floats, NDArray[np.bool_]]]:
         """Of each run, its features against the model (or another robot) and which of them its log has."""
         return [one.features(nominal) for one, nominal in zip(self.runs, self.nominal(robot), strict=True)]
+
+    def logs(self) -> list[list[NDArray[np.bool_]]]:
+        """Of each run which features its log has; on the floor then of another robot's, with a tracker where this has none."""
+        own = [one.there(one.seen) for one in self.runs]
+        if not self.reference.floor:
+            return [own]
+        tracker, seen = set(TRACKED), [set(one.seen) for one in self.runs]
+        tracked = any(tracker & mine for mine in seen)
+        others = [mine - tracker if tracked else mine | tracker for mine in seen]
+        return [own, [one.there(mine) for one, mine in zip(self.runs, others, strict=True)]]
 
     def commands(self) -> list[Array]:
         """Of each run (times, joints) rad on a grid."""

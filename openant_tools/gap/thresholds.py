@@ -52,7 +52,8 @@ WARMED_C, HEAT = 2.5, "thermal_derating"
 COPPER = 0.01
 #: robots of no more joints are cheap to simulate: all suspects are fitted together
 FEW_JOINTS = 2
-#: s after the judge has spoken from which no causes are looked for that it does not expect: slow computers have to answer, too
-PATIENCE_S = 65.0
+#: s after it has begun from which a diagnosis looks for no causes that the judge does not expect: slow computers have to answer,
+#: too; and how many of them may be over when the judge speaks, since what is prepared for later diagnoses is no part of this one
+PATIENCE_S, BEFOREHAND_S = 75.0, 30.0
 #: shares of that by which what takes long has to be begun, and what only makes the model better
 EARLY, LATE = 0.65, 1.2

@@ -328,7 +328,9 @@ def _verdict(
     """The verdict, the causes selected, and those that these runs cannot tell apart."""
     probability, energy, best, left = evidence.probability, evidence.judgement.energy, leader.name, leader.left
     if not _sure(evidence, names, leader):
-        return NONE if energy < ODD else UNEXPLAINED, (), ()
+        # No robot of the build leaves so much, and looks so strange, whatever no suspect can be convicted of.
+        ill = energy > STRANGE and evidence.plain.after > STRAYS * evidence.floor
+        return UNEXPLAINED if ill or energy > ODD else NONE, (), ()
     # What is half believed does not come before what is certain, whatever it closes.
     certain = any(probability[name] > CERTAIN for name in chosen.names)
     # Nor is it a riddle what a random cause leaves beside a likely one.
