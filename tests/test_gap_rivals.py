@@ -136,6 +136,18 @@ def test_a_joint_that_is_strained_is_asked_whatever_the_judge_says(tmp_path: Pat
     assert brakes.closed_at(range(8)) == pytest.approx(brakes.closed)
 
 
+def test_a_second_cause_is_put_where_it_sits_beside_the_first(tmp_path: Path) -> None:
+    """Alone it was found at the hips, since the first was in its way."""
+    robot, everywhere = Robot(8), tuple(range(8))
+    robot.factor("stiffness")[:] *= 0.5
+    robot.more("coulomb_friction")[:] += 0.1
+    windows = on_the_stand(tmp_path, robot)
+    windows.look([0, 1])
+    first = dataclasses.replace(sized("stiffness_error", 0.5), part=Part("stiffness_error", everywhere))
+    found = paired(windows, first, [suspect("coulomb_friction", (0, 2, 4, 6), 0.5)], [0, 1])
+    assert [one.part for one, _ in found] == [Part("coulomb_friction", everywhere)]
+
+
 def test_what_one_joint_does_is_not_lost_among_what_others_do(tmp_path: Path) -> None:
     """A knee brakes a little more than it should, while all hips are far stiffer: where the knee alone counts, that is seen."""
     robot = Robot(8)

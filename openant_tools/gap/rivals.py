@@ -162,10 +162,16 @@ def paired(
 
 
 def _guesses(one: Explained, best: Explained, protocol: Protocol) -> list[Explained]:
-    if one.beyond_tolerance:
-        return [dataclasses.replace(one, x=_part(one, share)) for share in PARTS]
     cause = one.part.definition
     places = {one.part.joints} | ({best.part.joints} if _fits(cause, best.part.joints, protocol) else set())
+    if one.beyond_tolerance:
+        # Where it was found alone, the best was in its way.
+        places |= {joints for joints in everywhere(protocol) if _fits(cause, joints, protocol)}
+        return [
+            dataclasses.replace(one, part=Part(cause.name, joints), x=_part(one, share))
+            for joints in sorted(places)
+            for share in PARTS
+        ]
     return [
         dataclasses.replace(one, part=Part(cause.name, joints), x=x)
         for joints in sorted(places)

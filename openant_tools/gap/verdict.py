@@ -258,6 +258,8 @@ def _joined(evidence: _Evidence, leader: _Leader, left: Judgement, chosen: _Chos
         # Unless it takes away so much of what is strange that nothing within tolerance does.
         much = (moves or carries(catalogue()[name])) and 1 - both.closed < PROVES * (1 - whole.closed)
         enough = both.closed > whole.closed + adds and (moves or adds == ADDS)
+        # Of what the judge is certain it is enough that runs do not speak against it.
+        enough |= moves and chance > CERTAIN and both.closed > whole.closed
         if enough or much or (silent and both.closed > whole.closed - ADDS):
             how = _rank(max(chance, probability[name]), 1 - both.closed)
             if second is None or how > second[0]:
@@ -309,7 +311,11 @@ def _seconds(evidence: _Evidence, best: str, left: Judgement) -> list[tuple[Expl
         look = paired(evidence.windows, known[best], hidden, patient.training)
     chance = {one.part.cause: max(left.probability[one.part.cause], probability[one.part.cause]) for one, _ in look}
     look.sort(key=lambda pair: _rank(chance[pair[0].part.cause], pair[1]), reverse=True)
-    return [(known[name], ADDS) for name in told] + [(one, ADDS_MUCH) for one, _ in look[:MORE]]
+    sited = [known[name] for name in told]
+    if sited and patient.in_time("other places of a second cause"):
+        better = {one.part.cause: one for one, _ in paired(evidence.windows, known[best], sited, patient.training)}
+        sited = [better.get(one.part.cause, one) for one in sited]
+    return [(one, ADDS) for one in sited] + [(one, ADDS_MUCH) for one, _ in look[:MORE]]
 
 
 def _polished(evidence: _Evidence, chosen: _Chosen) -> _Chosen:
