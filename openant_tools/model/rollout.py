@@ -127,6 +127,7 @@ class Rollouts:
         # The longest first, so that those still running are always the first simulations of the batch.
         self._segments = sorted(segments, key=lambda segment: -len(segment.control))
         self._batches: dict[int, Batch] = {}
+        self._finer: dict[int, Rollouts] = {}
         self._disable = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         if plant.setup is Setup.STAND and not any(_comes_close(plant, run) for run in runs):
             # Without contacts a few joints' dry friction is solved sooner than it is sorted into islands.
@@ -137,8 +138,32 @@ class Rollouts:
     def thinned(self, every: int) -> Rollouts:
         """The same with each so many-th of the segments alone: rows of the others are not simulated."""
         few = copy.copy(self)
-        few._segments, few._batches = self._segments[::every], {}
+        few._segments, few._batches, few._finer = self._segments[::every], {}, {}
         return few
+
+    def finer(self, parts: int) -> Rollouts:
+        """The same with each step cut into so many; as it is where actuators have delay buffers, whose samples count steps."""
+        model = self.plant.model
+        if (model.actuator_history[:, 0] > 0).any():
+            return self
+        if parts not in self._finer:
+            fine, model = copy.copy(self), copy.copy(model)
+            model.opt.timestep /= parts
+            fine.plant, fine._batches, fine._finer = replace(self.plant, model=model), {}, {}
+            fine._segments = [self._cut(segment, parts) for segment in self._segments]
+            self._finer[parts] = fine
+        return self._finer[parts]
+
+    def _cut(self, segment: Segment, parts: int) -> Segment:
+        at = (segment.step + segment.fraction) * parts
+        step = np.floor(at + 1e-9).astype(np.int64)
+        control = np.repeat(segment.control, parts, axis=0)[: int(step[-1]) + 1]
+        edges = segment.start + self.plant.timestep / parts * np.arange(len(control) + 1, dtype=np.float64)
+        control[:, self.plant.ctrl] = _setpoints(self.plant, segment.commands, edges)
+        off = {min(first * parts, len(control) - 1): joints for first, joints in segment.torque_off.items()}
+        return replace(
+            segment, control=control, step=step, fraction=np.clip(at - step, 0.0, 1.0), torque_off=off
+        )  # fmt: skip
 
     @property
     def steps(self) -> int:
@@ -324,7 +349,6 @@ def _segments(plant: Plant, leads: Plant, run: Run, index: int, offset: int, hor
     torque_off = run.signal("torque", plant.joints, default=1.0) == 0
     flips = 1 + np.flatnonzero((torque_off[1:] != torque_off[:-1]).any(axis=1))
     commands = Staircase.of(run.command_times, cmd)
-    slewing = np.array([_limits_slew(model, int(i)) for i in plant.actuator])
     rest = _at_rest(model)
     bases = _led(leads, run, starts, pos, commands)
     segments = []
@@ -335,9 +359,7 @@ def _segments(plant: Plant, leads: Plant, run: Run, index: int, offset: int, hor
         step = np.floor(at + 1e-9).astype(np.int64)
         nstep = int(step[-1]) + 1
         edges = t[first] + h * np.arange(nstep + 1)
-        setpoint = commands.mean(edges)
-        if slewing.any():
-            setpoint[:, slewing] = commands.at(edges[:-1] + h / 2)[:, slewing]
+        setpoint = _setpoints(plant, commands, edges)
         control = np.tile(rest, (nstep, 1))
         control[:, plant.ctrl] = setpoint
         off = {0: torque_off[first]}
@@ -359,6 +381,15 @@ def _segments(plant: Plant, leads: Plant, run: Run, index: int, offset: int, hor
             )
         )
     return segments
+
+
+def _setpoints(plant: Plant, commands: Staircase, edges: Array) -> Array:
+    """(steps, joints) rad: what each step between two edges (s) commands, see the contract."""
+    setpoint = commands.mean(edges)
+    slewing = np.array([_limits_slew(plant.model, int(i)) for i in plant.actuator])
+    if slewing.any():
+        setpoint[:, slewing] = commands.at((edges[:-1] + edges[1:]) / 2)[:, slewing]
+    return setpoint
 
 
 def _comes_close(plant: Plant, run: Run) -> bool:
