@@ -6,6 +6,7 @@ import numpy as np
 
 from openant_tools.effects.effect import Effect, Quantity, Values
 from openant_tools.effects.step import Law, Step
+from openant_tools.robot.kit import PLATFORM_PWM_LIMIT
 
 __all__ = ["EFFECT"]
 
@@ -22,8 +23,8 @@ def _law(values: Values) -> Law:
 
     def act(step: Step) -> None:
         torque = np.abs(step.motor_torque)
-        duty = np.minimum(torque / np.maximum(step.limit, 1e-9), 1.0)
-        # A chopped motor draws its current only for the part of the time that the duty says.
+        # A chopped motor draws its current only for the part of the time that the duty says; at its limit that is the platform's.
+        duty = PLATFORM_PWM_LIMIT * np.minimum(torque / np.maximum(step.limit, 1e-9), 1.0)
         current = (AMPERE_PER_NM * torque * duty).sum(axis=1, keepdims=True)
         share = np.maximum(1.0 - resistance * current / NOMINAL_V, LEAST_SHARE)
         step.stiffness *= share
