@@ -17,7 +17,7 @@ from openant_tools.gap.kept import judge_of
 from openant_tools.gap.population import Case, draw, play, robot_of, templates
 from openant_tools.gap.prepare import CACHE_VARIABLE, Prepared, cache_folder, prepare
 from openant_tools.gap.protocol import Protocol, same
-from openant_tools.gap.robot import Robot
+from openant_tools.gap.robot import Form, Robot
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
@@ -186,7 +186,7 @@ def test_what_no_simulated_robot_showed_is_not_strange(
     protocol: Protocol, prepare_few: Callable[[Protocol, int, list[Case]], Prepared]
 ) -> None:
     one = dataclasses.replace(protocol, runs=protocol.runs[:1])
-    whole = prepare_few(one, 16, [case for case in templates(one) if "stiffness_error" in case.causes][:16])
+    whole = prepare_few(one, 40, [case for case in templates(one) if "stiffness_error" in case.causes][:40])
     x, unseen, seen = whole.features[0], 100, 101
     x[:, unseen] = 0.0  # a block that lay around a switch of torque in whose run came first
     metric = metric_of(whole, [0], [np.ones(x.shape[1], bool)])
@@ -206,4 +206,36 @@ def test_a_robot_at_hand_is_simulated_from_where_the_first_one_began(protocol: P
             protocol, runs=(dataclasses.replace(protocol.runs[0], run=dataclasses.replace(first, columns=columns)),)
         )
         begun = at_hand.started_as(dataclasses.replace(protocol, runs=protocol.runs[:1])).runs[0].run
-        assert (begun.column(f"pos.{joint}")[0] == first.column(f"pos.{joint}")[0]) is np.bool_(taken)
+        apart = abs(begun.column(f"pos.{joint}")[0] - first.column(f"pos.{joint}")[0])
+        assert bool(apart < 1e-9) is taken
+
+
+def test_a_protocol_begins_where_the_model_rests_and_not_where_the_first_robot_did(protocol: Protocol) -> None:
+    """Its feet held a hip twisted as it came down, which says nothing of the robots that come after it."""
+    for played in protocol.runs:
+        rest = played.rest()
+        assert rest == pytest.approx(played.run.signal("cmd", JOINT_NAMES)[0], abs=0.05), "where it was told to be"
+        for off, own in ((0.03, False), (0.2, True)):
+            columns = {
+                **played.run.columns,
+                **{f"pos.{name}": np.full(len(played.run.t), at) for name, at in zip(JOINT_NAMES, rest, strict=True)},
+            }
+            columns["pos.hip_rr"] = columns["pos.hip_rr"] + off
+            twisted = dataclasses.replace(played, run=dataclasses.replace(played.run, columns=columns))
+            begun = dataclasses.replace(protocol, runs=(twisted,)).at_rest().runs[0].run
+            assert begun.column("pos.hip_rr")[0] == pytest.approx(rest[0] + own * off, abs=1e-6)
+            assert begun.column("pos.hip_rr")[-1] == pytest.approx(rest[0] + off)
+
+
+def test_a_servo_may_tell_what_it_asks_of_a_motor_that_gives_less() -> None:
+    rollouts = Rollouts(load_plant(MODEL, JOINT_NAMES, Setup.STAND), [commanded("stand", 1.0)])
+    given, asked = Robot(8), Robot(8)
+    for robot, tells in ((given, False), (asked, True)):
+        robot.form = Form(tells_asked=tells)
+        for kind in ("stiffness", "torque_limit"):
+            robot.weaken(kind, np.array([0]), 0.4)
+    found = simulate(rollouts, [given, asked])
+    moves, torque = found.signals["pos"], found.signals["torque"]
+    assert np.array_equal(moves[0], moves[1]), "what is told moves nothing"
+    assert torque[1, 5:, 0] == pytest.approx(torque[0, 5:, 0] / 0.4, rel=1e-3)
+    assert np.array_equal(torque[0, :, 1:], torque[1, :, 1:])

@@ -149,7 +149,7 @@ def differences(seen: Signals, simulated: Signals, names: Sequence[str]) -> dict
     """What was seen minus what the model does, (robots, rows, columns) each.
 
     A torque is scaled first, so that it fits the model's best: its unit is not known, and no two servos have quite the same. Supplies are shares of
-    the best seen. Base and heading count from where the robot started.
+    what they give unloaded. Base and heading count from where the robot started.
     """
     out: dict[str, Floats] = {}
     for name in names:
@@ -164,8 +164,7 @@ def differences(seen: Signals, simulated: Signals, names: Sequence[str]) -> dict
             scale = np.clip(np.abs(slope), usual / OWN_SCALE, usual * OWN_SCALE)
             out[name] = (x / np.maximum(scale, 1e-12)[:, None] - model).astype(np.float32)
         elif name == "volt":
-            best = np.nanpercentile(x.reshape(len(x), -1), 95, axis=1)[:, None, None]
-            out[name] = (x / best - 1).astype(np.float32)
+            out[name] = (x / _unloaded(x) - 1).astype(np.float32)
         elif name in ("base", "yaw"):
             out[name] = (_from_start(x) - _from_start(model)).astype(np.float32)
         else:
@@ -189,6 +188,9 @@ def with_noise(
             zero = np.array([robot.noise.get("torque_zero", 0.0) for robot in robots], np.float32)[:, None, None]
             y = y + zero * scale * rng.standard_normal((len(x), 1, x.shape[2]), np.float32)
         step = resolution.get(name, 0.0)
+        if name == "volt":
+            between = np.array([robot.noise.get("volt_between", 0.0) for robot in robots], np.float32)[:, None, None]
+            y = y + step * between
         out[name] = (np.round(y / step) * step if step > 0 else y).astype(np.float32)
     return out
 
@@ -199,6 +201,15 @@ def _width(signal: str, joints: int) -> int:
 
 def _least(signal: str) -> float:
     return LEAST * USUAL_NOISE[signal]
+
+
+def _unloaded(x: Floats) -> Floats:
+    """(robots, 1, 1) what a supply gives where little is asked: the mean of its better half, since steps of sensors are coarse."""
+    values = x.reshape(len(x), -1)
+    with np.errstate(invalid="ignore"):
+        better = np.where(values >= np.nanmedian(values, axis=1, keepdims=True), values, np.nan)
+    out: Floats = np.nanmean(better, axis=1)[:, None, None]
+    return out
 
 
 def _from_start(x: Floats) -> Floats:

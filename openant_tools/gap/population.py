@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 #: how many robots have none, one, two … causes
-COUNTS = (0.24, 0.52, 0.18, 0.04, 0.02)
+COUNTS = (0.19, 0.40, 0.28, 0.09, 0.04)
 #: of one joint's model robots have more causes at once: it is cheap, and real servos have many
 COUNTS_ONE_JOINT = (0.15, 0.30, 0.2, 0.15, 0.1, 0.06, 0.04)
 #: what tolerances are drawn wider by
@@ -95,6 +95,7 @@ def robot_of(protocol: Protocol, case: Case) -> Robot:
     robot = Robot(len(protocol.joints), reference.low, reference.high)
     if case.seed < 0:
         enter(robot, reference, [(name, joints, x) for name, (joints, x) in case.causes.items()])
+        robot.warming_c = WARMING_C / 2
         return robot
     rng = np.random.default_rng((977, case.seed))
     scatter(robot, reference, rng, WIDTH)
@@ -114,7 +115,6 @@ def robot_of(protocol: Protocol, case: Case) -> Robot:
         robot.shared_dropout = bool(rng.random() < 0.5)
     robot.warming_c = float(rng.uniform(0, WARMING_C))
     robot.form = random_form(rng, reference.seen.encoder_rad)
-    robot.start = resting(robot, reference, rng)
     return robot
 
 
@@ -149,8 +149,12 @@ def play(protocol: Protocol, cases: Sequence[Case], seed: int) -> list[Floats]:
     heat, turns = [robot.heat_c for robot in robots], _turns(protocol, rng)
     out = []
     for k, played in enumerate(protocol.runs):
-        for robot, begun in zip(robots, heat, strict=True):
+        standing = played.plant.setup is Setup.FLOOR
+        for n, (robot, begun) in enumerate(zip(robots, heat, strict=True)):
             robot.heat_c = begun + robot.warming_c * turns[k]
+            if n and cases[n - 1].seed >= 0:
+                at_rest = np.random.default_rng((979, cases[n - 1].seed, k))
+                robot.start = resting(robot, protocol.reference, at_rest, standing=standing)
         rollouts = Rollouts(played.plant, [played.run], nthread=1)
         signals = simulate(rollouts, robots, seed=seed * 64 + k, signals=played.signals).signals
         nominal = {name: values[:1] for name, values in signals.items()}

@@ -36,9 +36,9 @@ Array = NDArray[np.float64]
 CACHE_VARIABLE = "OPENANT_CACHE"
 LARGEST_BYTES = 4 * 2**30
 #: what is stored is bound to the code that made it: raise it when simulated robots change
-VERSION = 14
+VERSION = 15
 #: robots of a part, and of a whole preparation where the robot has many joints and where it has one or two
-PART, ROBOTS, ROBOTS_ONE_JOINT = 96, 3360, 16_000
+PART, ROBOTS, ROBOTS_ONE_JOINT = 96, 4320, 16_000
 #: robots without which no judge is trained, and the file that says that no more are to be made unless asked for
 LEAST, CLOSED = 480, "closed"
 Progress = Callable[[float, str], None]
@@ -114,7 +114,7 @@ def prepare(
         progress: told a share and words.
     """
     kept = find(protocol, whole=robots is not None) or _new(protocol)
-    protocol = _as_first(kept, protocol)
+    protocol = _as_first(kept, protocol).at_rest()
     coarse = protocol.coarse()
     size = PART if len(protocol.joints) > 2 else 8 * PART
     parts = -(-(robots or robots_of(protocol)) // size)

@@ -37,6 +37,8 @@ SAME_RAD = 0.01
 ALIKE = 0.95
 #: s at a run's beginning in which its positions say where it rests, and rad by which robots at rest differ at most
 BEGIN_S, ELSEWHERE_RAD = 0.1, 0.05
+#: s in which a model comes to rest under its first commands, and between the rows of what it does meanwhile
+REST_S, REST_ROW_S = 2.0, 0.02
 #: share of the time in which commands are slower than what they often ask for, and the least of the fastest that this is
 OFTEN, LEAST_OF_MOST = 0.9, 0.2
 #: smaller changes of a supply's share are rounding of numbers
@@ -85,6 +87,19 @@ class Played:
         """(features,) of the run itself against what the model does, and which of them its log has."""
         seen = {name: self.seen.get(name, nominal[name]) for name in self.signals}
         return self.layout.features(differences(seen, nominal, self.signals))[0], self.there(self.seen)
+
+    def rest(self) -> Array:
+        """(joints,) rad where the model comes to rest under the run's first commands."""
+        joints = self.plant.joints
+        t = np.arange(0.0, REST_S, REST_ROW_S)
+        columns = {}
+        for joint in joints:
+            command = self.run.column(f"cmd.{joint}")
+            asked = command[np.isfinite(command)][:1]
+            columns[f"cmd.{joint}"] = columns[f"pos.{joint}"] = np.full(len(t), asked[0] if len(asked) else np.nan)
+            columns[f"torque.{joint}"] = np.full(len(t), self.run.signal("torque", [joint], default=1.0)[0, 0])
+        out: Array = Rollouts(self.plant, [dataclasses.replace(self.run, t=t, columns=columns)])().pos[0, -1]
+        return out
 
     def there(self, seen: Collection[str]) -> NDArray[np.bool_]:
         """(features,) which of them a log of these signals has."""
@@ -210,14 +225,23 @@ class Protocol:
         Dry friction lets every robot rest a little differently; only where all simulations begin at one place is that
         among what healthy robots are seen to do.
         """
-        return dataclasses.replace(
-            self,
-            runs=tuple(
-                dataclasses.replace(one, run=_begun(one.run, first.run, self.joints))
-                for one, first in zip(self.runs, other.runs, strict=True)
-            ),
-            reference=dataclasses.replace(self.reference, seen=other.reference.seen),
-        )
+        begun = self._begun([_first(one.run, self.joints) for one in other.runs])
+        return dataclasses.replace(begun, reference=dataclasses.replace(self.reference, seen=other.reference.seen))
+
+    def at_rest(self) -> Protocol:
+        """The same, simulated from where the model itself rests under the first commands, if runs began about there.
+
+        How the robot that came first had come to rest is its own: another one's feet did not hold its legs twisted so.
+        """
+        return self._begun([one.rest() for one in self.runs])
+
+    def _begun(self, starts: Sequence[Array]) -> Protocol:
+        """The same, simulated from these (joints,) positions, but for runs that began elsewhere."""
+        runs = [
+            dataclasses.replace(one, run=_begun(one.run, start, self.joints))
+            for one, start in zip(self.runs, starts, strict=True)
+        ]
+        return dataclasses.replace(self, runs=tuple(runs))
 
     def nominal(self, robot: Robot | None = None) -> list[dict[str, Floats]]:
         """Of each run, what the model (or another robot) does with its commands from its start on, at its own rows."""
@@ -308,16 +332,20 @@ def _warmer(runs: Sequence[Run], joints: Sequence[str]) -> Array:
     return warmer
 
 
-def _begun(run: Run, other: Run, joints: Sequence[str]) -> Run:
-    """A run whose first positions are another's."""
+def _first(run: Run, joints: Sequence[str]) -> Array:
+    """(joints,) rad where a run begins; NaN where a joint was not measured all that time."""
+    begin: Array = run.signal("pos", joints)[run.t < run.t[0] + BEGIN_S].mean(axis=0)
+    return begin
+
+
+def _begun(run: Run, start: Array, joints: Sequence[str]) -> Run:
+    """A run whose first positions are these, if it began about there."""
+    first = run.t < run.t[0] + BEGIN_S
+    if not (np.abs(run.signal("pos", joints)[first] - start) <= ELSEWHERE_RAD).all():
+        return run
     columns = dict(run.columns)
-    for joint in joints:
-        own, given = run.column(f"pos.{joint}"), other.column(f"pos.{joint}")
-        rows = min(int(np.searchsorted(run.t, run.t[0] + BEGIN_S)), len(given))
-        apart = np.abs(own[:rows] - given[:rows])
-        if not np.isfinite(apart).all() or apart.max(initial=0.0) > ELSEWHERE_RAD:
-            return run
-        columns[f"pos.{joint}"] = np.concatenate([given[:rows], own[rows:]])
+    for joint, there in zip(joints, start, strict=True):
+        columns[f"pos.{joint}"] = np.where(first, there, run.column(f"pos.{joint}"))
     return dataclasses.replace(run, columns=columns)
 
 

@@ -36,6 +36,7 @@ class Form:
         loop_behind: a servo measures behind its play or spring, as encoders on output shafts do; a written MJCF, whose
             servos measure their own joint, cannot.
         tells_duty: what a servo says of its torque is what it puts on its motor, which back-EMF takes nothing from.
+        tells_asked: and it is what a healthy motor would make of it: a servo knows its current, not what becomes of it.
     """
 
     integrator: int = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
@@ -49,6 +50,7 @@ class Form:
     contact_depth: float = 1.0
     loop_behind: bool = True
     tells_duty: bool = True
+    tells_asked: bool = False
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ class Robot:
     Attributes:
         low, high: rad, between which each joint was seen to move.
         scale: kind → factor on what the model says ("stiffness", "damping" with the velocity gain, "armature",
-            "torque_limit", "link_mass"). add: kind → what comes on top ("coulomb_friction", N·m; "armature", kg·m²).
+            "torque_limit", "link_mass"). lacks: kind → the part of it that the motor lacks, not its loop. add: kind → what comes on top ("coulomb_friction", N·m; "armature", kg·m²).
         zero: rad, added to what the encoder reads. start: rad, how far from where the runs begin it rests, as dry friction
             lets it. length: factors on the links. delay, lag: s, of commands. slew: rad/s, inf for none.
         no_load: rad/s at which the torque limit has fallen to nothing, inf for none.
@@ -157,9 +159,9 @@ class Robot:
         adhesion_n: force of each foot. tilt: (2,) rad, how far downhill lies along the floor's x and y.
         jitter_s: deviation of when a command acts. dropout: share of commands lost, (joints,); longest_s: at a stretch.
         shared_dropout: all joints lose the same commands.
-        late: s by which a signal's log lags: "pos", "vel", "imu", "base".
+        late: s by which a signal's log lags: "pos", "vel", "imu", "acc" beyond that, "base".
         imu_rotation: (3,) rad. gyro_bias (3,) rad/s, acc_bias (3,) m/s². base_scale, base_yaw: of the tracker.
-        noise: signal → deviation of one sample.
+        noise: signal → deviation of one sample; what else its sensors do by chance.
         form: of its simulation.
     """
 
@@ -167,6 +169,7 @@ class Robot:
     low: Array = field(default_factory=lambda: np.zeros(0))
     high: Array = field(default_factory=lambda: np.zeros(0))
     scale: dict[str, Array] = field(default_factory=dict)
+    lacks: dict[str, Array] = field(default_factory=dict)
     add: dict[str, Array] = field(default_factory=dict)
     zero: Array = field(init=False)
     start: Array = field(init=False)
@@ -225,6 +228,11 @@ class Robot:
     def factor(self, kind: str) -> Array:
         """The factor of a kind, to be changed in place."""
         return self.scale.setdefault(kind, np.ones(self.joints))
+
+    def weaken(self, kind: str, joints: NDArray[np.int64], factor: float) -> None:
+        """Scale what the motors of some joints make of what they are asked."""
+        self.factor(kind)[joints] *= factor
+        self.lacks.setdefault(kind, np.ones(self.joints))[joints] *= factor
 
     def more(self, kind: str) -> Array:
         """What is added to a kind, to be changed in place."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -35,12 +36,16 @@ Array = NDArray[np.float64]
 CHUNK_BYTES = 192 * 2**20
 #: s over which velocities become an acceleration
 ACCELERATION_S = 0.01
+#: s, the longest step on a floor in which rotors behind play and springs do not rattle
+FINE_S = 0.002
 #: s for which rotors behind play and springs are led along before a simulation begins amid a run
 LED_S = 1.0
 #: time constants of a lag after which what was commanded is forgotten
 REMEMBERS = 5.0
 #: mjtCone of forms that are elliptic, or not
 _CONES = {False: int(mujoco.mjtCone.mjCONE_PYRAMIDAL), True: int(mujoco.mjtCone.mjCONE_ELLIPTIC)}
+#: signals that are as late as others, together with what makes them so
+LATE_WITH = {"gyro": ("imu",), "acc": ("imu", "acc"), "base": ("base",), "yaw": ("base",)}
 #: base signals and how many columns they have
 BASE = {"gyro": 3, "acc": 3, "base": 3, "yaw": 1}
 
@@ -79,22 +84,21 @@ def simulate(
     names += [name for name in BASE if floor and (signals is None or name in signals)]
     width = {name: BASE.get(name, len(plant.joints)) for name in names}
     out = {name: np.full((len(robots), rows, width[name]), np.nan, np.float32) for name in names}
-    longest = max(len(segment.control) for segment in rollouts.segments)
-    state = 8 * (plant.model.nq + 3 * plant.model.nv)
-    at_once = max(1, int(CHUNK_BYTES // (state * longest * len(rollouts.segments))))
-    groups = [np.arange(len(robots))]
-    if rollouts.horizon is not None:
-        # Rotors behind play and springs are led along to each window: that costs more than their own simulations.
-        hidden = np.array([_hides(robot) for robot in robots])
-        groups = [group for group in (np.flatnonzero(~hidden), np.flatnonzero(hidden)) if len(group)]
+    # Rotors behind play and springs take smaller steps, and are led along to each window: that costs more than the others.
+    hidden = np.array([_hides(robot) for robot in robots])
+    parts = math.ceil(plant.timestep / FINE_S - 1e-9) if floor else 1
+    groups = [(np.flatnonzero(~hidden), rollouts), (np.flatnonzero(hidden), rollouts.finer(parts))]
     with _unwarned():
-        for group in groups:
+        for group, stepped in groups:
+            longest = max(len(segment.control) for segment in stepped.segments)
+            state = 8 * (plant.model.nq + 3 * plant.model.nv)
+            at_once = max(1, int(CHUNK_BYTES // (state * longest * len(stepped.segments))))
             for first in range(0, len(group), at_once):
                 some = group[first : first + at_once]
                 # A run of its own of random numbers to each portion, whatever the others are.
                 rng = np.random.default_rng((seed, int(some[0])))
                 mine = {name: np.full((len(some), *whole.shape[1:]), np.nan, np.float32) for name, whole in out.items()}
-                _Batch(rollouts, [robots[k] for k in some], rng, warm_c).play(mine)
+                _Batch(stepped, [robots[k] for k in some], rng, warm_c).play(mine)
                 for name, values in mine.items():
                     out[name][some] = values
     return Log(out)
@@ -190,6 +194,11 @@ class _Batch:
             damp=damp,
         )  # fmt: skip
         duty = np.array([[robot.form is None or robot.form.tells_duty] for robot in robots])
+        self._asked = np.array([[robot.form is not None and robot.form.tells_asked] for robot in robots])
+        whole = np.ones(len(plant.joints))
+        self._lacks = {
+            kind: np.array([robot.lacks.get(kind, whole) for robot in robots]) for kind in ("stiffness", "torque_limit")
+        }
         generated = back_emf(robots, fields)
         untold = np.where(duty, generated, 0.0)
         self._untold = untold if untold.any() else None
@@ -198,7 +207,8 @@ class _Batch:
         last = last_laws(robots, generated, fields)
         for name, values in (("dof_armature", fields.armature), ("dof_damping", fields.damping)):
             self._batch.expand(name)[:, plant.dof] = values
-        return [*first, *laws_of([robot.laws for robot in robots], len(plant.joints)), self._note, *last]
+        between = laws_of([robot.laws for robot in robots], len(plant.joints))
+        return [*([self._ask] if self._asked.any() else []), *first, *between, self._note, *last]
 
     def _begun(self, warm_c: Array) -> tuple[Array, Array]:
         """As each simulation begins: where setpoints of limited rate are (rad), and how warm its servos are (°C)."""
@@ -223,9 +233,18 @@ class _Batch:
     def _start(self, segment: Segment) -> float:
         return segment.start - self._led * self._plant.timestep
 
+    def _ask(self, step: Step) -> None:
+        """What loops ask of motors, before any law on what these can give."""
+        lacks = self._lacks
+        self._healthy = step.stiffness / lacks["stiffness"], step.limit / lacks["torque_limit"]
+
     def _note(self, step: Step) -> None:
         """What the motors give and get, before laws on what comes of it."""
         told = step.motor_torque
+        if self._asked.any():
+            stiffness, limit = (of * step.supply for of in self._healthy)
+            healthy = dataclasses.replace(step, stiffness=stiffness, limit=limit)
+            told = np.where(self._asked, healthy.motor_torque, told)
         if self._untold is not None:
             told = told + np.where(step.on, self._untold * step.velocity, 0.0)
         self._given = told, step.supply
@@ -380,8 +399,8 @@ class _Batch:
             for r, robot in enumerate(self._robots):
                 k = s * self._n + r
                 for name, values in out.items():
-                    group = "imu" if name in ("gyro", "acc") else "base" if name in ("base", "yaw") else name
-                    when = np.clip(at - robot.late.get(group, 0.0) / h, 0.0, steps)
+                    late = sum(robot.late.get(group, 0.0) for group in LATE_WITH.get(name, (name,)))
+                    when = np.clip(at - late / h, 0.0, steps)
                     values[r, segment.row] = states.at(name, k, when, steps, robot)
 
 

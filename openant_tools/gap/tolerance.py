@@ -28,6 +28,8 @@ COPPER = 0.0039
 IMU_RAD, GYRO_RAD_S, ACC_M_S2 = math.radians(1.0), 0.01, 0.1
 #: share of its length by which a link may be longer; Ω of a supply and its cables
 LENGTH, SUPPLY_OHM = 0.01, 0.05
+#: share of what a model calls damping that may be back-EMF, and is gone with torque off
+ELECTRICAL = 0.15
 #: of the torso mass's tolerance on a robot that is not an Ant: share of its mass
 TORSO_SHARE = 0.03
 #: share by which a current or load sensor's scale is uncertain
@@ -36,10 +38,16 @@ TORQUE_SCALE = 0.03
 TORQUE_ZERO = 0.06
 #: s by which a velocity register is late at most on a healthy servo, and by which a row's stamp is off its samples
 VELOCITY_LATE_S, STAMP_S = 0.012, 0.0015
+#: s by which low-pass filters make a gyroscope late at most (25 Hz), and an accelerometer beyond it (Betaflight's is 10 to 25 Hz)
+IMU_LATE_S, ACC_LATE_S = 0.007, 0.010
+#: steps of a voltage sensor between which the supply may lie: which of its steps is nearest is a matter of chance
+VOLT_BETWEEN = 0.5
 #: logarithms of factors on what a contact is like beside its softness
-CONTACT_DAMPING, CONTACT_FORM = (-0.4, 0.15), (-0.6, 0.6)
+CONTACT_DAMPING, CONTACT_FORM = (-0.4, 0.15), (-0.9, 0.6)
 #: rad: no joint rests farther off than this
 FARTHEST_REST_RAD = 0.03
+#: share of a joint's usual torque with which a foot that stands may hold its leg twisted
+GRIP = 0.3
 #: logarithms between which a sensor's noise lies, as a factor on the usual: nobody says how good a sensor is
 NOISE = (-1.8, 0.5)
 
@@ -64,6 +72,7 @@ def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width:
     robot.more("coulomb_friction")[:] += COULOMB_NM * np.minimum(1.0, reference.torque / 0.2) * spread()
     robot.zero += width * ZERO_RAD * rng.uniform(-1, 1, n)
     robot.delay += DELAY_S * spread()
+    robot.electrical += float(rng.uniform(0, ELECTRICAL))
     robot.length *= 1 + width * LENGTH * rng.uniform(-1, 1, n)
     robot.law("voltage_sag", "resistance_ohm")[:] += float(rng.uniform(0, SUPPLY_OHM))
     robot.torso_kg += width * rng.uniform(-1, 1) * torso_kg(reference)
@@ -75,11 +84,14 @@ def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width:
     robot.acc_bias += width * ACC_M_S2 * rng.uniform(-1, 1, 3)
     # A servo's velocity register is a filtered one, and stamps are not exactly those of the samples.
     robot.late["vel"] = robot.late.get("vel", 0.0) + float(rng.uniform(0, VELOCITY_LATE_S))
+    robot.late["imu"] = robot.late.get("imu", 0.0) + float(rng.uniform(0, IMU_LATE_S))
+    robot.late["acc"] = float(rng.uniform(0, ACC_LATE_S))
     stamp = float(rng.uniform(-STAMP_S, STAMP_S))
     for signal in ("pos", "vel", "torque"):
         robot.late[signal] = robot.late.get(signal, 0.0) + stamp
     for signal, noise in USUAL_NOISE.items():
         robot.noise[signal] = noise * float(np.exp(rng.uniform(*NOISE)))
+    robot.noise["volt_between"] = float(rng.uniform(-VOLT_BETWEEN, VOLT_BETWEEN))
     robot.noise["torque_zero"] = float(TORQUE_ZERO * rng.uniform(0, 1))
     robot.noise["torque_scale"] = float(np.exp(TORQUE_SCALE * rng.normal()))
 
@@ -105,14 +117,19 @@ def random_form(rng: np.random.Generator, encoder_rad: float) -> Form:
         contact_depth=math.exp(rng.uniform(*CONTACT_FORM)),
         loop_behind=bool(rng.random() < 0.9),
         tells_duty=bool(rng.random() < 0.5),
+        tells_asked=bool(rng.random() < 0.5),
     )  # fmt: skip
 
 
-def resting(robot: Robot, reference: Reference, rng: np.random.Generator) -> Array:
-    """(joints,) rad: how far from its setpoint each joint may have come to rest, held by dry friction."""
-    friction = np.maximum(reference.friction + robot.add.get("coulomb_friction", 0.0), 0.0)
+def resting(robot: Robot, reference: Reference, rng: np.random.Generator, *, standing: bool) -> Array:
+    """(joints,) rad: how far from where it is asked to be each joint may have come to rest, held by dry friction.
+
+    Args:
+        standing: feet on a floor hold legs as they came down, too; most do little.
+    """
+    held = np.maximum(reference.friction + robot.add.get("coulomb_friction", 0.0), 0.0)
+    if standing:
+        held = held + GRIP * reference.torque * rng.uniform(0, 1) ** 3
     share = rng.uniform(0, 1)
-    out: Array = (
-        share * rng.uniform(-1, 1, robot.joints) * np.minimum(friction / reference.stiffness, FARTHEST_REST_RAD)
-    )
+    out: Array = share * rng.uniform(-1, 1, robot.joints) * np.minimum(held / reference.stiffness, FARTHEST_REST_RAD)
     return out

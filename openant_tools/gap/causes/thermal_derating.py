@@ -21,7 +21,7 @@ CAUSE = Cause(
     quantities=(
         amount("loss_per_c", "1/°C", 0.005, 0.06),
         shape("time_constant_s", "s", 5.0, 40.0),
-        shape("start_c", "°C", 2.0, 30.0),
+        shape("start_c", "°C", 0.5, 30.0),
     ),
     enter=_enter,
     native=False,

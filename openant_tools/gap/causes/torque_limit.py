@@ -11,7 +11,7 @@ __all__ = ["CAUSE"]
 
 
 def _enter(robot: Robot, joints: Ints, values: Values) -> None:
-    robot.factor("torque_limit")[joints] *= values["limit"]
+    robot.weaken("torque_limit", joints, values["limit"])
 
 
 CAUSE = Cause(

@@ -9,8 +9,8 @@ __all__ = ["CAUSE"]
 
 
 def _enter(robot: Robot, joints: Ints, values: Values) -> None:
-    robot.factor("stiffness")[joints] *= 1 - values["loss"]
-    robot.factor("torque_limit")[joints] *= 1 - values["loss"]
+    for kind in ("stiffness", "torque_limit"):
+        robot.weaken(kind, joints, 1 - values["loss"])
 
 
 CAUSE = Cause(
