@@ -36,7 +36,8 @@ def taught() -> tuple[ByJoint, np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_robots_that_were_not_taught_are_told_apart(taught: tuple[ByJoint, np.ndarray, np.ndarray, np.ndarray]) -> None:
-    _, unseen, _, truth = taught
+    judge, logits, _, truth = taught
+    unseen = judge.summary(logits)
     surest = unseen[:, len(CAUSES) : 2 * len(CAUSES)]
     for k in range(len(CAUSES)):
         assert np.quantile(surest[truth == k, k], 0.1) > np.quantile(surest[truth != k, k], 0.9)
@@ -48,9 +49,9 @@ def test_a_cause_is_known_at_a_joint_where_it_never_was(
     judge, _, _, _ = taught
     z = np.random.default_rng(4).normal(size=(20, JOINTS * EACH)).astype(np.float32)
     logs = np.zeros((20, JOINTS), np.float32)
-    healthy = judge.said(z, logs)
+    healthy = judge.summary(judge.logits(z, logs))
     z[:, 3 * EACH : 3 * EACH + 3] += 3
-    ill = judge.said(z, logs)
+    ill = judge.summary(judge.logits(z, logs))
     more = ill[:, len(CAUSES)] - healthy[:, len(CAUSES)]
     assert more.min() > 0
     assert more.mean() > 1.5

@@ -73,10 +73,10 @@ def test_a_suspect_is_put_where_the_runs_say(weak: Windows) -> None:
     one = suspect("torque_limit", (0,), 0.0)
     near = {"limit": float(np.log(0.4))}
     places: list[tuple[tuple[int, ...], dict[str, float]]] = [((0,), {"limit": float(np.log(0.9))}), ((0,), near)]
-    judgement = Judgement({}, np.zeros(1), 1.0, {"torque_limit": places})
+    judgement = Judgement({}, np.zeros(1), {"torque_limit": places})
     there, cost = placed(weak, judgement, {"torque_limit": one}, [0, 1])["torque_limit"]
     assert there.x == near
-    unnamed = Judgement({}, np.zeros(1), 1.0, {"torque_limit": []})
+    unnamed = Judgement({}, np.zeros(1), {"torque_limit": []})
     assert cost < placed(weak, unnamed, {"torque_limit": one}, [0, 1])["torque_limit"][1]
 
 
@@ -125,7 +125,7 @@ def test_a_joint_that_is_strained_is_asked_whatever_the_judge_says(tmp_path: Pat
     windows.refit([nothing(windows)], [0, 1], ())
     assert windows.strained([0, 1]) == [2]
     everywhere = suspect("damping_error", tuple(range(8)), 0.6)
-    judgement = Judgement({}, np.zeros(1), 1.0, {"damping_error": [(everywhere.part.joints, dict(everywhere.x))]})
+    judgement = Judgement({}, np.zeros(1), {"damping_error": [(everywhere.part.joints, dict(everywhere.x))]})
     one, _ = placed(windows, judgement, {"damping_error": everywhere}, [0, 1])["damping_error"]
     assert one.part.joints == (2,)
     # Among eight joints two causes at one of them are hard to tell apart; at that one they are not.

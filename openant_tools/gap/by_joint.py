@@ -76,11 +76,11 @@ class ByJoint:
 
     def taught(
         self, z: Floats, logs: Floats, causes: Sequence[Mapping[str, tuple[tuple[int, ...], object]]], seed: int
-    ) -> tuple[ByJoint, Floats]:
-        """Learn from robots; with it what is said of each by those that have not seen it.
+    ) -> tuple[ByJoint, Array]:
+        """Learn from robots; with it (robots, joints, causes) logits for each by those that have not seen it.
 
         Args:
-            z, logs: as `said`. causes: of each robot, name → where it sits and whatever.
+            z, logs: as `logits`. causes: of each robot, name → where it sits and whatever.
         """
         x = self.seen(z, logs)
         labels = np.zeros((*x.shape[:2], len(self.causes)), np.int64)
@@ -92,18 +92,21 @@ class ByJoint:
         members, unseen = teach(
             self._scaled(x), labels, shares=NETWORKS, neurons=NEURONS, rounds=ROUNDS, portion=PORTION, seed=seed
         )  # fmt: skip
-        return dataclasses.replace(self, members=members), self._summary(unseen)
+        return dataclasses.replace(self, members=members), unseen
 
-    def said(self, z: Floats, logs: Floats) -> Floats:
-        """(robots, inputs of the judge) of differences whitened and of logarithms, (robots, …) each."""
-        x = self._scaled(self.seen(z, logs))
-        return self._summary(logits_of(self.members, x, len(self.causes)))
+    def logits(self, z: Floats, logs: Floats) -> Array:
+        """(robots, joints, causes), of differences whitened and of logarithms, (robots, …) each."""
+        return logits_of(self.members, self._scaled(self.seen(z, logs)), len(self.causes))
 
     def _scaled(self, x: Floats) -> Floats:
         out: Floats = ((x - self.usual) / self.spread).clip(-FAR, FAR)
         return out
 
-    def _summary(self, logits: Array) -> Floats:
+    def named(self, logits: Array) -> dict[str, Array]:
+        """Cause → (robots, joints) logits."""
+        return {name: logits[..., k] for k, name in enumerate(self.causes)}
+
+    def summary(self, logits: Array) -> Floats:
         """Of (robots, joints, causes): how sure of each cause at all joints, at the surest two, and at servos of one model."""
         ordered = np.sort(logits, axis=1)
         mean = logits.mean(axis=1)

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.cause import Cause, Quantity, catalogue, enter
 from openant_tools.gap.features import Floats, differences
-from openant_tools.gap.judge import Judgement, Metric
+from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Played, Players, Protocol
 from openant_tools.gap.robot import Reference, Robot
+from openant_tools.gap.whitening import Metric
 from openant_tools.model.plant import Setup
 
 __all__ = ["Explained", "Hypothesis", "Part", "Scene", "bounds_of", "explain", "fit", "robot_with", "scene_of"]

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.files import atomic_writer
-from openant_tools.gap.judge import Judge, Metric, metric_of, train
+from openant_tools.gap.judge import Judge, metric_of, train
 from openant_tools.gap.prepare import Prepared
 from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.whitening import Metric
 
 __all__ = ["judge_of", "kept_metric"]
 
@@ -21,7 +22,7 @@ Bools = NDArray[np.bool_]
 Stored = TypeVar("Stored")
 
 #: of what is kept beside a preparation: another where judges are taught otherwise
-FORM = 2
+FORM = 3
 
 
 def judge_of(prepared: Prepared, protocol: Protocol, *, progress: Callable[[float, str], None]) -> Judge:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +15,7 @@ from sklearn.neural_network import MLPClassifier
 
 from openant_tools.gap.features import Floats
 
-__all__ = ["logit", "logits_of", "teach"]
+__all__ = ["Networks", "logits_of", "teach"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -22,6 +24,60 @@ Ints = NDArray[np.int64]
 DECAY = 1.0
 #: probabilities nearer to 0 or 1 than this count as this
 EDGE = 0.002
+#: those that see the whole robot: how many, each taught without its share of the robots; neurons, rounds of teaching
+NETWORKS, NEURONS, ROUNDS = 4, 128, 60
+#: robots of a step, at least; steps of a round, at most
+PORTION, STEPS = 64, 40
+#: main directions of the differences that they see, and of how many robots; deviations beyond which an input says no more
+DIRECTIONS, ENOUGH, FAR = 100, 3000, 5.0
+
+
+@dataclass(frozen=True)
+class Networks:
+    """Networks that see a whole robot: its differences along their main directions, and how well causes fit them.
+
+    Attributes:
+        centre: (features,) of the whitened differences' inverse hyperbolic sines. directions: (features, directions).
+        usual, spread: (inputs,) of what else they are told.
+    """
+
+    centre: Floats
+    directions: Floats
+    usual: Floats
+    spread: Floats
+    members: tuple[MLPClassifier, ...] = ()
+
+    @classmethod
+    def of(cls, z: Floats, inputs: Floats) -> Networks:
+        """For robots with whitened differences (robots, features) and inputs (robots, inputs)."""
+        x = np.arcsinh(z[:: -(-len(z) // ENOUGH)])
+        centre = x.mean(axis=0)
+        squares, vectors = np.linalg.eigh((x - centre) @ (x - centre).T)
+        squares, vectors = squares[-DIRECTIONS:], vectors[:, -DIRECTIONS:]
+        real = squares > 1e-6 * squares[-1]
+        # Along each direction these robots scatter by one.
+        directions = (x - centre).T @ (vectors[:, real] / squares[real]) * np.sqrt(len(x))
+        return cls(
+            centre, directions.astype(np.float32), inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-6)
+        )  # fmt: skip
+
+    def taught(self, z: Floats, inputs: Floats, labels: Ints, seed: int) -> tuple[Networks, Array]:
+        """The same with networks that have learned from robots, and the logits for those each had not seen."""
+        x = self._seen(z, inputs)
+        # Larger portions of more robots: as many steps whatever there is to learn from.
+        portion = max(PORTION, len(x) * (NETWORKS - 1) // NETWORKS // STEPS)
+        members, unseen = teach(
+            x, labels, shares=NETWORKS, neurons=NEURONS, rounds=ROUNDS, portion=portion, seed=seed
+        )  # fmt: skip
+        return dataclasses.replace(self, members=members), unseen
+
+    def logits(self, z: Floats, inputs: Floats, outputs: int) -> Array:
+        """(robots, outputs) the mean of what they say."""
+        return logits_of(self.members, self._seen(z, inputs), outputs)
+
+    def _seen(self, z: Floats, inputs: Floats) -> Floats:
+        own = (np.arcsinh(z) - self.centre) @ self.directions
+        return np.hstack([own, ((inputs - self.usual) / self.spread).clip(-FAR, FAR)]).astype(np.float32)
 
 
 def teach(
@@ -54,12 +110,12 @@ def logits_of(members: Sequence[MLPClassifier], x: Floats, outputs: int) -> Arra
     """(robots, …, outputs) the mean of what networks say of (robots, …, inputs)."""
     flat = x.reshape(-1, x.shape[-1])
     # Of one output a classifier tells both probabilities, of several each one's.
-    mean = np.mean([logit(np.asarray(one.predict_proba(flat))[:, -outputs:]) for one in members], axis=0)
+    mean = np.mean([_logit(np.asarray(one.predict_proba(flat))[:, -outputs:]) for one in members], axis=0)
     out: Array = mean.reshape(*x.shape[:-1], outputs)
     return out
 
 
-def logit(p: Array) -> Array:
+def _logit(p: Array) -> Array:
     """Of probabilities."""
     clipped = np.clip(p, EDGE, 1 - EDGE)
     out: Array = np.log(clipped / (1 - clipped))

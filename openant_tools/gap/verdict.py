@@ -197,7 +197,7 @@ def _simplify(evidence: _Evidence) -> None:
 
 def _led(evidence: _Evidence, names: Sequence[str]) -> _Leader:
     """What speaks for the first suspect: the judge, what it closes, and what is left of what is strange."""
-    patient, probability, best = evidence.patient, evidence.probability, names[0]
+    probability, best = evidence.probability, names[0]
     score = {name: evidence.score(name) for name in names}
     whole = evidence.alone[best]
     if probability[best] < FINDING:
@@ -226,16 +226,26 @@ def _led(evidence: _Evidence, names: Sequence[str]) -> _Leader:
         # Tolerances do what it does, and leave no more than of a healthy robot.
         probability[best] *= max(gained, 0.0) / BARELY
     if probability[best] > MAYBE or proved or max(probability[name] for name in names) > CERTAIN:
-        left = _without(patient, evidence.explained[best])
+        left = _without(evidence, best)
         eased = probability[best] > MAYBE and energy > 1 and left.energy < EASES * energy
     return _Leader(best, gained, beside, proved, left, eased)
 
 
-def _without(patient: Patient, explained: Explained) -> Judgement:
-    """What the judge says of what is left once a cause is taken into account: against the model that has it."""
-    robot = robot_with(patient.coarse.reference, (explained.part,), (explained.x,))
-    left = patient.coarse.features(robot)
-    return patient.judge.say(np.concatenate([left[k][0][left[k][1]] for k in patient.training]))
+def _without(evidence: _Evidence, name: str) -> Judgement:
+    """What the judge says of what is left once a cause is taken into account: against the model that has it.
+
+    Of the sizes that the fits to features and to windows gave it, the one that leaves less that is strange: where two causes act,
+    features give the first what belongs to both.
+    """
+    patient, explained = evidence.patient, evidence.explained[name]
+    sizes = [explained.x]
+    if not catalogue()[name].random:
+        sizes += [x for x in evidence.alone[name].refit.x if x != explained.x]
+    said = []
+    for x in sizes:
+        left = patient.coarse.features(robot_with(patient.coarse.reference, (explained.part,), (x,)))
+        said.append(patient.judge.say(np.concatenate([left[k][0][left[k][1]] for k in patient.training])))
+    return min(said, key=lambda judgement: judgement.energy)
 
 
 def _joined(evidence: _Evidence, leader: _Leader, left: Judgement, chosen: _Chosen) -> _Chosen:

@@ -1,0 +1,129 @@
+"""What each cause by itself looks like: robots that are as the model says but for one cause at one place, and what fits them.
+
+Where several causes act, the strongest hides the others. What is left of a robot once all that the best cause can do at its
+place is taken out shows the next one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.gap.features import Floats
+
+__all__ = ["Template", "Templates"]
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+#: its cause, where that sits, and its coordinates
+Template = tuple[str, tuple[int, ...], dict[str, float]]
+#: shorter templates do not show
+SHOWS = 1e-3
+#: of what templates of one place have in common, the share that is taken for noise
+NOISE = 1e-3
+#: numbers that only must not be zero
+TINY = 1e-6
+
+
+@dataclass(frozen=True)
+class Templates:
+    """Templates in the measure of healthy robots.
+
+    Attributes:
+        bank: what each is of. vectors: (templates, features). joints: how many the robot has.
+    """
+
+    bank: tuple[Template, ...]
+    vectors: Floats
+    joints: int
+
+    @classmethod
+    def of(cls, bank: Sequence[Template], vectors: Floats, joints: int) -> Templates:
+        """Those that show at all."""
+        seen = np.linalg.norm(vectors, axis=1) > SHOWS
+        return cls(tuple(one for one, shows in zip(bank, seen, strict=True) if shows), vectors[seen], joints)
+
+    @cached_property
+    def causes(self) -> tuple[str, ...]:
+        return tuple(sorted({name for name, _, _ in self.bank}))
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # What follows from the vectors need not be stored beside them.
+        return Templates, (self.bank, self.vectors, self.joints)
+
+    @cached_property
+    def _unit(self) -> Floats:
+        out: Floats = self.vectors / np.maximum(np.linalg.norm(self.vectors, axis=1, keepdims=True), TINY)
+        return out
+
+    @cached_property
+    def _alike(self) -> Floats:
+        """(templates, templates) cosines."""
+        out: Floats = self._unit @ self._unit.T
+        return out
+
+    @cached_property
+    def _of_cause(self) -> list[NDArray[np.int64]]:
+        names = np.array([name for name, _, _ in self.bank])
+        return [np.flatnonzero(names == cause) for cause in self.causes]
+
+    @cached_property
+    def _beside(self) -> list[NDArray[np.int64]]:
+        """Of each template, those of the same cause at the same place."""
+        groups: dict[tuple[str, tuple[int, ...]], list[int]] = {}
+        for k, (name, where, _) in enumerate(self.bank):
+            groups.setdefault((name, where), []).append(k)
+        return [np.array(groups[name, where]) for name, where, _ in self.bank]
+
+    def fits(self, z: Floats, some: Bools | None = None) -> Floats:
+        """(robots, templates) how far whitened differences go along each template, none backwards.
+
+        Args:
+            some: (features,) only by these; default all.
+        """
+        unit = self._unit
+        if some is not None:
+            z, part = z[:, some], self.vectors[:, some]
+            unit = part / np.maximum(np.linalg.norm(part, axis=1, keepdims=True), TINY)
+        out: Floats = np.maximum(z @ unit.T, 0.0)
+        return out
+
+    def by_cause(self, fit: Floats) -> Floats:
+        """(robots, causes) the best fit of each."""
+        return np.stack([fit[:, some].max(axis=1) for some in self._of_cause], axis=1)
+
+    def by_joint(self, fit: Floats) -> Floats:
+        """(robots, joints) the best fit of any cause that sits there alone."""
+        single = np.array([where[0] if len(where) == 1 else -1 for _, where, _ in self.bank])
+        return np.stack([fit[:, single == j].max(axis=1, initial=0.0) for j in range(self.joints)], axis=1)
+
+    def places(self, fit: Floats) -> dict[str, list[tuple[tuple[int, ...], dict[str, float]]]]:
+        """Cause → where its best templates sit and their coordinates, best first, each place once; fit: (templates,)."""
+        out: dict[str, list[tuple[tuple[int, ...], dict[str, float]]]] = {cause: [] for cause in self.causes}
+        for k in np.argsort(-fit):
+            name, where, x = self.bank[int(k)]
+            if where not in [there for there, _ in out[name]]:
+                out[name].append((where, dict(x)))
+        return out
+
+    def peeled(self, z: Floats, times: int) -> Iterator[tuple[Floats, Floats]]:
+        """What is left once the best cause at its place is taken out, then the next, and so on (matching pursuit).
+
+        Yields:
+            so many times: (robots, causes) the best fit of each to what is left; (robots, 1) how large that is.
+        """
+        along, size = (z @ self._unit.T).astype(np.float64), np.square(z, dtype=np.float64).sum(axis=1)
+        for _ in range(times):
+            for r, best in enumerate(along.argmax(axis=1)):
+                mine = self._beside[int(best)]
+                alike = self._alike[np.ix_(mine, mine)] + NOISE * np.eye(len(mine))
+                share = np.linalg.solve(alike, along[r, mine])
+                size[r] -= share @ along[r, mine]
+                along[r] -= share @ self._alike[mine]
+            left = np.sqrt(np.maximum(size, TINY))[:, None].astype(np.float32)
+            yield self.by_cause(np.maximum(along, 0.0).astype(np.float32)), left
