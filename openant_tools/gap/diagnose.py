@@ -27,7 +27,6 @@ from openant_tools.gap.prepare import Prepared, prepare
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.thresholds import (
     BEFOREHAND_S,
-    COPPER,
     DOUBT,
     FEW_JOINTS,
     FINDING,
@@ -112,8 +111,6 @@ def diagnose(
         suspects += [name for name in _questioned(protocol) if name not in suspects and name in judgement.places]
     suspects += [name for name in warmed if name not in suspects and name in judgement.places]
     explained = explain(scenes, suspects, judgement, thorough=warmed)
-    if warmed and HEAT in explained and explained[HEAT].x["loss_per_c"] < COPPER and len(explained) > 1:
-        del explained[HEAT]
     tell(0.85, "held-out runs")
     if few:
         return decide_together(patient, judgement, first, explained)

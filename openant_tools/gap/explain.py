@@ -19,6 +19,7 @@ from openant_tools.gap.features import Floats, differences
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Played, Players, Protocol
 from openant_tools.gap.robot import Reference, Robot
+from openant_tools.gap.thresholds import HEAT
 from openant_tools.gap.whitening import Metric
 from openant_tools.model.plant import Setup
 
@@ -121,6 +122,9 @@ class Scene:
 
 def scene_of(cause: str, scenes: Mapping[Setup, Scene]) -> Scene:
     """Where a cause shows."""
+    if cause == HEAT:
+        # Servos warm up from run to run, and most where they carry the robot.
+        return max(scenes.values(), key=lambda scene: max(float(one.warm_c.max()) for one in scene.runs))
     # What shifts command and encoder alike shows where feet stand, and hardly anywhere else.
     floor = catalogue()[cause].of_body or catalogue()[cause].silent
     first = Setup.FLOOR if floor else Setup.STAND

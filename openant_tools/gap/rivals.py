@@ -16,6 +16,7 @@ from openant_tools.gap.closure import Windows, unmoved
 from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.thresholds import HEAT
 
 __all__ = ["bodily", "carries", "everywhere", "moves_joints", "paired", "placed", "rivals"]
 
@@ -66,6 +67,10 @@ def _places(protocol: Protocol, judgement: Judgement, one: Explained, strained: 
     wider += [tuple(range(len(protocol.joints)))] if Scope.ALL in scopes else []
     places = {(where, tuple(x.items())): x for where, x in named}
     places |= {(where, tuple(x.items())): x for where in wider for _, x in named[:WIDER]}
+    if one.part.cause == HEAT:
+        # How warm this robot was no template knew, and where feet chatter no fit to features finds how much it lost.
+        sizes = [x for strength in STRENGTHS for x in one.part.definition.starts(strength)]
+        places |= {(where, tuple(x.items())): x for where in [*(where for where, _ in named), *wider] for x in sizes}
     del places[one.part.joints, tuple(one.x.items())]
     return [dataclasses.replace(one, part=Part(one.part.cause, where), x=x) for (where, _), x in places.items()]
 

@@ -38,6 +38,8 @@ SETTLED = 0.35
 #: gaps that are so many floors, of robots whose energy is so many gates, ask for an explanation; beyond ODD gates no robot of
 #: the build is healthy, whatever the judge says
 LARGE, STRANGE, ODD = 3.0, 3.0, 20.0
+#: energy beyond which what a set leaves is a riddle, and held-out closure below which it then has not explained the gap
+RIDDLE, EXPLAINS_RIDDLE = 10.0, 0.55
 #: floors that a re-fit of a healthy robot does not leave
 STRAYS = 4.0
 #: times what a re-fit leaves of a servo's other joints that it leaves of a joint where alone suspects are compared

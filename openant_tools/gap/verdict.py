@@ -12,7 +12,7 @@ import numpy as np
 from openant_tools.gap.cause import catalogue
 from openant_tools.gap.closure import ClosureByJoint, Refit, Windows, calibration_of, closures, nothing, unmoved
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis
-from openant_tools.gap.explain import Explained, Part, Scene, explain, fit, robot_with, scene_of
+from openant_tools.gap.explain import Explained, Hypothesis, Part, Scene, explain, fit, robot_with, scene_of
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.patient import Patient, diagnosis_of, found_of, shown, unfitted, warmth
 from openant_tools.gap.rivals import bodily, carries, everywhere, moves_joints, paired, placed, rivals
@@ -28,6 +28,7 @@ from openant_tools.gap.thresholds import (
     EARLY,
     EASES,
     EXPLAINS,
+    EXPLAINS_RIDDLE,
     FAR_WORSE,
     FINDING,
     LARGE,
@@ -39,6 +40,7 @@ from openant_tools.gap.thresholds import (
     ODD,
     OTHERS,
     PROVES,
+    RIDDLE,
     SECOND,
     SETTLED,
     STANDS_OUT,
@@ -118,11 +120,16 @@ class _Leader:
 
 @dataclass(frozen=True)
 class _Chosen:
-    """The causes that go into the improved model; what they leave together, and what the removal of each costs."""
+    """The causes that go into the improved model; what they leave together, and what the removal of each costs.
+
+    Attributes:
+        energy: how strange what they leave is; infinite where nobody asked.
+    """
 
     names: tuple[str, ...]
     closure: ClosureByJoint
     removal: Mapping[str, float]
+    energy: float = math.inf
 
 
 def decide(
@@ -146,6 +153,8 @@ def decide(
         max(evidence.probability[name] for name in names) > FINDING or leader.proved or leader.eased
     ):
         chosen = _joined(evidence, leader, leader.left, chosen)
+    if leader.left is not None:
+        chosen = dataclasses.replace(chosen, energy=_strangeness(evidence, chosen))
     verdict, selected, ambiguous = _verdict(evidence, names, leader, chosen)
     if selected and patient.in_time("slopes where the causes were found", LATE):
         chosen = _polished(evidence, chosen)
@@ -232,20 +241,36 @@ def _led(evidence: _Evidence, names: Sequence[str]) -> _Leader:
 
 
 def _without(evidence: _Evidence, name: str) -> Judgement:
-    """What the judge says of what is left once a cause is taken into account: against the model that has it.
-
-    Of the sizes that the fits to features and to windows gave it, the one that leaves less that is strange: where two causes act,
-    features give the first what belongs to both.
-    """
-    patient, explained = evidence.patient, evidence.explained[name]
+    """What the judge says of what is left once a cause is taken into account: against the model that has it."""
+    explained = evidence.explained[name]
     sizes = [explained.x]
     if not catalogue()[name].random:
         sizes += [x for x in evidence.alone[name].refit.x if x != explained.x]
-    said = []
-    for x in sizes:
-        left = patient.coarse.features(robot_with(patient.coarse.reference, (explained.part,), (x,)))
+    return _left(evidence, [((explained.part,), (x,)) for x in sizes])
+
+
+def _left(evidence: _Evidence, causes: Sequence[tuple[Hypothesis, Sequence[Mapping[str, float]]]]) -> Judgement:
+    """What the judge says against the model that has causes, in those of some sizes that leave least that is strange.
+
+    Fits to features and to windows give them different ones: where two causes act, features give the first what belongs to both.
+    """
+    patient, said = evidence.patient, []
+    for parts, x in causes:
+        left = patient.coarse.features(robot_with(patient.coarse.reference, parts, x))
         said.append(patient.judge.say(np.concatenate([left[k][0][left[k][1]] for k in patient.training])))
     return min(said, key=lambda judgement: judgement.energy)
+
+
+def _strangeness(evidence: _Evidence, chosen: _Chosen) -> float:
+    """How strange what a set of causes leaves is."""
+    explained = [evidence.explained[name] for name in chosen.names]
+    found = dict(zip((part.cause for part in chosen.closure.refit.hypothesis), chosen.closure.refit.x, strict=True))
+    known = [one for one in explained if not catalogue()[one.part.cause].random]
+    if not known:
+        return evidence.judgement.energy
+    parts = tuple(one.part for one in known)
+    sizes = [[one.x for one in known], [found.get(one.part.cause, one.x) for one in known]]
+    return _left(evidence, [(parts, x) for x in sizes]).energy
 
 
 def _joined(evidence: _Evidence, leader: _Leader, left: Judgement, chosen: _Chosen) -> _Chosen:
@@ -254,24 +279,22 @@ def _joined(evidence: _Evidence, leader: _Leader, left: Judgement, chosen: _Chos
     explained, probability, whole = evidence.explained, evidence.probability, chosen.closure
     tried = _seconds(evidence, leader.name, left)
     # What is random only adds its noise to every simulation.
-    fitted = [one for one, _ in tried if not catalogue()[one.part.cause].random]
+    fitted = [one for one in tried if not catalogue()[one.part.cause].random]
     starts = [_start(windows, [explained[leader.name], one], training) for one in fitted]
     pairs = evidence.closures(starts)[2] if starts else []
     together = {one.part: both for one, both in zip(fitted, pairs, strict=True)}
     second: tuple[float, Explained, ClosureByJoint] | None = None
-    for one, adds in tried:
-        name, chance = one.part.cause, left.probability[one.part.cause]
+    for one in tried:
+        name = one.part.cause
+        before = _found_both(evidence, leader.name, name)
+        chance = max(left.probability[name], before)
         both = together.get(one.part, whole)
         # What moves no joint, or not twice alike, no closure can prove: there the judge's word is enough.
         moves = moves_joints(catalogue()[name]) and not catalogue()[name].beside_joints_at(both.refit.x[-1])
-        silent = not moves and chance > FINDING
         # Unless it takes away so much of what is strange that nothing within tolerance does.
         much = (moves or carries(catalogue()[name])) and 1 - both.closed < PROVES * (1 - whole.closed)
-        enough = both.closed > whole.closed + adds and (moves or adds == ADDS)
-        # Of what the judge is certain it is enough that runs do not speak against it.
-        enough |= moves and chance > CERTAIN and both.closed > whole.closed
-        if enough or much or (silent and both.closed > whole.closed - ADDS):
-            how = _rank(max(chance, probability[name]), 1 - both.closed)
+        if much or both.closed - whole.closed > _has_to_add(left.probability[name], before, moves=moves):
+            how = _rank(chance, 1 - both.closed)
             if second is None or how > second[0]:
                 second = how, one, both
     if second is None:
@@ -286,23 +309,54 @@ def _joined(evidence: _Evidence, leader: _Leader, left: Judgement, chosen: _Chos
     return _Chosen((leader.name, name), both, removal)
 
 
-def _seconds(evidence: _Evidence, best: str, left: Judgement) -> list[tuple[Explained, float]]:
-    """Causes that may act beside the best, each with the held-out closure that it has to add.
+def _found_both(evidence: _Evidence, best: str, name: str) -> float:
+    """How probable the judge found a cause before it knew of any other, where it found the leader, too; else 0.
 
-    Those that the judge expects in what the best leaves, and those it half hides behind the best, where a first look says that
-    both together leave clearly less.
+    Those are no two names of one thing.
     """
-    patient, explained, probability = evidence.patient, evidence.explained, evidence.probability
-    seen = [
-        (name, chance) for name, chance in shown(left, patient.protocol)[:OTHERS] if chance > SUSPECT and name != best
-    ]
-    missing = [name for name, _ in seen if name not in explained]
+    before = dict(evidence.ranked)
+    return before[name] if min(before[best], before[name]) > FINDING else 0.0
+
+
+def _has_to_add(left: float, before: float, *, moves: bool) -> float:
+    """Held-out closure that a second cause has to add: the less, the more probable the judge finds it.
+
+    Args:
+        left: what the judge says of what the leader leaves; a leader that is a little off leaves what looks like other causes.
+        before: what it said of it beside the leader, of the robot as it is. moves: whether closure can tell the cause.
+    """
+    if not moves:
+        return -ADDS if max(left, before) > FINDING else ADDS if left > SECOND else math.inf
+    if before > CERTAIN:
+        return -ADDS
+    if before > FINDING or left > CERTAIN:
+        return 0.0
+    return ADDS if left > SECOND else ADDS_MUCH
+
+
+def _seconds(evidence: _Evidence, best: str, left: Judgement) -> list[Explained]:
+    """Causes that may act beside the best.
+
+    Those that the judge expects, in what the best leaves or from the beginning; those it half hides behind the best, where a first
+    look says that both together leave clearly less; and what by itself leaves least of the others.
+    """
+    patient, explained = evidence.patient, evidence.explained
+    chance = {
+        name: max(left.probability[name], _found_both(evidence, best, name))
+        for name in evidence.probability
+        if name != best
+    }
+    likely = sorted(
+        (name for name, _ in shown(left, patient.protocol) if name in chance), key=lambda name: -chance[name]
+    )
+    seen = [name for name in likely[:OTHERS] if chance[name] > SUSPECT]
+    missing = [name for name in seen if name not in explained]
     known = {**explained, **(explain(evidence.scenes, missing, left) if missing else {})}
     told = [
         name
-        for name, chance in seen[:TOLD]
+        for name in seen[:TOLD]
         if name in known
-        and max(chance, probability[name]) > SECOND
+        and chance[name] > SECOND
         and not (moves_joints(catalogue()[name]) and _vanished(known[name].part, known[name].x))
     ]
     odd = left.energy > STRANGE
@@ -319,13 +373,20 @@ def _seconds(evidence: _Evidence, best: str, left: Judgement) -> list[tuple[Expl
     look: list[tuple[Explained, float]] = []
     if hidden and patient.in_time("second causes that the judge does not expect"):
         look = paired(evidence.windows, known[best], hidden, patient.training)
-    chance = {one.part.cause: max(left.probability[one.part.cause], probability[one.part.cause]) for one, _ in look}
     look.sort(key=lambda pair: _rank(chance[pair[0].part.cause], pair[1]), reverse=True)
     sited = [known[name] for name in told]
     if sited and patient.in_time("other places of a second cause"):
         better = {one.part.cause: one for one, _ in paired(evidence.windows, known[best], sited, patient.training)}
         sited = [better.get(one.part.cause, one) for one in sited]
-    return [(one, ADDS) for one in sited] + [(one, ADDS_MUCH) for one, _ in look[:MORE]]
+    out = [*sited, *(one for one, _ in look[:MORE])]
+    alone = [name for name in explained if name != best and name in evidence.alone and moves_joints(catalogue()[name])]
+    if alone:
+        # What closes much by itself may do so beside the best, too.
+        least = max(alone, key=lambda name: evidence.alone[name].closed)
+        gains = evidence.alone[least].closed - evidence.plain.closed
+        if gains > ADDS_MUCH and least not in {one.part.cause for one in out}:
+            out.append(explained[least])
+    return out
 
 
 def _polished(evidence: _Evidence, chosen: _Chosen) -> _Chosen:
@@ -364,6 +425,13 @@ def _verdict(
     odd = left is not None and min(energy, left.energy) > STRANGE
     if leader.beside and not certain and odd and chosen.closure.closed < CLOSES_MOST:
         # Strange with it, too: a foot that came off is no offset, though nothing known is more like it.
+        return UNEXPLAINED, (), ()
+    large = chosen.closure.after > STRAYS * evidence.floor
+    if large and not noisy and chosen.energy > RIDDLE and chosen.closure.closed < EXPLAINS_RIDDLE:
+        # The better half of a gap that is still a riddle: it only looks like what it was called.
+        return UNEXPLAINED, (), ()
+    if carries(catalogue()[best]) and chosen.closure.closed < evidence.plain.closed - ADDS:
+        # Joints show little of what carries the robot, but they do not move farther from their model with it.
         return UNEXPLAINED, (), ()
     doubted = [
         name for name in chosen.names if certain and (probability[name] < SECOND or _idle(evidence, chosen, name))
