@@ -101,8 +101,8 @@ def test_beside_the_best_what_had_neither_size_nor_place_alone_is_tried_where_th
     assert left < 0.7
 
 
-def on_the_stand(folder: Path, robot: Robot) -> Windows:
-    """Two runs of an Ant whose legs hang free."""
+def on_the_stand(folder: Path, robot: Robot, *, warmer_c: float = 0.0) -> Windows:
+    """Two runs of an Ant whose legs hang free, its servos in the second this much warmer than in the first."""
     plant = load_plant(write(folder / "given.xml", nominal_mjcf("standard")), None, Setup.STAND)
     home = np.array([0.0 if joint.startswith("hip") else -0.6 for joint in plant.joints])
     runs = []
@@ -110,8 +110,11 @@ def on_the_stand(folder: Path, robot: Robot) -> Windows:
         commands = home + 0.5 * np.sin(2 * np.pi * (1.5 + n) * (T - T[0])[:, None] + np.arange(8))
         columns = {f"cmd.{joint}": commands[:, j] for j, joint in enumerate(plant.joints)}
         columns |= {f"pos.{joint}": np.full(len(T), home[j]) for j, joint in enumerate(plant.joints)}
+        columns |= {f"temp.{joint}": np.full(len(T), 25.0 + n * warmer_c) for joint in plant.joints}
         run = Run(f"run-{n}", Facts(joints=plant.joints, setup="stand"), T, columns)
-        seen = simulate(Rollouts(plant, [run]), [robot], signals=["pos"]).signals["pos"][0].astype(float)
+        warm_c = [np.full(len(plant.joints), n * warmer_c)]
+        found = simulate(Rollouts(plant, [run]), [robot], signals=["pos"], warm_c=warm_c)
+        seen = found.signals["pos"][0].astype(float)
         columns |= {f"pos.{joint}": seen[:, j] for j, joint in enumerate(plant.joints)}
         runs.append(dataclasses.replace(run, columns=columns))
     return Windows(Protocol.of(runs, plant.path, plant.joints, [None, None]))
@@ -134,6 +137,21 @@ def test_a_joint_that_is_strained_is_asked_whatever_the_judge_says(tmp_path: Pat
     _, _, (brakes, heavy) = closures(windows, starts, [1], [0])
     assert brakes.closed_at([2]) - heavy.closed_at([2]) > brakes.closed - heavy.closed > 0
     assert brakes.closed_at(range(8)) == pytest.approx(brakes.closed)
+
+
+def test_what_warm_servos_lose_is_tried_in_sizes_that_no_template_has(tmp_path: Path) -> None:
+    """Templates know not how warm this robot was: the judge names another joint, and a size that is next to nothing."""
+    robot = Robot(8)
+    robot.derating[2] = 0.03
+    windows = on_the_stand(tmp_path, robot, warmer_c=25.0)
+    windows.refit([nothing(windows)], [0, 1], ())
+    assert windows.strained([0, 1]) == [2]
+    named = suspect("thermal_derating", (5,), 0.0)
+    judgement = Judgement({}, np.zeros(1), {"thermal_derating": [(named.part.joints, dict(named.x))]})
+    there, cost = placed(windows, judgement, {"thermal_derating": named}, [0, 1])["thermal_derating"]
+    assert there.part.joints == (2,)
+    assert there.x["loss_per_c"] == pytest.approx(0.03, rel=0.3)
+    assert cost < 0.5 * windows.left([unmoved(windows, [named.part], [named.x])], [0, 1])[0]
 
 
 def test_a_second_cause_is_put_where_it_sits_beside_the_first(tmp_path: Path) -> None:
