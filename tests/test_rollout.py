@@ -393,6 +393,16 @@ def test_finer_steps_are_those_of_a_model_with_a_smaller_step(every: int, ant: P
     assert coarse.finer(2) is coarse.finer(2)
 
 
+def test_finer_steps_of_rows_that_scatter_are_taken_as_well(ant: Plant) -> None:
+    """Rows lie between steps: of segments that take as many, one may take fewer smaller ones than the next."""
+    run = walking(ant, 3.0)
+    jittered = np.sort(run.t + np.random.default_rng(0).uniform(-0.002, 0.002, len(run.t)))
+    fine = Rollouts(ant, [replace(run, t=jittered)], 0.2).finer(2)
+    lengths = [len(segment.control) for segment in fine.segments]
+    assert lengths == sorted(lengths, reverse=True)
+    assert np.isfinite(fine().pos[0]).all()
+
+
 def on_the_floor(plant: Plant, seconds: float = 2.0, heading: float = 0.0, rate: float = 4.0) -> Run:
     """An Ant that shifts its weight on the floor, with its base measured."""
     model = plain.on_floor(plant.path)

@@ -150,7 +150,9 @@ class Rollouts:
             fine, model = copy.copy(self), copy.copy(model)
             model.opt.timestep /= parts
             fine.plant, fine._batches, fine._finer = replace(self.plant, model=model), {}, {}
-            fine._segments = [self._cut(segment, parts) for segment in self._segments]
+            # Rows lie between steps: what was as long as another may now be a step shorter.
+            cut = (self._cut(segment, parts) for segment in self._segments)
+            fine._segments = sorted(cut, key=lambda segment: -len(segment.control))
             self._finer[parts] = fine
         return self._finer[parts]
 
