@@ -143,7 +143,8 @@ class Robot:
     Attributes:
         low, high: rad, between which each joint was seen to move.
         scale: kind → factor on what the model says ("stiffness", "damping" with the velocity gain, "armature",
-            "torque_limit", "link_mass"). lacks: kind → the part of it that the motor lacks, not its loop. add: kind → what comes on top ("coulomb_friction", N·m; "armature", kg·m²).
+            "torque_limit", "link_mass"). lacks: kind → the part of it that the motor lacks, not its loop.
+        add: kind → what comes on top ("coulomb_friction", N·m; "armature", kg·m²).
         zero: rad, added to what the encoder reads. start: rad, how far from where the runs begin it rests, as dry friction
             lets it. length: factors on the links. delay, lag: s, of commands. slew: rad/s, inf for none.
         no_load: rad/s at which the torque limit has fallen to nothing, inf for none.

@@ -86,8 +86,10 @@ def simulate(
     out = {name: np.full((len(robots), rows, width[name]), np.nan, np.float32) for name in names}
     # Rotors behind play and springs take smaller steps, and are led along to each window: that costs more than the others.
     hidden = np.array([_hides(robot) for robot in robots])
-    parts = math.ceil(plant.timestep / FINE_S - 1e-9) if floor else 1
-    groups = [(np.flatnonzero(~hidden), rollouts), (np.flatnonzero(hidden), rollouts.finer(parts))]
+    groups = [(np.flatnonzero(~hidden), rollouts)]
+    if hidden.any():
+        parts = math.ceil(plant.timestep / FINE_S - 1e-9) if floor else 1
+        groups.append((np.flatnonzero(hidden), rollouts.finer(parts)))
     with _unwarned():
         for group, stepped in groups:
             longest = max(len(segment.control) for segment in stepped.segments)

@@ -154,7 +154,7 @@ def decide(
     ):
         chosen = _joined(evidence, leader, leader.left, chosen)
     if leader.left is not None:
-        chosen = dataclasses.replace(chosen, energy=_strangeness(evidence, chosen))
+        chosen = dataclasses.replace(chosen, energy=_strangeness(evidence, chosen, leader.left))
     verdict, selected, ambiguous = _verdict(evidence, names, leader, chosen)
     if selected and patient.in_time("slopes where the causes were found", LATE):
         chosen = _polished(evidence, chosen)
@@ -261,13 +261,15 @@ def _left(evidence: _Evidence, causes: Sequence[tuple[Hypothesis, Sequence[Mappi
     return min(said, key=lambda judgement: judgement.energy)
 
 
-def _strangeness(evidence: _Evidence, chosen: _Chosen) -> float:
-    """How strange what a set of causes leaves is."""
-    explained = [evidence.explained[name] for name in chosen.names]
-    found = dict(zip((part.cause for part in chosen.closure.refit.hypothesis), chosen.closure.refit.x, strict=True))
-    known = [one for one in explained if not catalogue()[one.part.cause].random]
+def _strangeness(evidence: _Evidence, chosen: _Chosen, left: Judgement) -> float:
+    """How strange what a set of causes leaves is; left: what the first of them leaves."""
+    first, *_ = chosen.names
+    known = [evidence.explained[name] for name in chosen.names if not catalogue()[name].random]
     if not known:
         return evidence.judgement.energy
+    if [one.part.cause for one in known] == [first]:
+        return left.energy
+    found = dict(zip((part.cause for part in chosen.closure.refit.hypothesis), chosen.closure.refit.x, strict=True))
     parts = tuple(one.part for one in known)
     sizes = [[one.x for one in known], [found.get(one.part.cause, one.x) for one in known]]
     return _left(evidence, [(parts, x) for x in sizes]).energy

@@ -144,7 +144,7 @@ class Rollouts:
     def finer(self, parts: int) -> Rollouts:
         """The same with each step cut into so many; as it is where actuators have delay buffers, whose samples count steps."""
         model = self.plant.model
-        if (model.actuator_history[:, 0] > 0).any():
+        if parts == 1 or (model.actuator_history[:, 0] > 0).any():
             return self
         if parts not in self._finer:
             fine, model = copy.copy(self), copy.copy(model)
