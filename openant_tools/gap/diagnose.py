@@ -27,6 +27,7 @@ from openant_tools.gap.prepare import Prepared, prepare
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.thresholds import (
     BEFOREHAND_S,
+    COPPER,
     DOUBT,
     FEW_JOINTS,
     FINDING,
@@ -113,6 +114,9 @@ def diagnose(
     explained = explain(scenes, suspects, judgement, thorough=warmed)
     tell(0.85, "held-out runs")
     if few:
+        # There sizes come from the fits alone: what any motor loses is no cause.
+        if warmed and HEAT in explained and explained[HEAT].x["loss_per_c"] < COPPER and len(explained) > 1:
+            del explained[HEAT]
         return decide_together(patient, judgement, first, explained)
     return decide(patient, judgement, first, explained, scenes)
 
