@@ -207,7 +207,8 @@ def _model(model: Path | None, robot: Path | None, runs: tuple[Path, ...]) -> Pa
 
 
 def _print(found: Diagnosis) -> None:
-    from openant_tools.gap.words import sentence, where_words
+    from openant_tools.gap.diagnosis import UNEXPLAINED
+    from openant_tools.gap.words import rest_words, sentence, where_words
 
     click.echo(sentence(found))
     click.echo("effect               where               present  closes  parameters")
@@ -225,6 +226,8 @@ def _print(found: Diagnosis) -> None:
         f"gap of position on held-out runs: {1e3 * gap['before']:.2f} → {1e3 * gap['after']:.2f} mrad, "
         f"floor {1e3 * gap['floor']:.2f} mrad"
     )
+    if found.rest and found.verdict != UNEXPLAINED:
+        click.echo(rest_words(found))
     for note in found.notes:
         click.echo(note)
     if found.next_experiment:

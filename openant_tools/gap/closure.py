@@ -304,6 +304,13 @@ class Windows:
             k, [self.robot(refit, k) for refit in refits], (self._quick if quick else self._rollouts)[k]
         )
 
+    def simulated(self, k: int, refit: Refit, signals: Sequence[str]) -> dict[str, Array]:
+        """Signal → (rows, joints), what a re-fitted model does on run k."""
+        found = simulate(
+            self._rollouts[k], [self.robot(refit, k)], signals=signals, warm_c=[self.protocol.runs[k].warm_c]
+        ).signals
+        return {name: values[0].astype(np.float64) for name, values in found.items()}
+
     def before(self, k: int) -> Array:
         """(rows, joints) rad, the same of the model as it was given, with a base that it led itself."""
         if k not in self._before:

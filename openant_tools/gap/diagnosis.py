@@ -59,7 +59,8 @@ class Diagnosis:
         selected: those that go into the improved model, first the one whose removal costs most.
         ambiguous_with: sets that these runs cannot tell apart.
         gap: "before", "after", "floor" in rad, "signals" besides.
-        where: shares of the excess, largest first.
+        where: shares of the excess, largest first, with what the improved model leaves there, if there is one.
+        rest: what that leaves, and what it follows (`gap.rest.Following`); empty where nothing was fitted.
         calibration: kind → joint → factor or amount that the re-fit within tolerance found, for the improved model.
         notes: what it rests on, and what more signals would add.
     """
@@ -78,6 +79,7 @@ class Diagnosis:
     calibration: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     removal: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    rest: Mapping[str, Any] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
         """As formats, section 2, has it; what is ours alone comes after."""
@@ -112,6 +114,7 @@ class Diagnosis:
             "where": [dict(place) for place in self.where],
             "calibration": {kind: dict(values) for kind, values in self.calibration.items()},
             "removal": {name: _number(value) for name, value in self.removal.items()},
+            "rest": dict(self.rest),
             "notes": list(self.notes),
         }
 
@@ -154,6 +157,7 @@ def read_diagnosis(path: Path) -> Diagnosis:
             selected=tuple(text["selected"]), ambiguous_with=tuple(tuple(group) for group in text["ambiguous_with"]),
             next_experiment=text["next_experiment"], gap=text["gap"], where=text["where"],
             calibration=text.get("calibration", {}), removal=text.get("removal", {}), notes=tuple(text.get("notes", ())),
+            rest=text.get("rest", {}),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError) as error:
         raise BadInput(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +83,23 @@ class Measurement:
     def excess(self, signal: str) -> float:
         return excess(self.gaps[signal], self.floors[signal])
 
+    def resimulated(self, simulated: Sequence[Mapping[str, Array]]) -> tuple[Place, ...]:
+        """The same places with another simulation of the runs; shares are of what the excess was before.
+
+        Args:
+            simulated: of each run in order, signal → (rows, joints).
+        """
+        played = [
+            replace(one, simulated={**one.simulated, **other})
+            for one, other in zip(self.played, simulated, strict=True)
+        ]
+        floor = {signal: floors([one.run for one in played], self.joints, signal)[0] for signal in self.gaps}
+        return tuple(
+            place
+            for signal in self.gaps
+            for place in _places(played, self.joints, signal, floor[signal], of=self.played)
+        )
+
     def as_json(self) -> dict[str, Any]:
         return {
             "schema": "openant.gap-measure/1",
@@ -146,23 +163,39 @@ def _play(run: Run, plant: Plant, horizon_s: float | None) -> Played:
     return Played(run, measured, {"pos": done.pos[0], "vel": done.vel[0]}, regimes(run, plant))
 
 
-def _places(played: Sequence[Played], joints: Sequence[str], signal: str, floor: Array) -> list[Place]:
-    found = []
-    for j, joint in enumerate(joints):
-        for regime in Regime:
-            squares, seconds = [], 0.0
-            for one in played:
-                here = one.regime[:, j] == regime.value
-                error = (one.measured[signal][:, j] - one.simulated[signal][:, j])[here]
-                squares.append(error[np.isfinite(error)] ** 2)
-                seconds += float(np.median(np.diff(one.run.t))) * int(here.sum())
-            all_squares = np.concatenate(squares)
-            if len(all_squares):
-                beyond = max(0.0, float(all_squares.sum()) - len(all_squares) * float(floor[j]) ** 2)
-                found.append((joint, regime, beyond, math.sqrt(float(all_squares.mean())), seconds))
-    total = sum(beyond for _, _, beyond, _, _ in found)
+def _places(
+    played: Sequence[Played], joints: Sequence[str], signal: str, floor: Array, of: Sequence[Played] | None = None
+) -> list[Place]:
+    """What each joint and regime has of the gap, the largest share first.
+
+    Args:
+        of: the simulation whose excess the shares are of; default their own.
+    """
+    found = [
+        (joint, regime, *_there(played, j, regime, signal, float(floor[j])))
+        for j, joint in enumerate(joints)
+        for regime in Regime
+    ]
+    found = [one for one in found if math.isfinite(one[3])]
+    total = sum(one[2] for one in found)
+    if of is not None:
+        total = sum(_there(of, j, regime, signal, float(floor[j]))[0] for j in range(len(joints)) for regime in Regime)
     places = [
         Place(signal, joint, regime, beyond / total if total > 0 else 0.0, error, seconds)
         for joint, regime, beyond, error, seconds in found
     ]
     return sorted(places, key=lambda place: -place.share)
+
+
+def _there(played: Sequence[Played], j: int, regime: Regime, signal: str, floor: float) -> tuple[float, float, float]:
+    """Of a joint in one regime: the squares beyond its floor, their rms (NaN where it was never seen in it), and for how long, s."""
+    squares, seconds = [], 0.0
+    for one in played:
+        here = one.regime[:, j] == regime.value
+        error = (one.measured[signal][:, j] - one.simulated[signal][:, j])[here]
+        squares.append(error[np.isfinite(error)] ** 2)
+        seconds += float(np.median(np.diff(one.run.t))) * int(here.sum())
+    each = np.concatenate(squares)
+    if not len(each):
+        return 0.0, math.nan, seconds
+    return max(0.0, float(each.sum()) - len(each) * floor**2), math.sqrt(float(each.mean())), seconds

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.gap.cause import Scope, catalogue
-from openant_tools.gap.closure import Closure, Refit, Windows, heat_loss_of
+from openant_tools.gap.closure import Closure, Refit, Windows, calibration_of, heat_loss_of
 from openant_tools.gap.diagnosis import Diagnosis, Found, Span
 from openant_tools.gap.explain import Explained
 from openant_tools.gap.features import Floats
@@ -21,11 +21,16 @@ from openant_tools.gap.measure import Measurement
 from openant_tools.gap.next import suggestion
 from openant_tools.gap.prepare import Prepared
 from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.rest import rest_of
 from openant_tools.gap.sets import motions_of
 from openant_tools.gap.thresholds import PATIENCE_S
 from openant_tools.recording.run import Run
 
-__all__ = ["Patient", "diagnosis_of", "found_of", "shown", "unfitted", "warmth"]
+__all__ = ["Patient", "diagnosis_of", "found_of", "shown", "unfitted"]
+
+
+#: a re-fitted model on the windows that it was fitted on
+Left = tuple[Windows, Refit]
 
 
 @dataclass(frozen=True)
@@ -81,9 +86,21 @@ def shown(judgement: Judgement, protocol: Protocol) -> list[tuple[str, float]]:
 def diagnosis_of(
     patient: Patient, verdict: str, confidence: float, effects: tuple[Found, ...], selected: tuple[str, ...],
     ambiguous: tuple[tuple[str, ...], ...], gap: dict[str, float], removal: dict[str, float], judgement: Judgement,
-    calibration: dict[str, dict[str, float]] | None, notes: Sequence[str] = (),
+    left: Left | None, notes: Sequence[str] = (),
 ) -> Diagnosis:  # fmt: skip
-    signals = patient.measured.as_json()["signals"]
+    """A diagnosis, put down.
+
+    Args:
+        left: windows and the refit that goes into the improved model; None where there is none.
+    """
+    measured = patient.measured.as_json()
+    calibration: dict[str, dict[str, float]] = {}
+    where, rest = measured["where"], None
+    if left is not None:
+        judged = patient.held_out or patient.training
+        calibration = calibration_of(*left, judged)
+        rest, where = rest_of(*left, judged, patient.measured)
+        notes = (*notes, *_warmth(*left, judged))
     return Diagnosis(
         model=str(patient.model),
         runs=tuple(run.name for run in patient.runs),
@@ -96,11 +113,12 @@ def diagnosis_of(
         next_experiment=suggestion(
             verdict, ambiguous, len(motions_of(patient.protocol, range(len(patient.protocol.runs))))
         ),
-        gap={**gap, "energy": judgement.energy, "signals": signals},
-        where=patient.measured.as_json()["where"],
-        calibration=calibration or {},
+        gap={**gap, "energy": judgement.energy, "signals": measured["signals"]},
+        where=where,
+        calibration=calibration,
         removal=removal,
         notes=(*_notes(patient), *notes),
+        rest={} if rest is None else rest.as_json(),
     )
 
 
@@ -178,7 +196,7 @@ def unfitted(ranked: Sequence[tuple[str, float]], done: Sequence[str]) -> tuple[
     )
 
 
-def warmth(windows: Windows, refit: Refit, judged: Sequence[int]) -> list[str]:
+def _warmth(windows: Windows, refit: Refit, judged: Sequence[int]) -> list[str]:
     """What a diagnosis that knows how warm servos were has to say to whom a model of one warmth is written."""
     loss = heat_loss_of(windows, refit)
     if loss is None:

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.gap.apply import robot_of
-from openant_tools.gap.diagnosis import NONE, Diagnosis, Found
+from openant_tools.gap.diagnosis import NONE, UNEXPLAINED, Diagnosis, Found
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
-from openant_tools.gap.words import closed, sentence, standing, what_next, where_words
+from openant_tools.gap.words import closed, rest_words, sentence, standing, what_next, where_words
 from openant_tools.model.gap import HORIZON_S
 from openant_tools.model.plant import load_plant, setup_of
 from openant_tools.model.rollout import Rollouts
@@ -62,7 +62,9 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
     report.section("Where")
     if found.where:
         report.figure(
-            places(found), "Share of the excess gap, largest first; on a walking robot also by joint from above."
+            places(found),
+            "Share of the excess gap of the given model, largest first, and what the improved model leaves of it; on a walking "
+            "robot also by joint from above.",
         )
     report.section("Which")
     report.figure(
@@ -82,6 +84,8 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
         f"Measured and simulated around the moment at which the given model is farthest off, re-initialised every "
         f"{HORIZON_S:g} s; of {'the held-out runs' if held_out else 'all runs'}.",
     )
+    if found.rest and found.verdict != UNEXPLAINED:  # there the verdict says it
+        report.text(rest_words(found))
     report.section("What next").text(what_next(found))
     _details(report, found)
     return report
@@ -127,11 +131,18 @@ def places(found: Diagnosis) -> MatplotlibFigure:
     else:
         figure, axes = plots.figure(height=0.7 + 0.28 * len(largest))
     labels = [f"{place['signal']} · {place['joint']} · {place['regime']}" for place in largest]
-    axes.barh(range(len(largest)), [100 * float(place["share"]) for place in largest], color=plots.BLUE)
-    axes.set_yticks(range(len(largest)), labels)
+    before = [100 * float(place["share"]) for place in largest]
+    after = [place.get("share_after") for place in largest]
+    known = any(share is not None for share in after)
+    at, height = np.arange(len(largest)), 0.36 if known else 0.8
+    axes.barh(at - (0.19 if known else 0.0), before, height, color=plots.BLUE, label="before")
+    if known:
+        axes.barh(at + 0.19, [100 * float(share or 0.0) for share in after], height, color=plots.GREEN, label="after")
+        plots.legend(axes)
+    axes.set_yticks(at, labels)
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
-    axes.set_xlabel("share of the excess of its signal (%)")
+    axes.set_xlabel("share of the excess of its signal before (%)")
     return figure
 
 

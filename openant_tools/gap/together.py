@@ -9,12 +9,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from openant_tools.gap.cause import catalogue
-from openant_tools.gap.closure import Windows, calibration_of
+from openant_tools.gap.closure import Windows
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis
 from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.late import late_velocity
-from openant_tools.gap.patient import Patient, diagnosis_of, found_of, unfitted, warmth
+from openant_tools.gap.patient import Patient, diagnosis_of, found_of, unfitted
 from openant_tools.gap.sets import SetFits, choose, motions_of
 from openant_tools.gap.thresholds import ADDS, ADDS_ALONE, EXPLAINS, FINDING, LARGE, ODD, SURELY, TOGETHER
 from openant_tools.model.gap import excess
@@ -96,12 +96,10 @@ def decide_together(
         "refit": choice.nothing.after,
     }  # fmt: skip
     confidence = 1 - likely if verdict == NONE else max((probability[name] for name in selected[:1]), default=likely)
-    if verdict != NONE:
-        notes += warmth(windows, chosen.refit, patient.held_out or patient.training)
     return diagnosis_of(
         patient, verdict, confidence, (*effects, *unfitted(ranked, order)), selected, ambiguous, gap,
         {name: choice.removal[name] for name in selected if name in choice.removal}, judgement,
-        None if verdict == NONE else calibration_of(windows, chosen.refit, patient.held_out or patient.training), notes,
+        None if verdict == NONE else (windows, chosen.refit), notes,
     )  # fmt: skip
 
 

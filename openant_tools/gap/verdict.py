@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from openant_tools.gap.cause import catalogue
-from openant_tools.gap.closure import ClosureByJoint, Refit, Windows, calibration_of, closures, nothing, unmoved
+from openant_tools.gap.closure import ClosureByJoint, Refit, Windows, closures, nothing, unmoved
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis
 from openant_tools.gap.explain import Explained, Hypothesis, Part, Scene, explain, fit, robot_with, scene_of
 from openant_tools.gap.judge import Judgement
-from openant_tools.gap.patient import Patient, diagnosis_of, found_of, shown, unfitted, warmth
+from openant_tools.gap.patient import Patient, diagnosis_of, found_of, shown, unfitted
 from openant_tools.gap.rivals import bodily, carries, everywhere, moves_joints, paired, placed, rivals
 from openant_tools.gap.thresholds import (
     ADDS,
@@ -495,15 +495,11 @@ def _put_down(
         "floor": evidence.floor, "refit": evidence.plain.after,
     }  # fmt: skip
     chance = probability[leader.name]
-    calibration, notes = None, []
-    if verdict != NONE:
-        judged = patient.held_out or patient.training
-        calibration = calibration_of(evidence.windows, whole.refit, judged)
-        notes = warmth(evidence.windows, whole.refit, judged)
     return diagnosis_of(
         patient, verdict, 1 - chance if verdict == NONE else chance,
         (*effects, *unfitted(evidence.ranked, order)), selected, ambiguous, gap,
-        {name: chosen.removal[name] for name in selected}, evidence.judgement, calibration, notes,
+        {name: chosen.removal[name] for name in selected}, evidence.judgement,
+        None if verdict == NONE else (evidence.windows, whole.refit),
     )  # fmt: skip
 
 

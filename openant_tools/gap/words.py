@@ -8,7 +8,7 @@ from openant_tools.gap.cause import catalogue
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
 from openant_tools.model.gap import share_closed
 
-__all__ = ["closed", "sentence", "standing", "what_next", "where_words"]
+__all__ = ["closed", "rest_words", "sentence", "standing", "what_next", "where_words"]
 
 #: probability below which an effect is refuted rather than a runner-up
 REFUTED = 0.2
@@ -29,13 +29,24 @@ def sentence(found: Diagnosis) -> str:
         closest = "" if best is None else f"; closest is {best.effect}" + (
             "" if best.gap_closed is None else f", which closes {100 * best.gap_closed:.0f} % of it"
         )  # fmt: skip
-        return f"The gap is real, and nothing known here explains it{closest} ({sure})."
+        left = f" {rest_words(found)}" if found.rest else ""
+        return f"The gap is real, and nothing known here explains it{closest} ({sure}).{left}"
     one = by_name[found.verdict]
     words = f"{one.effect} ({where_words(one.joints)}): {catalogue()[one.effect].words}"
     share = closed(found)
     beside = [name for name in found.selected if name != found.verdict]
     more = f", with {' and '.join(beside)} beside it" if beside else ""
     return f"{words}{more}; the improved model closes {100 * share:.0f} % of the gap on held-out runs ({sure})."
+
+
+def rest_words(found: Diagnosis) -> str:
+    """What is left once the improved model has done what it can, and what that follows."""
+    rest = found.rest
+    low, high = rest["band_hz"]
+    text = f"What is left is largest at {rest['joint']}, {100 * rest['share']:.0f} % of it between {low:.1f} and {high:.1f} Hz"
+    if rest["regressor"] is None:
+        return f"{text}, where it follows nothing that was looked at."
+    return f"{text}, where it follows {rest['regressor']} (coherence {rest['coherence']:.2f})."
 
 
 def where_words(joints: tuple[str, ...] | str) -> str:
@@ -51,6 +62,8 @@ def closed(found: Diagnosis) -> float:
 
 def standing(found: Diagnosis, one: Found) -> str:
     """Why it is in the answer, or not."""
+    if found.verdict == UNEXPLAINED and one.effect == found.effects[0].effect:
+        return "closest, and not enough"
     if one.effect in found.selected:
         lost = found.removal.get(one.effect)
         return "selected" + (f"; without it {100 * lost:.0f} % less closes" if lost is not None else "")
