@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.gap.cause import catalogue
 from openant_tools.gap.diagnosis import NONE, Diagnosis
 from openant_tools.gap.explain import Scene, explain
 from openant_tools.gap.judge import Judgement
@@ -105,6 +106,7 @@ def diagnose(
     # Where nothing is likely and yet the log is strange, the likeliest few have to answer.
     puzzled = first[0][1] < FINDING and judgement.energy > STRANGE
     suspects = [name for n, (name, chance) in enumerate(first) if chance > SUSPECT or n < LIKELIEST][:SUSPECTS]
+    suspects += [name for name in catalogue()[suspects[0]].alike if name not in suspects and name in judgement.places]
     few = len(wanted) <= FEW_JOINTS
     if puzzled or few:
         suspects = [name for name, _ in first[: max(PUZZLED, len(suspects))]]

@@ -53,7 +53,8 @@ def placed(
         out.setdefault(tried[k].part.cause, (tried[k], float(left[k])))
     for one, cost in zip(tried, left, strict=True):
         name = one.part.cause
-        if one is explained[name] and catalogue()[name].beside_joints and cost < UNDECIDED * out[name][1]:
+        decided = one.misfit > one.nothing or cost > UNDECIDED * out[name][1]
+        if one is explained[name] and catalogue()[name].beside_joints and not decided:
             out[name] = one, float(cost)
     return {name: out[name] for name in explained}
 
@@ -67,6 +68,10 @@ def _places(protocol: Protocol, judgement: Judgement, one: Explained, strained: 
     wider += [tuple(range(len(protocol.joints)))] if Scope.ALL in scopes else []
     places = {(where, tuple(x.items())): x for where, x in named}
     places |= {(where, tuple(x.items())): x for where in wider for _, x in named[:WIDER]}
+    if one.part.definition.alike:
+        # Of what holds feet half as much does something else: fits to features, along a whole run, end where they began.
+        sizes = [x for strength in STRENGTHS for x in one.part.definition.starts(strength)]
+        places |= {(one.part.joints, tuple(x.items())): x for x in sizes}
     if one.part.cause == HEAT:
         # How warm this robot was no template knew, and where feet chatter no fit to features finds how much it lost.
         sizes = [x for strength in STRENGTHS for x in one.part.definition.starts(strength)]

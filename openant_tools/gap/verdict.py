@@ -190,7 +190,19 @@ def _heard(
             evidence.alone |= dict(zip(found, evidence.closures(starts)[2], strict=True))
             evidence.explained |= found
     _simplify(evidence)
+    _told_apart(evidence)
     return evidence
+
+
+def _told_apart(evidence: _Evidence) -> None:
+    """Of causes that look alike the judge says that there is one of them, and runs that were not used, which."""
+    chance, likeliest = evidence.probability, evidence.names[0]
+    for twin in catalogue()[likeliest].alike:
+        if twin in evidence.alone:
+            better, other = sorted((likeliest, twin), key=lambda name: -evidence.closed(evidence.alone[name]))
+            closed, less = (evidence.closed(evidence.alone[name]) for name in (better, other))
+            if closed > max(EXPLAINS, less + APART):
+                chance[other], chance[better] = sorted((chance[likeliest], chance[twin]))
 
 
 def _simplify(evidence: _Evidence) -> None:

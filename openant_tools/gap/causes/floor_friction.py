@@ -20,5 +20,6 @@ CAUSE = Cause(
     quantities=(factor("sliding", 0.18, 1.2),),
     enter=_enter,
     native=True,
+    alike=("foot_adhesion",),
     shows=lambda reference: reference.floor,
 )

@@ -24,5 +24,6 @@ CAUSE = Cause(
     quantities=(amount("force_n", "N", 0.05, 0.9, scale=_weight),),
     enter=_enter,
     native=True,
+    alike=("floor_friction",),
     shows=lambda reference: reference.floor,
 )
