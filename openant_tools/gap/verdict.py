@@ -307,7 +307,10 @@ def _joined(evidence: _Evidence, leader: _Leader, left: Judgement, chosen: _Chos
         moves = moves_joints(catalogue()[name]) and not catalogue()[name].beside_joints_at(both.refit.x[-1])
         # Unless it takes away so much of what is strange that nothing within tolerance does.
         much = (moves or carries(catalogue()[name])) and 1 - both.closed < PROVES * (1 - whole.closed)
-        if much or both.closed - whole.closed > _has_to_add(left.probability[name], before, moves=moves):
+        # What looks like the leader is hardly there beside it, whatever a judge says that cannot tell them apart.
+        alike = name in catalogue()[leader.name].alike
+        has_to_add = ADDS_MUCH if alike else _has_to_add(left.probability[name], before, moves=moves)
+        if much or both.closed - whole.closed > has_to_add:
             how = _rank(chance, 1 - both.closed)
             if second is None or how > second[0]:
                 second = how, one, both
