@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +11,12 @@ from plants import SERVO, drive, pendulum, run_of, sweep, write
 
 from openant_tools.gap.cause import catalogue
 from openant_tools.gap.closure import Windows, closures, nothing, unmoved
-from openant_tools.gap.explain import Explained, Part, Scene, explain
-from openant_tools.gap.features import Floats
+from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Protocol
-from openant_tools.gap.rivals import bodily, paired, placed, rivals
+from openant_tools.gap.rivals import bodily, paired, placed, resized, rivals
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
-from openant_tools.gap.whitening import Metric
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run
@@ -157,63 +154,16 @@ def test_what_warm_servos_lose_is_tried_in_sizes_that_no_template_has(tmp_path: 
     assert cost < 0.5 * windows.left([unmoved(windows, [named.part], [named.x])], [0, 1])[0]
 
 
-def test_what_holds_feet_is_tried_in_sizes_that_no_fit_came_to(tmp_path: Path) -> None:
-    """A whole run with twice the friction does something else: its fit came to nothing, and the windows know better."""
-    slippery = Robot(8)
-    slippery.floor_friction = 0.45
-    windows = on_the_floor(tmp_path, slippery)
-    windows.look([0, 1])
-    fitted = suspect("floor_friction", tuple(range(8)), 0.0)
-    fitted = dataclasses.replace(fitted, x={"sliding": 0.05}, misfit=2.0, nothing=1.0)
-    judgement = Judgement({}, np.zeros(1), {"floor_friction": [(fitted.part.joints, dict(fitted.x))]})
-    there, _ = placed(windows, judgement, {"floor_friction": fitted}, [0, 1])["floor_friction"]
-    assert there.x["sliding"] == pytest.approx(np.log(0.45), rel=0.5)
-    # What the whole run bears out is not given up for what joints of windows say a little better.
-    fitted = dataclasses.replace(fitted, misfit=0.5, x={"sliding": -0.6})
-    there, _ = placed(windows, judgement, {"floor_friction": fitted}, [0, 1])["floor_friction"]
-    assert there.x["sliding"] == -0.6
-
-
-def test_a_cause_of_the_body_is_fitted_from_the_share_of_its_template_that_is_most_like_the_robot(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begun: dict[Part, Mapping[str, float]] = {}
-    monkeypatch.setattr("openant_tools.gap.explain.fit", lambda scene, known: begun.update(known) or [])
-    loaded = Robot(8)
-    loaded.payload_kg = 0.11
-    protocol = on_the_floor(tmp_path, loaded).protocol
-    seen = np.concatenate([one[0] for one in protocol.features()])
-    scene = Scene(protocol, protocol.runs, Metric(Everything(), np.ones(len(seen), bool)), seen)  # type: ignore[arg-type]
-    part = Part("payload", tuple(range(8)))
-    template = {"mass_kg": part.definition.quantities[0].back(0.3, protocol.reference.robot_kg), "x_m": 0.0, "y_m": 0.0}
-    judgement = Judgement({}, 1.0, {"payload": [(part.joints, template)]})
-    explain({Setup.FLOOR: scene}, ["payload"], judgement)
-    # It carries a third of that.
-    assert 0 < begun[part]["mass_kg"] < 0.5 * template["mass_kg"]
-
-
-class Everything:
-    """A measure in which all features count as they are."""
-
-    def __call__(self, x: Floats) -> Floats:
-        return x
-
-
-def on_the_floor(folder: Path, robot: Robot) -> Windows:
-    """Two runs of an Ant that shifts its weight on its feet."""
-    plant = load_plant(write(folder / "given.xml", nominal_mjcf("standard")), None, Setup.FLOOR)
-    home = np.array([0.0 if joint.startswith("hip") else -0.6 for joint in plant.joints])
-    runs = []
-    for n in range(2):
-        swing = 0.35 * np.sin(2 * np.pi * (1.0 + 0.5 * n) * (T - T[0])[:, None] + np.arange(8) * (1 + n))
-        commands = home + swing * np.minimum(1.0, (T - T[0])[:, None] / 0.5)
-        columns = {f"cmd.{joint}": commands[:, j] for j, joint in enumerate(plant.joints)}
-        columns |= {f"pos.{joint}": np.full(len(T), home[j]) for j, joint in enumerate(plant.joints)}
-        run = Run(f"run-{n}", Facts(joints=plant.joints, setup="floor"), T, columns)
-        seen = simulate(Rollouts(plant, [run]), [robot], signals=["pos"]).signals["pos"][0].astype(float)
-        columns |= {f"pos.{joint}": seen[:, j] for j, joint in enumerate(plant.joints)}
-        runs.append(dataclasses.replace(run, columns=columns))
-    return Windows(Protocol.of(runs, plant.path, plant.joints, [None, None]))
+def test_of_other_sizes_the_runs_choose_the_one_that_leaves_least(weak: Windows) -> None:
+    """A size near its own is not tried again."""
+    far = sized("torque_limit", 0.95)
+    (found,) = resized(weak, [far], [0, 1])
+    tried = [x["limit"] for strength in (0.3, 0.7) for x in catalogue()["torque_limit"].starts(strength)]
+    assert found.x["limit"] in tried
+    costs = weak.left([unmoved(weak, [far.part], [{"limit": x}]) for x in tried], [0, 1])
+    assert found.x["limit"] == tried[int(np.argmin(costs))]
+    (other,) = resized(weak, [found], [0, 1])
+    assert other.x != found.x
 
 
 def test_a_second_cause_is_put_where_it_sits_beside_the_first(tmp_path: Path) -> None:

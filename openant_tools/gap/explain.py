@@ -8,7 +8,6 @@ causes are simulated side by side.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -44,8 +43,6 @@ BEHIND = 1.1
 BEYOND = 2.5
 #: places at which each cause is tried; and of those of which nobody knows which are likely
 PLACES, PROMISING = 2, 3
-#: shares of its best template that a cause of the body is tried in before it is fitted
-SHARES = (1.0, 0.6, 0.35, 0.2)
 #: the largest share that anything may take
 WHOLE = 0.98
 
@@ -79,14 +76,13 @@ class Explained:
 
     Attributes:
         x: its coordinates; std: their standard deviations, from curvature alone.
-        misfit: mean square of the whitened difference that is left; nothing: the same without any cause.
+        misfit: mean square of the whitened difference that is left.
     """
 
     part: Part
     x: Mapping[str, float]
     std: Mapping[str, float]
     misfit: float
-    nothing: float = math.inf
 
     @property
     def beyond_tolerance(self) -> bool:
@@ -113,11 +109,6 @@ class Scene:
         self._players = Players.of(self.runs)
         self._nominal = self._players.play([Robot(len(self.protocol.joints))])
         self._target = self.metric(self.seen[None])[0]
-
-    @property
-    def nothing(self) -> float:
-        """Mean square of the whitened differences between the robot at hand and the model as it is."""
-        return float(np.mean(np.square(self._target)))
 
     def residuals(self, robots: Sequence[Robot]) -> Floats:
         """(robots, features) whitened differences between the robot at hand and these."""
@@ -152,7 +143,6 @@ def explain(
             if scene_of(name, scenes) is scene
             for where, x in judgement.places[name][: None if name in thorough else PLACES]
         }
-        known = {part: _begun(scene, part, x) for part, x in known.items()}
         for name in set(thorough) & {part.cause for part in known}:
             mine = [part for part in known if part.cause == name]
             robots = [robot_with(scene.protocol.reference, (part,), (known[part],)) for part in mine]
@@ -165,16 +155,6 @@ def explain(
                 if name not in out or one.misfit < out[name].misfit:
                     out[name] = one
     return out
-
-
-def _begun(scene: Scene, part: Part, x: Mapping[str, float]) -> dict[str, float]:
-    """From where a cause is fitted: on the floor half of it may do something else, and fits follow what is near."""
-    if not part.definition.of_body:
-        return dict(x)
-    shapes = {q.name for q in part.definition.quantities if q.shape}
-    sizes = [{name: u if name in shapes else share * u for name, u in x.items()} for share in SHARES]
-    robots = [robot_with(scene.protocol.reference, (part,), (one,)) for one in sizes]
-    return sizes[int(np.square(scene.residuals(robots)).mean(axis=1).argmin())]
 
 
 @dataclass
@@ -244,7 +224,7 @@ def fit(scene: Scene, starts: Mapping[Part, Mapping[str, float]]) -> list[Explai
         for search in best:
             least = min(other.cost for other in best if other.part.cause == search.part.cause)
             search.done |= search.cost > BEHIND * least
-    return [_explained(search, scene.nothing) for search in best]
+    return [_explained(search) for search in best]
 
 
 def _learnt(search: _Search, tried: _Search) -> _Search:
@@ -318,8 +298,8 @@ def _begin(scene: Scene, searches: Sequence[_Search]) -> None:
         at += 1 + len(mine)
 
 
-def _explained(search: _Search, nothing: float) -> Explained:
+def _explained(search: _Search) -> Explained:
     assert search.tangent is not None
     covariance = np.linalg.pinv((search.tangent @ search.tangent.T).astype(np.float64)) * max(search.cost, 1.0)
     spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    return Explained(search.part, search.point(search.u), search.point(spread), search.cost, nothing)
+    return Explained(search.part, search.point(search.u), search.point(spread), search.cost)

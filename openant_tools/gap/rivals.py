@@ -18,7 +18,7 @@ from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.thresholds import HEAT
 
-__all__ = ["bodily", "carries", "everywhere", "moves_joints", "paired", "placed", "rivals"]
+__all__ = ["bodily", "carries", "everywhere", "moves_joints", "paired", "placed", "resized", "rivals"]
 
 #: places that the judge names among which the runs choose, and those whose sizes are tried wider
 NAMED, WIDER = 8, 2
@@ -26,6 +26,8 @@ NAMED, WIDER = 8, 2
 UNDECIDED = 1.5
 #: share of what a cause leaves that a rival leaves at most; how many of them count, and the sizes (0 … 1) they are tried in
 LEAVES, COUNT, STRENGTHS = 0.9, 2, (0.3, 0.7)
+#: share of a size within which another one is the same to a fit
+NEAR = 0.25
 #: shares of the sizes found alone in which two causes are tried together
 PARTS = (1.0, 0.6)
 
@@ -53,8 +55,7 @@ def placed(
         out.setdefault(tried[k].part.cause, (tried[k], float(left[k])))
     for one, cost in zip(tried, left, strict=True):
         name = one.part.cause
-        decided = one.misfit > one.nothing or cost > UNDECIDED * out[name][1]
-        if one is explained[name] and catalogue()[name].beside_joints and not decided:
+        if one is explained[name] and catalogue()[name].beside_joints and cost < UNDECIDED * out[name][1]:
             out[name] = one, float(cost)
     return {name: out[name] for name in explained}
 
@@ -68,16 +69,32 @@ def _places(protocol: Protocol, judgement: Judgement, one: Explained, strained: 
     wider += [tuple(range(len(protocol.joints)))] if Scope.ALL in scopes else []
     places = {(where, tuple(x.items())): x for where, x in named}
     places |= {(where, tuple(x.items())): x for where in wider for _, x in named[:WIDER]}
-    if one.part.definition.alike:
-        # Of what holds feet half as much does something else: fits to features, along a whole run, end where they began.
-        sizes = [x for strength in STRENGTHS for x in one.part.definition.starts(strength)]
-        places |= {(one.part.joints, tuple(x.items())): x for x in sizes}
     if one.part.cause == HEAT:
         # How warm this robot was no template knew, and where feet chatter no fit to features finds how much it lost.
         sizes = [x for strength in STRENGTHS for x in one.part.definition.starts(strength)]
         places |= {(where, tuple(x.items())): x for where in [*(where for where, _ in named), *wider] for x in sizes}
     del places[one.part.joints, tuple(one.x.items())]
     return [dataclasses.replace(one, part=Part(one.part.cause, where), x=x) for (where, _), x in places.items()]
+
+
+def resized(windows: Windows, explained: Sequence[Explained], training: Sequence[int]) -> list[Explained]:
+    """Each of these causes in the size, of a few that are not near its own, that leaves least.
+
+    Args:
+        windows: on which `nothing` was re-fitted. training: the runs to look at.
+    """
+    tried = [
+        dataclasses.replace(one, x=x)
+        for one in explained
+        for strength in STRENGTHS
+        for x in one.part.definition.starts(strength)
+        if any(abs(x[q.name] - one.x[q.name]) > NEAR * abs(one.x[q.name]) for q in one.part.definition.quantities)
+    ]
+    left = windows.left([unmoved(windows, [one.part], [one.x]) for one in tried], training)
+    out: dict[str, Explained] = {}
+    for k in np.argsort(left):
+        out.setdefault(tried[k].part.cause, tried[k])
+    return [out[one.part.cause] for one in explained]
 
 
 def rivals(

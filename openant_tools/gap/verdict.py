@@ -15,7 +15,7 @@ from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis
 from openant_tools.gap.explain import Explained, Hypothesis, Part, Scene, explain, fit, robot_with, scene_of
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.patient import Patient, diagnosis_of, found_of, shown, unfitted
-from openant_tools.gap.rivals import bodily, carries, everywhere, moves_joints, paired, placed, rivals
+from openant_tools.gap.rivals import bodily, carries, everywhere, moves_joints, paired, placed, resized, rivals
 from openant_tools.gap.thresholds import (
     ADDS,
     ADDS_ALONE,
@@ -190,8 +190,24 @@ def _heard(
             evidence.alone |= dict(zip(found, evidence.closures(starts)[2], strict=True))
             evidence.explained |= found
     _simplify(evidence)
+    _fitted_anew(evidence)
     _told_apart(evidence)
     return evidence
+
+
+def _fitted_anew(evidence: _Evidence) -> None:
+    """Causes that look alike, fitted from other sizes, too: what half of one does is another motion, and fits follow what is near."""
+    windows, training, alone = evidence.windows, evidence.patient.training, evidence.alone
+    twins = [name for name in alone if name in evidence.explained and set(catalogue()[name].alike) & set(alone)]
+    if evidence.names[0] not in twins:
+        return
+    others = resized(windows, [evidence.explained[name] for name in twins], training)
+    found = evidence.closures([_start(windows, [one], training) for one in others])[2]
+    for one, closure in zip(others, found, strict=True):
+        name = one.part.cause
+        # The runs that they were fitted on choose between them: those held out have to judge.
+        if np.argmin(windows.left([alone[name].refit, closure.refit], training)):
+            alone[name], evidence.explained[name] = closure, one
 
 
 def _told_apart(evidence: _Evidence) -> None:
