@@ -205,8 +205,7 @@ def _fitted_anew(evidence: _Evidence) -> None:
     found = evidence.closures([_start(windows, [one], training) for one in others])[2]
     for one, closure in zip(others, found, strict=True):
         name = one.part.cause
-        # The runs that they were fitted on choose between them: those held out have to judge.
-        if np.argmin(windows.left([alone[name].refit, closure.refit], training)):
+        if closure.closed > alone[name].closed:
             alone[name], evidence.explained[name] = closure, one
 
 
@@ -470,12 +469,16 @@ def _verdict(
         name for name in chosen.names if certain and (probability[name] < SECOND or _idle(evidence, chosen, name))
     ]
     selected = tuple(sorted(chosen.names, key=lambda name: (name in doubted, -chosen.removal[name])))
-    equal = [
+    near = [
         name
         for name in names[1:3]
-        if not leader.beside
-        and abs(evidence.closed(evidence.alone[name]) - evidence.closed(evidence.alone[best])) < APART
-        and probability[name] > probability[best] / 2
+        if abs(evidence.closed(evidence.alone[name]) - evidence.closed(evidence.alone[best])) < APART
+    ]
+    equal = [
+        name
+        for name in near
+        # Of what looks alike the judge cannot say which it is, either.
+        if name in catalogue()[best].alike or (not leader.beside and probability[name] > probability[best] / 2)
     ]
     if equal:
         return AMBIGUOUS, selected, ((best, *equal),)
