@@ -28,7 +28,7 @@ from openant_tools.gap.population import Case, applicable, draw, play, templates
 from openant_tools.gap.protocol import Protocol, same, shown
 from openant_tools.recording.run import Run
 
-__all__ = ["Prepared", "cache_folder", "find", "prepare"]
+__all__ = ["Prepared", "cache_folder", "find", "finished_since", "prepare"]
 
 Array = NDArray[np.float64]
 
@@ -96,6 +96,11 @@ def cache_folder() -> Path:
     given = os.environ.get(CACHE_VARIABLE)
     base = Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "openant"
     return base / "gap"
+
+
+def finished_since(when: float) -> bool:
+    """Whether any protocol's preparation has come to its end since then, s as `time.time` counts them."""
+    return any(path.stat().st_mtime >= when for path in cache_folder().glob(f"*/{CLOSED}"))
 
 
 def robots_of(protocol: Protocol) -> int:
