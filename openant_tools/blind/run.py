@@ -108,7 +108,8 @@ def _judge(folder: Path, robot: Path, diagnose: Diagnose, first: bool) -> str:
     """Diagnose one robot, and say how long it took; first: before all others, by itself."""
     from openant_tools.gap.prepare import finished_since
 
-    began, clock = time.monotonic(), time.time()
+    # Whole seconds: file systems' clocks are behind this one by a tick, or by as much as a second.
+    began, clock = time.monotonic(), int(time.time())
     try:
         found = diagnose(robot, folder / "model.xml")
     except OpenAntError as error:
