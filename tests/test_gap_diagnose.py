@@ -81,6 +81,10 @@ def test_bad_input_is_one_line(model: Path) -> None:
         diagnose(runs[:1], model)
     with pytest.raises(BadInput, match="the same as motion-0"):
         diagnose(runs, model, hold_out=[runs[0]])
+    with pytest.raises(BadInput, match="no effect 'stiction'"):
+        diagnose(runs, model, prior=["stiction"])
+    with pytest.raises(BadInput, match="did you mean 'backlash'"):
+        diagnose(runs, model, prior=["back_lash"])
     still = [dataclasses.replace(r, columns={n: np.zeros_like(v) for n, v in r.columns.items()}) for r in runs]
     with pytest.raises(BadInput, match="nothing moves"):
         diagnose(still, model)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,21 +11,33 @@ from openant_tools.gap.cause import catalogue
 from openant_tools.gap.closure import ClosureByJoint, Refit
 from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
-from openant_tools.gap.verdict import _Evidence, _told_apart
+from openant_tools.gap.patient import Patient
+from openant_tools.gap.verdict import _Chosen, _Evidence, _Leader, _told_apart, _verdict
 
 
-def evidence(**suspects: tuple[float, float]) -> _Evidence:
-    """Suspects with their probability and the share of the gap that each closes by itself."""
-    nothing: Any = None
+class Builder:
+    """A patient of whom nothing is known but what its builder declared."""
 
-    def closure(closed: float) -> ClosureByJoint:
+    declared = Patient.declared
+
+    def __init__(self, *prior: str) -> None:
+        self.prior = prior
+
+
+def evidence(*prior: str, **suspects: tuple[float, float]) -> _Evidence:
+    """Suspects with their probability and the share of the gap that each closes by itself; prior: what is declared."""
+    nothing, patient = cast(Any, None), cast(Any, Builder(*prior))
+
+    def closure(closed: float, *names: str) -> ClosureByJoint:
+        parts, sizes = [Part(name, (0,)) for name in names], [catalogue()[name].starts(0.5)[0] for name in names]
+        refit = Refit(tuple(parts), tuple(sizes), np.zeros(0))
         joints = np.array([[1.0], [(1 - closed) ** 2]])
-        return ClosureByJoint(1 - closed, closed, closed, closed, closed, Refit((), (), np.zeros(0)), joints, 0.0)
+        return ClosureByJoint(1 - closed, closed, closed, closed, closed, refit, joints, 0.0)
 
     return _Evidence(
-        nothing, Judgement({}, 5.0, {}), {}, nothing, [], {name: chance for name, (chance, _) in suspects.items()},
-        {name: Explained(Part(name, (0,)), {}, {}, 1.0) for name in suspects},
-        {name: closure(closed) for name, (_, closed) in suspects.items()}, closure(0.1), 1.0, 0.0, [0],
+        patient, Judgement({}, 5.0, {}), {}, nothing, [], {name: chance for name, (chance, _) in suspects.items()},
+        {name: Explained(Part(name, (0,)), catalogue()[name].starts(0.5)[0], {}, 1.0) for name in suspects},
+        {name: closure(closed, name) for name, (_, closed) in suspects.items()}, closure(0.1), 1.0, 0.0, [0],
     )  # fmt: skip
 
 
@@ -63,3 +75,33 @@ def test_what_looks_unlike_keeps_what_the_judge_gave_it() -> None:
 def test_looking_alike_is_mutual() -> None:
     for name, cause in catalogue().items():
         assert all(name in catalogue()[twin].alike for twin in cause.alike)
+
+
+def verdict_of(found: _Evidence, leads: str) -> tuple[str, tuple[str, ...], tuple[tuple[str, ...], ...]]:
+    names = sorted(found.explained, key=lambda name: name != leads)
+    leader = _Leader(leads, gained=0.7, beside=False, proved=True, left=None, eased=False)
+    return _verdict(found, names, leader, _Chosen((leads,), found.alone[leads], {leads: 0.7}))
+
+
+def test_what_runs_cannot_tell_apart_is_ambiguous_unless_one_of_it_was_declared() -> None:
+    suspects = {"torque_limit": (0.9, 0.80), "weak_joint": (0.8, 0.805), "payload": (0.1, 0.2)}
+    pair = ("torque_limit", "weak_joint")
+    assert verdict_of(evidence(**suspects), "torque_limit") == ("ambiguous", ("torque_limit",), (pair,))
+    assert verdict_of(evidence("torque_limit", **suspects), "torque_limit") == (
+        "torque_limit",
+        ("torque_limit",),
+        (pair,),
+    )
+    # What was declared otherwise has to lead first; what is told apart, or all of it declared, needs no prior.
+    for prior in (["weak_joint"], ["payload"], list(pair)):
+        assert verdict_of(evidence(*prior, **suspects), "torque_limit")[0] == "ambiguous"
+    assert verdict_of(evidence("weak_joint", **suspects), "weak_joint")[0] == "weak_joint"
+    clear = {**suspects, "weak_joint": (0.8, 0.5)}
+    assert verdict_of(evidence("weak_joint", **clear), "torque_limit") == ("torque_limit", ("torque_limit",), ())
+
+
+def test_causes_that_look_alike_are_ambiguous_however_sure_the_judge_is() -> None:
+    found = evidence(foot_adhesion=(0.9, 0.80), floor_friction=(0.05, 0.795))
+    assert verdict_of(found, "foot_adhesion")[2] == (("foot_adhesion", "floor_friction"),)
+    found = evidence(foot_adhesion=(0.9, 0.80), payload=(0.05, 0.795))
+    assert verdict_of(found, "foot_adhesion")[0] == "foot_adhesion"

@@ -50,6 +50,12 @@ robots_option = click.option(
     metavar="RUN",
     help="Judge on this run. Repeatable. Default: each run is left out in turn.",
 )
+@click.option(
+    "--prior",
+    multiple=True,
+    metavar="EFFECT",
+    help="An effect that you know or expect of this robot: it decides where the runs cannot. Repeatable.",
+)
 @joint_option
 @robots_option
 @robot_option
@@ -59,6 +65,7 @@ def diagnose(
     runs: tuple[Path, ...],
     model: Path | None,
     hold_out: tuple[Path, ...],
+    prior: tuple[str, ...],
     joints: tuple[str, ...],
     robots: int | None,
     robot: Path | None,
@@ -82,7 +89,9 @@ def diagnose(
     recordings, held_out = [read_run(path) for path in runs], [read_run(path) for path in hold_out]
     model = _model(model, robot, (*runs, *hold_out))
     with progress() as tell:
-        found = diagnosed(recordings, model, hold_out=held_out, joints=joints or None, robots=robots, progress=tell)
+        found = diagnosed(
+            recordings, model, hold_out=held_out, joints=joints or None, robots=robots, prior=prior, progress=tell
+        )
         if json_file:
             write_text(json_file, json.dumps(found.as_json(), indent=1, ensure_ascii=False) + "\n")
         written = None

@@ -7,6 +7,7 @@ large it would be; held-out closure decides between them, and says when none wil
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import hashlib
 import math
 import time
@@ -62,6 +63,7 @@ def diagnose(
     hold_out: Sequence[Run] = (),
     joints: Sequence[str] | None = None,
     robots: int | None = None,
+    prior: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Diagnose the gap between a robot and its model.
@@ -70,14 +72,16 @@ def diagnose(
         runs: recordings of one robot. hold_out: recordings to judge on; without them each run is left out in turn.
         joints: default every position servo of the model that all runs command and measure.
         robots: how many to simulate where the protocol was never prepared.
+        prior: effects that are known or expected of this robot: where the runs cannot tell causes apart, they do.
         progress: told a share and words.
 
     Raises:
-        BadInput: runs from which no diagnosis can be made.
+        BadInput: no such effect, or runs from which no diagnosis can be made.
     """
     tell, began = progress or (lambda share, words: None), time.monotonic()
     everything = [*runs, *hold_out]
     _check(runs, hold_out)
+    _check_prior(prior)
     wanted = joints_in_common(everything, model, joints)
     _check_motion(everything, wanted)
     played = Protocol.of(runs, model, wanted, [own_model(run) for run in runs])
@@ -94,7 +98,7 @@ def diagnose(
     training = prepared.ordered
     tell(0.7, "causes")
     began = max(began, time.monotonic() - BEFOREHAND_S)
-    patient = Patient(protocol, coarse, prepared, measured, judge, found, training, model, runs, hold_out, began)
+    patient = Patient(protocol, coarse, prepared, measured, judge, found, training, model, runs, hold_out, prior, began)
     judgement = judge.say(patient.features)
     first = shown(judgement, protocol)
     # No template was as warm as this robot was in each run: what a thermometer shows is asked about wherever it may sit.
@@ -112,6 +116,7 @@ def diagnose(
         suspects = [name for name, _ in first[: max(PUZZLED, len(suspects))]]
     if few:
         suspects += [name for name in _questioned(protocol) if name not in suspects and name in judgement.places]
+    suspects += [name for name in prior if name not in suspects and name in judgement.places]
     suspects += [name for name in warmed if name not in suspects and name in judgement.places]
     explained = explain(scenes, suspects, judgement, thorough=warmed)
     tell(0.85, "held-out runs")
@@ -139,6 +144,16 @@ def _check(runs: Sequence[Run], hold_out: Sequence[Run]) -> None:
                     f"the held-out run is the same as {other.name}", where=one.path or one.name,
                     remedy="hold out a run that is not diagnosed",
                 )  # fmt: skip
+
+
+def _check_prior(prior: Sequence[str]) -> None:
+    for name in prior:
+        if name not in catalogue():
+            near = difflib.get_close_matches(name, catalogue(), 1)
+            raise BadInput(
+                f"there is no effect {name!r}",
+                remedy=f"did you mean {near[0]!r}?" if near else f"name one of: {', '.join(sorted(catalogue()))}",
+            )
 
 
 def _content(run: Run) -> str:

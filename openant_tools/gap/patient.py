@@ -39,6 +39,7 @@ class Patient:
 
     Attributes:
         coarse: its protocol, in the steps and from the starts of the simulated robots that it is compared with.
+        prior: causes that its builder declared to be likely, whatever the runs say.
         began: when its diagnosis did, s of the clock that only goes forward. given_up: what there was no time for.
     """
 
@@ -52,6 +53,7 @@ class Patient:
     model: Path
     runs: Sequence[Run]
     hold_out: Sequence[Run]
+    prior: Sequence[str] = ()
     began: float = dataclasses.field(default_factory=time.monotonic)
     given_up: list[str] = dataclasses.field(default_factory=list)
 
@@ -65,6 +67,11 @@ class Patient:
             return True
         self.given_up.append(wanted)
         return False
+
+    def declared(self, group: Sequence[str]) -> str | None:
+        """Of causes that the runs cannot tell apart, the one that was declared; None where that is none or several."""
+        mine = [name for name in group if name in self.prior]
+        return mine[0] if len(mine) == 1 else None
 
     @property
     def held_out(self) -> list[int]:
@@ -93,6 +100,9 @@ def diagnosis_of(
     Args:
         left: windows and the refit that goes into the improved model; None where there is none.
     """
+    if ambiguous and verdict in ambiguous[0]:
+        others = " and ".join(name for name in ambiguous[0] if name != verdict)
+        notes = (*notes, f"{verdict} was declared beforehand: these runs cannot tell it from {others}")
     measured = patient.measured.as_json()
     calibration: dict[str, dict[str, float]] = {}
     where, rest = measured["where"], None

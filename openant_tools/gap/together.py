@@ -72,6 +72,12 @@ def decide_together(
         likeliest = [name for name, _ in ranked if name in moving]
         group = dict.fromkeys((selected[0], *(name for name in (*others, *likeliest) if name not in chosen.names)))
         verdict, ambiguous = AMBIGUOUS, (tuple(group)[:TOGETHER],)
+        declared = None if one_motion else patient.declared(ambiguous[0])
+        if declared is not None and choice.rival is not None and declared in choice.rival.names:
+            chosen = choice.rival
+            selected = (declared, *(name for name in chosen.names if name != declared), *beside)
+        if declared in selected[:1]:
+            verdict = selected[0]
         if one_motion:
             notes.append("one kind of motion alone: what fits it may fit no other")
     else:

@@ -132,6 +132,18 @@ class _Chosen:
     energy: float = math.inf
 
 
+@dataclass(frozen=True)
+class _Said:
+    """A verdict, the suspects in the order that led to it, and the causes that these runs cannot tell apart."""
+
+    names: Sequence[str]
+    leader: _Leader
+    chosen: _Chosen
+    verdict: str
+    selected: tuple[str, ...]
+    ambiguous: tuple[tuple[str, ...], ...]
+
+
 def decide(
     patient: Patient,
     judgement: Judgement,
@@ -145,7 +157,16 @@ def decide(
         ranked: every cause that can show, with its probability. explained: the suspects, fitted on simulated robots.
     """
     evidence = _heard(patient, judgement, ranked, explained, scenes)
-    names = evidence.names
+    said = _judged(evidence, evidence.names)
+    declared = patient.declared([name for group in said.ambiguous for name in group])
+    if declared is not None and said.leader.name != declared:
+        # What the runs leave open, what is known besides decides.
+        said = _judged(evidence, [declared, *(name for name in evidence.names if name != declared)])
+    return _put_down(evidence, said)
+
+
+def _judged(evidence: _Evidence, names: Sequence[str]) -> _Said:
+    """What is to be said if the first of these suspects leads."""
     leader = _led(evidence, names)
     whole = evidence.alone[leader.name]
     chosen = _Chosen((leader.name,), whole, {leader.name: whole.closed - evidence.plain.closed})
@@ -156,9 +177,9 @@ def decide(
     if leader.left is not None:
         chosen = dataclasses.replace(chosen, energy=_strangeness(evidence, chosen, leader.left))
     verdict, selected, ambiguous = _verdict(evidence, names, leader, chosen)
-    if selected and patient.in_time("slopes where the causes were found", LATE):
+    if selected and evidence.patient.in_time("slopes where the causes were found", LATE):
         chosen = _polished(evidence, chosen)
-    return _put_down(evidence, names, leader, chosen, (verdict, selected, ambiguous))
+    return _Said(names, leader, chosen, verdict, selected, ambiguous)
 
 
 def _heard(
@@ -480,9 +501,12 @@ def _verdict(
         # Of what looks alike the judge cannot say which it is, either.
         if name in catalogue()[best].alike or (not leader.beside and probability[name] > probability[best] / 2)
     ]
-    if equal:
-        return AMBIGUOUS, selected, ((best, *equal),)
-    return selected[0], selected, ()
+    if not equal:
+        return selected[0], selected, ()
+    group = (best, *equal)
+    if evidence.patient.declared(group) == best:
+        return best, tuple(sorted(selected, key=lambda name: name != best)), (group,)
+    return AMBIGUOUS, selected, (group,)
 
 
 def _idle(evidence: _Evidence, chosen: _Chosen, name: str) -> bool:
@@ -508,13 +532,10 @@ def _sure(evidence: _Evidence, names: Sequence[str], leader: _Leader) -> bool:
     )
 
 
-def _put_down(
-    evidence: _Evidence, names: Sequence[str], leader: _Leader, chosen: _Chosen,
-    said: tuple[str, tuple[str, ...], tuple[tuple[str, ...], ...]],
-) -> Diagnosis:  # fmt: skip
-    verdict, selected, ambiguous = said
+def _put_down(evidence: _Evidence, said: _Said) -> Diagnosis:
+    verdict, selected, chosen = said.verdict, said.selected, said.chosen
     patient, probability, whole = evidence.patient, evidence.probability, chosen.closure
-    order = [*selected, *(name for name in names if name not in selected)]
+    order = [*selected, *(name for name in said.names if name not in selected)]
     # The set was re-fitted together: these are the sizes that leave what it leaves.
     points = dict(zip((part.cause for part in whole.refit.hypothesis), whole.refit.x, strict=True))
     effects = []
@@ -528,10 +549,10 @@ def _put_down(
         "before": evidence.before, "after": evidence.before if verdict == NONE else whole.after,
         "floor": evidence.floor, "refit": evidence.plain.after,
     }  # fmt: skip
-    chance = probability[leader.name]
+    chance = probability[said.leader.name]
     return diagnosis_of(
         patient, verdict, 1 - chance if verdict == NONE else chance,
-        (*effects, *unfitted(evidence.ranked, order)), selected, ambiguous, gap,
+        (*effects, *unfitted(evidence.ranked, order)), selected, said.ambiguous, gap,
         {name: chosen.removal[name] for name in selected}, evidence.judgement,
         None if verdict == NONE else (evidence.windows, whole.refit),
     )  # fmt: skip
