@@ -14,7 +14,7 @@ from openant_tools.gap.closure import Windows, closures, nothing, unmoved
 from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Protocol
-from openant_tools.gap.rivals import bodily, paired, placed, resized, rivals
+from openant_tools.gap.rivals import bodily, paired, placed, resized, rivals, unexpected
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.plant import Setup, load_plant
@@ -176,6 +176,21 @@ def test_a_second_cause_is_put_where_it_sits_beside_the_first(tmp_path: Path) ->
     first = dataclasses.replace(sized("stiffness_error", 0.5), part=Part("stiffness_error", everywhere))
     found = paired(windows, first, [suspect("coulomb_friction", (0, 2, 4, 6), 0.5)], [0, 1])
     assert [one.part for one, _ in found] == [Part("coulomb_friction", everywhere)]
+
+
+def test_what_acts_beside_the_first_is_found_though_nobody_suspects_it(tmp_path: Path) -> None:
+    robot, hips = Robot(8), (0, 2, 4, 6)
+    robot.factor("stiffness")[:] *= 0.5
+    robot.delay[::2] += 0.06
+    windows = on_the_stand(tmp_path, robot)
+    windows.look([0, 1])
+    first = dataclasses.replace(sized("stiffness_error", 0.5), part=Part("stiffness_error", tuple(range(8))))
+    found = unexpected(windows, first, ["stiffness_error"], [hips, tuple(range(8))], [0, 1])
+    best, share = min(found, key=lambda pair: pair[1])
+    # Late and slow are much alike in the few sizes of a first look.
+    assert (best.part.cause in {"action_delay", "actuator_lag"}, best.part.joints) == (True, hips)
+    assert share < 0.7
+    assert unexpected(windows, first, list(catalogue()), [hips], [0, 1]) == []
 
 
 def test_what_one_joint_does_is_not_lost_among_what_others_do(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from openant_tools.gap.closure import ClosureByJoint, Refit
 from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.patient import Patient
-from openant_tools.gap.verdict import _Chosen, _Evidence, _Leader, _told_apart, _verdict
+from openant_tools.gap.verdict import _Chosen, _Evidence, _Leader, _plain, _told_apart, _verdict
 
 
 class Builder:
@@ -105,3 +105,24 @@ def test_causes_that_look_alike_are_ambiguous_however_sure_the_judge_is() -> Non
     assert verdict_of(found, "foot_adhesion")[2] == (("foot_adhesion", "floor_friction"),)
     found = evidence(foot_adhesion=(0.9, 0.80), payload=(0.05, 0.795))
     assert verdict_of(found, "foot_adhesion")[0] == "foot_adhesion"
+
+
+def test_a_first_look_is_plain_where_one_cause_leaves_far_less_than_the_others() -> None:
+    def look(**shares: float) -> list[tuple[Explained, float]]:
+        return [(Explained(Part(name, (0,)), {}, {}, 1.0), share) for name, share in shares.items()]
+
+    assert _plain([]) is None
+    assert _plain(look(backlash=0.8)) is None
+    assert _plain(look(backlash=0.5)) == Part("backlash", (0,))
+    assert _plain(look(cogging=0.9, backlash=0.5)) == Part("backlash", (0,))
+    assert _plain(look(cogging=0.6, backlash=0.5)) is None
+
+
+def test_two_causes_that_the_judge_was_sure_of_are_no_riddle_whatever_they_leave() -> None:
+    found = evidence(cogging=(0.99, 0.5), floor_tilt=(0.9, 0.3))
+    leader = _Leader("cogging", gained=0.1, beside=False, proved=False, left=None, eased=False)
+    both = _Chosen(("cogging", "floor_tilt"), found.alone["cogging"], {"cogging": 0.1, "floor_tilt": 0.0}, energy=30.0)
+    found.ranked = [("cogging", 0.99), ("floor_tilt", 0.9)]
+    assert _verdict(found, ["cogging", "floor_tilt"], leader, both)[:2] == ("cogging", ("cogging", "floor_tilt"))
+    found.ranked = [("cogging", 0.99), ("floor_tilt", 0.1)]
+    assert _verdict(found, ["cogging", "floor_tilt"], leader, both)[0] == "unexplained"

@@ -117,6 +117,10 @@ class ClosureByJoint(Closure):
     joints: Array
     floor: float
 
+    def outlier(self, groups: Iterable[Sequence[int]], times: float) -> int | None:
+        """The joint of which it leaves most beside others with the same servo, if that is so many times what it leaves of them."""
+        return _outlier(np.sqrt(self.joints[1]), groups, times)
+
     def closed_at(self, joints: Sequence[int]) -> float:
         """The share that is gone of the excess of some joints."""
         before, after = np.sqrt(self.joints[:, list(joints)].mean(axis=1))
@@ -513,13 +517,7 @@ class Windows:
 
     def _outlier(self, seen: Sequence[int], times: float) -> int | None:
         left = np.sqrt(np.mean([np.square(self._plain[k]) for k in seen], axis=0))
-        share = np.ones(len(left))
-        for group in self.protocol.servos():
-            for j in group:
-                others = [left[i] for i in group if i != j]
-                share[j] = left[j] / np.median(others) if others else 1.0
-        worst = int(np.argmax(share))
-        return worst if share[worst] > times else None
+        return _outlier(left, self.protocol.servos(), times)
 
     def _weight(self, k: int) -> Array:
         """(joints,) that errors of a run are multiplied by: its rows go together, and windows stand for those not followed."""
@@ -649,6 +647,16 @@ def closures(
         closed, worst = _closed(before, after, floor), min(runs, default=float("nan"))
         out.append(ClosureByJoint(after, closed, low, high, worst, fits[s][0], means[[0, s + 1]], floor))
     return before, floor, out
+
+
+def _outlier(left: Array, groups: Iterable[Sequence[int]], times: float) -> int | None:
+    share = np.ones(len(left))
+    for group in groups:
+        for j in group:
+            others = [left[i] for i in group if i != j]
+            share[j] = left[j] / np.median(others) if others else 1.0
+    worst = int(np.argmax(share))
+    return worst if share[worst] > times else None
 
 
 def _closed(before: float, after: float, floor: float) -> float:

@@ -17,8 +17,9 @@ from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.thresholds import HEAT
+from openant_tools.model.plant import Setup
 
-__all__ = ["bodily", "carries", "everywhere", "moves_joints", "paired", "placed", "resized", "rivals"]
+__all__ = ["bodily", "carries", "everywhere", "moves_joints", "paired", "placed", "resized", "rivals", "unexpected"]
 
 #: places that the judge names among which the runs choose, and those whose sizes are tried wider
 NAMED, WIDER = 8, 2
@@ -185,6 +186,43 @@ def paired(
         one, share = pairs[k][0], float(np.sqrt(left[k] / least))
         if share < LEAVES:
             found.setdefault(one.part.cause, (one, share))
+    return list(found.values())
+
+
+def unexpected(
+    windows: Windows,
+    best: Explained,
+    known: Collection[str],
+    places: Sequence[tuple[int, ...]],
+    training: Sequence[int],
+) -> list[tuple[Explained, float]]:
+    """Causes that nobody suspects and that leave clearly less beside the best than it leaves alone: how much, as a share.
+
+    Args:
+        windows: on which `nothing` was re-fitted. known: causes that are looked at anyway. places: joints where to look.
+        training: the runs to look at; those on the stand, where there are any: there joints show what acts on them, and at once.
+    """
+    stand = [k for k in training if windows.protocol.runs[k].plant.setup is Setup.STAND]
+    tried = [
+        Explained(Part(name, joints), x, dict.fromkeys(x, 0.0), np.inf)
+        for joints in dict.fromkeys(places)
+        for name, cause in catalogue().items()
+        if name not in known
+        and moves_joints(cause)
+        and _fits(cause, joints, windows.protocol)
+        and cause.shows(windows.protocol.reference)
+        for turn, strength in enumerate(STRENGTHS)
+        for x in cause.starts(strength, turn, len(STRENGTHS))
+    ]
+    refits = [unmoved(windows, [best.part], [best.x])]
+    refits += [unmoved(windows, [best.part, one.part], [best.x, one.x]) for one in tried]
+    least, *left = windows.left(refits, stand or training)
+    found: dict[str, tuple[Explained, float]] = {}
+    for k in np.argsort(left):
+        share = float(np.sqrt(left[k] / least))
+        if share > LEAVES:
+            break
+        found.setdefault(tried[k].part.cause, (tried[k], share))
     return list(found.values())
 
 

@@ -10,12 +10,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from openant_tools.gap.cause import catalogue
-from openant_tools.gap.closure import ClosureByJoint, Refit, Windows, closures, nothing, unmoved
+from openant_tools.gap.closure import STRAINED, ClosureByJoint, Refit, Windows, closures, nothing, unmoved
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis
 from openant_tools.gap.explain import Explained, Hypothesis, Part, Scene, explain, fit, robot_with, scene_of
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.patient import Patient, diagnosis_of, found_of, shown, unfitted
-from openant_tools.gap.rivals import bodily, carries, everywhere, moves_joints, paired, placed, resized, rivals
+from openant_tools.gap.rivals import (
+    bodily,
+    carries,
+    everywhere,
+    moves_joints,
+    paired,
+    placed,
+    resized,
+    rivals,
+    unexpected,
+)
 from openant_tools.gap.thresholds import (
     ADDS,
     ADDS_ALONE,
@@ -327,7 +337,7 @@ def _joined(evidence: _Evidence, leader: _Leader, left: Judgement, chosen: _Chos
     """The leader with the cause that acts beside it, if there is one."""
     windows, training = evidence.windows, evidence.patient.training
     explained, probability, whole = evidence.explained, evidence.probability, chosen.closure
-    tried = _seconds(evidence, leader.name, left)
+    tried, plain = _seconds(evidence, leader.name, left)
     # What is random only adds its noise to every simulation.
     fitted = [one for one in tried if not catalogue()[one.part.cause].random]
     starts = [_start(windows, [explained[leader.name], one], training) for one in fitted]
@@ -346,6 +356,8 @@ def _joined(evidence: _Evidence, leader: _Leader, left: Judgement, chosen: _Chos
         # What looks like the leader is hardly there beside it, whatever a judge says that cannot tell them apart.
         alike = name in catalogue()[leader.name].alike
         has_to_add = ADDS_MUCH if alike else _has_to_add(left.probability[name], before, moves=moves)
+        if one.part == plain:
+            has_to_add = min(has_to_add, ADDS)
         if much or both.closed - whole.closed > has_to_add:
             how = _rank(chance, 1 - both.closed)
             if second is None or how > second[0]:
@@ -387,8 +399,8 @@ def _has_to_add(left: float, before: float, *, moves: bool) -> float:
     return ADDS if left > SECOND else ADDS_MUCH
 
 
-def _seconds(evidence: _Evidence, best: str, left: Judgement) -> list[Explained]:
-    """Causes that may act beside the best.
+def _seconds(evidence: _Evidence, best: str, left: Judgement) -> tuple[list[Explained], Part | None]:
+    """Causes that may act beside the best; and the one that a first look finds plain: it leaves far less than any other does.
 
     Those that the judge expects, in what the best leaves or from the beginning; those it half hides behind the best, where a first
     look says that both together leave clearly less; and what by itself leaves least of the others.
@@ -426,7 +438,21 @@ def _seconds(evidence: _Evidence, best: str, left: Judgement) -> list[Explained]
     look: list[tuple[Explained, float]] = []
     if hidden and patient.in_time("second causes that the judge does not expect"):
         look = paired(evidence.windows, known[best], hidden, patient.training)
-    look.sort(key=lambda pair: _rank(chance[pair[0].part.cause], pair[1]), reverse=True)
+    whole = evidence.alone.get(best, evidence.plain)
+    lost = odd and whole.after > STRAYS * evidence.floor and not catalogue()[best].random
+    if lost and patient.in_time("second causes that nobody suspects"):
+        groups = patient.protocol.servos()
+        strained = whole.outlier(groups, STRAINED)
+        places = [
+            known[best].part.joints,
+            *everywhere(patient.protocol),
+            *([(strained,)] if strained is not None else []),
+        ]
+        look += unexpected(
+            evidence.windows, known[best], {best, *(one.part.cause for one in hidden), *told}, places, patient.training
+        )
+    plain = _plain(look)
+    look.sort(key=lambda pair: _rank(chance.get(pair[0].part.cause, 0.0), pair[1]), reverse=True)
     sited = [known[name] for name in told]
     if sited and patient.in_time("other places of a second cause"):
         better = {one.part.cause: one for one, _ in paired(evidence.windows, known[best], sited, patient.training)}
@@ -439,7 +465,15 @@ def _seconds(evidence: _Evidence, best: str, left: Judgement) -> list[Explained]
         gains = evidence.alone[least].closed - evidence.plain.closed
         if gains > ADDS_MUCH and least not in {one.part.cause for one in out}:
             out.append(explained[least])
-    return out
+    return out, plain
+
+
+def _plain(look: Sequence[tuple[Explained, float]]) -> Part | None:
+    """The one of some causes that leaves much less than without it, as a share, and clearly less than all others."""
+    shares = sorted(share for _, share in look)
+    if not shares or shares[0] > PROVES * (shares[1] if len(shares) > 1 else 1.0):
+        return None
+    return min(look, key=lambda pair: pair[1])[0].part
 
 
 def _polished(evidence: _Evidence, chosen: _Chosen) -> _Chosen:
@@ -466,12 +500,14 @@ def _verdict(
     # Nor is it a riddle what a random cause leaves beside a likely one.
     noisy = any(catalogue()[name].random for name in chosen.names[1:])
     noisy = noisy and min(probability[name] for name in chosen.names) > FINDING
+    # What the judge was sure of before it knew of anything is no riddle where there are two of it.
+    both = len(chosen.names) > 1 and certain and _found_both(evidence, *chosen.names) > 0
     little = excess(evidence.before, evidence.floor) > LARGE * evidence.floor and chosen.closure.closed < EXPLAINS
     refit = evidence.alone[best].refit
     vanished = _vanished(refit.hypothesis[0], refit.x[0]) and not catalogue()[best].random
     as_odd = left is not None and left.energy > ODD and leader.gained < ADDS_ALONE
     doubtful = probability[best] < CERTAIN or vanished or as_odd
-    if not leader.beside and little and energy > STRANGE and doubtful and not noisy:
+    if not leader.beside and little and energy > STRANGE and doubtful and not noisy and not both:
         # However sure the judge is: what comes out as nothing at all, or closes little and leaves a robot as odd as it was, is not
         # what makes the gap. No fit finds what is random.
         return UNEXPLAINED, (), ()
@@ -480,7 +516,7 @@ def _verdict(
         # Strange with it, too: a foot that came off is no offset, though nothing known is more like it.
         return UNEXPLAINED, (), ()
     large = chosen.closure.after > STRAYS * evidence.floor
-    if large and not noisy and chosen.energy > RIDDLE and chosen.closure.closed < EXPLAINS_RIDDLE:
+    if large and not noisy and not both and chosen.energy > RIDDLE and chosen.closure.closed < EXPLAINS_RIDDLE:
         # The better half of a gap that is still a riddle: it only looks like what it was called.
         return UNEXPLAINED, (), ()
     if carries(catalogue()[best]) and chosen.closure.closed < evidence.plain.closed - ADDS:
