@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,12 +12,14 @@ from plants import SERVO, drive, pendulum, run_of, sweep, write
 
 from openant_tools.gap.cause import catalogue
 from openant_tools.gap.closure import Windows, closures, nothing, unmoved
-from openant_tools.gap.explain import Explained, Part
+from openant_tools.gap.explain import Explained, Part, Scene, known_to
+from openant_tools.gap.features import Floats
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.rivals import bodily, paired, placed, resized, rivals, unexpected
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
+from openant_tools.gap.whitening import Metric
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run
@@ -191,6 +194,23 @@ def test_what_acts_beside_the_first_is_found_though_nobody_suspects_it(tmp_path:
     assert (best.part.cause in {"action_delay", "actuator_lag"}, best.part.joints) == (True, hips)
     assert share < 0.7
     assert unexpected(windows, first, list(catalogue()), [hips], [0, 1]) == []
+
+
+class Everything:
+    """A measure in which all features count as they are."""
+
+    def __call__(self, x: Floats) -> Floats:
+        return x
+
+
+def test_what_windows_alone_found_is_known_as_well_as_the_runs_let_it_be(tmp_path: Path) -> None:
+    protocol = on_the_stand(tmp_path, Robot(8)).protocol
+    seen = np.concatenate([one[0] for one in protocol.features()])
+    scene = Scene(protocol, protocol.runs, Metric(cast(Any, Everything()), np.ones(len(seen), bool)), seen)
+    found = dataclasses.replace(suspect("coulomb_friction", (0, 2, 4, 6), 0.5), std={"torque_nm": 0.0})
+    known = known_to(scene, found)
+    assert 0 < known.std["torque_nm"] < np.inf
+    assert (known.part, known.x) == (found.part, found.x)
 
 
 def test_what_one_joint_does_is_not_lost_among_what_others_do(tmp_path: Path) -> None:

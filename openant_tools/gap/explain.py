@@ -23,7 +23,18 @@ from openant_tools.gap.thresholds import HEAT
 from openant_tools.gap.whitening import Metric
 from openant_tools.model.plant import Setup
 
-__all__ = ["Explained", "Hypothesis", "Part", "Scene", "bounds_of", "explain", "fit", "robot_with", "scene_of"]
+__all__ = [
+    "Explained",
+    "Hypothesis",
+    "Part",
+    "Scene",
+    "bounds_of",
+    "explain",
+    "fit",
+    "known_to",
+    "robot_with",
+    "scene_of",
+]
 
 Array = NDArray[np.float64]
 
@@ -225,6 +236,13 @@ def fit(scene: Scene, starts: Mapping[Part, Mapping[str, float]]) -> list[Explai
             least = min(other.cost for other in best if other.part.cause == search.part.cause)
             search.done |= search.cost > BEHIND * least
     return [_explained(search) for search in best]
+
+
+def known_to(scene: Scene, one: Explained) -> Explained:
+    """The same with how well its sizes are known there: a cause that only windows of the runs found has nothing to say of that."""
+    search = _Search(one.part, np.array([one.x[q.name] for q in one.part.definition.quantities]))
+    _begin(scene, [search])
+    return dataclasses.replace(one, std=_explained(search).std)
 
 
 def _learnt(search: _Search, tried: _Search) -> _Search:

@@ -95,7 +95,7 @@ def resized(windows: Windows, explained: Sequence[Explained], training: Sequence
     out: dict[str, Explained] = {}
     for k in np.argsort(left):
         out.setdefault(tried[k].part.cause, tried[k])
-    return [out[one.part.cause] for one in explained]
+    return list(out.values())
 
 
 def rivals(

@@ -12,7 +12,7 @@ import numpy as np
 from openant_tools.gap.cause import catalogue
 from openant_tools.gap.closure import STRAINED, ClosureByJoint, Refit, Windows, closures, nothing, unmoved
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis
-from openant_tools.gap.explain import Explained, Hypothesis, Part, Scene, explain, fit, robot_with, scene_of
+from openant_tools.gap.explain import Explained, Hypothesis, Part, Scene, explain, fit, known_to, robot_with, scene_of
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.patient import Patient, diagnosis_of, found_of, shown, unfitted
 from openant_tools.gap.rivals import (
@@ -366,7 +366,7 @@ def _joined(evidence: _Evidence, leader: _Leader, left: Judgement, chosen: _Chos
         return chosen
     _, one, both = second
     name = one.part.cause
-    explained[name] = one
+    explained[name] = one if any(one.std.values()) else known_to(scene_of(name, evidence.scenes), one)
     known = name in evidence.alone and not catalogue()[name].random
     without = evidence.alone[name] if known else evidence.plain
     probability[name] = max(probability[name], left.probability[name])
