@@ -121,17 +121,7 @@ def rivals(
     if where is not None:
         # What acts on others, too, does as much there: only they would tell.
         anywhere = [joints for joints in anywhere if set(joints) <= set(where)]
-    others = [
-        (Part(name, joints), start)
-        for joints in dict.fromkeys(anywhere)
-        for name, cause in catalogue().items()
-        if name not in known
-        and moves_joints(cause)
-        and _fits(cause, joints, protocol)
-        and cause.shows(protocol.reference)
-        for turn, strength in enumerate(STRENGTHS)
-        for start in cause.starts(strength, turn, len(STRENGTHS))
-    ]
+    others = _others(protocol, anywhere, known)
     tried = [*((one.part, one.x) for one in best), *others]
     left = windows.left([unmoved(windows, [part], [x]) for part, x in tried], training, where)
     least, rest = left[: len(best)].min(), left[len(best) :]
@@ -143,6 +133,23 @@ def rivals(
         if part.cause not in [other.cause for other in found]:
             found[part] = start
     return found
+
+
+def _others(
+    protocol: Protocol, places: Sequence[tuple[int, ...]], known: Collection[str]
+) -> list[tuple[Part, dict[str, float]]]:
+    """Causes that are not known yet and move joints, at each of these places that they may sit at, in a few sizes."""
+    return [
+        (Part(name, joints), start)
+        for joints in dict.fromkeys(places)
+        for name, cause in catalogue().items()
+        if name not in known
+        and moves_joints(cause)
+        and _fits(cause, joints, protocol)
+        and cause.shows(protocol.reference)
+        for turn, strength in enumerate(STRENGTHS)
+        for start in cause.starts(strength, turn, len(STRENGTHS))
+    ]
 
 
 def everywhere(protocol: Protocol) -> list[tuple[int, ...]]:
@@ -203,17 +210,8 @@ def unexpected(
         training: the runs to look at; those on the stand, where there are any: there joints show what acts on them, and at once.
     """
     stand = [k for k in training if windows.protocol.runs[k].plant.setup is Setup.STAND]
-    tried = [
-        Explained(Part(name, joints), x, dict.fromkeys(x, 0.0), np.inf)
-        for joints in dict.fromkeys(places)
-        for name, cause in catalogue().items()
-        if name not in known
-        and moves_joints(cause)
-        and _fits(cause, joints, windows.protocol)
-        and cause.shows(windows.protocol.reference)
-        for turn, strength in enumerate(STRENGTHS)
-        for x in cause.starts(strength, turn, len(STRENGTHS))
-    ]
+    others = _others(windows.protocol, places, known)
+    tried = [Explained(part, x, dict.fromkeys(x, 0.0), np.inf) for part, x in others]
     refits = [unmoved(windows, [best.part], [best.x])]
     refits += [unmoved(windows, [best.part, one.part], [best.x, one.x]) for one in tried]
     least, *left = windows.left(refits, stand or training)

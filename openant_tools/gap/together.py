@@ -39,9 +39,7 @@ def decide_together(
     parts, starts = [explained[name].part for name in moving], [explained[name].x for name in moving]
     choice = choose(fits, parts, starts, probability, witnessed)
     chosen, floor = choice.chosen, float(np.sqrt(np.mean(windows.floor**2)))
-    notes = [
-        f"closed where left out: {', '.join(f'{name} {100 * share:.0f} %' for name, share in chosen.folds.items())}"
-    ]
+    notes = []
     if late is not None:
         explained, probability = (
             {**explained, late[0].part.cause: late[0]},
@@ -101,11 +99,14 @@ def decide_together(
         "before": chosen.before, "after": chosen.before if verdict == NONE else chosen.after, "floor": floor,
         "refit": choice.nothing.after,
     }  # fmt: skip
+    folds = ", ".join(f"{name} {100 * share:.0f} %" for name, share in chosen.folds.items())
+    # What the removal of each costs is known of the set that explains most, not of one that was declared in its place.
+    removal = choice.removal if chosen is choice.chosen else {}
     confidence = 1 - likely if verdict == NONE else max((probability[name] for name in selected[:1]), default=likely)
     return diagnosis_of(
         patient, verdict, confidence, (*effects, *unfitted(ranked, order)), selected, ambiguous, gap,
-        {name: choice.removal[name] for name in selected if name in choice.removal}, judgement,
-        None if verdict == NONE else (windows, chosen.refit), notes,
+        {name: removal[name] for name in selected if name in removal}, judgement,
+        None if verdict == NONE else (windows, chosen.refit), [f"closed where left out: {folds}", *notes],
     )  # fmt: skip
 
 
