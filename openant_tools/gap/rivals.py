@@ -19,7 +19,18 @@ from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.thresholds import HEAT
 from openant_tools.model.plant import Setup
 
-__all__ = ["bodily", "carries", "everywhere", "moves_joints", "paired", "placed", "resized", "rivals", "unexpected"]
+__all__ = [
+    "bodily",
+    "carries",
+    "everywhere",
+    "moves_joints",
+    "paired",
+    "placed",
+    "resized",
+    "rivals",
+    "told",
+    "unexpected",
+]
 
 #: places that the judge names among which the runs choose, and those whose sizes are tried wider
 NAMED, WIDER = 8, 2
@@ -29,6 +40,8 @@ UNDECIDED = 1.5
 LEAVES, COUNT, STRENGTHS = 0.9, 2, (0.3, 0.7)
 #: share of a size within which another one is the same to a fit
 NEAR = 0.25
+#: places of a second cause that the judge names, once it knows the first
+TOLD_AT = 3
 #: shares of the sizes found alone in which two causes are tried together
 PARTS = (1.0, 0.6)
 
@@ -169,7 +182,11 @@ def bodily(protocol: Protocol, known: Collection[str]) -> list[Explained]:
 
 
 def paired(
-    windows: Windows, best: Explained, others: Sequence[Explained], training: Sequence[int]
+    windows: Windows,
+    best: Explained,
+    others: Sequence[Explained],
+    training: Sequence[int],
+    elsewhere: Sequence[Explained] = (),
 ) -> list[tuple[Explained, float]]:
     """Of causes that leave clearly less beside the best than it leaves alone: how much, as a share; at their best sizes.
 
@@ -178,13 +195,10 @@ def paired(
 
     Args:
         windows: on which `nothing` was re-fitted. training: the runs to look at.
+        elsewhere: the same causes at other places, which are tried as they are.
     """
-    pairs = [
-        (there, _part(best, whole))
-        for one in others
-        for there in _guesses(one, best, windows.protocol)
-        for whole in PARTS
-    ]
+    guesses = [there for one in others for there in _guesses(one, best, windows.protocol)]
+    pairs = [(there, _part(best, whole)) for there in [*guesses, *elsewhere] for whole in PARTS]
     refits = [unmoved(windows, [best.part], [best.x])]
     refits += [unmoved(windows, [best.part, one.part], [x, one.x]) for one, x in pairs]
     least, *left = windows.left(refits, training)
@@ -241,6 +255,20 @@ def _guesses(one: Explained, best: Explained, protocol: Protocol) -> list[Explai
         for strength in STRENGTHS
         for x in cause.starts(strength)
     ]
+
+
+def told(windows: Windows, judgement: Judgement, causes: Collection[str], training: Sequence[int]) -> list[Explained]:
+    """Some causes where a judge says that they sit, in the sizes of the templates that say so; and where a joint is strained."""
+    named = [(name, *there) for name in causes for there in judgement.places[name][:TOLD_AT]]
+    named += [
+        (name, (j,), x)
+        for name in causes
+        for j in windows.strained(training)
+        if _fits(catalogue()[name], (j,), windows.protocol)
+        for strength in STRENGTHS
+        for x in catalogue()[name].starts(strength)
+    ]
+    return [Explained(Part(name, joints), x, dict.fromkeys(x, 0.0), np.inf) for name, joints, x in named]
 
 
 def _fits(cause: Cause, joints: tuple[int, ...], protocol: Protocol) -> bool:

@@ -24,6 +24,7 @@ from openant_tools.gap.rivals import (
     placed,
     resized,
     rivals,
+    told,
     unexpected,
 )
 from openant_tools.gap.thresholds import (
@@ -95,7 +96,14 @@ class _Evidence:
     @property
     def names(self) -> list[str]:
         """The suspects, first the one for which most speaks."""
-        return sorted(self.explained, key=lambda name: -self.score(name))
+        names = sorted(self.explained, key=lambda name: -self.score(name))
+        first, chance, closed = names[0], self.probability, {name: self.alone[name].closed for name in self.alone}
+        certain = [name for name in names if chance[name] > CERTAIN and closed.get(name, 0.0) > closed[first]]
+        if chance[first] < SECOND and certain:
+            # What is hardly believed and does well at one joint is no reason to doubt what is certain and does more.
+            names.remove(certain[0])
+            names.insert(0, certain[0])
+        return names
 
     def score(self, name: str) -> float:
         """How a suspect ranks: by the judge, and by what it leaves of the gap on held-out runs."""
@@ -417,25 +425,33 @@ def _seconds(evidence: _Evidence, best: str, left: Judgement) -> tuple[list[Expl
     seen = [name for name in likely[:OTHERS] if chance[name] > SUSPECT]
     missing = [name for name in seen if name not in explained]
     known = {**explained, **(explain(evidence.scenes, missing, left) if missing else {})}
-    told = [
+    expected = [
         name
         for name in seen[:TOLD]
         if name in known
         and chance[name] > SECOND
         and not (moves_joints(catalogue()[name]) and _vanished(known[name].part, known[name].x))
     ]
+    sited = [known[name] for name in expected]
+    look: list[tuple[Explained, float]] = []
+    if sited:
+        # Found alone, it sat where the best does if that hid it.
+        elsewhere = told(evidence.windows, left, expected, patient.training)
+        look = paired(evidence.windows, known[best], sited, patient.training, elsewhere)
+        better = {one.part.cause: one for one, _ in look}
+        sited = [better.get(one.part.cause, one) for one in sited]
     odd = left.energy > STRANGE
     hidden = [
         one
         for name, one in known.items()
-        if name not in (best, *told)
+        if name not in (best, *expected)
         and (one.beyond_tolerance or odd)
         and (moves_joints(catalogue()[name]) or (odd and carries(catalogue()[name])))
     ]
     if odd:
         # What carries or holds the body shows in every joint, and the judge of joints takes it for anything.
         hidden += bodily(patient.protocol, known)
-    look: list[tuple[Explained, float]] = []
+    look = []
     if hidden and patient.in_time("second causes that the judge does not expect"):
         look = paired(evidence.windows, known[best], hidden, patient.training)
     whole = evidence.alone.get(best, evidence.plain)
@@ -449,14 +465,14 @@ def _seconds(evidence: _Evidence, best: str, left: Judgement) -> tuple[list[Expl
             *([(strained,)] if strained is not None else []),
         ]
         look += unexpected(
-            evidence.windows, known[best], {best, *(one.part.cause for one in hidden), *told}, places, patient.training
+            evidence.windows,
+            known[best],
+            {best, *(one.part.cause for one in hidden), *expected},
+            places,
+            patient.training,
         )
     plain = _plain(look)
     look.sort(key=lambda pair: _rank(chance.get(pair[0].part.cause, 0.0), pair[1]), reverse=True)
-    sited = [known[name] for name in told]
-    if sited and patient.in_time("other places of a second cause"):
-        better = {one.part.cause: one for one, _ in paired(evidence.windows, known[best], sited, patient.training)}
-        sited = [better.get(one.part.cause, one) for one in sited]
     out = [*sited, *(one for one, _ in look[:MORE])]
     alone = [name for name in explained if name != best and name in evidence.alone and moves_joints(catalogue()[name])]
     if alone:
@@ -497,9 +513,10 @@ def _verdict(
         return UNEXPLAINED if ill or energy > ODD else NONE, (), ()
     # What is half believed does not come before what is certain, whatever it closes.
     certain = any(probability[name] > CERTAIN for name in chosen.names)
-    # Nor is it a riddle what a random cause leaves beside a likely one.
-    noisy = any(catalogue()[name].random for name in chosen.names[1:])
-    noisy = noisy and min(probability[name] for name in chosen.names) > FINDING
+    # Nor is it a riddle what a random cause leaves: beside a likely one, or by itself where it is certain.
+    noisy = probability[best] > FINDING and any(
+        catalogue()[name].random and probability[name] > (CERTAIN if name == best else FINDING) for name in chosen.names
+    )
     # What the judge was sure of before it knew of anything is no riddle where there are two of it.
     both = len(chosen.names) > 1 and certain and _found_both(evidence, *chosen.names) > 0
     little = excess(evidence.before, evidence.floor) > LARGE * evidence.floor and chosen.closure.closed < EXPLAINS
