@@ -16,7 +16,7 @@ from openant_tools.gap.explain import Explained, Part, Scene, known_to
 from openant_tools.gap.features import Floats
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Protocol
-from openant_tools.gap.rivals import bodily, paired, placed, resized, rivals, unexpected
+from openant_tools.gap.rivals import bodily, paired, placed, resized, rivals, told, unexpected
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.whitening import Metric
@@ -179,6 +179,25 @@ def test_a_second_cause_is_put_where_it_sits_beside_the_first(tmp_path: Path) ->
     first = dataclasses.replace(sized("stiffness_error", 0.5), part=Part("stiffness_error", everywhere))
     found = paired(windows, first, [suspect("coulomb_friction", (0, 2, 4, 6), 0.5)], [0, 1])
     assert [one.part for one, _ in found] == [Part("coulomb_friction", everywhere)]
+
+
+def test_an_expected_second_cause_is_tried_where_the_judge_sees_it_once_it_knows_the_first(tmp_path: Path) -> None:
+    """Alone it was found at the first one's joint, which hid its own; in what that leaves the judge sees where it is."""
+    robot = Robot(8)
+    robot.factor("stiffness")[4] *= 0.4
+    robot.delay[1] += 0.03
+    windows = on_the_stand(tmp_path, robot)
+    windows.refit([nothing(windows)], [0, 1], ())
+    first = dataclasses.replace(sized("stiffness_error", 0.4), part=Part("stiffness_error", (4,)))
+    hidden = suspect("action_delay", (4,), 0.5)
+    ((near, wider),) = paired(windows, first, [hidden], [0, 1])
+    assert near.part.joints == (1, 3, 5, 7), "of all places that nobody names the nearest"
+    judgement = Judgement({}, 1.0, {"action_delay": [((1,), dict(suspect("action_delay", (1,), 0.5).x))]})
+    elsewhere = told(windows, judgement, ["action_delay"], [0, 1])
+    assert {one.part.joints for one in elsewhere} == {(1,), *((j,) for j in windows.strained([0, 1]))}
+    ((found, share),) = paired(windows, first, [hidden], [0, 1], elsewhere)
+    assert found.part == Part("action_delay", (1,))
+    assert share < wider
 
 
 def test_what_acts_beside_the_first_is_found_though_nobody_suspects_it(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, cast
 
 import numpy as np
@@ -126,3 +127,34 @@ def test_two_causes_that_the_judge_was_sure_of_are_no_riddle_whatever_they_leave
     assert _verdict(found, ["cogging", "floor_tilt"], leader, both)[:2] == ("cogging", ("cogging", "floor_tilt"))
     found.ranked = [("cogging", 0.99), ("floor_tilt", 0.1)]
     assert _verdict(found, ["cogging", "floor_tilt"], leader, both)[0] == "unexplained"
+
+
+@pytest.mark.parametrize(
+    ("chance", "beside", "said"),
+    [(0.98, 0.45, "command_dropout"), (0.7, 0.45, "unexplained"), (0.98, None, "command_dropout")],
+    ids=["certain, with another", "likely", "certain, alone"],
+)
+def test_what_a_certain_random_cause_leaves_is_no_riddle(chance: float, beside: float | None, said: str) -> None:
+    """Commands that are lost at random leave a robot as odd as it was: no simulation loses the same ones."""
+    found = evidence(command_dropout=(chance, 0.1), zero_offset=(beside or 0.1, 0.15))
+    found.ranked, left = list(found.probability.items()), Judgement({}, 21.0, {})
+    leader = _Leader("command_dropout", gained=0.0, beside=False, proved=False, left=left, eased=False)
+    names = ("command_dropout", "zero_offset") if beside else ("command_dropout",)
+    chosen = _Chosen(names, found.alone[names[-1]], dict.fromkeys(names, 0.03), energy=21.0)
+    verdict, selected, _ = _verdict(found, ["command_dropout", "zero_offset"], leader, chosen)
+    assert (verdict, set(selected)) == (said, set(names) if said != "unexplained" else set())
+
+
+def test_what_is_hardly_believed_does_not_lead_before_what_is_certain_and_closes_more() -> None:
+    """Where suspects are compared at one joint alone, something there may close more than what acts on all."""
+    found = evidence(dead_zone=(0.1, 0.30), cogging=(1.0, 0.40))
+    for name, share in (("dead_zone", 0.9), ("cogging", 0.2)):
+        closure = found.alone[name]
+        joints = np.hstack([np.array([[1.0], [(1 - share) ** 2]]), closure.joints])
+        found.alone[name] = dataclasses.replace(closure, joints=joints)
+    assert found.score("dead_zone") > found.score("cogging"), "at the joint where suspects are compared"
+    assert found.names[0] == "cogging"
+    found.probability["dead_zone"] = 0.6
+    assert found.names[0] == "dead_zone"
+    found.probability |= {"dead_zone": 0.1, "cogging": 0.7}
+    assert found.names[0] == "dead_zone"
