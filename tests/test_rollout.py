@@ -85,6 +85,19 @@ def test_rows_may_come_at_any_times(spacing: str, pendulum: Plant) -> None:
     assert np.ptp(simulated) > 0.8
 
 
+@pytest.mark.parametrize(("allowed", "threads"), [("3", 3), ("2,1", 2), ("all", 0), (None, 0)])
+def test_as_many_threads_as_are_allowed_where_several_processes_share_a_computer(
+    allowed: str | None, threads: int, pendulum: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if allowed is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", allowed)
+    t = np.arange(20) / 50
+    run = plants.run_of({"cmd.joint": np.zeros(20), "pos.joint": np.zeros(20)}, t, ["joint"])
+    assert Rollouts(pendulum, [run]).nthread == threads
+    assert Rollouts(pendulum, [run], nthread=1).nthread == 1, "whoever says how many gets them"
+
+
 def test_a_command_acts_from_its_own_time_on(pendulum: Plant) -> None:
     """`cmd_t` five steps after `t` moves everything by five steps, which here is one row."""
     t = 2.0 + np.arange(600) * 5 * H

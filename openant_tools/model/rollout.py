@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -95,6 +96,15 @@ class Segment:
     commands: Staircase
 
 
+def _allowed_threads() -> int:
+    """By OMP_NUM_THREADS, which joblib sets where it runs processes side by side: threads of all would wait for each other.
+
+    0 where it says nothing.
+    """
+    allowed = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    return int(allowed) if allowed.isdecimal() else 0
+
+
 class Rollouts:
     """Runs prepared for one plant: called with variants of its model, returns what each would have done.
 
@@ -102,7 +112,7 @@ class Rollouts:
         plant: the model, set up as the runs were made.
         runs: recorded runs that command every joint of the plant.
         horizon: seconds between re-initialisations from measurement; None simulates each run from its start.
-        nthread: threads; 0 takes all cores.
+        nthread: threads; 0 takes as many as the environment variable OMP_NUM_THREADS allows, else all cores.
         leader: a variant of the plant's model by which a base that nobody measured is led along; default that model.
 
     Raises:
@@ -115,7 +125,7 @@ class Rollouts:
     ) -> None:  # fmt: skip
         self.runs = tuple(runs)
         self.horizon = horizon
-        self.nthread = nthread
+        self.nthread = nthread or _allowed_threads()
         ends = np.cumsum([0, *(len(run.t) for run in runs)])
         self.rows = tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(ends))
         leads = plant if leader is None else replace(plant, model=leader)
