@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.gap.regime import Regime, regimes
-from openant_tools.model.floor import floors
+from openant_tools.model.floor import floors, stamp_error
 from openant_tools.model.gap import excess, gap
 from openant_tools.model.plant import Plant, load_plant, setup_of
 from openant_tools.model.rollout import Rollouts
@@ -67,7 +67,8 @@ class Measurement:
     Attributes:
         horizon_s: between re-initialisations from measurement; None is never.
         gaps, floors: signal → rms over all joints and samples, and what no model could beat.
-        from_repeats: whether the floor comes from repeats of the same commands, else from the sensors' resolution.
+        from_repeats: whether the floor comes from repeats of the same commands, else from the sensors.
+        stamp_error_s: as `model.floor.stamp_error`; in a floor from the sensors.
         places: largest share first, signal by signal.
     """
 
@@ -77,6 +78,7 @@ class Measurement:
     gaps: dict[str, float]
     floors: dict[str, float]
     from_repeats: bool
+    stamp_error_s: float
     places: tuple[Place, ...]
     played: tuple[Played, ...]
 
@@ -106,7 +108,8 @@ class Measurement:
             "model": str(self.model),
             "runs": [played.run.name for played in self.played],
             "horizon_s": self.horizon_s,
-            "floor_from": "repeats" if self.from_repeats else "resolution",
+            "floor_from": "repeats" if self.from_repeats else "sensors",
+            "stamp_error_s": self.stamp_error_s,
             "signals": {
                 signal: {"gap": self.gaps[signal], "floor": self.floors[signal], "excess": self.excess(signal),
                          "unit": UNITS[signal]}
@@ -149,6 +152,7 @@ def measure(
     places = [place for signal in gaps for place in _places(played, wanted, signal, found[signal][0])]
     return Measurement(
         model, tuple(wanted), horizon_s, gaps, {signal: rms(found[signal][0]) for signal in gaps}, found["pos"][1],
+        stamp_error(runs, wanted),
         tuple(places), played,
     )  # fmt: skip
 

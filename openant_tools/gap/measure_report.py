@@ -64,7 +64,7 @@ def gap_report(found: Measurement) -> Report:
     )
     report.section("How it was measured").text(
         f"Each run is simulated from its measured state with its own commands, {horizon}. The floor comes from "
-        f"{'repeats of the same commands' if found.from_repeats else 'the resolution of the sensors (record repeats for a better one)'}. "
+        f"{'repeats of the same commands' if found.from_repeats else _sensors(found)}. "
         "The gap is the root mean square of measured minus simulated over all joints and samples."
     )
     return report
@@ -123,3 +123,9 @@ def worst(found: Measurement) -> MatplotlibFigure:
     axes.set_title(f"{found.joints[j]}, {one.run.name}", loc="left", fontsize=10, fontweight="bold")
     plots.legend(axes)
     return figure
+
+
+def _sensors(found: Measurement) -> str:
+    late = found.stamp_error_s
+    stamps = f" and time stamps that are off by {1e3 * late:.2g} ms" if late else ""
+    return f"the resolution and noise of the sensors{stamps} (record repeats for a better one)"
