@@ -324,6 +324,22 @@ def test_the_score_counts_what_is_right_and_shows_what_is_not(
     assert (docs.parent / "pictures" / "blind-confusion.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_several_sets_are_scored_together(sealed_set: tuple[Path, Path, bytes], tmp_path: Path) -> None:
+    folder, key_file, _ = sealed_set
+    run_set(folder, diagnose=says)
+    other = shutil.copytree(folder, tmp_path / "other")
+    out, docs = tmp_path / "score.json", tmp_path / "blind.md"
+    asked = ["blind", "score", str(folder), str(other), "--json", str(out), "--docs", str(docs)]
+    done = CliRunner().invoke(gap, [*asked, "--key-file", str(key_file), "--key-file", str(key_file)])
+    assert done.exit_code == 0, done.output
+    told = json.loads(out.read_text())
+    assert (told["robots"], told["missing"], len(told["sets"])) == (6, 0, 2)
+    assert "| false alarms on robots without effect | 0 % | 0 … 66 % | 2 |" in done.output
+    assert docs.read_text().count("commitment of the answers") == 2
+    refused = CliRunner().invoke(gap, [*asked, "--key-file", str(key_file)])
+    assert "1 keys for 2 sets" in str(refused.exception)
+
+
 def test_a_set_that_is_judged_in_part_can_be_scored_so_far(
     sealed_set: tuple[Path, Path, bytes], tmp_path: Path
 ) -> None:
@@ -355,7 +371,7 @@ def test_a_false_alarm_and_a_wrong_name_are_shown() -> None:
         Case("robot-003", ill("stiffness_error", "all", scale=1.25, size="small"), {"verdict": "none", "effects": []}),
         Case("robot-004", ill("backlash", ("knee_fl",), gap_rad=0.007, size="small"), {"verdict": "none", "effects": []}),
     ]  # fmt: skip
-    found = score({"seed": 1, "commitment": "x"}, cases)
+    found = score([{"seed": 1, "commitment": "x"}], cases)
     assert [case.robot for case in found.failures] == ["robot-000", "robot-001", "robot-004"]
     alarms = next(row for row in found.rows if row.words.startswith("false alarms"))
     assert (alarms.k, alarms.n, alarms.reached) == (1, 1, "below")
@@ -415,5 +431,5 @@ def test_a_set_goes_on_where_it_was_and_another_is_not_written_over(sealed_set: 
 def test_docs_name_the_commonest_confusions(tmp_path: Path) -> None:
     wrong = {"verdict": "actuator_lag", "effects": []}
     cases = [Case(f"robot-{k}", ill("action_delay", "all", delay_s=0.04), wrong) for k in range(2)]
-    write_docs(score({"seed": 1, "commitment": "x", "seed_from_commit": "abc"}, cases), tmp_path / "blind.md")
+    write_docs(score([{"seed": 1, "commitment": "x", "seed_from_commit": "abc"}], cases), tmp_path / "blind.md")
     assert "action_delay taken for actuator_lag (2)" in (tmp_path / "blind.md").read_text()

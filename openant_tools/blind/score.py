@@ -114,15 +114,16 @@ class Row:
 
 @dataclass(frozen=True)
 class Score:
-    """What a set showed.
+    """What one set showed, or several together.
 
     Attributes:
+        sets: the facts of each.
         confusions: (truth, verdict) → how often, medium and large single effects, none and outside.
         reliability: (low, high, mean stated probability, present, count) of each bin.
         failures: in words, one a robot.
     """
 
-    facts: Mapping[str, Any]
+    sets: tuple[Mapping[str, Any], ...]
     cases: tuple[Case, ...]
     rows: tuple[Row, ...]
     confusions: Mapping[tuple[str, str], int]
@@ -134,13 +135,19 @@ class Score:
 
     @property
     def missing(self) -> int:
-        """Robots of the set without a verdict, which were left out."""
-        return int(self.facts.get("robots", len(self.cases))) - len(self.cases)
+        """Robots without a verdict, which were left out."""
+        return self.robots - len(self.cases)
+
+    @property
+    def robots(self) -> int:
+        """How many the sets have, judged or not."""
+        counts = [int(facts.get("robots", 0)) for facts in self.sets]
+        return sum(counts) if all(counts) else len(self.cases)
 
     def as_json(self) -> dict[str, Any]:
         return {
             "schema": "openant.blind-score/1",
-            "set": dict(self.facts),
+            "sets": [dict(facts) for facts in self.sets],
             "robots": len(self.cases),
             "missing": self.missing,
             "rows": [row.as_json() for row in self.rows],
@@ -179,13 +186,13 @@ def read(folder: Path, key: bytes | None, *, so_far: bool = False) -> tuple[dict
     return facts, [Case(name, answers[name], said[name]) for name in judged]
 
 
-def score(facts: Mapping[str, Any], cases: Sequence[Case]) -> Score:
-    """The table, confusions and reliability of these robots."""
+def score(sets: Sequence[Mapping[str, Any]], cases: Sequence[Case]) -> Score:
+    """The table, confusions and reliability of these robots; sets: the facts of those that they are from."""
     counted: Counter[tuple[str, str]] = Counter()
     for case in cases:
         if case.answer.group != "two" and case.large:
             counted[(case.answer.outside or case.answer.verdict, case.verdict)] += 1
-    return Score(facts, tuple(cases), tuple(_rows(cases)), dict(counted), tuple(_reliability(cases)))
+    return Score(tuple(sets), tuple(cases), tuple(_rows(cases)), dict(counted), tuple(_reliability(cases)))
 
 
 def _rows(cases: Sequence[Case]) -> list[Row]:

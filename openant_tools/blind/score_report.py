@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ def _table(found: Score) -> list[list[str]]:
                 "robots that have no verdict yet, left out",
                 str(found.missing),
                 "",
-                str(found.facts["robots"]),
+                str(found.robots),
                 "",
                 "",
                 "",
@@ -143,15 +144,17 @@ def _failures(found: Score) -> list[list[str]]:
 
 
 def _origin(found: Score) -> str:
-    facts = found.facts
+    whole = f", those judged so far of {found.robots}" if found.missing else ""
+    virtual = sum(case.answer.maker == "virtual" for case in found.cases)
+    bus = f" {virtual} came from the virtual robot's bus." if virtual else ""
+    return f"{len(found.cases)} robots{whole}, {'; and '.join(map(_seed, found.sets))}.{bus}"
+
+
+def _seed(facts: Mapping[str, Any]) -> str:
     seed = f"seed {facts['seed']}"
     if "seed_from_commit" in facts:
         seed += f" (the first 8 digits of commit `{facts['seed_from_commit']}`)"
-    makers = {case.answer.maker for case in found.cases}
-    virtual = sum(case.answer.maker == "virtual" for case in found.cases)
-    whole = f", those judged so far of {facts['robots']}" if found.missing else ""
-    words = f"{len(found.cases)} robots{whole}, {seed}, commitment of the answers `{facts['commitment']}`."
-    return words + (f" {virtual} came from the virtual robot's bus." if "virtual" in makers else "")
+    return f"{seed}, commitment of the answers `{facts['commitment']}`"
 
 
 def _drawn(found: Score) -> list[str]:
@@ -191,7 +194,7 @@ def write_docs(found: Score, path: Path) -> None:
     worst = _worst(found)[:3]
     lines = [
         "# The blind benchmark", "",
-        "<!-- Written by `openant gap blind score SET --docs docs/blind.md`: do not edit. -->", "",
+        "<!-- Written by `openant gap blind score SET… --docs docs/blind.md`: do not edit. -->", "",
         "Robots that nobody chose, simulated by other code than the diagnosis uses, judged before the answers are opened.", "",
         "```sh", *_COMMANDS, "```", "", *_drawn(found), "", *_HOW, "", "## Result", "", _origin(found), "", *table_lines(found), "",
     ]  # fmt: skip
@@ -210,7 +213,7 @@ def write_docs(found: Score, path: Path) -> None:
 _COMMANDS = (
     "openant gap blind make --out SET --robots 240 --seed-from COMMIT --key-file KEY    # answers sealed",
     "openant gap blind run SET --jobs 2                                                 # or --backend dask, ray",
-    "openant gap blind score SET --key-file KEY --docs docs/blind.md                    # opens the answers",
+    "openant gap blind score SET… --key-file KEY… --docs docs/blind.md                  # opens the answers",
 )
 _SCOPES = "Scopes: one joint (j), the servos of one model (g), all joints (a), the body (b)."
 _HOW = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,6 +22,7 @@ from openant_tools.cli.blind_sets import (
 )
 from openant_tools.cli.options import json_option, out_option, report_option
 from openant_tools.cli.progress import progress_bar
+from openant_tools.errors import BadInput
 
 __all__ = ["blind"]
 
@@ -114,19 +116,31 @@ def run(folder: Path, jobs: int, backend: str, scheduler: str | None) -> None:
 
 
 @blind.command()
-@set_argument
-@key_option
+@click.argument("folders", metavar="SET…", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--key-file",
+    "key_files",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="Of each set, in their order. Default: they are open.",
+)
 @docs_option
 @click.option("--so-far", is_flag=True, help="Only robots that have a verdict; the table says so.")
 @json_option
 @report_option
 def score(
-    folder: Path, key_file: Path | None, docs: Path | None, so_far: bool, json_file: Path | None, report: Path | None
+    folders: tuple[Path, ...],
+    key_files: tuple[Path, ...],
+    docs: Path | None,
+    so_far: bool,
+    json_file: Path | None,
+    report: Path | None,
 ) -> None:
-    """Open the answers of SET and compare: exit code 1 where a figure lies below what is asked for first.
+    """Open the answers of one SET or several and compare: exit code 1 where a figure lies below what is asked for first.
 
     \b
       openant gap blind score set --key-file set.key --docs docs/blind.md
+      openant gap blind score a b --key-file a.key --key-file b.key
     """
     from openant_tools.blind.score import read
     from openant_tools.blind.score import score as scored
@@ -134,8 +148,20 @@ def score(
     from openant_tools.files import write_text
     from openant_tools.virtual.seal import read_key
 
-    facts, cases = read(folder, None if key_file is None else read_key(key_file), so_far=so_far)
-    found = scored(facts, cases)
+    if key_files and len(key_files) != len(folders):
+        raise BadInput(
+            f"{len(key_files)} keys for {len(folders)} sets",
+            remedy="give one --key-file for each set, in the same order",
+        )
+    keys: list[bytes | None] = [read_key(path) for path in key_files]
+    keys += [None] * (len(folders) - len(keys))
+    opened = [read(folder, key, so_far=so_far) for folder, key in zip(folders, keys, strict=True)]
+    cases = [
+        replace(case, robot=f"{folder.name}/{case.robot}") if len(folders) > 1 else case
+        for folder, (_, mine) in zip(folders, opened, strict=True)
+        for case in mine
+    ]
+    found = scored([facts for facts, _ in opened], cases)
     for line in table_lines(found):
         click.echo(line)
     click.echo(f"{len(found.failures)} of {len(cases)} robots went wrong")
