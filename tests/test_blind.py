@@ -338,6 +338,8 @@ def test_several_sets_are_scored_together(sealed_set: tuple[Path, Path, bytes], 
     assert docs.read_text().count("commitment of the answers") == 2
     refused = CliRunner().invoke(gap, [*asked, "--key-file", str(key_file)])
     assert "1 keys for 2 sets" in str(refused.exception)
+    twice = ["blind", "score", str(folder), str(folder), "--key-file", str(key_file), "--key-file", str(key_file)]
+    assert "the same set twice" in str(CliRunner().invoke(gap, twice).exception)
 
 
 def test_a_set_that_is_judged_in_part_can_be_scored_so_far(

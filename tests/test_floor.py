@@ -65,7 +65,7 @@ def test_noise_is_what_scatters_where_nothing_moves() -> None:
     command = np.where(t < 4, 0.0, 0.5 * np.sin(3 * t))
     values = command + rng.normal(0, 0.01, 400)
     run = Run("noisy", Facts(("joint",)), t, {"cmd.joint": command, "pos.joint": values})
-    assert noise(run, "pos", "joint") == pytest.approx(0.01, rel=0.15)
+    assert noise(run, "pos", ["joint"]) == pytest.approx([0.01], rel=0.15)
     assert floors([run], ["joint"])[0] == pytest.approx([0.01], rel=0.15)
     never = Run("moves", run.facts, t, {"cmd.joint": np.sin(t), "pos.joint": values})
-    assert noise(never, "pos", "joint") == 0.0
+    assert noise(never, "pos", ["joint"]) == [0.0]

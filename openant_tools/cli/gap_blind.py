@@ -121,8 +121,9 @@ def run(folder: Path, jobs: int, backend: str, scheduler: str | None) -> None:
     "--key-file",
     "key_files",
     multiple=True,
-    type=click.Path(path_type=Path),
-    help="Of each set, in their order. Default: they are open.",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="The key of each set's answers, in their order. Default: they are open.",
 )
 @docs_option
 @click.option("--so-far", is_flag=True, help="Only robots that have a verdict; the table says so.")
@@ -153,6 +154,8 @@ def score(
             f"{len(key_files)} keys for {len(folders)} sets",
             remedy="give one --key-file for each set, in the same order",
         )
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise BadInput("the same set twice: its robots would count twice", remedy="name each set once")
     keys: list[bytes | None] = [read_key(path) for path in key_files]
     keys += [None] * (len(folders) - len(keys))
     opened = [read(folder, key, so_far=so_far) for folder, key in zip(folders, keys, strict=True)]

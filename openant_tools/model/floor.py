@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from openant_tools.model.gap import gap
 from openant_tools.recording.run import Run
 
-__all__ = ["floors", "noise", "resolution", "stamp_error"]
+__all__ = ["floors", "noise", "resolution", "stamp_error", "steps"]
 
 Array = NDArray[np.float64]
 #: smaller changes are rounding of the numbers, not steps of a sensor
@@ -40,18 +40,24 @@ def resolution(run: Run, signal: str, joint: str) -> float:
     return float(steps.min()) if len(steps) else 0.0
 
 
-def noise(run: Run, signal: str, joint: str) -> float:
-    """What scatters from row to row while a joint is at rest, in the signal's unit; 0 where it never rests.
+def steps(runs: Sequence[Run], signal: str, joints: Sequence[str]) -> Array:
+    """(joints,) the coarsest step of each joint's sensor in any run."""
+    return np.array([max(resolution(run, signal, joint) for run in runs) for joint in joints])
+
+
+def noise(run: Run, signal: str, joints: Sequence[str]) -> Array:
+    """(joints,) what scatters from row to row while each is at rest, in the signal's unit; 0 where it never rests.
 
     At rest as far as commands say: of a robot that still settles or is shaken divided differences leave nothing, or seldom.
     """
     rows, weights = _differences(run.t)
-    command, values = run.column(f"cmd.{joint}"), run.column(f"{signal}.{joint}")
-    since = np.where(np.diff(command, prepend=np.nan) != 0, run.t, -np.inf)
-    resting = run.t - np.maximum.accumulate(since) > SETTLED_S
-    scatter = np.einsum("ki,ki->k", weights, values[rows])[resting[rows].all(axis=1)]
-    scatter = scatter[np.isfinite(scatter)]
-    return float(np.median(np.abs(scatter))) / HALF_WITHIN if len(scatter) >= RESTING else 0.0
+    commands = run.signal("cmd", joints)
+    changed = np.diff(commands, axis=0, prepend=np.nan) != 0
+    since = np.maximum.accumulate(np.where(changed, run.t[:, None], -np.inf), axis=0)
+    resting = np.logical_and.reduce((run.t[:, None] - since > SETTLED_S)[rows], axis=1)
+    scatter = np.abs(np.einsum("ki,kij->kj", weights, run.signal(signal, joints)[rows]))
+    each = [scatter[resting[:, j] & np.isfinite(scatter[:, j]), j] for j in range(len(joints))]
+    return np.array([np.median(one) / HALF_WITHIN if len(one) >= RESTING else 0.0 for one in each])
 
 
 def stamp_error(runs: Sequence[Run], joints: Sequence[str]) -> float:
@@ -105,10 +111,9 @@ def floors(runs: Sequence[Run], joints: Sequence[str], signal: str = "pos") -> t
     A joint of which no repeat says anything has what its sensor leaves: the coarsest step / √12, or its noise at rest where that is
     more than a step; and what it moves within the error of a row's time stamp.
     """
-    steps = np.array([max(resolution(run, signal, joint) for run in runs) for joint in joints])
-    at_rest = np.array([max(noise(run, signal, joint) for run in runs) for joint in joints])
+    step, at_rest = steps(runs, signal, joints), np.max([noise(run, signal, joints) for run in runs], axis=0)
     # Less than a step is an encoder between two of them, and what that leaves is known.
-    sensors = np.where(at_rest > steps, at_rest, steps / math.sqrt(12))
+    sensors = np.where(at_rest > step, at_rest, step / math.sqrt(12))
     by_sensors = np.hypot(sensors, stamp_error(runs, joints) * _speeds(runs, joints, signal))
     by_name = {run.name: run for run in runs}
     pairs = [(run, by_name[run.facts.repeat_of]) for run in runs if run.facts.repeat_of in by_name]

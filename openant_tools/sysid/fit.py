@@ -29,7 +29,7 @@ from scipy.stats import norm
 
 from openant_tools.effects.catalogue import effect
 from openant_tools.effects.rollout import EffectValues, rollout
-from openant_tools.model.floor import resolution
+from openant_tools.model.floor import steps
 from openant_tools.model.gap import HORIZON_S, Gap, gap
 from openant_tools.model.plant import Plant, Setup
 from openant_tools.model.rollout import Rollouts, Trajectories
@@ -949,4 +949,4 @@ def gaps(datasets: Sequence[Dataset], parameters: Sequence[Parameter], us: Seque
 
 def sensor_floor(runs: Sequence[Run], joints: Sequence[str]) -> Array:
     """(joints,) rad, the deviation that the encoder's resolution alone gives: its coarsest quantum / √12."""
-    return np.array([max(resolution(run, "pos", joint) for run in runs) for joint in joints]) / math.sqrt(12)
+    return steps(runs, "pos", joints) / math.sqrt(12)
