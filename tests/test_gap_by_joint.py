@@ -60,3 +60,16 @@ def test_a_cause_is_known_at_a_joint_where_it_never_was(
 def test_templates_of_a_cause_at_a_joint_are_those_that_sit_there_alone_if_any_do() -> None:
     bank = [("late", (0,), {}), ("late", (0, 1), {}), ("heavy", (0, 1), {}), ("late", (1,), {})]
     assert [list(some) for some in places_of(bank, ["late", "heavy", "weak"], 1)] == [[3], [2], []]
+
+
+def test_what_is_random_sits_where_joints_say_so(taught: tuple[ByJoint, np.ndarray, np.ndarray, np.ndarray]) -> None:
+    judge, _, _, _ = taught
+    everywhere, single = tuple(range(JOINTS)), [(j,) for j in range(JOINTS)]
+    logits = np.full((JOINTS, len(CAUSES)), -4.0)
+    logits[2, 1] = 3.0
+    likely = judge.likelihood(logits, "rough", [*single, everywhere])
+    assert int(likely.argmax()) == 2
+    logits[:, 1] = 1.0
+    likely = judge.likelihood(logits, "rough", [*single, everywhere])
+    assert int(likely.argmax()) == len(single)
+    assert np.exp(likely[-1]) == pytest.approx((1 / (1 + np.exp(-1.0))) ** JOINTS)

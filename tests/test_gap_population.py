@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.cause import catalogue
 from openant_tools.gap.features import COLUMNS
-from openant_tools.gap.judge import Judge, metric_of
+from openant_tools.gap.judge import Judge, metric_of, train
 from openant_tools.gap.kept import judge_of
 from openant_tools.gap.population import Case, draw, play, robot_of, templates
 from openant_tools.gap.prepare import CACHE_VARIABLE, Prepared, cache_folder, prepare
@@ -180,6 +180,21 @@ def test_the_first_judge_brings_that_of_robots_with_other_sensors(
         assert len(taught) == judges, f"with {signals}"
     assert len(set(taught)) == len(taught)
     assert taught[0] == min(taught), "what saw positions alone"
+
+
+def test_a_judge_says_how_strange_robots_are(
+    protocol: Protocol, prepare_few: Callable[[Protocol, int, list[Case]], Prepared]
+) -> None:
+    bank = templates(protocol)[:160]
+    whole = prepare_few(protocol, 160, bank)
+    judge = train(whole, [0, 1], [np.ones(x.shape[1], bool) for x in whole.features])
+    x = np.concatenate(whole.features, axis=1)
+    energy = judge.energy(x)
+    assert np.isfinite(energy).all()
+    assert np.median(energy[whole.healthy()]) < 1
+    said = judge.say(x[0])
+    assert set(said.probability) == {name for case in bank for name in case.causes}
+    assert said.energy == pytest.approx(energy[0])
 
 
 def test_what_no_simulated_robot_showed_is_not_strange(

@@ -106,6 +106,14 @@ class ByJoint:
         """Cause → (robots, joints) logits."""
         return {name: logits[..., k] for k, name in enumerate(self.causes)}
 
+    def likelihood(self, logits: Array, cause: str, places: Sequence[tuple[int, ...]]) -> Array:
+        """(places,) logarithms of how likely a cause sits at these joints and at no other; logits: (joints, causes)."""
+        own = logits[:, self.causes.index(cause)]
+        there = np.array([[j in where for j in range(len(own))] for where in places])
+        # log p where it sits, log (1 − p) where it does not.
+        out: Array = -np.logaddexp(0.0, np.where(there, -own, own)).sum(axis=1)
+        return out
+
     def summary(self, logits: Array) -> Floats:
         """Of (robots, joints, causes): how sure of each cause at all joints, at the surest two, and at servos of one model."""
         ordered = np.sort(logits, axis=1)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.gap.cause import Cause, Quantity, catalogue, enter
-from openant_tools.gap.features import Floats, differences
+from openant_tools.gap.features import Floats
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Played, Players, Protocol
 from openant_tools.gap.robot import Reference, Robot
@@ -124,7 +124,7 @@ class Scene:
     def residuals(self, robots: Sequence[Robot]) -> Floats:
         """(robots, features) whitened differences between the robot at hand and these."""
         parts = [
-            one.layout.features(differences(found, nominal, one.signals))
+            one.layout.features(found, nominal)
             for one, found, nominal in zip(self.runs, self._players.play(robots), self._nominal, strict=True)
         ]
         out: Floats = np.nan_to_num(self.metric(np.concatenate(parts, axis=1)) - self._target)
@@ -152,7 +152,7 @@ def explain(
             Part(name, where): x
             for name in suspects
             if scene_of(name, scenes) is scene
-            for where, x in judgement.places[name][: None if name in thorough else PLACES]
+            for where, x in judgement.places[name][: _places_tried(name, thorough)]
         }
         for name in set(thorough) & {part.cause for part in known}:
             mine = [part for part in known if part.cause == name]
@@ -166,6 +166,13 @@ def explain(
                 if name not in out or one.misfit < out[name].misfit:
                     out[name] = one
     return out
+
+
+def _places_tried(name: str, thorough: Sequence[str]) -> int | None:
+    if catalogue()[name].random:
+        # No simulation loses the very same commands: where it sits, only the judge can say.
+        return 1
+    return None if name in thorough else PLACES
 
 
 @dataclass

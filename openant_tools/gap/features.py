@@ -1,7 +1,8 @@
 """What a judge looks at: how a robot's log differs from the simulation's, in pieces long enough to be steady.
 
 Single samples on the floor chatter (a gram more moves them by many deviations), so that differences are averaged over
-blocks; what scatters within a block enters as the logarithm of its size.
+blocks; what scatters within a block enters as the logarithm of its size. Commands that come late or never leave no mean at all:
+by how much each row is late, by the word of every joint and of all together, enters as the size and the peaks of its scatter.
 """
 
 from __future__ import annotations
@@ -11,12 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from openant_tools.gap.robot import USUAL_NOISE, Robot
 from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
 
-__all__ = ["COLUMNS", "Layout", "Signals", "around_switching", "logged", "with_noise"]
+__all__ = ["COLUMNS", "LATE", "Layout", "Signals", "around_switching", "logged", "with_noise"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -45,6 +47,10 @@ LETS_GO_S = 0.03
 OWN_SCALE = 2.0
 #: least size of a scatter, as a share of the signal's noise
 LEAST = 0.3
+#: what the features of lateness are called; rows about a row that it is compared with; rad/s, a speed from which positions tell it
+LATE, LATE_ROWS, TELLS_RAD_S = "late", 5, 1.0
+#: s, the least size of a scatter of lateness
+LEAST_LATE_S = 1e-4
 
 
 @dataclass(frozen=True)
@@ -82,13 +88,26 @@ class Layout:
             n = _width(signal, self.joints)
             count = len(self.blocks(signal)) - 1
             out[signal] = ["mean"] * (count * n) + ["size"] * n + ["rough"] * n
+        if "pos" in self.signals:
+            n = self.joints + 1
+            out[LATE] = ["size"] * n + ["peak"] * n
         return out
 
-    def features(self, differences: Signals) -> Floats:
-        """(robots, features): block means, and logarithms of sizes, of the differences (robots, rows, columns)."""
-        parts = []
+    def joints_of(self, signal: str) -> list[int]:
+        """The joint of each of a signal's features, in the order of `features`; −1 for those of no joint, or of all."""
+        width = self.joints + 1 if signal == LATE else _width(signal, self.joints)
+        each = [-1] * width if signal in COLUMNS else [j if j < self.joints else -1 for j in range(width)]
+        return each * (len(self.groups()[signal]) // width)
+
+    def features(self, seen: Signals, simulated: Signals) -> Floats:
+        """(robots, features): block means, and logarithms of sizes, of how logs differ from what the model does.
+
+        Args:
+            seen, simulated: (robots, rows, columns) of each signal; the model may be one for all robots.
+        """
+        parts, apart = [], differences(seen, simulated, self.signals)
         for signal in self.signals:
-            x = differences[signal]
+            x = apart[signal]
             if signal not in COLUMNS and self.unsure.any():
                 x = np.where(self.unsure, np.float32(np.nan), x)
             edges = self.blocks(signal)
@@ -99,7 +118,31 @@ class Layout:
             size = np.log10(np.sqrt(np.nanmean(np.square(means), axis=1)) + _least(signal))
             rough = self._roughness(signal, x)
             parts += [np.nan_to_num(means).reshape(n, -1), np.nan_to_num(size), np.nan_to_num(rough)]
+        if "pos" in self.signals:
+            parts += self._late(np.where(self.unsure, np.float32(np.nan), apart["pos"]), simulated["pos"])
         return np.concatenate(parts, axis=1).astype(np.float32)
+
+    def _late(self, x: Floats, simulated: Floats) -> list[Floats]:
+        """Logarithms of how far rows scatter in time, and of how much of that is in few of them; (robots, joints + 1) each.
+
+        A row that is late by τ lies τ times its speed behind those about it: each joint says so, as far as it moves, and where one
+        bus serves them all, they say the same.
+
+        Args:
+            x: (robots, rows, joints) rad, NaN where nobody knows. simulated: the same of the model.
+        """
+        known = np.isfinite(x)
+        values = np.where(known, x, np.float32(0))
+        jump = np.where(known, values - _about(values) / np.maximum(_about(known), 1e-6), 0)[:, self.t >= SKIP_S]
+        speed = np.nan_to_num(np.gradient(simulated, self.t, axis=1))[:, self.t >= SKIP_S]
+        weight = np.square(speed) + TELLS_RAD_S**2
+        late = np.concatenate(
+            [-jump * speed / weight, -(jump * speed).sum(axis=2, keepdims=True) / weight.sum(axis=2, keepdims=True)],
+            axis=2,
+        )
+        size = np.sqrt(np.mean(np.square(late), axis=1)) + LEAST_LATE_S
+        peak = np.mean(late**4, axis=1) ** 0.25 + LEAST_LATE_S
+        return [np.log10(size), np.log10(peak / size)]
 
     def _roughness(self, signal: str, x: Floats) -> Floats:
         """(robots, columns): logarithm of what scatters faster than blocks."""
@@ -173,11 +216,19 @@ def differences(seen: Signals, simulated: Signals, names: Sequence[str]) -> dict
 
 
 def with_noise(
-    signals: Signals, robots: Sequence[Robot], resolution: Mapping[str, float], rng: np.random.Generator
+    signals: Signals, robots: Sequence[Robot], resolution: Mapping[str, float], rng: np.random.Generator, t: Array
 ) -> dict[str, Floats]:
-    """What imperfect sensors make of the truth: noise of each robot's own size, and steps."""
+    """What imperfect sensors make of the truth: noise of each robot's own size, and steps; servos are read a little off the stamp.
+
+    Args:
+        t: (rows,) s, the stamps.
+    """
     out: dict[str, Floats] = {}
+    scatter = np.array([robot.noise.get("stamp", 0.0) for robot in robots], np.float32)[:, None, None]
+    off = scatter * rng.standard_normal((len(robots), len(t), 1), np.float32).clip(-3, 3)
     for name, x in signals.items():
+        if name in ("pos", "vel"):
+            x = x + off * np.gradient(x, t, axis=1)
         noise = np.array([robot.noise.get(name, 0.0) for robot in robots], np.float32)[:, None, None]
         scale = 1.0
         if name == "torque":
@@ -192,6 +243,12 @@ def with_noise(
             between = np.array([robot.noise.get("volt_between", 0.0) for robot in robots], np.float32)[:, None, None]
             y = y + step * between
         out[name] = (np.round(y / step) * step if step > 0 else y).astype(np.float32)
+    return out
+
+
+def _about(x: Floats | Bools) -> Array:
+    """(robots, rows, columns) means over the rows about each, of nothing beyond the first and the last."""
+    out: Array = uniform_filter1d(x.astype(np.float64), LATE_ROWS, axis=1, mode="constant")
     return out
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.by_joint import FEWEST_JOINTS, ByJoint, places_of
 from openant_tools.gap.cause import catalogue
-from openant_tools.gap.features import COLUMNS, Floats
+from openant_tools.gap.features import Floats
 from openant_tools.gap.networks import Networks
 from openant_tools.gap.prepare import Prepared
 from openant_tools.gap.stack import Stack, evidence
@@ -126,23 +126,37 @@ class Judge:
 
     def probabilities(self, x: Floats) -> Array:
         """(robots, causes), of features (robots, features)."""
+        told = self.told(x)
+        return self._believed(told, self._at_joints(told))
+
+    def _at_joints(self, told: _Told) -> Array | None:
+        """(robots, joints, causes) logits by the networks that see one joint at a time, if there are any."""
+        return None if self.by_joint is None else self.by_joint.logits(told.z, told.logs)
+
+    def _believed(self, told: _Told, logits: Array | None) -> Array:
+        """(robots, causes) probabilities."""
         assert self.networks is not None
         assert self.stack is not None
-        told, at_joints, inputs = self.told(x), {}, []
-        if self.by_joint is not None:
-            logits = self.by_joint.logits(told.z, told.logs)
+        at_joints, inputs = {}, []
+        if self.by_joint is not None and logits is not None:
             at_joints, inputs = self.by_joint.named(logits), [self.by_joint.summary(logits)]
         whole = self.networks.logits(told.z, np.hstack([told.inputs, *inputs]), len(self.causes))
         return self.stack(evidence(self.templates, told.z, whole, at_joints))
 
     def say(self, x: Floats) -> Judgement:
         """Judge one robot, of features (features,)."""
-        chances = self.probabilities(x[None])[0]
-        z = self.whitening(x[None, self.means])
+        told = self.told(x[None])
+        logits = self._at_joints(told)
+        chances = self._believed(told, logits)[0]
+        places = self.templates.places(self.templates.fits(told.z)[0])
+        if self.by_joint is not None and logits is not None:
+            for name in self.by_joint.causes:
+                if catalogue()[name].random:
+                    # No template tells where: it has lost other commands than this robot.
+                    likelihood = self.by_joint.likelihood(logits[0], name, [where for where, _ in places[name]])
+                    places[name] = [places[name][k] for k in np.argsort(-likelihood)]
         return Judgement(
-            dict(zip(self.causes, map(float, chances), strict=True)),
-            float(self.energy(x[None])[0]),
-            self.templates.places(self.templates.fits(z)[0]),
+            dict(zip(self.causes, map(float, chances), strict=True)), float(self.energy(x[None])[0]), places
         )
 
 
@@ -167,9 +181,9 @@ def train(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools], se
     joints = len(prepared.protocol.joints)
     templates = Templates.of(bank, whitening.of_templates(vectors[:, means]), joints)
     logs = x[measure][:, ~means]
-    energies = _energies(whitening(x[others][:, means]), groups[means])
+    energies = _energies(whitening(x[others][:, means]), groups)
     judge = Judge(
-        means, np.median(logs, axis=0), logs.std(axis=0) + LEAST_SPREAD, whitening, templates, groups[means],
+        means, np.median(logs, axis=0), logs.std(axis=0) + LEAST_SPREAD, whitening, templates, groups,
         np.quantile(energies, 1 - GATE, axis=0),
     )  # fmt: skip
     taught = np.concatenate([np.flatnonzero(~prepared.healthy()), others])
@@ -214,9 +228,9 @@ class _Layout:
 
     @property
     def groups(self) -> Ints:
-        """Of each feature, a number for its run and signal, from 0."""
+        """Of each block mean, a number for its run and signal, from 0."""
         _, signals = np.unique(self.signals, return_inverse=True)
-        return np.unique(self.runs * (signals.max() + 1) + signals, return_inverse=True)[1]
+        return np.unique((self.runs * (signals.max() + 1) + signals)[self.means], return_inverse=True)[1]
 
 
 def _layout(prepared: Prepared, which: Sequence[int]) -> _Layout:
@@ -228,7 +242,7 @@ def _layout(prepared: Prepared, which: Sequence[int]) -> _Layout:
             runs += [n] * len(kinds)
             floor += [played.plant.setup is Setup.FLOOR] * len(kinds)
             signals += [signal] * len(kinds)
-            joints += [-1] * len(kinds) if signal in COLUMNS else [j % played.layout.joints for j in range(len(kinds))]
+            joints += played.layout.joints_of(signal)
     return _Layout(np.array(means), np.array(runs), np.array(floor), np.array(signals), np.array(joints))
 
 

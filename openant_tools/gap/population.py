@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.gap.cause import Cause, Scope, catalogue, enter
-from openant_tools.gap.features import Floats, differences, with_noise
+from openant_tools.gap.features import Floats, with_noise
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
@@ -158,9 +158,11 @@ def play(protocol: Protocol, cases: Sequence[Case], seed: int) -> list[Floats]:
         rollouts = Rollouts(played.plant, [played.run], nthread=1)
         signals = simulate(rollouts, robots, seed=seed * 64 + k, signals=played.signals).signals
         nominal = {name: values[:1] for name, values in signals.items()}
-        noisy = with_noise({name: values[1:] for name, values in signals.items()}, robots[1:], steps, rng)
+        noisy = with_noise(
+            {name: values[1:] for name, values in signals.items()}, robots[1:], steps, rng, played.layout.t
+        )
         # A robot that no step can hold together shows as very ill, not as infinite.
-        found = played.layout.features(differences(noisy, nominal, played.signals))
+        found = played.layout.features(noisy, nominal)
         out.append(np.clip(np.nan_to_num(found, nan=0.0, posinf=LARGEST, neginf=-LARGEST), -LARGEST, LARGEST))
     return out
 

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.features import COLUMNS, Floats, Layout, around_switching, differences, logged
+from openant_tools.gap.features import COLUMNS, LATE, Floats, Layout, around_switching, logged
 from openant_tools.gap.robot import Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.floor import resolution
@@ -86,7 +86,7 @@ class Played:
     def features(self, nominal: Mapping[str, Floats]) -> tuple[Floats, NDArray[np.bool_]]:
         """(features,) of the run itself against what the model does, and which of them its log has."""
         seen = {name: self.seen.get(name, nominal[name]) for name in self.signals}
-        return self.layout.features(differences(seen, nominal, self.signals))[0], self.there(self.seen)
+        return self.layout.features(seen, nominal)[0], self.there(self.seen)
 
     def rest(self) -> Array:
         """(joints,) rad where the model comes to rest under the run's first commands."""
@@ -103,7 +103,8 @@ class Played:
 
     def there(self, seen: Collection[str]) -> NDArray[np.bool_]:
         """(features,) which of them a log of these signals has."""
-        return np.concatenate([np.full(len(names), name in seen) for name, names in self.layout.groups().items()])
+        groups = self.layout.groups()
+        return np.concatenate([np.full(len(groups[name]), _read_from(name) in seen) for name in groups])
 
 
 @dataclass(frozen=True)
@@ -278,6 +279,11 @@ class Protocol:
             state.update(path.read_bytes())
         state.update(json.dumps(list(self.joints)).encode())
         return state.hexdigest()[:16]
+
+
+def _read_from(signal: str) -> str:
+    """The signal that features are of: how late rows are is read from positions."""
+    return "pos" if signal == LATE else signal
 
 
 def same(one: Array, other: Array) -> bool:

@@ -76,6 +76,8 @@ def placed(
 
 def _places(protocol: Protocol, judgement: Judgement, one: Explained, strained: Sequence[int]) -> list[Explained]:
     """Where else it may sit than where it was fitted."""
+    if catalogue()[one.part.cause].random:
+        return []
     scopes = one.part.definition.scopes
     named = [(one.part.joints, one.x), *judgement.places[one.part.cause][:NAMED]]
     wider = [tuple(group) for group in protocol.servos()] if Scope.SERVO in scopes else []

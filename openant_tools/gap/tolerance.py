@@ -38,6 +38,8 @@ TORQUE_SCALE = 0.03
 TORQUE_ZERO = 0.06
 #: s by which a velocity register is late at most on a healthy servo, and by which a row's stamp is off its samples
 VELOCITY_LATE_S, STAMP_S = 0.012, 0.0015
+#: s, deviation of when a row is read about its stamp, on the worst healthy robot: hosts are no clocks
+ROW_S = 0.001
 #: s by which low-pass filters make a gyroscope late at most (25 Hz), and an accelerometer beyond it (Betaflight's is 10 to 25 Hz)
 IMU_LATE_S, ACC_LATE_S = 0.007, 0.010
 #: steps of a voltage sensor between which the supply may lie: which of its steps is nearest is a matter of chance
@@ -91,6 +93,7 @@ def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width:
         robot.late[signal] = robot.late.get(signal, 0.0) + stamp
     for signal, noise in USUAL_NOISE.items():
         robot.noise[signal] = noise * float(np.exp(rng.uniform(*NOISE)))
+    robot.noise["stamp"] = float(rng.uniform(0, ROW_S))
     robot.noise["volt_between"] = float(rng.uniform(-VOLT_BETWEEN, VOLT_BETWEEN))
     robot.noise["torque_zero"] = float(TORQUE_ZERO * rng.uniform(0, 1))
     robot.noise["torque_scale"] = float(np.exp(TORQUE_SCALE * rng.normal()))

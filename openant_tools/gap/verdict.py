@@ -297,7 +297,8 @@ def _led(evidence: _Evidence, names: Sequence[str]) -> _Leader:
         probability[best] = max(probability[best], share * max(taken))
     left, eased, energy = None, False, evidence.judgement.energy
     healthy = evidence.plain.after < LARGE * evidence.floor and energy < STRANGE
-    if healthy and moves_joints(catalogue()[best]) and not beside and gained < BARELY:
+    needless = healthy and moves_joints(catalogue()[best]) and not beside and gained < BARELY
+    if needless or (energy < 1 and carries(catalogue()[best]) and gained < 0):
         # Tolerances do what it does, and leave no more than of a healthy robot.
         probability[best] *= max(gained, 0.0) / BARELY
     if probability[best] > MAYBE or proved or max(probability[name] for name in names) > CERTAIN:
