@@ -49,6 +49,17 @@ def test_a_few_rows_that_are_very_late_are_peaks() -> None:
     assert lost > 1.25 * jitter
 
 
+@pytest.mark.parametrize("rate_hz", [50, 200])
+def test_a_command_that_is_lost_shows_at_any_rate(rate_hz: int) -> None:
+    count = 10 * rate_hz
+    t = np.arange(count) / rate_hz
+    by = np.repeat(0.02 * (np.random.default_rng(6).random(500) < 0.05), rate_hz // 50)
+    swing = [0.5 * np.sin(2 * np.pi * 0.9 * (t - late_s))[None, :, None].astype(np.float32) for late_s in (by, 0.0)]
+    mine = Layout(t, Setup.STAND, 1, ("pos",), float(t[-1]), np.zeros((count, 1), bool))
+    size = 10 ** mine.features({"pos": swing[0]}, {"pos": swing[1]})[0, -4]
+    assert 0.55 * np.sqrt(np.mean(by**2)) < size < np.sqrt(np.mean(by**2))
+
+
 def test_what_joints_do_each_for_itself_is_not_late_together() -> None:
     rng = np.random.default_rng(3)
     apart, _ = late(moved(T[:, None] - 0.005 * rng.normal(size=(ROWS, JOINTS))))

@@ -47,8 +47,8 @@ LETS_GO_S = 0.03
 OWN_SCALE = 2.0
 #: least size of a scatter, as a share of the signal's noise
 LEAST = 0.3
-#: what the features of lateness are called; rows about a row that it is compared with; rad/s, a speed from which positions tell it
-LATE, LATE_ROWS, TELLS_RAD_S = "late", 5, 1.0
+#: what the features of lateness are called; s about a row that it is compared with; rad/s, a speed from which positions tell it
+LATE, ABOUT_S, TELLS_RAD_S = "late", 0.1, 1.0
 #: s, the least size of a scatter of lateness
 LEAST_LATE_S = 1e-4
 
@@ -133,7 +133,9 @@ class Layout:
         """
         known = np.isfinite(x)
         values = np.where(known, x, np.float32(0))
-        jump = np.where(known, values - _about(values) / np.maximum(_about(known), 1e-6), 0)[:, self.t >= SKIP_S]
+        rows = max(3, round(ABOUT_S / float(np.median(np.diff(self.t)))) | 1)
+        usual = _about(values, rows) / np.maximum(_about(known, rows), 1e-6)
+        jump = np.where(known, values - usual, 0)[:, self.t >= SKIP_S]
         speed = np.nan_to_num(np.gradient(simulated, self.t, axis=1))[:, self.t >= SKIP_S]
         weight = np.square(speed) + TELLS_RAD_S**2
         late = np.concatenate(
@@ -246,9 +248,9 @@ def with_noise(
     return out
 
 
-def _about(x: Floats | Bools) -> Array:
-    """(robots, rows, columns) means over the rows about each, of nothing beyond the first and the last."""
-    out: Array = uniform_filter1d(x.astype(np.float64), LATE_ROWS, axis=1, mode="constant")
+def _about(x: Floats | Bools, rows: int) -> Array:
+    """(robots, rows, columns) means over so many rows about each, of nothing beyond the first and the last."""
+    out: Array = uniform_filter1d(x.astype(np.float64), rows, axis=1, mode="constant")
     return out
 
 
