@@ -168,7 +168,8 @@ def play(protocol: Protocol, cases: Sequence[Case], seed: int) -> list[Floats]:
 
 
 def _turns(protocol: Protocol, rng: np.random.Generator) -> Ints:
-    """(runs,) which run came first, which next: as they are given, or those on the stand before those on the floor."""
+    """(runs,) which run came first, which next: as they are given, or those on the stand first, or those on the floor."""
     floor = np.array([one.plant.setup is Setup.FLOOR for one in protocol.runs])
-    order = np.argsort(floor, kind="stable") if rng.random() < 0.5 else np.arange(len(floor))
+    orders = [np.arange(len(floor)), np.argsort(floor, kind="stable"), np.argsort(~floor, kind="stable")]
+    order = orders[int(rng.integers(len(orders)))]
     return np.argsort(order)
