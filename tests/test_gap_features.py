@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from openant_tools.gap.features import LATE, LEAST_LATE_S, SKIP_S, Layout
+from openant_tools.gap.features import LATENESS, LEAST_LATE_S, SKIP_S, Layout
 from openant_tools.model.plant import Setup
 
 JOINTS, ROWS, PERIOD_S = 8, 500, 0.02
@@ -27,7 +27,7 @@ def late(seen: np.ndarray, unsure: np.ndarray | None = None) -> tuple[np.ndarray
     """(joints + 1,) s that rows scatter by, and how much of that is in few of them, of one log against `moved`."""
     mine = layout(unsure)
     found = mine.features({"pos": seen}, {"pos": moved(T)})[0]
-    at = np.concatenate([np.full(len(kinds), name == LATE) for name, kinds in mine.groups().items()])
+    at = np.concatenate([np.full(len(kinds), name == LATENESS) for name, kinds in mine.groups().items()])
     size, peak = found[at].reshape(2, JOINTS + 1)
     return 10**size - LEAST_LATE_S, 10**peak
 
@@ -94,7 +94,7 @@ def test_features_of_a_signal_say_which_joint_they_are_of() -> None:
     groups = mine.groups()
     for signal, kinds in groups.items():
         assert len(mine.joints_of(signal)) == len(kinds)
-    assert mine.joints_of(LATE) == [*range(JOINTS), -1, *range(JOINTS), -1]
+    assert mine.joints_of(LATENESS) == [*range(JOINTS), -1, *range(JOINTS), -1]
     assert set(mine.joints_of("gyro")) == {-1}
     assert mine.joints_of("pos")[:JOINTS] == list(range(JOINTS))
     count = sum(map(len, groups.values()))

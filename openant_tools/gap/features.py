@@ -18,7 +18,7 @@ from openant_tools.gap.robot import USUAL_NOISE, Robot
 from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
 
-__all__ = ["COLUMNS", "LATE", "Layout", "Signals", "around_switching", "logged", "with_noise"]
+__all__ = ["COLUMNS", "LATENESS", "Layout", "Signals", "around_switching", "logged", "with_noise"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -48,7 +48,7 @@ OWN_SCALE = 2.0
 #: least size of a scatter, as a share of the signal's noise
 LEAST = 0.3
 #: what the features of lateness are called; s about a row that it is compared with; rad/s, a speed from which positions tell it
-LATE, ABOUT_S, TELLS_RAD_S = "late", 0.1, 1.0
+LATENESS, ABOUT_S, TELLS_RAD_S = "lateness", 0.1, 1.0
 #: s, the least size of a scatter of lateness
 LEAST_LATE_S = 1e-4
 
@@ -59,7 +59,7 @@ class Layout:
 
     Attributes:
         t: (rows,) s since the run's start. setup: how the robot stood. joints: how many.
-        signals: which, in order.
+        signals: which, in order; positions of joints among them.
         seconds: how long the protocol's run is: a log that goes on longer is cut there.
         unsure: (rows, joints) as `around_switching`.
     """
@@ -88,16 +88,16 @@ class Layout:
             n = _width(signal, self.joints)
             count = len(self.blocks(signal)) - 1
             out[signal] = ["mean"] * (count * n) + ["size"] * n + ["rough"] * n
-        if "pos" in self.signals:
-            n = self.joints + 1
-            out[LATE] = ["size"] * n + ["peak"] * n
+        n = self.joints + 1
+        out[LATENESS] = ["size"] * n + ["peak"] * n
         return out
 
     def joints_of(self, signal: str) -> list[int]:
         """The joint of each of a signal's features, in the order of `features`; −1 for those of no joint, or of all."""
-        width = self.joints + 1 if signal == LATE else _width(signal, self.joints)
-        each = [-1] * width if signal in COLUMNS else [j if j < self.joints else -1 for j in range(width)]
-        return each * (len(self.groups()[signal]) // width)
+        if signal == LATENESS:
+            return 2 * [*range(self.joints), -1]
+        count = len(self.groups()[signal])
+        return [-1] * count if signal in COLUMNS else [k % self.joints for k in range(count)]
 
     def features(self, seen: Signals, simulated: Signals) -> Floats:
         """(robots, features): block means, and logarithms of sizes, of how logs differ from what the model does.
@@ -106,10 +106,12 @@ class Layout:
             seen, simulated: (robots, rows, columns) of each signal; the model may be one for all robots.
         """
         parts, apart = [], differences(seen, simulated, self.signals)
+        if self.unsure.any():
+            apart |= {
+                name: np.where(self.unsure, np.float32(np.nan), x) for name, x in apart.items() if name not in COLUMNS
+            }
         for signal in self.signals:
             x = apart[signal]
-            if signal not in COLUMNS and self.unsure.any():
-                x = np.where(self.unsure, np.float32(np.nan), x)
             edges = self.blocks(signal)
             means = _means(x, self.t, edges)
             if signal in DRIFTING:
@@ -118,8 +120,7 @@ class Layout:
             size = np.log10(np.sqrt(np.nanmean(np.square(means), axis=1)) + _least(signal))
             rough = self._roughness(signal, x)
             parts += [np.nan_to_num(means).reshape(n, -1), np.nan_to_num(size), np.nan_to_num(rough)]
-        if "pos" in self.signals:
-            parts += self._late(np.where(self.unsure, np.float32(np.nan), apart["pos"]), simulated["pos"])
+        parts += self._late(apart["pos"], simulated["pos"])
         return np.concatenate(parts, axis=1).astype(np.float32)
 
     def _late(self, x: Floats, simulated: Floats) -> list[Floats]:

@@ -122,7 +122,10 @@ class Judge:
 
     def energy(self, x: Floats) -> Array:
         """(robots,) largest energy of any run's signal, as a multiple of its gate."""
-        return np.asarray((_energies(self.whitening(x[:, self.means]), self.groups) / self.gates).max(axis=1))
+        return self._energy(self.whitening(x[:, self.means]))
+
+    def _energy(self, z: Floats) -> Array:
+        return np.asarray((_energies(z, self.groups) / self.gates).max(axis=1))
 
     def probabilities(self, x: Floats) -> Array:
         """(robots, causes), of features (robots, features)."""
@@ -148,16 +151,20 @@ class Judge:
         told = self.told(x[None])
         logits = self._at_joints(told)
         chances = self._believed(told, logits)[0]
-        places = self.templates.places(self.templates.fits(told.z)[0])
-        if self.by_joint is not None and logits is not None:
-            for name in self.by_joint.causes:
-                if catalogue()[name].random:
-                    # No template tells where: it has lost other commands than this robot.
-                    likelihood = self.by_joint.likelihood(logits[0], name, [where for where, _ in places[name]])
-                    places[name] = [places[name][k] for k in np.argsort(-likelihood)]
-        return Judgement(
-            dict(zip(self.causes, map(float, chances), strict=True)), float(self.energy(x[None])[0]), places
-        )
+        energy = float(self._energy(told.z)[0])
+        return Judgement(dict(zip(self.causes, map(float, chances), strict=True)), energy, self._places(told, logits))
+
+    def _places(self, told: _Told, logits: Array | None) -> dict[str, list[tuple[tuple[int, ...], dict[str, float]]]]:
+        """Of one robot, as `Judgement.places`."""
+        out = self.templates.places(self.templates.fits(told.z)[0])
+        if self.by_joint is None or logits is None:
+            return out
+        for name in self.by_joint.causes:
+            if catalogue()[name].random:
+                # No template tells where: it has lost other commands than this robot.
+                likelihood = self.by_joint.likelihood(logits[0], name, [where for where, _ in out[name]])
+                out[name] = [out[name][k] for k in np.argsort(-likelihood)]
+        return out
 
 
 def train(prepared: Prepared, which: Sequence[int], columns: Sequence[Bools], seed: int = 0) -> Judge:

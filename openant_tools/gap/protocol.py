@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.features import COLUMNS, LATE, Floats, Layout, around_switching, logged
+from openant_tools.gap.features import COLUMNS, LATENESS, Floats, Layout, around_switching, logged
 from openant_tools.gap.robot import Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.floor import resolution
@@ -283,7 +283,7 @@ class Protocol:
 
 def _read_from(signal: str) -> str:
     """The signal that features are of: how late rows are is read from positions."""
-    return "pos" if signal == LATE else signal
+    return "pos" if signal == LATENESS else signal
 
 
 def same(one: Array, other: Array) -> bool:
