@@ -158,3 +158,35 @@ def test_what_is_hardly_believed_does_not_lead_before_what_is_certain_and_closes
     assert found.names[0] == "dead_zone"
     found.probability |= {"dead_zone": 0.1, "cogging": 0.7}
     assert found.names[0] == "dead_zone"
+
+
+def leads(name: str, gained: float, left: float, *, beside: bool = False) -> _Leader:
+    return _Leader(name, gained, beside, proved=False, left=Judgement({}, left, {}), eased=False)
+
+
+@pytest.mark.parametrize(("left", "said"), [(25.0, "unexplained"), (5.0, "stribeck_friction")])
+def test_what_takes_nothing_away_has_no_part_in_a_riddle(left: float, said: str) -> None:
+    """A re-fit closed what was closed, whatever the judge is sure of."""
+    found = dataclasses.replace(
+        evidence(stribeck_friction=(0.98, 0.6)), judgement=Judgement({}, 25.0, {}), ranked=[("stribeck_friction", 0.98)]
+    )
+    chosen = _Chosen(("stribeck_friction",), found.alone["stribeck_friction"], {"stribeck_friction": 0.0}, energy=25.0)
+    assert _verdict(found, ["stribeck_friction"], leads("stribeck_friction", 0.0, left), chosen)[0] == said
+
+
+@pytest.mark.parametrize(
+    ("other", "said"), [("imu_misalignment", "unexplained"), ("zero_offset", "imu_bias")], ids=["senses", "a joint"]
+)
+def test_what_only_senses_show_is_no_reason_for_joints_to_stray(other: str, said: str) -> None:
+    found = evidence(**{"imu_bias": (0.9, 0.01), other: (0.8, 0.01)})
+    found.ranked = list(found.probability.items())
+    chosen = _Chosen(("imu_bias", other), found.alone[other], {"imu_bias": 0.02, other: 0.01}, energy=180.0)
+    assert _verdict(found, ["imu_bias", other], leads("imu_bias", 0.0, 190.0, beside=True), chosen)[0] == said
+
+
+@pytest.mark.parametrize(("closed", "said"), [(0.5, "unexplained"), (0.6, "zero_offset")])
+def test_half_of_a_huge_gap_is_no_explanation_of_a_robot_that_stays_strange(closed: float, said: str) -> None:
+    """A foot that came off is a shorter leg, and an offset of its joints does half of what it does."""
+    found = evidence(zero_offset=(0.93, closed))
+    chosen = _Chosen(("zero_offset",), found.alone["zero_offset"], {"zero_offset": 0.3}, energy=4.5)
+    assert _verdict(found, ["zero_offset"], leads("zero_offset", 0.3, 4.5, beside=True), chosen)[0] == said

@@ -18,7 +18,9 @@ from openant_tools.gap.robot import USUAL_NOISE, Robot
 from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
 
-__all__ = ["COLUMNS", "LATENESS", "Layout", "Signals", "around_switching", "logged", "with_noise"]
+__all__ = [
+    "COLUMNS", "LATENESS", "SKIP_S", "Layout", "Signals", "around_switching", "beside_neighbours", "logged", "with_noise",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -132,11 +134,7 @@ class Layout:
         Args:
             x: (robots, rows, joints) rad, NaN where nobody knows. simulated: the same of the model.
         """
-        known = np.isfinite(x)
-        values = np.where(known, x, np.float32(0))
-        rows = max(3, round(ABOUT_S / float(np.median(np.diff(self.t)))) | 1)
-        usual = _about(values, rows) / np.maximum(_about(known, rows), 1e-6)
-        jump = np.where(known, values - usual, 0)[:, self.t >= SKIP_S]
+        jump = beside_neighbours(x, self.t)[:, self.t >= SKIP_S]
         speed = np.nan_to_num(np.gradient(simulated, self.t, axis=1))[:, self.t >= SKIP_S]
         weight = np.square(speed) + TELLS_RAD_S**2
         late = np.concatenate(
@@ -153,6 +151,15 @@ class Layout:
         change = np.diff(x[:, seen], axis=1)
         out: Floats = np.log10(np.sqrt(np.nanmean(np.square(change), axis=1)) + LEAST * _least(signal))
         return out
+
+
+def beside_neighbours(x: Floats, t: Array) -> Array:
+    """(robots, rows, columns) how far each row lies off the mean of those `ABOUT_S` about it; 0 where nobody knows."""
+    known = np.isfinite(x)
+    values = np.where(known, x, np.float32(0))
+    rows = max(3, round(ABOUT_S / float(np.median(np.diff(t)))) | 1)
+    usual = _about(values, rows) / np.maximum(_about(known, rows), 1e-6)
+    return np.where(known, values - usual, 0)
 
 
 def around_switching(run: Run, joints: Sequence[str]) -> Bools:

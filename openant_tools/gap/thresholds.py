@@ -33,13 +33,18 @@ CLOSES_MOST = 0.75
 ADDS_MUCH = 0.15
 #: share of what a re-fit leaves that a cause leaves of it where closure alone proves it
 PROVES = 0.72
-#: share of what a re-fit leaves that is little enough: no rival is looked for where the best cause leaves no more
-SETTLED = 0.35
+#: share of what a re-fit leaves that is little enough, no rival is looked for where the best cause leaves no more; and floors that
+#: are too many, whatever share they are
+SETTLED, ASTRAY = 0.35, 10.0
 #: gaps that are so many floors, of robots whose energy is so many gates, ask for an explanation; beyond ODD gates no robot of
 #: the build is healthy, whatever the judge says
 LARGE, STRANGE, ODD = 3.0, 3.0, 20.0
 #: energy beyond which what a set leaves is a riddle, and held-out closure below which it then has not explained the gap
 RIDDLE, EXPLAINS_RIDDLE = 10.0, 0.55
+#: share of a scatter that comes back at the same angles beyond which nothing random makes it
+RETURNS = 0.15
+#: share of what is strange that a cause leaves which has no part in it
+STAYS = 0.95
 #: floors that a re-fit of a healthy robot does not leave
 STRAYS = 4.0
 #: times what a re-fit leaves of a servo's other joints that it leaves of a joint where alone suspects are compared

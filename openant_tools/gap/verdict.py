@@ -15,6 +15,7 @@ from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis
 from openant_tools.gap.explain import Explained, Hypothesis, Part, Scene, explain, fit, known_to, robot_with, scene_of
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.patient import Patient, diagnosis_of, found_of, shown, unfitted
+from openant_tools.gap.returning import returning
 from openant_tools.gap.rivals import (
     bodily,
     carries,
@@ -32,6 +33,7 @@ from openant_tools.gap.thresholds import (
     ADDS_ALONE,
     ADDS_MUCH,
     APART,
+    ASTRAY,
     BARELY,
     CERTAIN,
     CLEARLY,
@@ -51,10 +53,12 @@ from openant_tools.gap.thresholds import (
     ODD,
     OTHERS,
     PROVES,
+    RETURNS,
     RIDDLE,
     SECOND,
     SETTLED,
     STANDS_OUT,
+    STAYS,
     STRANGE,
     STRAYS,
     SURELY,
@@ -222,6 +226,8 @@ def _heard(
         dict(zip(names, singles, strict=True)), plain, before, floor, where,
     )  # fmt: skip
     unsettled = 1 - max(map(evidence.closed, singles)) > SETTLED * (1 - evidence.closed(plain))
+    # However much of a huge gap is closed: what is right leaves no such one.
+    unsettled |= min(one.after for one in singles) > ASTRAY * floor
     if judgement.energy > 1 and unsettled and patient.in_time("causes that nobody suspects"):
         found = _rivals(evidence)
         if found:
@@ -231,6 +237,7 @@ def _heard(
     _simplify(evidence)
     _fitted_anew(evidence)
     _told_apart(evidence)
+    _refute(evidence)
     return evidence
 
 
@@ -257,6 +264,28 @@ def _told_apart(evidence: _Evidence) -> None:
             closed, less = (evidence.closed(evidence.alone[name]) for name in (better, other))
             if closed > max(EXPLAINS, less + APART):
                 chance[other], chance[better] = sorted((chance[likeliest], chance[twin]))
+
+
+def _refute(evidence: _Evidence) -> None:
+    """Lost and late commands come anywhere: where nothing else is likely, what comes back at the same angles is not theirs."""
+    patient, chance = evidence.patient, evidence.probability
+    random = [name for name in evidence.explained if catalogue()[name].random and chance[name] > SUSPECT]
+    if not random or any(likely > SECOND and not catalogue()[name].random for name, likely in chance.items()):
+        return
+    coarse, nominal = patient.coarse, patient.coarse.nominal()
+    # On the floor legs trip over each other's errors.
+    runs = [k for k in patient.training if coarse.runs[k].plant.setup is Setup.STAND] or patient.training
+    t = [coarse.runs[k].layout.t for k in runs]
+    for name in random:
+        mine = list(evidence.explained[name].part.joints)
+        share = returning(
+            t, [coarse.runs[k].seen["pos"][0][:, mine] for k in runs], [nominal[k]["pos"][0][:, mine] for k in runs]
+        )
+        if share > RETURNS:
+            chance[name] = SUSPECT
+            patient.refuted.append(
+                f"{name} is refuted: {100 * share:.0f} % of what scatters comes back at the same angles, as a gear's faults do"
+            )
 
 
 def _simplify(evidence: _Evidence) -> None:
@@ -298,7 +327,7 @@ def _led(evidence: _Evidence, names: Sequence[str]) -> _Leader:
     left, eased, energy = None, False, evidence.judgement.energy
     healthy = evidence.plain.after < LARGE * evidence.floor and energy < STRANGE
     needless = healthy and moves_joints(catalogue()[best]) and not beside and gained < BARELY
-    if needless or (energy < 1 and carries(catalogue()[best]) and gained < 0):
+    if needless or (energy < 1 and carries(catalogue()[best]) and gained < -ADDS):
         # Tolerances do what it does, and leave no more than of a healthy robot.
         probability[best] *= max(gained, 0.0) / BARELY
     if probability[best] > MAYBE or proved or max(probability[name] for name in names) > CERTAIN:
@@ -518,8 +547,9 @@ def _verdict(
     noisy = probability[best] > FINDING and any(
         catalogue()[name].random and probability[name] > (CERTAIN if name == best else FINDING) for name in chosen.names
     )
-    # What the judge was sure of before it knew of anything is no riddle where there are two of it.
-    both = len(chosen.names) > 1 and certain and _found_both(evidence, *chosen.names) > 0
+    # What the judge was sure of before it knew of anything is no riddle where there are two of it, one of which joints can show.
+    shows = any(moves_joints(catalogue()[name]) or carries(catalogue()[name]) for name in chosen.names)
+    both = len(chosen.names) > 1 and certain and shows and _found_both(evidence, *chosen.names) > 0
     little = excess(evidence.before, evidence.floor) > LARGE * evidence.floor and chosen.closure.closed < EXPLAINS
     refit = evidence.alone[best].refit
     vanished = _vanished(refit.hypothesis[0], refit.x[0]) and not catalogue()[best].random
@@ -534,7 +564,12 @@ def _verdict(
         # Strange with it, too: a foot that came off is no offset, though nothing known is more like it.
         return UNEXPLAINED, (), ()
     large = chosen.closure.after > STRAYS * evidence.floor
-    if large and not noisy and not both and chosen.energy > RIDDLE and chosen.closure.closed < EXPLAINS_RIDDLE:
+    astray = chosen.closure.after > ASTRAY * evidence.floor
+    riddle = (large and chosen.energy > RIDDLE) or (astray and chosen.energy > STRANGE)
+    # What leaves the gap and all that is strange as they were has no part in either.
+    stays = left is not None and leader.gained < ADDS and left.energy > STAYS * energy
+    idle = stays and len(chosen.names) == 1 and not catalogue()[best].random
+    if riddle and not noisy and not both and (idle or chosen.closure.closed < EXPLAINS_RIDDLE):
         # The better half of a gap that is still a riddle: it only looks like what it was called.
         return UNEXPLAINED, (), ()
     if carries(catalogue()[best]) and chosen.closure.closed < evidence.plain.closed - ADDS:
