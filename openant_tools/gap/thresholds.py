@@ -33,9 +33,8 @@ CLOSES_MOST = 0.75
 ADDS_MUCH = 0.15
 #: share of what a re-fit leaves that a cause leaves of it where closure alone proves it
 PROVES = 0.72
-#: share of what a re-fit leaves that is little enough, no rival is looked for where the best cause leaves no more; and floors that
-#: are too many, whatever share they are
-SETTLED, ASTRAY = 0.35, 10.0
+#: share of what a re-fit leaves that is little enough: no rival is looked for where the best cause leaves no more
+SETTLED = 0.35
 #: gaps that are so many floors, of robots whose energy is so many gates, ask for an explanation; beyond ODD gates no robot of
 #: the build is healthy, whatever the judge says
 LARGE, STRANGE, ODD = 3.0, 3.0, 20.0
@@ -45,8 +44,8 @@ RIDDLE, EXPLAINS_RIDDLE = 10.0, 0.55
 RETURNS = 0.15
 #: share of what is strange that a cause leaves which has no part in it
 STAYS = 0.95
-#: floors that a re-fit of a healthy robot does not leave
-STRAYS = 4.0
+#: floors that a re-fit of a healthy robot does not leave; and that make a riddle of whatever is strange
+STRAYS, ASTRAY = 4.0, 10.0
 #: times what a re-fit leaves of a servo's other joints that it leaves of a joint where alone suspects are compared
 STANDS_OUT = 2.0
 #: sets whose closures differ by less are not told apart; effects in a set that is not told from others, at most

@@ -226,8 +226,6 @@ def _heard(
         dict(zip(names, singles, strict=True)), plain, before, floor, where,
     )  # fmt: skip
     unsettled = 1 - max(map(evidence.closed, singles)) > SETTLED * (1 - evidence.closed(plain))
-    # However much of a huge gap is closed: what is right leaves no such one.
-    unsettled |= min(one.after for one in singles) > ASTRAY * floor
     if judgement.energy > 1 and unsettled and patient.in_time("causes that nobody suspects"):
         found = _rivals(evidence)
         if found:
