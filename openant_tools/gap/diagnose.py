@@ -103,7 +103,8 @@ def diagnose(
     first = shown(judgement, protocol)
     # No template was as warm as this robot was in each run: what a thermometer shows is asked about wherever it may sit.
     warmed = [HEAT] if protocol.warmed_c > WARMED_C else []
-    if first[0][1] < DOUBT and judgement.energy < STRANGE and not warmed:
+    # Nor is a thermometer a reason to ask where nothing differs from healthy robots.
+    if first[0][1] < DOUBT and judgement.energy < (1.0 if warmed else STRANGE):
         tell(1.0, "done")
         return _healthy(patient, judgement, first)
     scenes = _scenes(prepared, coarse, found, training)
