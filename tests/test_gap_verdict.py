@@ -190,3 +190,27 @@ def test_half_of_a_huge_gap_is_no_explanation_of_a_robot_that_stays_strange(clos
     found = evidence(zero_offset=(0.93, closed))
     chosen = _Chosen(("zero_offset",), found.alone["zero_offset"], {"zero_offset": 0.3}, energy=4.5)
     assert _verdict(found, ["zero_offset"], leads("zero_offset", 0.3, 4.5, beside=True), chosen)[0] == said
+
+
+@pytest.mark.parametrize(
+    ("energy", "sure", "said"),
+    [(1.4, 0.97, "action_delay"), (1.4, 0.7, "none"), (0.9, 0.97, "none"), (4.0, 0.7, "action_delay")],
+)
+def test_where_the_judge_is_sure_of_something_fits_may_say_which_it_is(energy: float, sure: float, said: str) -> None:
+    """A delay that a judge takes for a lag closes what the lag does not."""
+    found = evidence(action_delay=(0.1, 0.74), actuator_lag=(sure, 0.47))
+    found = dataclasses.replace(found, judgement=Judgement({}, energy, {}), floor=0.2)
+    leader = _Leader("action_delay", gained=0.1, beside=False, proved=False, left=None, eased=False)
+    chosen = _Chosen(("action_delay",), found.alone["action_delay"], {"action_delay": 0.6}, energy=0.9)
+    assert _verdict(found, ["action_delay", "actuator_lag"], leader, chosen)[0] == said
+
+
+@pytest.mark.parametrize(("chance", "said"), [(0.98, "cable_drag"), (0.7, "unexplained")])
+def test_joints_that_move_away_refute_what_carries_the_robot_unless_it_is_certain(chance: float, said: str) -> None:
+    found = evidence(cable_drag=(chance, 0.78))
+    found = dataclasses.replace(
+        found, judgement=Judgement({}, 2.4, {}), plain=dataclasses.replace(found.plain, closed=0.87)
+    )
+    leader = _Leader("cable_drag", gained=-0.09, beside=True, proved=False, left=None, eased=False)
+    chosen = _Chosen(("cable_drag",), found.alone["cable_drag"], {"cable_drag": -0.09}, energy=2.0)
+    assert _verdict(found, ["cable_drag"], leader, chosen)[0] == said

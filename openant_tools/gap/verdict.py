@@ -570,7 +570,7 @@ def _verdict(
     if riddle and not noisy and not both and (idle or chosen.closure.closed < EXPLAINS_RIDDLE):
         # The better half of a gap that is still a riddle: it only looks like what it was called.
         return UNEXPLAINED, (), ()
-    if carries(catalogue()[best]) and chosen.closure.closed < evidence.plain.closed - ADDS:
+    if not certain and carries(catalogue()[best]) and chosen.closure.closed < evidence.plain.closed - ADDS:
         # Joints show little of what carries the robot, but they do not move farther from their model with it.
         return UNEXPLAINED, (), ()
     doubted = [
@@ -615,7 +615,7 @@ def _sure(evidence: _Evidence, names: Sequence[str], leader: _Leader) -> bool:
             and evidence.closed(evidence.alone[best]) > EXPLAINS
         )
         # Where the judge is sure of something, and the log is strange, which of its suspects it is the fits may say.
-        or (energy > STRANGE and max(probability[name] for name in names) > FINDING)
+        or max(probability[name] for name in names) > (FINDING if energy > STRANGE else CERTAIN if energy > 1 else 1.0)
     )
 
 
