@@ -297,6 +297,7 @@ def test_kill_minus_nine_costs_no_more_than_since_the_last_save(tmp_path):
         process.send_signal(signal.SIGKILL)
         process.wait()
     step = saved()
+    assert step > 400
     result = train(ant(), folder=tmp_path, steps=step + 50, seed=1, settings=QUICK)
     assert result.step == step + 50
     # What the killed process had written beyond its last checkpoint is gone; what came after is what it would have been.

@@ -566,8 +566,8 @@ def _verdict(
     riddle = (large and chosen.energy > RIDDLE) or (astray and chosen.energy > STRANGE)
     # What leaves the gap and all that is strange as they were has no part in either.
     stays = left is not None and leader.gained < ADDS and left.energy > STAYS * energy
-    idle = stays and len(chosen.names) == 1 and not catalogue()[best].random
-    if riddle and not noisy and not both and (idle or chosen.closure.closed < EXPLAINS_RIDDLE):
+    no_part = stays and len(chosen.names) == 1 and not catalogue()[best].random
+    if riddle and not noisy and not both and (no_part or chosen.closure.closed < EXPLAINS_RIDDLE):
         # The better half of a gap that is still a riddle: it only looks like what it was called.
         return UNEXPLAINED, (), ()
     if not certain and carries(catalogue()[best]) and chosen.closure.closed < evidence.plain.closed - ADDS:
@@ -604,6 +604,7 @@ def _idle(evidence: _Evidence, chosen: _Chosen, name: str) -> bool:
 def _sure(evidence: _Evidence, names: Sequence[str], leader: _Leader) -> bool:
     """Whether there is any finding at all."""
     probability, energy, best = evidence.probability, evidence.judgement.energy, leader.name
+    surest = max(probability[name] for name in names)
     if probability[best] < CERTAIN and not evidence.explained[best].beyond_tolerance:
         return False
     return (
@@ -615,7 +616,8 @@ def _sure(evidence: _Evidence, names: Sequence[str], leader: _Leader) -> bool:
             and evidence.closed(evidence.alone[best]) > EXPLAINS
         )
         # Where the judge is sure of something, and the log is strange, which of its suspects it is the fits may say.
-        or max(probability[name] for name in names) > (FINDING if energy > STRANGE else CERTAIN if energy > 1 else 1.0)
+        or (energy > STRANGE and surest > FINDING)
+        or (energy > 1 and surest > CERTAIN)
     )
 
 
