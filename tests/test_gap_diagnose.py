@@ -12,7 +12,8 @@ from plants import BENCH, ENCODER_RAD, drive, pendulum, run_of, sweep, write
 
 from openant_tools.errors import BadInput
 from openant_tools.gap.diagnose import diagnose
-from openant_tools.gap.diagnosis import NONE, Diagnosis, Found, Span, read_diagnosis
+from openant_tools.gap.diagnosis import NONE, UNEXPLAINED, Diagnosis, Found, Span, read_diagnosis
+from openant_tools.gap.words import sentence, standing
 from openant_tools.recording.run import Run
 
 ROBOTS, RATE_HZ = 768, 50
@@ -53,6 +54,18 @@ def test_a_robot_within_tolerance_is_healthy(model: Path) -> None:
     )
     assert found.verdict == NONE
     assert found.selected == ()
+
+
+def test_a_healthy_robot_that_warmed_up_is_answered_without_fits(model: Path) -> None:
+    """A thermometer is a reason to ask only where something differs from healthy robots."""
+    runs = []
+    for warmer_c, run in zip((0.0, 3.0, 6.0), recorded(pendulum()), strict=True):
+        columns = {**run.columns, "temp.joint": np.full(len(run.t), 30.0 + warmer_c)}
+        runs.append(dataclasses.replace(run, columns=columns))
+    found = diagnose(runs, model, robots=ROBOTS)
+    assert found.gap["energy"] < 1
+    assert found.verdict == NONE
+    assert all(one.gap_closed is None for one in found.effects), "nothing was fitted"
 
 
 def test_late_commands_are_named_and_close_the_gap(model: Path) -> None:
@@ -111,3 +124,16 @@ def test_a_diagnosis_survives_its_json(tmp_path: Path) -> None:
     path.write_text("{}")
     with pytest.raises(BadInput, match="no diagnosis"):
         read_diagnosis(path)
+
+
+def test_what_a_signature_refutes_is_not_called_closest() -> None:
+    lost, sticking = (
+        Found(name, ("knee",), {}, 0.1, 0.3, 0.2, 0.4, True) for name in ("command_dropout", "stribeck_friction")
+    )
+    found = Diagnosis(
+        "m.xml", ("a", "b"), (), UNEXPLAINED, 0.9, (lost, sticking), (), (), None,
+        {"before": 0.01, "after": 0.008, "floor": 0.001}, (), refuted={"command_dropout": "it comes back at the same angles"},
+    )  # fmt: skip
+    assert "closest is stribeck_friction" in sentence(found)
+    assert standing(found, lost) == "refuted: it comes back at the same angles"
+    assert standing(found, sticking) == "closest, and not enough"

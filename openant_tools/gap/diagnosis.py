@@ -62,6 +62,7 @@ class Diagnosis:
         where: shares of the excess, largest first, with what the improved model leaves there, if there is one.
         rest: what that leaves, and what it follows (`gap.rest.Following`); empty where nothing was fitted.
         calibration: kind → joint → factor or amount that the re-fit within tolerance found, for the improved model.
+        refuted: effect → what signature speaks against it, in words.
         notes: what it rests on, and what more signals would add.
     """
 
@@ -78,6 +79,7 @@ class Diagnosis:
     where: Sequence[Mapping[str, Any]]
     calibration: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     removal: Mapping[str, float] = field(default_factory=dict)
+    refuted: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     rest: Mapping[str, Any] = field(default_factory=dict)
 
@@ -115,6 +117,7 @@ class Diagnosis:
             "calibration": {kind: dict(values) for kind, values in self.calibration.items()},
             "removal": {name: _number(value) for name, value in self.removal.items()},
             "rest": dict(self.rest),
+            "refuted": dict(self.refuted),
             "notes": list(self.notes),
         }
 
@@ -157,7 +160,7 @@ def read_diagnosis(path: Path) -> Diagnosis:
             selected=tuple(text["selected"]), ambiguous_with=tuple(tuple(group) for group in text["ambiguous_with"]),
             next_experiment=text["next_experiment"], gap=text["gap"], where=text["where"],
             calibration=text.get("calibration", {}), removal=text.get("removal", {}), notes=tuple(text.get("notes", ())),
-            rest=text.get("rest", {}),
+            rest=text.get("rest", {}), refuted=text.get("refuted", {}),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError) as error:
         raise BadInput(

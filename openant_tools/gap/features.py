@@ -12,14 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
+from openant_tools.gap.arrivals import KINDS_OF_ONE, Arrivals
+from openant_tools.gap.neighbours import beside_neighbours
 from openant_tools.gap.robot import USUAL_NOISE, Robot
 from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
 
 __all__ = [
-    "COLUMNS", "LATENESS", "SKIP_S", "Layout", "Signals", "around_switching", "beside_neighbours", "logged", "with_noise",
+    "ARRIVAL", "COLUMNS", "LATENESS", "SKIP_S", "Layout", "Signals", "around_switching", "logged", "with_noise",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -49,8 +50,8 @@ LETS_GO_S = 0.03
 OWN_SCALE = 2.0
 #: least size of a scatter, as a share of the signal's noise
 LEAST = 0.3
-#: what the features of lateness are called; s about a row that it is compared with; rad/s, a speed from which positions tell it
-LATENESS, ABOUT_S, TELLS_RAD_S = "lateness", 0.1, 1.0
+#: what the features of rows that are late are called, and those of commands; rad/s, a speed from which positions tell the former
+LATENESS, ARRIVAL, TELLS_RAD_S = "lateness", "arrival", 1.0
 #: s, the least size of a scatter of lateness
 LEAST_LATE_S = 1e-4
 
@@ -64,6 +65,7 @@ class Layout:
         signals: which, in order; positions of joints among them.
         seconds: how long the protocol's run is: a log that goes on longer is cut there.
         unsure: (rows, joints) as `around_switching`.
+        arrivals: the run's commands; None where nothing is asked of when they came.
     """
 
     t: Array
@@ -72,6 +74,7 @@ class Layout:
     signals: tuple[str, ...]
     seconds: float
     unsure: Bools
+    arrivals: Arrivals | None = None
 
     def blocks(self, signal: str) -> Array:
         """Edges of the blocks of a signal, s."""
@@ -92,12 +95,16 @@ class Layout:
             out[signal] = ["mean"] * (count * n) + ["size"] * n + ["rough"] * n
         n = self.joints + 1
         out[LATENESS] = ["size"] * n + ["peak"] * n
+        if self.arrivals is not None:
+            out[ARRIVAL] = [kind for kind in KINDS_OF_ONE for _ in range(n)] + ["shared"]
         return out
 
     def joints_of(self, signal: str) -> list[int]:
         """The joint of each of a signal's features, in the order of `features`; −1 for those of no joint, or of all."""
         if signal == LATENESS:
             return 2 * [*range(self.joints), -1]
+        if signal == ARRIVAL:
+            return len(KINDS_OF_ONE) * [*range(self.joints), -1] + [-1]
         count = len(self.groups()[signal])
         return [-1] * count if signal in COLUMNS else [k % self.joints for k in range(count)]
 
@@ -105,7 +112,7 @@ class Layout:
         """(robots, features): block means, and logarithms of sizes, of how logs differ from what the model does.
 
         Args:
-            seen, simulated: (robots, rows, columns) of each signal; the model may be one for all robots.
+            seen: (robots, rows, columns) of each signal. simulated: the same of the model, one for all robots.
         """
         parts, apart = [], differences(seen, simulated, self.signals)
         if self.unsure.any():
@@ -123,6 +130,8 @@ class Layout:
             rough = self._roughness(signal, x)
             parts += [np.nan_to_num(means).reshape(n, -1), np.nan_to_num(size), np.nan_to_num(rough)]
         parts += self._late(apart["pos"], simulated["pos"])
+        if self.arrivals is not None:
+            parts += self.arrivals(apart["pos"], simulated["pos"][0])
         return np.concatenate(parts, axis=1).astype(np.float32)
 
     def _late(self, x: Floats, simulated: Floats) -> list[Floats]:
@@ -151,15 +160,6 @@ class Layout:
         change = np.diff(x[:, seen], axis=1)
         out: Floats = np.log10(np.sqrt(np.nanmean(np.square(change), axis=1)) + LEAST * _least(signal))
         return out
-
-
-def beside_neighbours(x: Floats, t: Array) -> Array:
-    """(robots, rows, columns) how far each row lies off the mean of those `ABOUT_S` about it; 0 where nobody knows."""
-    known = np.isfinite(x)
-    values = np.where(known, x, np.float32(0))
-    rows = max(3, round(ABOUT_S / float(np.median(np.diff(t)))) | 1)
-    usual = _about(values, rows) / np.maximum(_about(known, rows), 1e-6)
-    return np.where(known, values - usual, 0)
 
 
 def around_switching(run: Run, joints: Sequence[str]) -> Bools:
@@ -253,12 +253,6 @@ def with_noise(
             between = np.array([robot.noise.get("volt_between", 0.0) for robot in robots], np.float32)[:, None, None]
             y = y + step * between
         out[name] = (np.round(y / step) * step if step > 0 else y).astype(np.float32)
-    return out
-
-
-def _about(x: Floats | Bools, rows: int) -> Array:
-    """(robots, rows, columns) means over so many rows about each, of nothing beyond the first and the last."""
-    out: Array = uniform_filter1d(x.astype(np.float64), rows, axis=1, mode="constant")
     return out
 
 

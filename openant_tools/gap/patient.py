@@ -41,7 +41,7 @@ class Patient:
         coarse: its protocol, in the steps and from the starts of the simulated robots that it is compared with.
         prior: causes that its builder declared to be likely, whatever the runs say.
         began: when its diagnosis did, s of the clock that only goes forward. given_up: what there was no time for.
-        refuted: what a signature speaks against, in words.
+        refuted: cause → what signature speaks against it, in words.
     """
 
     protocol: Protocol
@@ -57,7 +57,7 @@ class Patient:
     prior: Sequence[str] = ()
     began: float = dataclasses.field(default_factory=time.monotonic)
     given_up: list[str] = dataclasses.field(default_factory=list)
-    refuted: list[str] = dataclasses.field(default_factory=list)
+    refuted: dict[str, str] = dataclasses.field(default_factory=dict)
 
     def in_time(self, wanted: str, share: float = 1.0) -> bool:
         """Whether there is time for what is wanted; if not, the diagnosis will say so.
@@ -129,6 +129,7 @@ def diagnosis_of(
         where=where,
         calibration=calibration,
         removal=removal,
+        refuted=dict(patient.refuted),
         notes=(*_notes(patient), *notes),
         rest={} if rest is None else rest.as_json(),
     )
@@ -141,7 +142,7 @@ def _notes(patient: Patient) -> tuple[str, ...]:
         f"judged by {len(patient.prepared.cases)} simulated robots that played these commands",
         "held-out runs as given" if patient.hold_out else "each run left out of the fits in turn",
         *(f"{wanted} were not tried: {PATIENCE_S:.0f} s were over on this computer" for wanted in patient.given_up),
-        *patient.refuted,
+        *(f"{name} is refuted: {why}" for name, why in patient.refuted.items()),
     ]
     if not patient.protocol.reference.floor:
         notes.append("no run on the floor: body, contact and environment cannot show")

@@ -17,7 +17,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.features import COLUMNS, LATENESS, Floats, Layout, around_switching, logged
+from openant_tools.gap.arrivals import Arrivals
+from openant_tools.gap.features import ARRIVAL, COLUMNS, LATENESS, SKIP_S, Floats, Layout, around_switching, logged
 from openant_tools.gap.robot import Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.floor import resolution
@@ -78,9 +79,10 @@ class Played:
 
     @cached_property
     def layout(self) -> Layout:
+        t = self.run.t - self.run.t[0]
         return Layout(
-            self.run.t - self.run.t[0], self.plant.setup, len(self.plant.joints), self.signals, self.run.duration_s,
-            around_switching(self.run, self.plant.joints),
+            t, self.plant.setup, len(self.plant.joints), self.signals, self.run.duration_s,
+            around_switching(self.run, self.plant.joints), Arrivals.of(self.run, self.plant, t >= SKIP_S),
         )  # fmt: skip
 
     def features(self, nominal: Mapping[str, Floats]) -> tuple[Floats, NDArray[np.bool_]]:
@@ -282,8 +284,8 @@ class Protocol:
 
 
 def _read_from(signal: str) -> str:
-    """The signal that features are of: how late rows are is read from positions."""
-    return "pos" if signal == LATENESS else signal
+    """The signal that features are of: how late rows and commands are is read from positions."""
+    return "pos" if signal in (LATENESS, ARRIVAL) else signal
 
 
 def same(one: Array, other: Array) -> bool:

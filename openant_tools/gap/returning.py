@@ -11,7 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.features import SKIP_S, Floats, beside_neighbours
+from openant_tools.gap.features import SKIP_S, Floats
+from openant_tools.gap.neighbours import beside_neighbours
 
 __all__ = ["returning"]
 

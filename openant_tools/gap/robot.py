@@ -37,6 +37,8 @@ class Form:
             servos measure their own joint, cannot.
         tells_duty: what a servo says of its torque is what it puts on its motor, which back-EMF takes nothing from.
         tells_asked: and it is what a healthy motor would make of it: a servo knows its current, not what becomes of it.
+        one_packet: one packet brings every joint its command, so that one that is late is late for all; else each by itself.
+        never_early: no command acts before its usual time, however its clock scatters.
     """
 
     integrator: int = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
@@ -51,6 +53,8 @@ class Form:
     loop_behind: bool = True
     tells_duty: bool = True
     tells_asked: bool = False
+    one_packet: bool = True
+    never_early: bool = False
 
 
 @dataclass(frozen=True)

@@ -355,10 +355,11 @@ class _Batch:
         else:
             mean = np.empty((len(edges) - 1, len(plant.joints)))
             times = commands.times
-            jitter = self._rng.normal(0.0, robot.jitter_s, len(times)) if robot.jitter_s > 0 else 0.0
-            late = np.maximum.accumulate(times + jitter)
+            one_packet = robot.form is None or robot.form.one_packet
+            packet = self._late(robot, times) if one_packet else None
             shared = self._lost(robot, times, 0) if robot.shared_dropout else None
             for j in range(len(plant.joints)):
+                late = packet if packet is not None else self._late(robot, times)
                 lost = shared if shared is not None else self._lost(robot, times, j)
                 column = dataclasses.replace(commands, times=late, values=_without(commands.values[:, j : j + 1], lost))
                 mean[:, j] = column.mean(edges - robot.delay[j])[:, 0]
@@ -371,6 +372,16 @@ class _Batch:
                 whole = np.concatenate([before, mean[:, filtered]])
                 mean[:, filtered] = _filtered(whole, h / float(robot.lag[filtered]))[len(before) :]
         return mean
+
+    def _late(self, robot: Robot, times: Array) -> Array:
+        """When commands that were due at these times act, in order."""
+        if robot.jitter_s <= 0:
+            return times
+        jitter = self._rng.normal(0.0, robot.jitter_s, len(times))
+        if robot.form is not None and robot.form.never_early:
+            jitter = np.maximum(jitter, 0.0)
+        late: Array = np.maximum.accumulate(times + jitter)
+        return late
 
     def _lost(self, robot: Robot, times: Array, j: int) -> NDArray[np.bool_]:
         """Which commands never arrive: stretches of up to `longest_s`, together `dropout` of all."""

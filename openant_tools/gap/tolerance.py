@@ -121,6 +121,8 @@ def random_form(rng: np.random.Generator, encoder_rad: float) -> Form:
         loop_behind=bool(rng.random() < 0.9),
         tells_duty=bool(rng.random() < 0.5),
         tells_asked=bool(rng.random() < 0.5),
+        one_packet=bool(rng.random() < 0.6),
+        never_early=bool(rng.random() < 0.4),
     )  # fmt: skip
 
 

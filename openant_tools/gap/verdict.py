@@ -276,13 +276,14 @@ def _refute(evidence: _Evidence) -> None:
     t = [coarse.runs[k].layout.t for k in runs]
     for name in random:
         mine = list(evidence.explained[name].part.joints)
-        share = returning(
-            t, [coarse.runs[k].seen["pos"][0][:, mine] for k in runs], [nominal[k]["pos"][0][:, mine] for k in runs]
-        )
+        known = [
+            np.where(coarse.runs[k].layout.unsure, np.float32(np.nan), coarse.runs[k].seen["pos"][0]) for k in runs
+        ]
+        share = returning(t, [one[:, mine] for one in known], [nominal[k]["pos"][0][:, mine] for k in runs])
         if share > RETURNS:
             chance[name] = SUSPECT
-            patient.refuted.append(
-                f"{name} is refuted: {100 * share:.0f} % of what scatters comes back at the same angles, as a gear's faults do"
+            patient.refuted[name] = (
+                f"{100 * share:.0f} % of what scatters comes back at the same angles, as a gear's faults do"
             )
 
 

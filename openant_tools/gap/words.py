@@ -25,7 +25,7 @@ def sentence(found: Diagnosis) -> str:
         candidates = sets or " or ".join(one.effect for one in found.effects[:2])
         return f"The gap is real, but these runs cannot tell its causes apart: {candidates} ({sure})."
     if found.verdict == UNEXPLAINED:
-        best = found.effects[0] if found.effects else None
+        best = _closest(found)
         closest = "" if best is None else f"; closest is {best.effect}" + (
             "" if best.gap_closed is None else f", which closes {100 * best.gap_closed:.0f} % of it"
         )  # fmt: skip
@@ -62,7 +62,9 @@ def closed(found: Diagnosis) -> float:
 
 def standing(found: Diagnosis, one: Found) -> str:
     """Why it is in the answer, or not."""
-    if found.verdict == UNEXPLAINED and one.effect == found.effects[0].effect:
+    if one.effect in found.refuted:
+        return f"refuted: {found.refuted[one.effect]}"
+    if found.verdict == UNEXPLAINED and one is _closest(found):
         return "closest, and not enough"
     if one.effect in found.selected:
         lost = found.removal.get(one.effect)
@@ -74,6 +76,11 @@ def standing(found: Diagnosis, one: Found) -> str:
     if one.gap_closed is not None and one.gap_closed < 0.1:
         return "closes nothing by itself on held-out runs"
     return "not needed beside what was selected"
+
+
+def _closest(found: Diagnosis) -> Found | None:
+    """Of the effects considered, the best that no signature speaks against."""
+    return next((one for one in found.effects if one.effect not in found.refuted), None)
 
 
 def what_next(found: Diagnosis) -> str:
