@@ -40,6 +40,8 @@ SETTLED = 0.35
 LARGE, STRANGE, ODD = 3.0, 3.0, 20.0
 #: energy beyond which what a set leaves is a riddle, and held-out closure below which it then has not explained the gap
 RIDDLE, EXPLAINS_RIDDLE = 10.0, 0.55
+#: share of what is strange, left where windows put a cause, that it leaves where features put it: there it stays
+FAR_LESS = 0.5
 #: share of a scatter that comes back at the same angles beyond which nothing random makes it
 RETURNS = 0.15
 #: share of what is strange that a cause leaves which has no part in it

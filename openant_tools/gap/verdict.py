@@ -42,6 +42,7 @@ from openant_tools.gap.thresholds import (
     EASES,
     EXPLAINS,
     EXPLAINS_RIDDLE,
+    FAR_LESS,
     FAR_WORSE,
     FINDING,
     LARGE,
@@ -213,11 +214,14 @@ def _heard(
     windows.look(training)
     where = windows.strained(training, STANDS_OUT) or range(len(patient.protocol.joints))
     sited = placed(windows, judgement, explained, training)
+    _kept_in_place(patient, windows, explained, sited, probability)
     windows.settle(
         _beside(windows, sited.values(), training), training, lambda: patient.in_time("other friction cones", EARLY)
     )
     likely_first = sorted(explained, key=lambda name: -probability[name])
     names = _worth_fitting(likely_first, {name: cost for name, (_, cost) in sited.items()})
+    # Causes that look alike have to be compared.
+    names += [name for name in catalogue()[likely_first[0]].alike if name in sited and name not in names]
     explained = {name: sited[name][0] for name in names}
     starts = [nothing(windows), *(_start(windows, [explained[name]], training) for name in names)]
     before, floor, (plain, *singles) = _closures(windows, patient, starts)
@@ -237,6 +241,25 @@ def _heard(
     _told_apart(evidence)
     _refute(evidence)
     return evidence
+
+
+def _kept_in_place(
+    patient: Patient, windows: Windows, explained: Mapping[str, Explained], sited: dict[str, tuple[Explained, float]],
+    probability: Mapping[str, float],
+) -> None:  # fmt: skip
+    """What is certain stays where features put it, if that takes far more of what is strange away than where windows do.
+
+    Windows see what is largest. Beside a second cause that is larger, the first would do harm wherever it sits, and least where it
+    does least.
+    """
+    for name, (there, _) in sited.items():
+        here = explained[name]
+        if probability[name] < CERTAIN or here.part == there.part or not moves_joints(catalogue()[name]):
+            continue
+        energy, instead = (_left(patient, [((one.part,), (one.x,))]).energy for one in (here, there))
+        if energy < FAR_LESS * instead:
+            (cost,) = windows.left([unmoved(windows, [here.part], [here.x])], patient.training)
+            sited[name] = here, float(cost)
 
 
 def _fitted_anew(evidence: _Evidence) -> None:
@@ -341,15 +364,15 @@ def _without(evidence: _Evidence, name: str) -> Judgement:
     sizes = [explained.x]
     if not catalogue()[name].random:
         sizes += [x for x in evidence.alone[name].refit.x if x != explained.x]
-    return _left(evidence, [((explained.part,), (x,)) for x in sizes])
+    return _left(evidence.patient, [((explained.part,), (x,)) for x in sizes])
 
 
-def _left(evidence: _Evidence, causes: Sequence[tuple[Hypothesis, Sequence[Mapping[str, float]]]]) -> Judgement:
+def _left(patient: Patient, causes: Sequence[tuple[Hypothesis, Sequence[Mapping[str, float]]]]) -> Judgement:
     """What the judge says against the model that has causes, in those of some sizes that leave least that is strange.
 
     Fits to features and to windows give them different ones: where two causes act, features give the first what belongs to both.
     """
-    patient, said = evidence.patient, []
+    said = []
     for parts, x in causes:
         left = patient.coarse.features(robot_with(patient.coarse.reference, parts, x))
         said.append(patient.judge.say(np.concatenate([left[k][0][left[k][1]] for k in patient.training])))
@@ -367,7 +390,7 @@ def _strangeness(evidence: _Evidence, chosen: _Chosen, left: Judgement) -> float
     found = dict(zip((part.cause for part in chosen.closure.refit.hypothesis), chosen.closure.refit.x, strict=True))
     parts = tuple(one.part for one in known)
     sizes = [[one.x for one in known], [found.get(one.part.cause, one.x) for one in known]]
-    return _left(evidence, [(parts, x) for x in sizes]).energy
+    return _left(evidence.patient, [(parts, x) for x in sizes]).energy
 
 
 def _joined(evidence: _Evidence, leader: _Leader, left: Judgement, chosen: _Chosen) -> _Chosen:
@@ -380,34 +403,41 @@ def _joined(evidence: _Evidence, leader: _Leader, left: Judgement, chosen: _Chos
     starts = [_start(windows, [explained[leader.name], one], training) for one in fitted]
     pairs = evidence.closures(starts)[2] if starts else []
     together = {one.part: both for one, both in zip(fitted, pairs, strict=True)}
-    second: tuple[float, Explained, ClosureByJoint] | None = None
+    # What a second cause adds shows where a random leader does not drown it.
+    calm = {part: (both, whole) for part, both in together.items()}
+    if catalogue()[leader.name].random and fitted:
+        singles = evidence.closures([_start(windows, [one], training) for one in fitted])[2]
+        calm = {one.part: (single, evidence.plain) for one, single in zip(fitted, singles, strict=True)}
+    second: tuple[float, Explained, ClosureByJoint, float] | None = None
     for one in tried:
         name = one.part.cause
         before = _found_both(evidence, leader.name, name)
         chance = max(left.probability[name], before)
         both = together.get(one.part, whole)
+        with_it, without_it = calm.get(one.part, (whole, whole))
         # What moves no joint, or not twice alike, no closure can prove: there the judge's word is enough.
         moves = moves_joints(catalogue()[name]) and not catalogue()[name].beside_joints_at(both.refit.x[-1])
         # Unless it takes away so much of what is strange that nothing within tolerance does.
-        much = (moves or carries(catalogue()[name])) and 1 - both.closed < PROVES * (1 - whole.closed)
+        much = (moves or carries(catalogue()[name])) and 1 - with_it.closed < PROVES * (1 - without_it.closed)
         # What looks like the leader is hardly there beside it, whatever a judge says that cannot tell them apart.
         alike = name in catalogue()[leader.name].alike
         has_to_add = ADDS_MUCH if alike else _has_to_add(left.probability[name], before, moves=moves)
         if one.part == plain:
             has_to_add = min(has_to_add, ADDS)
-        if much or both.closed - whole.closed > has_to_add:
-            how = _rank(chance, 1 - both.closed)
+        adds = with_it.closed - without_it.closed
+        if much or adds > has_to_add:
+            how = _rank(chance, 1 - with_it.closed)
             if second is None or how > second[0]:
-                second = how, one, both
+                second = how, one, both, adds
     if second is None:
         return chosen
-    _, one, both = second
+    _, one, both, adds = second
     name = one.part.cause
     explained[name] = one if any(one.std.values()) else known_to(scene_of(name, evidence.scenes), one)
     known = name in evidence.alone and not catalogue()[name].random
     without = evidence.alone[name] if known else evidence.plain
     probability[name] = max(probability[name], left.probability[name])
-    removal = {leader.name: both.closed - without.closed, name: both.closed - whole.closed}
+    removal = {leader.name: both.closed - without.closed, name: adds}
     return _Chosen((leader.name, name), both, removal)
 
 
@@ -612,7 +642,7 @@ def _sure(evidence: _Evidence, names: Sequence[str], leader: _Leader) -> bool:
         probability[best] > (SECOND if energy > STRANGE else FINDING)
         or leader.eased
         or (
-            (energy > 1 or evidence.plain.after > STRAYS * evidence.floor)
+            (energy > 1 or evidence.plain.after > STRAYS * evidence.floor or probability[best] > MAYBE)
             and leader.proved
             and evidence.closed(evidence.alone[best]) > EXPLAINS
         )
