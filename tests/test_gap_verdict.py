@@ -8,12 +8,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from openant_tools.gap import verdict as of_verdict
 from openant_tools.gap.cause import catalogue
 from openant_tools.gap.closure import ClosureByJoint, Refit
 from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.patient import Patient
-from openant_tools.gap.verdict import _Chosen, _Evidence, _Leader, _plain, _told_apart, _verdict
+from openant_tools.gap.verdict import _Chosen, _Evidence, _Leader, _led, _plain, _taken_in, _told_apart, _verdict
 
 
 class Builder:
@@ -23,6 +24,7 @@ class Builder:
 
     def __init__(self, *prior: str) -> None:
         self.prior = prior
+        self.refuted: dict[str, str] = {}
 
 
 def evidence(*prior: str, **suspects: tuple[float, float]) -> _Evidence:
@@ -76,6 +78,44 @@ def test_what_looks_unlike_keeps_what_the_judge_gave_it() -> None:
 def test_looking_alike_is_mutual() -> None:
     for name, cause in catalogue().items():
         assert all(name in catalogue()[twin].alike for twin in cause.alike)
+
+
+@pytest.mark.parametrize(
+    ("jitter", "dropout", "leads"),
+    [(0.93, 0.92, "command_dropout"), (0.9, 0.3, "clock_jitter"), (0.4, 0.6, "command_dropout")],
+)
+def test_lost_commands_are_late_ones_too_and_not_the_other_way_round(jitter: float, dropout: float, leads: str) -> None:
+    found = evidence(clock_jitter=(jitter, 0.1), command_dropout=(dropout, 0.1))
+    _taken_in(found)
+    assert found.names[0] == leads
+    assert list(found.patient.refuted) == (["clock_jitter"] if min(jitter, dropout) > 0.5 else [])
+
+
+def of_healthy_build(chance: float, closed: float, plain: float, energy: float, floor: float) -> _Evidence:
+    found = evidence(stribeck_friction=(chance, closed))
+    without = dataclasses.replace(evidence(payload=(0.1, plain)).alone["payload"], refit=found.plain.refit)
+    return dataclasses.replace(found, judgement=Judgement({}, energy, {}), plain=without, floor=floor)
+
+
+@pytest.mark.parametrize(("chance", "believed"), [(0.97, 0.97), (0.7, 0.0)])
+def test_what_tolerances_do_as_well_is_nothing_unless_it_is_certain(
+    monkeypatch: pytest.MonkeyPatch, chance: float, believed: float
+) -> None:
+    monkeypatch.setattr(of_verdict, "_without", lambda found, name: Judgement({}, 1.0, {}))
+    found = of_healthy_build(chance, closed=0.78, plain=0.79, energy=1.9, floor=0.1)
+    _led(found, found.names)
+    assert found.probability["stribeck_friction"] == pytest.approx(believed)
+
+
+@pytest.mark.parametrize(("energy", "floor", "proved"), [(1.2, 0.2, False), (5.0, 0.2, True), (1.2, 0.1, True)])
+def test_a_third_of_what_healthy_robots_leave_proves_nothing(
+    monkeypatch: pytest.MonkeyPatch, energy: float, floor: float, proved: bool
+) -> None:
+    monkeypatch.setattr(of_verdict, "_without", lambda found, name: Judgement({}, 1.0, {}))
+    monkeypatch.setattr(of_verdict, "nothing", lambda windows: found.plain.refit)
+    monkeypatch.setattr(_Evidence, "closures", lambda found, starts: (1.0, floor, [found.plain]))
+    found = of_healthy_build(0.05, closed=0.66, plain=0.5, energy=energy, floor=floor)
+    assert _led(found, found.names).proved is proved
 
 
 def verdict_of(found: _Evidence, leads: str) -> tuple[str, tuple[str, ...], tuple[tuple[str, ...], ...]]:
@@ -214,3 +254,16 @@ def test_joints_that_move_away_refute_what_carries_the_robot_unless_it_is_certai
     leader = _Leader("cable_drag", gained=-0.09, beside=True, proved=False, left=None, eased=False)
     chosen = _Chosen(("cable_drag",), found.alone["cable_drag"], {"cable_drag": -0.09}, energy=2.0)
     assert _verdict(found, ["cable_drag"], leader, chosen)[0] == said
+
+
+@pytest.mark.parametrize(
+    ("expected", "adds", "first"), [(0.1, 0.05, "link_mass"), (0.4, 0.05, "payload"), (0.1, 0.2, "payload")]
+)
+def test_what_shows_only_in_what_a_certain_cause_leaves_does_not_come_first(
+    expected: float, adds: float, first: str
+) -> None:
+    found = evidence(link_mass=(0.95, 0.77), payload=(0.51, 0.79))
+    found.ranked = [("link_mass", 0.95), ("payload", expected)]
+    leader = _Leader("link_mass", gained=0.6, beside=False, proved=False, left=Judgement({}, 1.0, {}), eased=False)
+    chosen = _Chosen(("link_mass", "payload"), found.alone["payload"], {"link_mass": 0.0, "payload": adds})
+    assert _verdict(found, ["link_mass", "payload"], leader, chosen)[0] == first

@@ -142,6 +142,7 @@ class Cause:
         silent: whether command and encoder shift alike, so that joint positions hardly show it.
         unseen: names of quantities that joint positions do not show.
         alike: causes that a log as a whole hardly tells from it, while windows of it, each begun anew, do.
+        shows_as: causes that a log of it shows, too, while a log of theirs does not show it.
         simpler: the cause that it is no more than at coordinates like these, if it is.
         random: whether it acts at random times: no simulation repeats what happened, and what one closes says little.
         stated: from the quantities to the catalogue's parameters, where those are not the same.
@@ -162,6 +163,7 @@ class Cause:
     silent: bool = False
     unseen: frozenset[str] = frozenset()
     alike: tuple[str, ...] = ()
+    shows_as: tuple[str, ...] = ()
     simpler: Callable[[Mapping[str, float]], str | None] = lambda x: None
     random: bool = False
     stated: Callable[[Values, Reference, Ints], dict[str, float]] = lambda values, reference, joints: dict(values)

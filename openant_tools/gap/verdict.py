@@ -240,6 +240,7 @@ def _heard(
     _fitted_anew(evidence)
     _told_apart(evidence)
     _refute(evidence)
+    _taken_in(evidence)
     return evidence
 
 
@@ -310,6 +311,16 @@ def _refute(evidence: _Evidence) -> None:
             )
 
 
+def _taken_in(evidence: _Evidence) -> None:
+    """Where two are likely and one of them shows as the other, too, there is that one alone: it explains both."""
+    chance = evidence.probability
+    for name in evidence.explained:
+        for other in catalogue()[name].shows_as:
+            if other in evidence.explained and min(chance[name], chance[other]) > FINDING:
+                chance[other] = SUSPECT
+                evidence.patient.refuted[other] = f"{name} looks like this, too, and not the other way round"
+
+
 def _simplify(evidence: _Evidence) -> None:
     """Where a suspect is no more than another one, it is that one."""
     probability = evidence.probability
@@ -335,7 +346,9 @@ def _led(evidence: _Evidence, names: Sequence[str]) -> _Leader:
     gained = closed - without
     # Joint positions say little of the body: there closure alone proves nothing that the judge does not half believe.
     beside = catalogue()[best].beside_joints_at(whole.refit.x[0])
-    proves = gained > ADDS_ALONE or 1 - closed < PROVES * (1 - without)
+    # Of what is left of a healthy robot a cause may take a third by chance.
+    healthy = evidence.plain.after < LARGE * evidence.floor and evidence.judgement.energy < STRANGE
+    proves = gained > ADDS_ALONE or (not healthy and 1 - closed < PROVES * (1 - without))
     proved = proves and (not beside or probability[best] > SECOND) and not catalogue()[best].random
     if proved:
         # What none of the others closes speaks for a cause whatever the judge thought of it.
@@ -347,10 +360,10 @@ def _led(evidence: _Evidence, names: Sequence[str]) -> _Leader:
         taken = [probability[name] for name in names if evidence.explained[name].part.joints == here]
         probability[best] = max(probability[best], share * max(taken))
     left, eased, energy = None, False, evidence.judgement.energy
-    healthy = evidence.plain.after < LARGE * evidence.floor and energy < STRANGE
     needless = healthy and moves_joints(catalogue()[best]) and not beside and gained < BARELY
-    if needless or (energy < 1 and carries(catalogue()[best]) and gained < -ADDS):
-        # Tolerances do what it does, and leave no more than of a healthy robot.
+    farther = energy < 1 and carries(catalogue()[best]) and gained < -ADDS
+    if probability[best] < CERTAIN and (needless or farther):
+        # Tolerances do what it does, and leave no more than of a healthy robot, of which no judge is certain.
         probability[best] *= max(gained, 0.0) / BARELY
     if probability[best] > MAYBE or proved or max(probability[name] for name in names) > CERTAIN:
         left = _without(evidence, best)
@@ -476,7 +489,7 @@ def _seconds(evidence: _Evidence, best: str, left: Judgement) -> tuple[list[Expl
     chance = {
         name: max(left.probability[name], _found_both(evidence, best, name))
         for name in evidence.probability
-        if name != best
+        if name != best and name not in catalogue()[best].shows_as
     }
     likely = sorted(
         (name for name, _ in shown(left, patient.protocol) if name in chance), key=lambda name: -chance[name]
@@ -628,8 +641,12 @@ def _verdict(
 
 
 def _idle(evidence: _Evidence, chosen: _Chosen, name: str) -> bool:
-    """Whether only the judge's word speaks for a cause, and that is not certain."""
-    return evidence.probability[name] < CERTAIN and chosen.removal[name] < ADDS
+    """Whether only the judge's word speaks for a cause, and that is not certain.
+
+    What it does not expect before it knows of the other may be what that one leaves where it was misplaced: it has to add more.
+    """
+    expected = dict(evidence.ranked).get(name, 0.0) > SECOND
+    return evidence.probability[name] < CERTAIN and chosen.removal[name] < (ADDS if expected else ADDS_MUCH)
 
 
 def _sure(evidence: _Evidence, names: Sequence[str], leader: _Leader) -> bool:

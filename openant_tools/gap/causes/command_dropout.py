@@ -28,4 +28,6 @@ CAUSE = Cause(
     enter=_enter,
     native=False,
     random=True,
+    # A command that is lost is late, too, while a clock that jitters loses none.
+    shows_as=("clock_jitter",),
 )
