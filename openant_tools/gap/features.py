@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.gap.arrivals import KINDS_OF_ONE, Arrivals
+from openant_tools.gap.following import KINDS, Following
 from openant_tools.gap.neighbours import beside_neighbours
 from openant_tools.gap.robot import USUAL_NOISE, Robot
 from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
 
 __all__ = [
-    "ARRIVAL", "COLUMNS", "LATENESS", "SKIP_S", "Layout", "Signals", "around_switching", "logged", "with_noise",
+    "ARRIVAL", "COLUMNS", "FOLLOWING", "LATENESS", "SKIP_S", "Layout", "Signals", "around_switching", "logged", "with_noise",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -50,8 +51,10 @@ LETS_GO_S = 0.03
 OWN_SCALE = 2.0
 #: least size of a scatter, as a share of the signal's noise
 LEAST = 0.3
-#: what the features of rows that are late are called, and those of commands; rad/s, a speed from which positions tell the former
-LATENESS, ARRIVAL, TELLS_RAD_S = "lateness", "arrival", 1.0
+#: what the features of rows that are late are called, those of commands, and those of the body behind its legs
+LATENESS, ARRIVAL, FOLLOWING = "lateness", "arrival", "following"
+#: rad/s, a speed from which positions tell how late a row is
+TELLS_RAD_S = 1.0
 #: s, the least size of a scatter of lateness
 LEAST_LATE_S = 1e-4
 
@@ -66,6 +69,7 @@ class Layout:
         seconds: how long the protocol's run is: a log that goes on longer is cut there.
         unsure: (rows, joints) as `around_switching`.
         arrivals: the run's commands; None where nothing is asked of when they came.
+        following: the rows at which body and legs are compared; None where no body moves.
     """
 
     t: Array
@@ -75,6 +79,7 @@ class Layout:
     seconds: float
     unsure: Bools
     arrivals: Arrivals | None = None
+    following: Following | None = None
 
     def blocks(self, signal: str) -> Array:
         """Edges of the blocks of a signal, s."""
@@ -97,6 +102,8 @@ class Layout:
         out[LATENESS] = ["size"] * n + ["peak"] * n
         if self.arrivals is not None:
             out[ARRIVAL] = [kind for kind in KINDS_OF_ONE for _ in range(n)] + ["shared"]
+        if self.following is not None:
+            out[FOLLOWING] = list(KINDS)
         return out
 
     def joints_of(self, signal: str) -> list[int]:
@@ -106,7 +113,7 @@ class Layout:
         if signal == ARRIVAL:
             return len(KINDS_OF_ONE) * [*range(self.joints), -1] + [-1]
         count = len(self.groups()[signal])
-        return [-1] * count if signal in COLUMNS else [k % self.joints for k in range(count)]
+        return [-1] * count if signal in (*COLUMNS, FOLLOWING) else [k % self.joints for k in range(count)]
 
     def features(self, seen: Signals, simulated: Signals) -> Floats:
         """(robots, features): block means, and logarithms of sizes, of how logs differ from what the model does.
@@ -132,6 +139,8 @@ class Layout:
         parts += self._late(apart["pos"], simulated["pos"])
         if self.arrivals is not None:
             parts += self.arrivals(apart["pos"], simulated["pos"][0])
+        if self.following is not None:
+            parts.append(self.following(seen["pos"], seen["gyro"]))
         return np.concatenate(parts, axis=1).astype(np.float32)
 
     def _late(self, x: Floats, simulated: Floats) -> list[Floats]:

@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 CACHE_VARIABLE = "OPENANT_CACHE"
 LARGEST_BYTES = 4 * 2**30
 #: what is stored is bound to the code that made it: raise it when simulated robots change
-VERSION = 18
+VERSION = 19
 #: robots of a part, and of a whole preparation where the robot has many joints and where it has one or two
 PART, ROBOTS, ROBOTS_ONE_JOINT = 96, 4320, 16_000
 #: robots without which no judge is trained, and the file that says that no more are to be made unless asked for

@@ -18,7 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.gap.arrivals import Arrivals
-from openant_tools.gap.features import ARRIVAL, COLUMNS, LATENESS, SKIP_S, Floats, Layout, around_switching, logged
+from openant_tools.gap.features import (
+    ARRIVAL,
+    COLUMNS,
+    FOLLOWING,
+    LATENESS,
+    SKIP_S,
+    Floats,
+    Layout,
+    around_switching,
+    logged,
+)
+from openant_tools.gap.following import Following
 from openant_tools.gap.robot import Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.floor import resolution
@@ -83,6 +94,7 @@ class Played:
         return Layout(
             t, self.plant.setup, len(self.plant.joints), self.signals, self.run.duration_s,
             around_switching(self.run, self.plant.joints), Arrivals.of(self.run, self.plant, t >= SKIP_S),
+            Following.of(t) if "gyro" in self.signals else None,
         )  # fmt: skip
 
     def features(self, nominal: Mapping[str, Floats]) -> tuple[Floats, NDArray[np.bool_]]:
@@ -284,8 +296,8 @@ class Protocol:
 
 
 def _read_from(signal: str) -> str:
-    """The signal that features are of: how late rows and commands are is read from positions."""
-    return "pos" if signal in (LATENESS, ARRIVAL) else signal
+    """The signal that features are of: how late rows and commands are is read from positions, how late a body is where it turns."""
+    return "pos" if signal in (LATENESS, ARRIVAL) else "gyro" if signal == FOLLOWING else signal
 
 
 def same(one: Array, other: Array) -> bool:
