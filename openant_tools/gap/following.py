@@ -23,12 +23,14 @@ Ints = NDArray[np.int64]
 SHIFTS_S, SPACING_S = (-0.08, 0.1), 0.005
 #: s: shifts at which it is said how much worse the fit is than at its best; s that count as one
 ASKED_S, LAG_S = (-0.04, -0.02, 0.0, 0.02, 0.04, 0.06), 0.01
-#: s at a run's beginning that are left out, beyond the shifts
-SKIP_S = 0.4
+#: s at a run's beginning that are left out, beyond the shifts; rows without which nothing is said
+SKIP_S, FEWEST = 0.4, 50
 #: what is said of a run
 KINDS = ("lag", "loose", *(["worse"] * len(ASKED_S)))
 #: share of joints' speeds that is taken for noise, and rad/s of speeds and of turning that always is
 NOISE, LEAST_RAD_S = 1e-3, 1e-3
+#: share of the turning below which nothing counts as unexplained
+LEAST_SHARE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class Following:
         """For rows at these times, s; None where there are too few."""
         shifts = np.arange(SHIFTS_S[0], SHIFTS_S[1] + SPACING_S / 2, SPACING_S)
         inside = np.flatnonzero((t > t[0] + SKIP_S - SHIFTS_S[0]) & (t < t[-1] - SHIFTS_S[1]))
-        if len(inside) < 50:
+        if len(inside) < FEWEST:
             return None
         at = t[inside] + shifts[:, None]
         before = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
@@ -81,7 +83,7 @@ class Following:
             whole = (energy[:, before] * (1 - share) + energy[:, before + 1] * share).sum(axis=1)
             whole += len(self.inside) * LEAST_RAD_S**2
             left[:, k] = 1 - np.einsum("rki,rkl,rli->r", along, inverse, along) / whole
-        left = np.log10(np.clip(left, 1e-4, 1.0))
+        left = np.log10(np.clip(left, LEAST_SHARE, 1.0))
         best = np.clip(left.argmin(axis=1), 1, len(self.shifts) - 2)
         rows = np.arange(len(left))
         a, b, c = left[rows, best - 1], left[rows, best], left[rows, best + 1]
