@@ -6,6 +6,7 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from openant_tools.comms.bus import Bus, Timing
+from openant_tools.comms.lateness import Lateness
 from openant_tools.comms.line import PortGone
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import kit
@@ -48,6 +49,7 @@ class WireLine:
     received: int = 0
     stepped: bool = True
     unplugged: bool = False
+    lateness: Lateness = field(default_factory=lambda: Lateness(real=False))
 
     def __post_init__(self) -> None:
         self._t = 1.0

@@ -24,6 +24,7 @@ from openant_tools.blind.log import facts_of, imu_columns, tracker_columns
 from openant_tools.blind.robot import TrueRobot, true_robot
 from openant_tools.blind.simulate import COPPER_PER_K, WARM_C
 from openant_tools.comms.bus import Bus, Timing
+from openant_tools.comms.lateness import Lateness
 from openant_tools.comms.servos import Block, Servo, Servos
 from openant_tools.recording.run import Run
 from openant_tools.robot.joints import JOINTS
@@ -155,6 +156,7 @@ class _Wire:
     written: int = 0
     received: int = 0
     stepped: bool = True
+    lateness: Lateness = field(default_factory=lambda: Lateness(real=False))
     _t: float = 0.0
     _coming: deque[tuple[float, bytes]] = field(default_factory=deque)
     _arrivals: list[tuple[int, float]] = field(default_factory=list)

@@ -10,10 +10,12 @@ import json
 import math
 import select
 import socket
+import struct
 import time
 from pathlib import Path
 from typing import Any, Protocol
 
+from openant_tools.comms.lateness import Lateness
 from openant_tools.comms.line import Line
 from openant_tools.errors import HardwareFault
 
@@ -26,7 +28,13 @@ CONTROL_TIMEOUT_S = 30.0
 
 
 class Clock(Protocol):
-    """Time in s, monotonic, of no particular origin."""
+    """Time in s, monotonic, of no particular origin.
+
+    Attributes:
+        lateness: how late this computer was in the waits so far.
+    """
+
+    lateness: Lateness
 
     @property
     def stepped(self) -> bool:
@@ -55,9 +63,16 @@ class Clock(Protocol):
 
 
 class RealClock:
-    """The host's monotonic clock, the same one for all processes."""
+    """The host's monotonic clock, the same one for all processes.
+
+    Args:
+        robot_pid: of a virtual robot that runs in real time, see `Lateness`.
+    """
 
     stepped = False
+
+    def __init__(self, robot_pid: int | None = None) -> None:
+        self.lateness = Lateness(robot_pid)
 
     def now(self) -> float:
         return time.monotonic()
@@ -66,11 +81,14 @@ class RealClock:
         rest = t - time.monotonic()
         if rest > SPIN_S:
             time.sleep(rest - SPIN_S)
+            self.lateness.note(time.monotonic() - t)
         while time.monotonic() < t:
             pass
 
     def wait_readable(self, line: Line, deadline: float) -> bool:
-        ready, _, _ = select.select([line], [], [], max(0.0, deadline - time.monotonic()))
+        before = time.monotonic()
+        ready, _, _ = select.select([line], [], [], max(0.0, deadline - before))
+        self.lateness.note(time.monotonic() - max(deadline, before))
         return bool(ready)
 
     def arrivals(self, line: Line) -> list[tuple[int, float]]:
@@ -116,6 +134,14 @@ class VirtualControl:
             raise HardwareFault(f"the virtual robot refuses {do!r}: {answer['error']}", where=self.path)
         return answer
 
+    @property
+    def robot_pid(self) -> int | None:
+        """The virtual robot's process, where the system tells it."""
+        if not hasattr(socket, "SO_PEERCRED"):
+            return None
+        pid, _, _ = struct.unpack("3i", self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+        return int(pid) or None
+
     def close(self) -> None:
         self._socket.close()
 
@@ -131,6 +157,7 @@ class SteppedClock:
 
     def __init__(self, control: VirtualControl, *, bus: Line | None = None, imu: Line | None = None) -> None:
         self._control = control
+        self.lateness = Lateness(real=False)
         self._lines: dict[str, Line] = {}
         #: bytes (written, received) before the counts of the robot began
         self._base: dict[str, tuple[int, int]] = {}

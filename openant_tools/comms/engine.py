@@ -150,8 +150,8 @@ class Engine:
 
     def _connect(self) -> None:
         config = self.config
-        self.clock: Clock = RealClock()
         control = VirtualControl(config.control) if config.control else None
+        self.clock: Clock = RealClock(None if control is None else control.robot_pid)
         self._line = SerialLine(config.port, config.baud)
         if control is not None and control.ask("now")["stepped"]:
             self.clock = SteppedClock(control, bus=self._line)
@@ -444,8 +444,10 @@ class Engine:
         self._asked_at = t
         self._cycles += 1
         self._worst_wake = max(self._worst_wake, wake)
+        # What holds up this cycle's waits makes the loop as late as waking up late does.
+        late = self.clock.lateness.cycle(wake)
         if self._recorder is not None:
-            self._record(t, cmd_t, wake, answers, agent)
+            self._record(t, cmd_t, late, answers, agent)
         self._telemetry(t, cmd_t, wake, answers)
         if self._torque:
             trip = self._watch.check(t, answers) or self._stood_still(t - before)
@@ -869,6 +871,7 @@ class Engine:
             "cycles": self._cycles,
             "overruns": self._overruns,
             "worst_wake_s": self._worst_wake,
+            "late": self.clock.lateness.words,
         }
 
     def _measure(self) -> Array:

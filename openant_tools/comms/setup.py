@@ -50,7 +50,7 @@ def open_bus(port: str, baud: int, control: str | None = None) -> Bus:
     """A bus for tools that ask a few questions and own nothing: scan, calibration of loose motors."""
     remote = VirtualControl(control) if control else None
     line = SerialLine(port, baud)
-    clock: Clock = RealClock()
+    clock: Clock = RealClock(None if remote is None else remote.robot_pid)
     if remote is not None and remote.ask("now")["stepped"]:
         clock = SteppedClock(remote, bus=line)
     latency = Host().latency_timer_ms(port)

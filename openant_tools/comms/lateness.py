@@ -1,0 +1,156 @@
+"""How late this computer is: one measure for the engine's loop, for a single question, and for recordings.
+
+Late is what the system took beyond what it was asked for: a wait that returned after its deadline, a thread that was
+ready to run and did not. A servo, a cable or an adapter cannot cause either, so what is lost meanwhile is no finding
+about them. A virtual robot in real time is a process of this computer, and its share counts, too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["LATE_S", "REMEDY", "Lateness", "late_rows", "lateness_words", "of_wake"]
+
+#: What a deadline leaves to the operating system (`bus.Timing.margin_s`): later than that, answers are missed.
+LATE_S = 4e-3
+#: Fewer late cycles than this say nothing of a whole measurement: every desktop has some.
+SHARE = 0.005
+#: Share of time in which somebody waited for a processor, from which on a computer is called busy.
+BUSY = 0.25
+REMEDY = "close what keeps this computer busy, and run it again"
+#: of a thread: ns on a processor, ns of readiness without one, time slices
+_OWN, _OF = "/proc/thread-self/schedstat", "/proc/{}/schedstat"
+_PRESSURE = "/proc/pressure/cpu"
+
+
+@dataclass
+class Lateness:
+    """One process's waits, and what it and a virtual robot waited for a processor.
+
+    Attributes:
+        robot_pid: of a virtual robot that runs in real time on this computer.
+        real: whether this computer's time counts; a stepped robot's stands still meanwhile, and only what is noted counts.
+        cycles, late: turns of a loop, and those that were late by more than `LATE_S`.
+        worst_s: the latest.
+    """
+
+    robot_pid: int | None = None
+    real: bool = True
+    cycles: int = 0
+    late: int = 0
+    worst_s: float = 0.0
+    _noted_s: float = 0.0
+    _files: tuple[int, ...] = field(default=(), repr=False)
+
+    def __post_init__(self) -> None:
+        paths = [_OWN] + ([_OF.format(self.robot_pid)] if self.robot_pid else [])
+        self._files = tuple(file for file in map(_open, paths) if file is not None) if self.real else ()
+        self._queued_s = self._queue()
+        self._began = time.monotonic(), _pressure_s() if self.real else None
+
+    def note(self, seconds: float) -> None:
+        """A wait returned so many s after it should have; negative where it did not."""
+        if seconds > self._noted_s:
+            self._noted_s = seconds
+            self.worst_s = max(self.worst_s, seconds)
+
+    def cycle(self, wake_s: float = 0.0) -> float:
+        """How late (s) the cycle was that ends now, by its wake-up `wake_s`, its waits and the run queues; counted."""
+        queued = self._queue()
+        seconds = max(wake_s, self._noted_s, queued - self._queued_s)
+        self._queued_s, self._noted_s = queued, 0.0
+        self.cycles += 1
+        self.late += seconds > LATE_S
+        self.worst_s = max(self.worst_s, seconds)
+        return seconds
+
+    @property
+    def share(self) -> float:
+        """Of the cycles, those that were late."""
+        return self.late / self.cycles if self.cycles else float(self.worst_s > LATE_S)
+
+    @property
+    def pressure(self) -> float:
+        """Share of the time since this measure began in which some process waited for a processor; 0 where the system
+        does not tell."""
+        (began, before), now = self._began, _pressure_s()
+        return 0.0 if before is None or now is None else min(1.0, (now - before) / max(time.monotonic() - began, 1e-3))
+
+    @property
+    def busy(self) -> bool:
+        """Whether this computer was late often enough, or so short of processors, that losses may be its own."""
+        return self.share > SHARE or self.pressure > BUSY
+
+    @property
+    def words(self) -> str:
+        """How late it was, as a sentence; empty where it was not."""
+        said = lateness_words(self.worst_s, self.late, self.cycles)
+        if self.pressure > BUSY:
+            said = (
+                said or "this computer was busy"
+            ) + f"; programs waited for a processor {self.pressure:.0%} of the time"
+        return said
+
+    def close(self) -> None:
+        for file in self._files:
+            with contextlib.suppress(OSError):
+                os.close(file)
+        self._files = ()
+
+    def _queue(self) -> float:
+        """s that this thread and the robot's were ready to run and did not."""
+        total = 0
+        for file in self._files:
+            try:
+                fields = os.pread(file, 64, 0).split()
+            except OSError:
+                continue  # the robot is gone
+            total += int(fields[1]) if len(fields) > 1 else 0
+        return total * 1e-9
+
+
+def of_wake(wake: NDArray[np.float64]) -> str:
+    """How late the computer was that recorded these wake-ups, (n,) s, as a sentence; empty where it was not."""
+    known = wake[np.isfinite(wake)]
+    return lateness_words(float(known.max()), int((known > LATE_S).sum()), len(known)) if len(known) else ""
+
+
+def late_rows(wake: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(n,) the rows of which nothing is to be concluded: the computer was late in them, or in one beside them.
+
+    Args:
+        wake: (n,) s, how late it was in each row; NaN where nobody knows.
+    """
+    late = np.nan_to_num(wake) > LATE_S
+    around: NDArray[np.bool_] = late | np.r_[late[1:], False] | np.r_[False, late[:-1]]
+    return around
+
+
+def lateness_words(worst_s: float, late: int, cycles: int) -> str:
+    """How late it was, as a sentence; empty where it was not."""
+    if worst_s <= LATE_S or (cycles and late <= SHARE * cycles):
+        return ""
+    often = f" in {max(late / cycles, 0.01):.0%} of cycles" if cycles else ""
+    return f"this computer was late by up to {worst_s * 1e3:.0f} ms{often}"
+
+
+def _pressure_s() -> float | None:
+    """s in which some process waited for a processor, since this computer started."""
+    try:
+        with open(_PRESSURE, encoding="ascii") as file:
+            return int(file.readline().rpartition("total=")[2]) * 1e-6
+    except (OSError, ValueError):
+        return None
+
+
+def _open(path: str) -> int | None:
+    try:
+        return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return None
