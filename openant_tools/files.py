@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import math
 import mmap
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
-__all__ = ["atomic_writer", "shared_memory", "write_bytes", "write_text"]
+__all__ = ["atomic_writer", "json_text", "known", "shared_memory", "write_bytes", "write_text"]
 
 
 @contextmanager
@@ -63,6 +65,24 @@ def write_bytes(path: str | Path, data: bytes) -> None:
 def write_text(path: str | Path, text: str) -> None:
     """Write `text` as UTF-8 to `path` by `atomic_writer`."""
     write_bytes(path, text.encode())
+
+
+def known(content: Any) -> Any:
+    """The same JSON content with None for every number that is none (NaN, infinity), which JSON does not have."""
+    if isinstance(content, Mapping):
+        return {key: known(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [known(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
+def json_text(content: Any, *, indent: int | None = 1) -> str:
+    """JSON that every reader takes: one document, a line's end, null where a number is not known.
+
+    Raises:
+        TypeError: there is something in it that JSON cannot hold.
+    """
+    return json.dumps(known(content), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def shared_memory(size: int, fd: int | None = None) -> tuple[int, mmap.mmap]:

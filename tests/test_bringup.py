@@ -67,7 +67,8 @@ def test_every_step_of_building_is_a_command_that_explains_itself():
 
 
 def found(name: str, ok: bool = True) -> Finding:
-    return Finding(name, ok, f"{name} done", (), "", f"openant calib {name}")
+    problems = () if ok else (f"{name}: it says no",)
+    return Finding(name, ok, f"{name} done", (), "", f"openant calib {name}", problems=problems)
 
 
 def test_a_new_robot_has_everything_to_do(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -13,8 +14,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from openant_tools.bringup.walk import standing
+from openant_tools.cli.calib import show_finding
 from openant_tools.errors import BadInput, HardwareFault
-from openant_tools.procedure.finding import Evidence, Finding, keep, latest
+from openant_tools.files import json_text
+from openant_tools.procedure.finding import Evidence, Finding, keep, latest, together
 from openant_tools.procedure.journal import EepromWrite, Journal, append_writes
 from openant_tools.procedure.step import (
     Answer,
@@ -108,15 +112,59 @@ words = st.text(max_size=40)
 
 
 @given(
-    value=st.none() | numbers, name=words, unit=words, ok=st.booleans(), problems=st.lists(words, max_size=3),
+    value=st.none() | st.floats(), name=words, unit=words, ok=st.sampled_from([True, False, None]),
+    problems=st.lists(words, min_size=1, max_size=3), unsure=st.lists(words, min_size=1, max_size=3),
     data=st.dictionaries(words, numbers | words, max_size=3),
 )  # fmt: skip
-def test_a_finding_survives_its_json(value, name, unit, ok, problems, data):
+def test_a_finding_survives_its_json(value, name, unit, ok, problems, unsure, data):
     finding = Finding(
         "zeros", ok, "what", (Evidence(name, value, unit, "source"),), "next", "command",
         (Evidence("p", 1.0, "rad", "fit", 0.5, 1.5),), data, problems=tuple(problems),
+        unsure=() if ok is not None else tuple(unsure),
     )  # fmt: skip
-    assert Finding.of_json(json.loads(json.dumps(finding.as_json()))) == finding
+    assert Finding.of_json(json.loads(json_text(finding.as_json()))) == finding
+
+
+@pytest.mark.parametrize("figure", [None, math.nan, math.inf, -math.inf])
+def test_a_figure_that_is_not_known_keeps_a_finding_from_saying_yes(figure, tmp_path, capsys):
+    evidence = (Evidence("height", 0.1, "m", "tag"), Evidence("scale", figure, "1", "gyro over camera", figure, 1.0))
+    finding = Finding(
+        "arena", True, "the camera hangs well", evidence, "", "openant calib arena", data={"left": figure}
+    )
+    assert (finding.ok, finding.verdict) == (None, "cannot judge")
+    assert finding.unsure == ("scale is not known (gyro over camera)",)
+    assert show_finding(finding, tmp_path / "out.json") == 1
+    assert "CANNOT JUDGE: the camera hangs well\n  scale is not known" in capsys.readouterr().out
+    content = json.loads((tmp_path / "out.json").read_text(), parse_constant=pytest.fail)
+    assert (content["ok"], content["verdict"]) == (None, "cannot judge")
+    assert content["evidence"][1]["value"] is content["data"]["left"] is None
+    assert "# arena: ? cannot judge" in finding.as_markdown()
+
+
+def test_a_no_names_what_is_wrong_or_is_none():
+    with pytest.raises(ValueError, match="names nothing that is wrong"):
+        Finding("arena", False, "camera at 2 m", (), "mend what is listed", "openant calib arena")
+    with pytest.raises(ValueError, match="does not say why"):
+        Finding("arena", None, "camera at 2 m", (), "", "openant calib arena")
+    # A comparison with NaN says no and nobody has written down why: that is not judged, and it is said.
+    evidence = (Evidence("tag size", math.nan, "1", "lying robot"),)
+    finding = Finding("arena", False, "camera at 2 m", evidence, "mend what is listed", "openant calib arena")
+    assert finding.unsure == ("tag size is not known (lying robot)",)
+    assert finding.ok is None
+
+
+def test_several_verdicts_come_to_the_worst_of_them():
+    assert together(True, True) is True
+    assert together(True, None) is None
+    assert together(None, False, True) is False
+
+
+def test_a_step_that_cannot_judge_is_not_green_and_holds_up_what_needs_it(tmp_path):
+    folder = create_robot(tmp_path / "ant")
+    keep(Finding("connect", True, "the bus", (Evidence("IMU rate", math.nan, "Hz", "polls"),), "", "command"), folder)
+    states = standing(folder)
+    assert states["connect"].state == "unsure"
+    assert "connect" in states["estop"].waits_for
 
 
 def test_the_newest_finding_of_a_step_is_found_and_a_torn_one_passed_over(tmp_path):

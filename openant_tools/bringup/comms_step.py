@@ -10,6 +10,7 @@ from openant_tools.calib.wires import engine_config
 from openant_tools.comms.dropouts.diagnose import diagnose_dropouts
 from openant_tools.comms.dropouts.outcome import dropouts_finding
 from openant_tools.comms.soak import soak
+from openant_tools.procedure.finding import together
 from openant_tools.procedure.step import Ask, Bench, Intent, Procedure
 from openant_tools.recording.tables import read_run
 
@@ -48,10 +49,11 @@ def comms_step(bench: Bench) -> Procedure:
     moving = dropouts_finding(told, [bench.folder.relative(path)], COMMAND)
     return replace(
         still,
-        ok=still.ok and moving.ok,
+        ok=together(still.ok, moving.ok),
         what=f"{still.what}; while it moved: {moving.what}",
         evidence=(*still.evidence, *moving.evidence),
         problems=(*still.problems, *moving.problems),
+        unsure=(*still.unsure, *moving.unsure),
         next_action="; ".join(words for words in (moving.next_action, still.next_action) if words),
         data={**still.data, **moving.data},
     )

@@ -38,21 +38,28 @@ def gap_check(bench: Bench) -> Procedure:
     before, after = found
     closed = 1 - after.excess("pos") / before.excess("pos") if before.excess("pos") > 0 else math.nan
     better = after.gaps["pos"] <= before.gaps["pos"]
+    unsure = (
+        []
+        if math.isfinite(closed)
+        else ["gap closed: the nominal model is off by no more than the floor → nothing to judge by"]
+    )
     worst = after.places[0] if after.places else None
     return Finding(
         "gap",
-        better,
+        False if not better else None if unsure else True,
         f"simulated joints are {1e3 * after.gaps['pos']:.2f} mrad off (nominal {1e3 * before.gaps['pos']:.2f}, "
         f"floor {1e3 * after.floors['pos']:.2f})" + (f", most at {worst.joint} in {worst.regime}" if worst else ""),
         (
             Evidence("position gap, nominal", before.gaps["pos"], "rad", "0.5 s horizon, held-out recording"),
             Evidence("position gap, calibrated", after.gaps["pos"], "rad", "the same"),
             Evidence("floor", after.floors["pos"], "rad", "repeats of the recording"),
-            Evidence("gap closed", None if math.isnan(closed) else closed, "1", "1 − excess after / before"),
+            Evidence("gap closed", closed, "1", "1 − excess after / before"),
         ),
         "" if better else "the calibrated model is no better: record again, or `openant gap diagnose`",
         COMMAND,
         data={"by_joint_rad": gap_by_joint(after), "measure": after.as_json()},
+        problems=() if better else ("the calibrated model is farther off than the nominal one",),
+        unsure=tuple(unsure),
     )
 
 

@@ -71,4 +71,5 @@ def identification(bench: Bench) -> Procedure:
             "held_out": [bench.folder.relative(take.path) for take in judge],
             "values": {v.name: [v.value, v.low, v.high, v.verdict] for v in best.values},
         },
+        problems=() if better else ("no fitted value predicts better than the nominal model → it stays in use",),
     )

@@ -18,6 +18,7 @@ COMMAND = "openant passport"
 _STATES = {
     "ok": Mark("ok", "good"),
     "failed": Mark("no", "bad"),
+    "unsure": Mark("cannot judge", "warn"),
     "stale": Mark("older than its needs", "warn"),
     "todo": Mark("not done"),
 }
@@ -30,7 +31,9 @@ def passport_step(bench: Bench) -> Procedure:
     states = standing(bench.folder)
     done = [name for name, now in states.items() if now.state == "ok"]
     missing = [
-        WALK[name].title for name, now in states.items() if now.state in ("todo", "failed") and name != "passport"
+        WALK[name].title
+        for name, now in states.items()
+        if now.state in ("todo", "failed", "unsure") and name != "passport"
     ]
     return Finding(
         "passport",
@@ -85,9 +88,7 @@ def passport(folder: RobotFolder) -> Report:
             if name != "passport"
         ],
     )
-    problems = [
-        f"- {now.step.title}: {line}" for now in states.values() if now.finding for line in now.finding.problems
-    ]
+    problems = [f"- {now.step.title}: {line}" for now in states.values() if now.finding for line in now.finding.lines]
     if problems:
         report.section("What to look at").text("\n".join(problems))
     _motors(report, folder)

@@ -182,7 +182,7 @@ WALK: Mapping[str, Step] = {
     )
 }
 
-State = Literal["todo", "ok", "failed", "stale"]
+State = Literal["todo", "ok", "failed", "unsure", "stale"]
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,9 @@ def standing(folder: RobotFolder) -> dict[str, Standing]:
             # A passport tells of every step.
             told = found.values() if name == "passport" else needed
             newer = any(other is not None and other.date > finding.date for other in told)
-            state = "failed" if not finding.ok else "stale" if newer else "ok"
+            state = "stale" if newer else "ok"
+            if not finding.ok:
+                state = "unsure" if finding.ok is None else "failed"
         waits = tuple(other for other, seen in zip(step.needs, needed, strict=True) if seen is None or not seen.ok)
         out[name] = Standing(step, finding, state, waits)
     return out
@@ -239,7 +241,8 @@ def do(step: Step, bench: Bench, face: Face) -> Finding:
         raise
     except OpenAntError as error:
         what = f"{error.where}: {error.what}" if error.where else error.what
-        finding = Finding(step.name, False, what, (), error.remedy or "", f"openant calib {step.name}")
+        command = f"openant calib {step.name}"
+        finding = Finding(step.name, False, what, (), error.remedy or "", command, problems=(what,))
     keep(finding, bench.folder)
     return finding
 

@@ -92,7 +92,7 @@ def judge_sizes(lying_m: float, standing_m: float, camera_m: float, tag_m: float
     """
     ratio = (camera_m - lying_m - tag_m) / (camera_m - LYING_M - tag_m)
     step = (standing_m - lying_m) / (STANDING_M - LYING_M)
-    if abs(ratio - 1) <= SIZE_SHARE:
+    if abs(ratio - 1) <= SIZE_SHARE or not math.isfinite(ratio + step):
         return Sizes(ratio, step, "", None)
     # Were the body's size wrong, the rise would be wrong by the same ratio; were the origin's, it would be right.
     if abs(step - ratio) < abs(step - 1):
@@ -119,7 +119,9 @@ def arena(bench: Bench) -> Procedure:
             "name a camera with --camera and run it again before learning on the robot", COMMAND,
             problems=("no camera → floor experiments on the robot need one",),
         )  # fmt: skip
-    problems, values = list[str](), dict[str, object]()
+    # What is worth knowing, what is wrong, and what could not be judged.
+    problems, wrong, unsure = list[str](), list[str](), list[str]()
+    values = dict[str, object]()
     yield Progress(0.0, f"looking through {where}")
     info, lens, seen, words = yield from _look(bench, config, where)
     problems += words
@@ -166,7 +168,7 @@ def arena(bench: Bench) -> Procedure:
     sizes = judge_sizes(_height(lying), _height(standing), camera_m, config.camera.body_tag_position_m[2], setup)
     if sizes.wrong:
         declared = setup.body_tag_size_m if sizes.wrong == "body" else setup.origin_tag_size_m
-        problems.append(
+        wrong.append(
             f"tag size: the {sizes.wrong}'s tag is declared {1e3 * declared:.0f} mm, but everything fits only if its edge is about "
             f"{1e3 * (sizes.size_m or 0.0):.0f} mm → measure it, correct camera.{sizes.wrong}_tag_size_m in robot.toml, run it again"
         )
@@ -197,20 +199,19 @@ def arena(bench: Bench) -> Procedure:
     ]
     share = _turned(record, turning)
     evidence.append(Evidence("body's turn over the hips', opposite", share, "1", "camera, feet in place"))
-    if share < TURNED_SHARE:
-        problems.append(
-            f"with its feet in place the body turned by {share:+.2f} of what its hips turned the other way → "
-            + (
-                "hips turn the wrong way: `openant calib zeros`"
-                if share < -TURNED_SHARE
-                else "do its feet slide? `openant calib zeros` if not"
-            )
-        )
+    if not math.isfinite(share):
+        unsure.append("which way the hips turn the body: joints or tag were not seen while it turned → run it again")
+    elif share < TURNED_SHARE:
+        turned = f"with its feet in place the body turned by {share:+.2f} of what its hips turned the other way → "
+        if share < -TURNED_SHARE:
+            wrong.append(f"{turned}hips turn the wrong way: `openant calib zeros`")
+        else:
+            problems.append(f"{turned}do its feet slide? `openant calib zeros` if not")
     latency_s: float | None = None
     try:
         late = camera_latency(turning["t"], turning["yaw"], record.imu.t, record.imu.columns["gyro.z"])
     except (BadInput, KeyError) as error:
-        problems.append(f"latency: {error} → is the IMU step done? does the robot turn?")
+        unsure.append(f"latency: {error} → is the IMU step done? does the robot turn?")
     else:
         latency_s = info.latency_s + late.latency_s
         evidence += [
@@ -230,7 +231,7 @@ def arena(bench: Bench) -> Procedure:
     yield Hands("Put it back on its stand.", "place", setup="stand")
     rest(bench)
     bench.folder.update(values, provenance=Provenance("measured", COMMAND, bench.folder.relative(_path(bench))))
-    ok = not sizes.wrong and latency_s is not None and share > -TURNED_SHARE
+    ok = False if wrong else None if unsure else True
     return Finding(
         "arena",
         ok,
@@ -246,7 +247,8 @@ def arena(bench: Bench) -> Procedure:
             "sizes": vars(sizes),
             "latency_s": latency_s,
         },
-        problems=tuple(problems),
+        problems=(*wrong, *problems),
+        unsure=tuple(unsure),
     )
 
 
@@ -385,13 +387,15 @@ def _between(record: Recording, phase: str) -> dict[str, Array]:
     """t, x, y, z, yaw of the poses within a phase; raises HardwareFault where the tag was lost."""
     begin, end = record.run.facts.extra["phases"][phase]
     t = record.pose.t - record.run.t[0]
-    rows = (t >= begin) & (t < end)
+    columns = record.pose.columns
+    rows = (
+        (t >= begin) & (t < end) & np.isfinite([columns[f"base.{name}"] for name in ("x", "y", "z", "yaw")]).all(axis=0)
+    )
     if rows.sum() < 10:
         raise HardwareFault(
             f"the robot's tag was seen in {int(rows.sum())} pictures while it was {phase}",
             remedy="light, focus, and both tags in view",
         )
-    columns = record.pose.columns
     return {"t": record.pose.t[rows], **{name: columns[f"base.{name}"][rows] for name in ("x", "y", "z", "yaw")}}
 
 
@@ -399,15 +403,21 @@ def _turned(record: Recording, turning: dict[str, Array]) -> float:
     """How far the body turned over how far all hips turned together the other way: 1 where no foot slides."""
     run = record.run
     hips = [joint for joint in run.joints if JOINTS[joint].kind == "hip"]
-    angle = np.interp(turning["t"], run.t, np.nanmean(run.signal("pos", hips), axis=1))
-    yaw = np.unwrap(turning["yaw"])
+    turned = np.mean(run.signal("pos", hips), axis=1)
+    seen, found = np.isfinite(turned), np.isfinite(turning["yaw"])
+    if seen.sum() < 2 or found.sum() < 2:
+        return math.nan
+    angle = np.interp(turning["t"][found], run.t[seen], turned[seen])
+    yaw = np.unwrap(turning["yaw"][found])
     angle, yaw = angle - angle.mean(), yaw - yaw.mean()
-    return float(-(yaw @ angle) / (angle @ angle))
+    return float(-(yaw @ angle) / (angle @ angle)) if np.ptp(angle) > 0 else math.nan
 
 
 def _height(poses: dict[str, Array]) -> float:
-    return float(np.nanmedian(poses["z"]))
+    seen = poses["z"][np.isfinite(poses["z"])]
+    return float(np.median(seen)) if len(seen) else math.nan
 
 
 def _mean_angle(angles: Array) -> float:
-    return math.atan2(float(np.nanmean(np.sin(angles))), float(np.nanmean(np.cos(angles))))
+    seen = angles[np.isfinite(angles)]
+    return math.atan2(float(np.mean(np.sin(seen))), float(np.mean(np.cos(seen)))) if len(seen) else math.nan

@@ -121,7 +121,7 @@ def bounds(bench: Bench) -> Procedure:
     if blocked:
         return Finding(
             "bounds", False, f"{', '.join(blocked)} can hardly be moved", tuple(evidence), "free the joint and run it again", COMMAND,
-            problems=tuple(problems),
+            problems=(*problems, *(f"{joint} can hardly be moved → free it" for joint in blocked)),
         )  # fmt: skip
     yield Intent(
         "write these limits into robot.toml; then sweep every joint slowly through its range, and play "

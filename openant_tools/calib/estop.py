@@ -91,7 +91,9 @@ def estop(bench: Bench) -> Procedure:
     yield Say(
         "killed: its guardian switched torque off" if not left else f"id {left} kept torque", "fail" if left else "ok"
     )
-    ok = stopped and not left
+    problems = [f"{joint} kept torque after the stop key" for joint, value in off.items() if value]
+    problems += [f"id {id} kept torque after its program was killed" for id in left]
+    ok = not problems
     return Finding(
         "estop",
         ok,
@@ -104,6 +106,7 @@ def estop(bench: Bench) -> Procedure:
         "" if ok else "pull the power plug; report this with the robot's folder",
         COMMAND,
         data={"servos": [vars(one) for one in seen]},
+        problems=tuple(problems),
     )
 
 

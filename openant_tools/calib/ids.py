@@ -285,7 +285,16 @@ def _all_named(found: Scan, motors: Sequence[Motor], config: RobotConfig) -> boo
 
 
 def _finding(named: Sequence[str], motors: Sequence[Motor], problems: Sequence[str], what: str = "") -> Finding:
-    ok = not problems and len(named) == len(motors)
+    said = " ".join(problems)
+    problems = [
+        *problems,
+        *(
+            f"{m.joint}: id {m.id} was not read back → run the step again with --joint {m.joint}"
+            for m in motors
+            if m.joint not in named and m.joint not in said
+        ),
+    ]
+    ok = not problems
     return Finding(
         "ids",
         ok,

@@ -108,7 +108,13 @@ def inventory(bench: Bench) -> Procedure:
         errors = {s.joint: servos.hardware_errors(s.joint) for s in present}
         problems += [f"{joint}: {e.name} → {e.advice}" for joint, found_errors in errors.items() for e in found_errors]
         volts = {s.joint: servos.read("present_input_voltage", s.joint) for s in present}
-    if delay_s is not None:
+    if delay_s is None:
+        problems.append(
+            "return delay: no servo could be tried"
+            if not present
+            else "return delay: answers are lost whatever the delay → look at cables and plugs, then `openant calib comms`"
+        )
+    else:
         evidence.append(
             Evidence("return delay", delay_s, "s", f"smallest of {len(DELAYS)} without a loss in {SWEEP_READS} reads")
         )

@@ -395,4 +395,4 @@ def _measured(engine: EngineProcess, names: list[str]) -> np.ndarray[tuple[int],
 
 
 def _failed(what: str, remedy: str, problems: tuple[str, ...] = (), evidence: list[Evidence] | None = None) -> Finding:
-    return Finding("zeros", False, what, tuple(evidence or ()), remedy, COMMAND, problems=problems)
+    return Finding("zeros", False, what, tuple(evidence or ()), remedy, COMMAND, problems=problems or (what,))

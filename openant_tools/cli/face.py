@@ -150,8 +150,8 @@ class CommandFace:
 
 def echo_finding(finding: Finding) -> None:
     """The result of a step, for stdout: the sentence, what is wrong, what is next."""
-    click.echo(f"{'ok' if finding.ok else 'NOT OK'}: {finding.what}")
-    for problem in finding.problems:
-        click.echo(f"  {problem}")
+    click.echo(f"{finding.verdict if finding.ok else finding.verdict.upper()}: {finding.what}")
+    for words in finding.lines:
+        click.echo(f"  {words}")
     if finding.next_action:
         click.echo(f"next: {finding.next_action}")

@@ -446,6 +446,8 @@ def _conclude(finding: Finding, folder: RobotFolder | None, json_file: Path | No
     from openant_tools.procedure.finding import keep
 
     click.echo(finding.what)
+    for words in finding.lines:
+        click.echo(f"  {words}")
     if finding.next_action:
         click.echo(f"→ {finding.next_action}")
     if folder is not None:

@@ -1,23 +1,30 @@
-"""What a procedure leaves behind: evidence with units and sources, a verdict, and what to do next."""
+"""What a procedure leaves behind: evidence with units and sources, a verdict, and what to do next.
+
+A verdict needs figures. It has three states: yes, no with what is wrong, and "cannot judge" with why. None can be had
+without its ground: a finding that would say yes beside a figure that is not known says that it cannot judge, and one that
+says no without naming what is wrong cannot be built.
+"""
 
 from __future__ import annotations
 
 import datetime
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from openant_tools.files import write_text
+from openant_tools.files import json_text, known, write_text
 
 if TYPE_CHECKING:  # a manual that lists the steps opens without NumPy
     from openant_tools.robot.config import Provenance
     from openant_tools.robot.folder import RobotFolder
 
-__all__ = ["SCHEMA", "Evidence", "Finding", "keep", "latest"]
+__all__ = ["SCHEMA", "Evidence", "Finding", "Verdict", "keep", "latest", "together"]
 
 SCHEMA = "openant.finding/1"
+Verdict = Literal["ok", "not ok", "cannot judge"]
 
 
 @dataclass(frozen=True)
@@ -25,7 +32,7 @@ class Evidence:
     """One number that a finding rests on.
 
     Attributes:
-        value: in `unit`; None where the data do not give it.
+        value: in `unit`; None where the data do not give it, which NaN and infinity become.
         low, high: its 95 % interval where there is one.
         source: the instrument, register, file or formula that it came from.
     """
@@ -37,6 +44,12 @@ class Evidence:
     low: float | None = None
     high: float | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("value", "low", "high"):
+            number = getattr(self, name)
+            if number is not None and not math.isfinite(number):
+                object.__setattr__(self, name, None)
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -44,19 +57,24 @@ class Finding:
 
     Attributes:
         step: which procedure, as in the name of its file in `findings/`.
-        ok: whether it says yes.
+        ok: True: it says yes; False: no, and `problems` name what is wrong; None: it cannot judge, and `unsure` says why.
         what: one sentence.
-        evidence: the numbers.
+        evidence: the numbers that the verdict rests on. With one of them unknown it cannot say yes: whatever `ok` was
+            given, it cannot judge then. What the verdict does not rest on belongs into `data`.
         next_action: what the builder should do now; empty where there is nothing to do.
         command: the command that made it.
         parameters: name → value with interval, as in fit.json, so that `openant sysid compare` reads both.
         data: the readings and tables themselves, as JSON has them.
         date: UTC.
         problems: one line each for what is not as it should be, with the joint and what to do about it.
+        unsure: one line each for what could not be judged, and why.
+
+    Raises:
+        ValueError: it says no, or that it cannot judge, and lists nothing.
     """
 
     step: str
-    ok: bool
+    ok: bool | None
     what: str
     evidence: tuple[Evidence, ...]
     next_action: str
@@ -65,6 +83,31 @@ class Finding:
     data: Mapping[str, Any] = field(default_factory=dict)
     date: datetime.datetime = field(default_factory=lambda: datetime.datetime.now(datetime.UTC).replace(microsecond=0))
     problems: tuple[str, ...] = ()
+    unsure: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        unknown = tuple(f"{e.name} is not known ({e.source})" for e in self.evidence if e.value is None)
+        if self.ok is not False and unknown:
+            object.__setattr__(self, "unsure", tuple(dict.fromkeys((*self.unsure, *unknown))))
+        if self.ok and self.unsure:
+            object.__setattr__(self, "ok", None)
+        if self.ok is False and not self.problems:
+            if not (self.unsure or unknown):
+                raise ValueError(f"the finding of {self.step} says no and names nothing that is wrong: {self.what}")
+            object.__setattr__(self, "ok", None)
+            object.__setattr__(self, "unsure", self.unsure or unknown)
+        if self.ok is None and not self.unsure:
+            raise ValueError(f"the finding of {self.step} cannot judge and does not say why: {self.what}")
+
+    @property
+    def verdict(self) -> Verdict:
+        """The three states in words."""
+        return "cannot judge" if self.ok is None else "ok" if self.ok else "not ok"
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """What is to be read below the sentence: why it cannot judge, and what is wrong, unless the sentence says it."""
+        return tuple(words for words in (*self.unsure, *self.problems) if words != self.what)
 
     def as_json(self) -> dict[str, Any]:
         """As it stands in `findings/`."""
@@ -74,7 +117,9 @@ class Finding:
             "date": self.date.isoformat().replace("+00:00", "Z"),
             "command": self.command,
             "ok": self.ok,
+            "verdict": self.verdict,
             "what": self.what,
+            "unsure": list(self.unsure),
             "problems": list(self.problems),
             "next_action": self.next_action,
             "evidence": [vars(evidence) for evidence in self.evidence],
@@ -89,15 +134,18 @@ class Finding:
                 }
                 for p in self.parameters
             },
-            "data": dict(self.data),
+            "data": known(self.data),
         }
 
     @classmethod
     def of_json(cls, content: Mapping[str, Any]) -> Finding:
         """The inverse of `as_json`; raises KeyError, TypeError or ValueError on what it did not write."""
+        ok, problems = content["ok"], tuple(content.get("problems", ()))
+        if ok is False and not problems:
+            problems = (str(content["what"]),)  # as they were written before they had to name what is wrong
         return cls(
             step=str(content["step"]),
-            ok=bool(content["ok"]),
+            ok=None if ok is None else bool(ok),
             what=str(content["what"]),
             evidence=tuple(Evidence(**entry) for entry in content["evidence"]),
             next_action=str(content["next_action"]),
@@ -108,18 +156,27 @@ class Finding:
             ),
             data=content["data"],
             date=datetime.datetime.fromisoformat(str(content["date"])),
-            problems=tuple(content.get("problems", ())),
+            problems=problems,
+            unsure=tuple(content.get("unsure", ())),
         )
 
     def as_markdown(self) -> str:
         """The same for people: the sentence, what is wrong, the numbers, what is next."""
-        lines = [f"# {self.step}: {'✓ ok' if self.ok else '✗ not ok'}", "", self.what, ""]
-        lines += [f"- {problem}" for problem in self.problems] + [""] * bool(self.problems)
+        lines = [f"# {self.step}: {_SIGNS[self.verdict]} {self.verdict}", "", self.what, ""]
+        lines += [f"- {words}" for words in self.lines] + [""] * bool(self.lines)
         if self.evidence:
             lines += ["| what | value | interval | unit | source |", "|---|---|---|---|---|"]
             lines += [_row(evidence) for evidence in self.evidence] + [""]
         lines += [f"Next: {self.next_action}", ""] if self.next_action else []
         return "\n".join([*lines, f"{self.date:%Y-%m-%d %H:%M} UTC, `{self.command}`", ""])
+
+
+_SIGNS: Mapping[Verdict, str] = {"ok": "✓", "not ok": "✗", "cannot judge": "?"}
+
+
+def together(*verdicts: bool | None) -> bool | None:
+    """What several verdicts come to: no where one says no, else unsure where one is, else yes."""
+    return False if False in verdicts else None if None in verdicts else True
 
 
 def _row(evidence: Evidence) -> str:
@@ -154,7 +211,7 @@ def keep(finding: Finding, folder: RobotFolder, recording: str | None = None) ->
 
     stamp = finding.date.strftime("%Y%m%dT%H%M%SZ")
     path = folder.findings / f"{finding.step}-{stamp}.json"
-    write_text(path, json.dumps(finding.as_json(), indent=1, ensure_ascii=False) + "\n")
+    write_text(path, json_text(finding.as_json()))
     write_text(path.with_suffix(".md"), finding.as_markdown())
     values: dict[str, Any] = {}
     provenance: dict[str, Provenance] = {}

@@ -5,15 +5,20 @@ from __future__ import annotations
 from rich.text import Text
 
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.tui.marks import MARKS, mark, marked, spelled
+from openant_tools.tui.marks import MARKS, Name, mark, marked, spelled
 
-__all__ = ["finding_lines"]
+__all__ = ["finding_lines", "sign"]
+
+
+def sign(finding: Finding) -> Name:
+    """The mark of its verdict."""
+    return "unsure" if finding.ok is None else "ok" if finding.ok else "fail"
 
 
 def finding_lines(finding: Finding, before: str = "") -> list[Text]:
     """One text a line of the log; `before` stands before the sentence."""
-    lines = [marked("ok" if finding.ok else "fail", f"{before}{finding.what}")]
-    lines += [Text(f"  {mark('warn')} {spelled(problem)}", style=MARKS["warn"].colour) for problem in finding.problems]
+    lines = [marked(sign(finding), f"{before}{finding.what}")]
+    lines += [Text(f"  {mark('warn')} {spelled(words)}", style=MARKS["warn"].colour) for words in finding.lines]
     lines += [_evidence(evidence) for evidence in finding.evidence]
     if finding.next_action:
         lines.append(Text(f"Next: {spelled(finding.next_action)}", style="bold"))

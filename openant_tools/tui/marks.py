@@ -12,7 +12,7 @@ from rich.text import Text
 
 __all__ = ["BLUE", "MARKS", "Mark", "Name", "can_unicode", "mark", "marked", "plain", "spelled"]
 
-Name = Literal["ok", "warn", "fail", "wait", "todo", "stale", "info", "off", "on"]
+Name = Literal["ok", "warn", "fail", "unsure", "wait", "todo", "stale", "info", "off", "on"]
 
 #: Okabe–Ito: told apart by every kind of colour vision.
 GREEN, ORANGE, VERMILION, BLUE, GREY = "#009E73", "#E69F00", "#D55E00", "#56B4E9", "#A8A8A8"
@@ -36,6 +36,7 @@ MARKS: Mapping[Name, Mark] = {
     "ok": Mark("✓", "+", "ok", GREEN),
     "warn": Mark("▲", "!", "look", ORANGE),
     "fail": Mark("✗", "x", "no", VERMILION),
+    "unsure": Mark("?", "?", "unsure", ORANGE),
     "wait": Mark("…", "~", "running", BLUE),
     "todo": Mark("·", ".", "to do", GREY),
     "stale": Mark("↻", "o", "again", ORANGE),

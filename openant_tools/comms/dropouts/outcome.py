@@ -44,7 +44,7 @@ def dropouts_finding(
     evidence = [
         Evidence("time watched", round(log.seconds, 3), "s", source),
         Evidence("answers asked for", float(asked), "", source),
-        Evidence("share lost", lost / max(1, asked), "", source, low, high),
+        Evidence("share lost", lost / asked if asked else None, "", source, low, high),
     ]
     last = np.nanmax(np.where(np.isfinite(log.rtt), log.rtt, -np.inf), axis=1)
     last = last[np.isfinite(last)]
@@ -59,6 +59,7 @@ def dropouts_finding(
         evidence.append(Evidence(f"probability of {best.cause}", best.probability, "", "openant comms diagnose"))
     remedy = "" if found.verdict in ("none", "unknown") else best.remedy
     steps = [words for words in (remedy, found.next_test) if words]
+    marks = tuple(why.words for why in best.evidence if why.nats > 0)[:_SHOWN]
     return Finding(
         step=STEP,
         ok=found.healthy_bus,
@@ -67,7 +68,7 @@ def dropouts_finding(
         next_action="; to make sure: ".join(steps),
         command=command,
         data={"diagnosis": found.as_json()},
-        problems=() if found.healthy_bus else tuple(why.words for why in best.evidence if why.nats > 0)[:_SHOWN],
+        problems=() if found.healthy_bus else marks or (found.what,),
     )
 
 

@@ -195,33 +195,35 @@ def friction_finding(
     if not slid:
         most = max(math.tan(slope.angle_rad) for slope in slopes)
         return Finding(
-            "floor-friction", False, f"The robot did not slide: the coefficient is above {most:.2f}.",
+            "floor-friction", None, f"The robot did not slide: the coefficient is above {most:.2f}.",
             (Evidence("friction, at least", most, "1", f"μ = tan α by {source}"),),
             "Tilt further, until it slides.", command, data=data,
+            unsure=("The coefficient is known from below only.",),
         )  # fmt: skip
     chosen: Kind = "kinetic" if "kinetic" in found else "static"
     mu = found[chosen]
     interval = "" if mu.low is None or mu.high is None else f" [{mu.low:.3f}, {mu.high:.3f}]"
     what = f"Floor friction: μ = {mu.value:.3f}{interval} ({chosen}, {mu.readings} readings)."
     actions: list[str] = []
-    ok = mu.low is not None
-    if not ok:
-        actions.append("One reading has no interval: take at least three, with the robot turned in between.")
+    problems: list[str] = []
+    unsure: list[str] = []
+    if mu.low is None:
+        unsure.append("One reading has no interval.")
+        actions.append("Take at least three readings, with the robot turned in between.")
     if mu.value < LEAST_FRICTION:
-        ok = False
+        problems.append(f"A coefficient of {mu.value:.3f} cannot be.")
         actions.append("No floor is so slippery: did the plate tilt, and was it level when the reference was taken?")
     if len(found) == 2:
         ratio = found["static"].value / mu.value
         what += f" It holds up to {found['static'].value:.3f} before it slides, {ratio:.2f} times as much."
         if ratio < 1 and not _overlap(found["static"], mu):
-            ok = False
-            what += " Static friction below kinetic friction cannot be."
+            problems.append("Static friction below kinetic friction cannot be.")
             actions.append("Look whether the two kinds of readings were swapped.")
     elif chosen == "static":
         actions.append("Feet that slip feel the kinetic coefficient, which is lower: tap the plate and add --kinetic.")
     return Finding(
-        "floor-friction", ok, what, evidence, " ".join(actions), command,
-        parameters=(of(chosen, "floor_friction"),), data=data,
+        "floor-friction", False if problems else None if unsure else True, what, evidence, " ".join(actions), command,
+        parameters=(of(chosen, "floor_friction"),), data=data, problems=tuple(problems), unsure=tuple(unsure),
     )  # fmt: skip
 
 

@@ -169,4 +169,5 @@ def torque_finding(
         next_action=action,
         command=command,
         data={"rows": [{**vars(load), "verdict": load.verdict} for load in loads]},
+        problems=() if worst.verdict == "holds" else (what,),
     )

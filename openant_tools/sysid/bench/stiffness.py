@@ -332,7 +332,8 @@ def stiffness_finding(
     parameters: list[Evidence] = []
     words: list[str] = []
     actions: list[str] = []
-    ok = True
+    problems: list[str] = []
+    unsure: list[str] = []
     verdict: DivisorVerdict | None = None
     if duty is not None and servo_stiffness is not None:
         verdict = decide_divisor(duty, p_gain)
@@ -344,11 +345,11 @@ def stiffness_finding(
             Evidence("P divisor", verdict.divisor, "1", "Present PWM over position error", verdict.low, verdict.high)
         )
         words.append(f"By the servo's own duty {verdict.words}")
-        ok = ok and len(verdict.supported) == 1
+        if len(verdict.supported) != 1:
+            unsure.append("the servo's own duty does not decide which P divisor this firmware has")
         if i_gain:
-            words.append(f"position_i_gain is {i_gain:.0f}, so that duty grows while the error stands")
+            problems.append(f"position_i_gain is {i_gain:.0f}, so that duty grows while the error stands")
             actions.append("Set position_i_gain to 0 for this measurement.")
-            ok = False
     if scale is not None:
         over = "measured position error" if measured_error else "deflection of the goal"
         arm = "" if arm_m is None else f", lever arm {arm_m:.3f} m"
@@ -358,19 +359,19 @@ def stiffness_finding(
         if verdict is None:
             verdict = decide_divisor(scale.scaled(1 / stall), p_gain, _SHEET_TOLERANCE)
             words.append(f"By the scale {verdict.words}, as far as the data sheet's stall torque is true")
-            ok = ok and len(verdict.supported) == 1
+            if len(verdict.supported) != 1:
+                unsure.append("the scale does not decide which P divisor this firmware has")
         if servo_stiffness is not None:
             ratio = scale.slope / servo_stiffness.slope
             evidence.append(Evidence("scale over servo", ratio, "1", "the two stiffnesses above"))
             if abs(ratio - 1) > _SHEET_TOLERANCE + (scale.high - scale.low) / 2 / scale.slope:
-                ok = False
-                words.append(
+                problems.append(
                     f"the scale gives {ratio:.2f} times what duty and data sheet give: more than servos differ"
                 )
                 actions.append(
                     "Measure the lever arm again (--arm), look whether the torso moves, and repeat with smaller steps."
                 )
-        if not ok and not measured_error and verdict is not None and not verdict.supported:
+        if (problems or unsure) and not measured_error and verdict is not None and not verdict.supported:
             actions.append("Repeat with the robot connected, so that the position error is measured, not assumed.")
     elif servo_stiffness is not None:
         # Under a name of its own: its interval leaves out what the data sheet's stall torque may be wrong by.
@@ -383,10 +384,12 @@ def stiffness_finding(
     interval = f"[{best.low:.2f}, {best.high:.2f}]"
     return Finding(
         step=f"stiffness-{joint}",
-        ok=ok,
+        ok=False if problems else None if unsure else True,
         what=f"{joint}: {best.value:.2f} N·m/rad {interval}{by}. " + "; ".join(words) + ".",
         evidence=tuple(evidence),
         next_action=" ".join(dict.fromkeys(actions)),
+        problems=tuple(problems),
+        unsure=tuple(unsure),
         command=command,
         parameters=tuple(parameters),
         data={

@@ -14,13 +14,14 @@ from textual.widgets.option_list import Option
 from openant_tools.bringup.walk import WALK, Standing, standing
 from openant_tools.procedure.step import Step
 from openant_tools.tui.choices import Choices
+from openant_tools.tui.found import sign
 from openant_tools.tui.leg_map import LegMap
 from openant_tools.tui.marks import Name, mark, marked, plain, spelled
 from openant_tools.tui.page import Page
 
 __all__ = ["WalkScreen", "standing_mark"]
 
-_MARKS: dict[str, Name] = {"todo": "todo", "ok": "ok", "failed": "fail", "stale": "stale"}
+_MARKS: dict[str, Name] = {"todo": "todo", "ok": "ok", "failed": "fail", "unsure": "unsure", "stale": "stale"}
 CHECK, VIRTUAL = "check", "virtual"
 
 
@@ -43,6 +44,7 @@ will do before it does anything. You can leave a step, come back, repeat it, and
 | `·` to do | not done yet |
 | `✓` ok | done, with evidence in the robot's `findings/` |
 | `✗` no | it found something: open it and read what to do |
+| `?` unsure | it cannot judge: open it and read what is not known |
 | `↻` again | a step that it builds on was done again since |
 
 No robot here? The line below the steps starts a virtual one, which behaves like a real one down to its bytes.
@@ -132,7 +134,7 @@ _ABOUT_VIRTUAL = Text.assemble(
 def _about(step: Step, one: Standing | None) -> Text:
     text = Text.assemble((f"{step.title}", "bold"), f"  about {step.minutes:g} min\n{step.does}\n")
     if one is not None and one.finding is not None:
-        text.append(f"{mark('ok' if one.finding.ok else 'fail')} {one.finding.what}\n", "bold")
+        text.append(f"{mark(sign(one.finding))} {one.finding.what}\n", "bold")
     if one is not None and one.waits_for:
         text.append(f"{mark('warn')} wants first: {', '.join(WALK[name].title for name in one.waits_for)}\n")
     if step.table:
