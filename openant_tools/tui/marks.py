@@ -36,7 +36,7 @@ MARKS: Mapping[Name, Mark] = {
     "ok": Mark("✓", "+", "ok", GREEN),
     "warn": Mark("▲", "!", "look", ORANGE),
     "fail": Mark("✗", "x", "no", VERMILION),
-    "unsure": Mark("?", "?", "unsure", ORANGE),
+    "unsure": Mark("?", "?", "doubt", ORANGE),
     "wait": Mark("…", "~", "running", BLUE),
     "todo": Mark("·", ".", "to do", GREY),
     "stale": Mark("↻", "o", "again", ORANGE),

@@ -44,7 +44,7 @@ will do before it does anything. You can leave a step, come back, repeat it, and
 | `·` to do | not done yet |
 | `✓` ok | done, with evidence in the robot's `findings/` |
 | `✗` no | it found something: open it and read what to do |
-| `?` unsure | it cannot judge: open it and read what is not known |
+| `?` doubt | it cannot judge: open it and read why |
 | `↻` again | a step that it builds on was done again since |
 
 No robot here? The line below the steps starts a virtual one, which behaves like a real one down to its bytes.
