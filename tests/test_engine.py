@@ -23,6 +23,7 @@ from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.guards import Guards
 from openant_tools.comms.messages import EngineConfig
+from openant_tools.comms.restart import Interlock, MotionStopped, Restart, StopCause
 from openant_tools.comms.setup import camera_of_robot, config_of_unknown_robot, imu_of_robot
 from openant_tools.errors import HardwareFault
 from openant_tools.recording.reader import read_recording
@@ -194,17 +195,24 @@ def test_a_motion_may_not_begin_nor_end_without_torque(stepped: dict[str, str]) 
 
 
 @pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="limits of another process are Linux'")
-def test_a_full_disk_stops_the_motion_and_the_next_recording_goes_on(stepped: dict[str, str], tmp_path: Path) -> None:
+def test_a_full_disk_ends_motion_until_the_builder_says_otherwise(stepped: dict[str, str], tmp_path: Path) -> None:
     with EngineProcess(config(stepped)) as engine:
         engine.ask(messages.Torque(True))
         engine.ask(messages.Record(str(tmp_path / "full"), Facts(JOINT_NAMES)))
         unlimited = resource.prlimit(engine.pid, resource.RLIMIT_FSIZE)
         resource.prlimit(engine.pid, resource.RLIMIT_FSIZE, (30_000, unlimited[1]))
-        with pytest.raises(HardwareFault, match="the recording stopped"):
+        with pytest.raises(MotionStopped, match=r"the recording stopped; .* is kept, \d+ rows") as stopped:
             engine.ask(messages.Hold(60.0))
+        assert stopped.value.cause is StopCause.STORAGE
         resource.prlimit(engine.pid, resource.RLIMIT_FSIZE, unlimited)
         assert not any(torques(stepped))
-        engine.ask(messages.Torque(True))
+        with pytest.raises(HardwareFault, match="does not begin again by itself"):
+            engine.ask(messages.Torque(True))
+        for command in (messages.Look(0.1), messages.StopRecording()):  # neither overlooks that nothing is recorded
+            with pytest.raises(MotionStopped, match="the recording stopped"):
+                engine.ask(command)
+        assert not any(torques(stepped))
+        engine.ask(messages.Torque(True, Restart()))
         engine.ask(messages.Record(str(tmp_path / "run"), Facts(JOINT_NAMES)))
         engine.ask(messages.Hold(0.2))
         assert engine.ask(messages.StopRecording())[1] >= 15
@@ -221,7 +229,9 @@ def test_a_motion_that_the_watchdog_stopped_is_not_taken_for_going_on(live: dict
         os.kill(engine.pid, signal.SIGCONT)
         with pytest.raises(HardwareFault, match=r"stood still for 0\.\d+ s, and the servos' Bus Watchdog stopped"):
             wait_until(lambda: engine.done(moving))
-        engine.ask(messages.Torque(True))
+        with pytest.raises(HardwareFault, match="does not begin again by itself"):
+            engine.ask(messages.Torque(True))
+        engine.ask(messages.Torque(True, Interlock("comms soak").stopped(StopCause.STALL, "", 0.0)))
         engine.ask(messages.Hold(0.1))
 
 
@@ -234,9 +244,6 @@ def test_what_cannot_be_is_refused_and_nothing_moves(stepped: dict[str, str]) ->
             engine.ask(messages.Ramp(np.full(8, 2.0)))
         with pytest.raises(HardwareFault, match="EEPROM is locked"):
             engine.ask(messages.WriteRegister("hip_rr", "pwm_limit", 400))
-        # Goals of a policy are clipped, as the platform clips them.
-        end = engine.ask(messages.Goal(np.full(8, 2.0), 1.0))
-        assert (end[::2] < 0.9).all()
 
 
 def test_a_second_connect_finds_the_port_taken(live: dict[str, str]) -> None:
@@ -337,12 +344,13 @@ def test_unplugging_stops_the_motion_and_plugging_in_goes_on_from_there(live: di
         wait_until(back)
         assert any("torque was still on" in text for text in said)
         assert not any(torques(live))
-        engine.ask(messages.Torque(True))
+        engine.ask(messages.Torque(True, Restart()))  # whoever plugged it in again says so
         engine.ask(messages.Hold(0.2))
     control.close()
     recording = read_recording(out)
     assert recording.damage is None
-    assert any(event["kind"] == "stopped" for event in recording.events)
+    ends = [(event["kind"], event["cause"]) for event in recording.events if event["kind"] in ("stopped", "restart")]
+    assert ends == [("stopped", "port"), ("restart", None)]
 
 
 # ---- dying with torque on ----------------------------------------------------------------------------------------

@@ -65,8 +65,9 @@ def soak(
 ) -> None:
     """Read and write at full rate for hours while the legs swing, log every loss with all that was seen around it.
 
-    The robot is on its stand, legs free. A guard that stops it is told, and the soak goes on. Ctrl-C ends it with torque
-    off and the log whole; --resume goes on with it.
+    The robot is on its stand, legs free. What stops it is told; the legs swing again only after silence, twelve times in
+    ten minutes at most (docs/restart.md), else the soak goes on listening, torque off. Ctrl-C ends it with torque off and
+    the log whole; --resume goes on with it.
 
     \b
       openant comms soak --robot my-ant --out soak.mcap --minutes 60
@@ -130,9 +131,11 @@ def _on_the_bus(
         click.echo(f"stopped: {stop}")
     if json_file:
         content = {"run": str(done.path), "seconds": done.seconds, "rows": done.cycles, "stops": list(done.stops),
-                   "whole": done.whole, "statistics": done.statistics}  # fmt: skip
+                   "ended": done.ended, "whole": done.whole, "statistics": done.statistics}  # fmt: skip
         write_text(json_file, json.dumps(content, indent=1) + "\n")
     click.echo(f"`openant comms diagnose {done.path}` says why", err=True)
+    if done.ended:
+        click.echo(f"openant: motion has ended for good: {done.ended}", err=True)
     if not done.whole:
         raise SystemExit(1)
 

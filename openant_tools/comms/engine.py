@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pickle
 import select
 import signal
 import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
@@ -28,13 +29,15 @@ from openant_tools.comms import guardian, messages
 from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.body_imu import BodyImu
 from openant_tools.comms.bus import Answer, Bus, Timing
+from openant_tools.comms.checked import checked
 from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
-from openant_tools.comms.faults import Cause
+from openant_tools.comms.faults import BrokenAnswer, Cause, NoAnswer
 from openant_tools.comms.guards import Trip, Watch
 from openant_tools.comms.line import PortGone, SerialLine
 from openant_tools.comms.messages import EngineConfig
-from openant_tools.comms.motion import Motion, catch, hold, play, ramp
+from openant_tools.comms.motion import Motion, catch, held, hold, play, ramp
 from openant_tools.comms.ports import WANTED_LATENCY_MS, Host, udev_rule
+from openant_tools.comms.restart import StopCause
 from openant_tools.comms.ring import ERR_CODES, Ring
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Block, Servo, Servos
 from openant_tools.comms.thinning import Thinning
@@ -105,6 +108,10 @@ class Engine:
         self._waiting: list[tuple[int, Motion]] = []
         #: (number, until when) of commands that only let time pass
         self._looks: list[tuple[int, float]] = []
+        #: what ended motion last; torque comes on again only with a reason then
+        self._trip: Trip | None = None
+        #: why the recording that was asked for is not written any more, until whoever records is told
+        self._unrecorded: RecordingStopped | None = None
         self._recorder: RecordingWriter | None = None
         self._thinning: Thinning | None = None
         #: when the raw bytes of a loss were kept last, s
@@ -363,10 +370,11 @@ class Engine:
                 self._cycle(wake, cycles)
             except PortGone as error:
                 self._port_lost()
-                self._stopped(Trip(str(error.what), "look at the USB cable; the servos' watchdog stops them"))
+                remedy = "look at the USB cable; the servos' watchdog stops them"
+                self._stopped(Trip(str(error.what), remedy, cause=StopCause.PORT))
             except HardwareFault as error:
                 # A servo that had to answer did not, or refused: what its motion waits for will not come.
-                self._stopped(Trip(error.what, error.remedy or ""))
+                self._stopped(Trip(error.what, error.remedy or "", cause=_cause_of(error)))
             self._end_looks()
             self._flush()
             late = int((self.clock.now() - due) / self._period)
@@ -500,6 +508,7 @@ class Engine:
         return Trip(
             f"this computer stood still for {seconds:.2f} s, and the servos' Bus Watchdog stopped the motion",
             "close what else keeps it busy, or let it not go to sleep",
+            cause=StopCause.STALL,
         )
 
     def _motion_ended(self, motion: Motion) -> None:
@@ -525,7 +534,8 @@ class Engine:
             return trip
         servo = self._servos[trip.joint]
         names = ", ".join(error.name for error in errors)
-        return Trip(f"{servo.joint} (id {servo.id}) reports {names}", errors[0].advice, trip.joint)
+        what = f"{servo.joint} (id {servo.id}) reports {names}"
+        return Trip(what, errors[0].advice, trip.joint, cause=StopCause.HARDWARE_ERROR)
 
     def _who_is_silent(self, trip: Trip) -> Trip:
         """Each servo asked alone: in a common read those behind a silent one wait for it and seem silent, too."""
@@ -547,11 +557,14 @@ class Engine:
                 f"{names} is silent and what comes from {other.joint} (id {other.id}) is broken",
                 f"probably both have id {other.id}: unplug {other.joint}, and `openant comms scan` shows it",
                 first.joint,
+                cause=trip.cause,
             )
         if len(silent) > 1:
             remedy = f"look at the cable before {first.joint} and at each servo's connectors"
-            return Trip(f"{names} do not answer", remedy, first.joint)
-        return trip if first.joint == trip.joint else Trip(f"{names} does not answer", trip.remedy, first.joint)
+            return Trip(f"{names} do not answer", remedy, first.joint, cause=trip.cause)
+        if first.joint == trip.joint:
+            return trip
+        return Trip(f"{names} does not answer", trip.remedy, first.joint, cause=trip.cause)
 
     def _stopped(self, trip: Trip) -> None:
         """Release everyone, tell, and only then make sure: on a bad line that may take a while."""
@@ -560,10 +573,11 @@ class Engine:
                 self._servos.torque_off_now()
         if self._recorder is not None:
             with contextlib.suppress(RecordingStopped):  # told by the next cycle's row
-                self._recorder.event("stopped", what=trip.what, joint=trip.joint)
-        self._say(messages.Stopped(trip.what, trip.remedy, trip.joint))
+                self._recorder.event("stopped", what=trip.what, joint=trip.joint, cause=trip.cause.value)
+        self._trip = trip
+        self._say(messages.Stopped(trip.what, trip.remedy, trip.joint, trip.cause))
         for number, _ in self._waiting:
-            self._say(messages.Reply(number, error=(trip.what, None, trip.remedy)))
+            self._say(messages.Reply(number, error=(trip.what, None, trip.remedy), cause=trip.cause))
         self._waiting.clear()
         self._torque_off()
 
@@ -636,7 +650,12 @@ class Engine:
         """The disk is full: the robot must not go on moving for a recording that nobody will have."""
         with contextlib.suppress(RecordingStopped):
             self._close_recording()
-        self._stopped(Trip(error.what, error.remedy or "", None))
+        self._unrecorded = error
+        self._stopped(Trip(error.what, error.remedy or "", cause=StopCause.STORAGE))
+        # Who only lets time pass does so for this recording, too.
+        for number, _ in self._looks:
+            self._say(_refusal(number, None, error))
+        self._looks.clear()
 
     def _telemetry(
         self, t: float, cmd_t: float | None, wake: float, answers: list[tuple[Answer, Block | None]]
@@ -680,17 +699,27 @@ class Engine:
             raise _ParentGone
         try:
             while self._connection.poll(0.2 if block else 0.0):
-                number, command = self._connection.recv()
+                received = self._connection.recv_bytes()
+                try:
+                    number, command = pickle.loads(received)  # from our parent alone, over a socket pair
+                except Exception as error:
+                    self._notice(f"a message of {len(received)} bytes was refused: it cannot be read ({error})")
+                    continue
                 if command is None:
                     self._ending = True
                     return
                 try:
                     answer = self._do(number, command)
                 except PortGone as error:
-                    self._port_lost()
-                    answer = messages.Reply(number, error=(error.what, error.where, error.remedy))
+                    if not self._lost:
+                        self._port_lost()
+                    answer = _refusal(number, command, error)
                 except OpenAntError as error:
-                    answer = messages.Reply(number, error=(error.what, error.where, error.remedy))
+                    answer = _refusal(number, command, error)
+                except Exception as error:  # ours: whoever waits is told, and nothing moves on with it
+                    what = f"{type(command).__name__} failed in the engine: {type(error).__name__}: {error}"
+                    self._stopped(Trip(what, "report it: `openant support` packs what is needed"))
+                    answer = messages.Reply(number, error=(what, None, None), cause=StopCause.UNKNOWN)
                 if answer is not None:
                     self._say(answer)
                 if block:
@@ -700,14 +729,17 @@ class Engine:
 
     def _do(self, number: int, command: messages.Command) -> messages.Reply | None:
         """One command; None where its reply comes later."""
+        command = checked(command, self._servos, self.config.limits_rad)
         if isinstance(command, messages.Stop):
-            self._stopped(Trip("stopped by hand", ""))
+            self._stopped(Trip("stopped by hand", "", cause=StopCause.BY_HAND))
             return messages.Reply(number)
         if isinstance(command, messages.Look):
+            if self._unrecorded is not None:
+                raise self._unrecorded
             self._looks.append((number, self.clock.now() + command.seconds))
             return None
         if self._lost:
-            raise HardwareFault("the port is gone", where=self.config.port, remedy="look at the USB cable")
+            raise PortGone(self.config.port)
         handlers: dict[type, Callable[[int, Any], messages.Reply | None]] = {
             messages.Torque: self._do_torque,
             messages.Ramp: self._do_move,
@@ -715,7 +747,7 @@ class Engine:
             messages.Hold: self._do_move,
             messages.Goal: self._do_goal,
             messages.Record: self._do_record,
-            messages.StopRecording: lambda number, _: messages.Reply(number, value=self._close_recording()),
+            messages.StopRecording: self._do_stop_recording,
             messages.ReadRegister: self._do_read,
             messages.WriteRegister: self._do_write,
             messages.Statistics: lambda number, _: messages.Reply(number, value=self._statistics()),
@@ -727,7 +759,17 @@ class Engine:
             self._torque_off()
             return messages.Reply(number)
         if not self._torque:
+            if self._trip is not None and command.restart is None:
+                raise BadInput(
+                    f"motion was stopped and does not begin again by itself: {self._trip.what}",
+                    remedy="look at the robot, then start anew",
+                )
             self._switch_on()
+            if command.restart is not None:
+                self._notice(str(command.restart))
+                if self._recorder is not None:
+                    self._recorder.event("restart", **asdict(command.restart))
+            self._trip = None
         return messages.Reply(number, value=self._goal)
 
     def _switch_on(self) -> None:
@@ -762,44 +804,21 @@ class Engine:
         if isinstance(command, messages.Hold):
             motions = [hold(self._goal, command.seconds, rate)]
         elif isinstance(command, messages.Ramp):
-            self._within_limits(command.target[None, :])
             motions = [ramp(self._goal, command.target, rate)]
         else:
-            self._within_limits(command.commands)
-            limp = command.limp
-            if limp is not None and (limp.shape != command.commands.shape or limp[[0, -1]].any()):
-                raise BadInput("a motion must begin and end with the torque of all joints on")
-            motions = play(self._goal, command.commands, rate, command.name, limp)
+            motions = play(self._goal, command.commands, rate, command.name, command.limp)
         self._motions.extend(motions)
         self._waiting.append((number, motions[-1]))
 
     def _do_goal(self, number: int, command: messages.Goal) -> None:
         if not self._torque:
             raise BadInput("torque is off", remedy="switch it on first")
-        low, high = self._limit_arrays()
-        cycles = max(1, round(command.seconds * self.config.rate_hz))
-        row = np.clip(command.target, low, high)
-        motion = Motion("goal", np.repeat(row[None, :], cycles, axis=0), number=number, measured=command.measured)
+        rows = held(command.target, command.seconds, self.config.rate_hz)
+        motion = Motion("goal", rows, number=number, measured=command.measured)
         motion.agent = command.agent
         self._motions.clear()
         self._motions.append(motion)
         self._waiting.append((number, motion))
-
-    def _limit_arrays(self) -> tuple[Array, Array]:
-        limits = [self.config.limits_rad.get(joint, (-np.inf, np.inf)) for joint in self._servos.joints]
-        return np.array([low for low, _ in limits]), np.array([high for _, high in limits])
-
-    def _within_limits(self, commands: Array) -> None:
-        low, high = self._limit_arrays()
-        if commands.ndim != 2 or commands.shape[1] != len(low) or not np.isfinite(commands).all():
-            raise BadInput(f"commands of shape {commands.shape} for {len(low)} joints")
-        outside = np.argwhere((commands < low - 1e-9) | (commands > high + 1e-9))
-        if len(outside):
-            row, k = outside[0]
-            raise BadInput(
-                f"a command of {commands[row, k]:.3f} rad for {self._servos.joints[k]} is outside its limits "
-                f"{low[k]:.3f} to {high[k]:.3f}"
-            )
 
     def _do_record(self, number: int, command: messages.Record) -> messages.Reply:
         if self._recorder is not None:
@@ -817,19 +836,23 @@ class Engine:
         if command.thin_s is not None:
             facts = replace(facts, extra={**facts.extra, "rate_hz": self.config.rate_hz, "thinned_s": command.thin_s})
         self._registers = self._read_registers()
+        self._unrecorded = None
         continued = None
         if command.resume:
             continued = continuation(command.path, channels, self.clock.now(), wall_counts=not self.clock.stepped)
-        self._recorder = RecordingWriter(
-            command.path,
-            facts=facts,
-            channels=channels,
-            registers=self._registers,
-            config=command.config,
-            clock=self.clock.now,
-            overwrite=command.overwrite,
-            continued=continued,
-        )
+        try:
+            self._recorder = RecordingWriter(
+                command.path,
+                facts=facts,
+                channels=channels,
+                registers=self._registers,
+                config=command.config,
+                clock=self.clock.now,
+                overwrite=command.overwrite,
+                continued=continued,
+            )
+        except (TypeError, ValueError, AttributeError) as error:
+            raise BadInput(f"Record.facts cannot be recorded: {error}", where=command.path) from error
         self._thinning = None if command.thin_s is None else Thinning(command.thin_s, self._servos.joints)
         self._bus.failed = None
         if continued is not None:
@@ -856,6 +879,18 @@ class Engine:
             recorder.event("counts", **self._thinning.rest(self.clock.now()))
         recorder.close()
         return str(recorder.path), recorder.cycles
+
+    def _do_stop_recording(self, number: int, command: messages.StopRecording) -> messages.Reply:
+        """Also where the recording ended before, it is told: nobody takes a part for the whole."""
+        unrecorded, self._unrecorded = self._unrecorded, None
+        if unrecorded is not None:
+            raise unrecorded
+        try:
+            return messages.Reply(number, value=self._close_recording())
+        except RecordingStopped as error:
+            self._recording_failed(error)
+            self._unrecorded = None
+            raise
 
     def _do_read(self, number: int, command: messages.ReadRegister) -> messages.Reply:
         return messages.Reply(number, value=self._servos.read_all(command.register))
@@ -896,6 +931,25 @@ class Engine:
         except OSError:
             if patience_s == 0.0:
                 raise _ParentGone from None
+
+
+def _cause_of(error: OpenAntError) -> StopCause:
+    """What ended motion, where an error did."""
+    if isinstance(error, RecordingStopped):
+        return StopCause.STORAGE
+    if isinstance(error, PortGone):
+        return StopCause.PORT
+    return StopCause.SILENCE if isinstance(error, (NoAnswer, BrokenAnswer)) else StopCause.UNKNOWN
+
+
+def _refusal(number: int, command: messages.Command | None, error: OpenAntError) -> messages.Reply:
+    """The reply to a command that failed; with a cause where nothing is recorded any more, or motion cannot begin."""
+    ends = isinstance(error, RecordingStopped) or (
+        isinstance(command, messages.Torque) and not isinstance(error, BadInput)
+    )
+    return messages.Reply(
+        number, error=(error.what, error.where, error.remedy), cause=_cause_of(error) if ends else None
+    )
 
 
 def main() -> None:

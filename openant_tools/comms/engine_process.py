@@ -21,8 +21,9 @@ from types import TracebackType
 from typing import Any, ClassVar
 
 from openant_tools.comms.messages import Command, EngineConfig, Event, Finished, Notice, Reply, Stop, Stopped
+from openant_tools.comms.restart import MotionStopped
 from openant_tools.comms.ring import Ring, columns
-from openant_tools.errors import HardwareFault
+from openant_tools.errors import BadInput, HardwareFault
 
 __all__ = ["EngineProcess"]
 
@@ -94,12 +95,14 @@ class EngineProcess:
     # ---- commands ------------------------------------------------------------------------------------------------
 
     def start(self, command: Command) -> int:
-        """Send a command without waiting; its number, for `done`."""
+        """Send a command without waiting; its number, for `done`. What cannot be sent is refused, and nothing changes."""
         number = next(self._numbers)
         try:
             self._connection.send((number, command))
         except OSError:
             self._died()
+        except Exception as error:  # whatever pickling makes of it
+            raise BadInput(f"{type(command).__name__} cannot be sent to the engine: {error}") from error
         return number
 
     def done(self, number: int) -> bool:
@@ -116,7 +119,8 @@ class EngineProcess:
         """Send a command and wait for its answer; for a motion that is its end.
 
         Raises:
-            HardwareFault: the engine says no, was stopped meanwhile, or has died.
+            MotionStopped: the motion was stopped meanwhile; its `cause` says why.
+            HardwareFault: the engine says no, or has died.
         """
         return self.wait(self.start(command), timeout_s)
 
@@ -162,6 +166,8 @@ class EngineProcess:
     def _value(self, reply: Reply) -> Any:
         if reply.error is not None:
             what, where, remedy = reply.error
+            if reply.cause is not None:
+                raise MotionStopped(what, where=where or self.config.port, remedy=remedy, cause=reply.cause)
             raise HardwareFault(what, where=where or self.config.port, remedy=remedy)
         return reply.value
 

@@ -9,6 +9,7 @@ from typing import Literal
 
 from openant_tools.comms.bus import Answer
 from openant_tools.comms.faults import Cause
+from openant_tools.comms.restart import StopCause
 from openant_tools.comms.servos import Block, Servo
 
 __all__ = ["Guards", "Trip", "Watch"]
@@ -46,12 +47,14 @@ class Trip:
 
     Attributes:
         examine: what to look into once torque is off, to say it more exactly.
+        cause: what faces decide by whether motion may go on, see `restart`.
     """
 
     what: str
     remedy: str
     joint: str | None = None
     examine: Literal["", "alert", "silence"] = ""
+    cause: StopCause = StopCause.UNKNOWN
 
 
 @dataclass
@@ -109,6 +112,7 @@ class Watch:
                 f"{len(self._missed)} of {len(self.servos)} servos have not been heard for up to {silent:.2f} s, what "
                 f"comes is broken ({_words(everyone)})",
                 "noise on the bus, or a loose connector near the adapter: look at the first cables and the ground",
+                cause=StopCause.SILENCE,
             )
         causes = _words(missed)
         broken = _broken(missed) > missed.total() / 4
@@ -119,12 +123,14 @@ class Watch:
             else "look at its cable and at the one before it in the chain",
             servo.joint,
             "silence",
+            StopCause.SILENCE,
         )
 
     def _measured(self, t: float, servo: Servo, answer: Answer, block: Block) -> Trip | None:
         guards, model, place = self.guards, servo.model, f"{servo.joint} (id {servo.id})"
         if answer.alert:
-            return Trip(f"{place} raises its alert bit", "read its hardware error status", servo.joint, "alert")
+            remedy = "read its hardware error status"
+            return Trip(f"{place} raises its alert bit", remedy, servo.joint, "alert", StopCause.HARDWARE_ERROR)
         if guards.angle_margin_rad is not None and servo.joint in self.limits_rad:
             angle = servo.to_joint(model.registers["present_position"].to_si(block.position))
             low, high = self.limits_rad[servo.joint]
@@ -133,6 +139,7 @@ class Watch:
                     f"{place} is at {angle:.2f} rad, outside its limits {low:.2f} to {high:.2f}",
                     "look for a wrong zero, a reversed joint, or something that pushes it",
                     servo.joint,
+                    cause=StopCause.LIMITS,
                 )
         strained = (
             guards.current_share is not None
@@ -149,6 +156,7 @@ class Watch:
                     f"{place} pushes with {amount:.2f}{unit} for {t - since:.1f} s",
                     "free the joint: is a leg blocked, or the load too much?",
                     servo.joint,
+                    cause=StopCause.OVERLOAD,
                 )
         else:
             self._strained_since.pop(servo.id, None)
@@ -161,6 +169,7 @@ class Watch:
                     f"{place} is at {block.temperature} °C, {limit:.0f} °C is its limit",
                     "let it cool for 20 minutes and take load off this joint",
                     servo.joint,
+                    cause=StopCause.HEAT,
                 )
         if guards.voltage:
             volts, (low, high) = block.voltage * 0.1, model.supply_range_v
@@ -169,6 +178,7 @@ class Watch:
                     f"{place} is supplied with {volts:.1f} V, it needs {low:.1f} to {high:.1f} V",
                     "look at the power connector and the supply under load",
                     servo.joint,
+                    cause=StopCause.VOLTAGE,
                 )
         return None
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.comms.guards import Guards
+from openant_tools.comms.restart import Restart, StopCause
 from openant_tools.comms.servos import Servo
 from openant_tools.recording.run import Facts
 
@@ -62,7 +63,7 @@ class EngineConfig:
     Attributes:
         port: device path or `socket://` URL; a stable path survives re-plugging.
         control: control socket of a virtual robot; its clock is used where it is stepped.
-        limits_rad: joint → (low, high); commands beyond are refused, measurements far beyond stop the motion.
+        limits_rad: joint → (low, high); commands beyond are refused (`checked`), measurements far beyond stop the motion.
         registers: joint → register → counts that must be in force; EEPROM is written only where it differs.
         chain: lists of joints, each in the order of its cable from the adapter outwards, where that is known.
         watchdog_s: how long servos go on moving when nothing is heard of us any more.
@@ -90,9 +91,14 @@ class EngineConfig:
 
 @dataclass(frozen=True)
 class Torque:
-    """Torque of all servos on, at the position measured, or off."""
+    """Torque of all servos on, at the position measured, or off.
+
+    Attributes:
+        restart: after a stop torque comes on only with the reason that `restart.Interlock` gives, or the builder.
+    """
 
     on: bool
+    restart: Restart | None = None
 
 
 @dataclass(frozen=True)
@@ -125,9 +131,9 @@ class Hold:
 
 @dataclass(frozen=True)
 class Goal:
-    """A new goal (joints,) rad, clipped to the limits, for `seconds`; the reply comes when they have passed.
+    """A new goal (joints,) rad within the limits, for `seconds`; the reply comes when they have passed.
 
-    It is sent as it is: ramp to where such steps begin. The telemetry's `goal` holds the number of this command in the rows
+    It is sent as it is: ramp to where such steps begin. One beyond the limits is refused; who scales actions clips them. The telemetry's `goal` holds the number of this command in the rows
     in which it is in force.
 
     Attributes:
@@ -222,11 +228,16 @@ Command = (
 
 @dataclass(frozen=True)
 class Reply:
-    """The answer to command number `number`: a value, or (what, where, remedy) of an error."""
+    """The answer to command number `number`: a value, or (what, where, remedy) of an error.
+
+    Attributes:
+        cause: of the stop that is the error; None where the command was refused and nothing was stopped.
+    """
 
     number: int
     value: Any = None
     error: tuple[str, str | None, str | None] | None = None
+    cause: StopCause | None = None
 
 
 @dataclass(frozen=True)
@@ -238,11 +249,12 @@ class Finished:
 
 @dataclass(frozen=True)
 class Stopped:
-    """Torque was switched off by a guard, the stop key, or an error."""
+    """Torque was switched off by a guard, the stop key, or an error; `restart.RULES` says what follows from its cause."""
 
     what: str
     remedy: str | None = None
     joint: str | None = None
+    cause: StopCause = StopCause.UNKNOWN
 
 
 @dataclass(frozen=True)

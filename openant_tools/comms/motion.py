@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["RAMP_SPEED_RAD_S", "Motion", "catch", "hold", "play", "ramp"]
+__all__ = ["RAMP_SPEED_RAD_S", "Motion", "catch", "held", "hold", "play", "ramp"]
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,12 @@ def ramp(start: Array, end: Array, rate_hz: float, *, speed_rad_s: float = RAMP_
 
 def hold(position: Array, seconds: float, rate_hz: float) -> Motion:
     """Stay at `position` (joints,)."""
-    return Motion("hold", np.repeat(position[None, :], max(1, round(seconds * rate_hz)), axis=0))
+    return Motion("hold", held(position, seconds, rate_hz))
+
+
+def held(position: Array, seconds: float, rate_hz: float) -> Array:
+    """(n, joints), the same row again and again; not to be written to, since all are one: hours of it take no memory."""
+    return np.broadcast_to(position, (max(1, round(seconds * rate_hz)), len(position)))
 
 
 def play(

@@ -1,8 +1,9 @@
 """A soak of the bus: hours of traffic at full rate while the robot moves, so that a rare loss is seen and its cause told.
 
 The legs swing gently around the home pose and rest now and then, so that angles, loads and shaking all vary. The log is
-one recording that keeps what is not as it should be, with the raw bytes around it, and few of the healthy cycles. What a
-guard stops is gone on with once the servos answer again: it is the losses that are wanted here.
+one recording that keeps what is not as it should be, with the raw bytes around it, and few of the healthy cycles. After
+a stop the table of `restart` says whether the legs swing again; where they do not, the soak goes on listening, torque off:
+it is the losses that are wanted here. A recording that is not written any more ends it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from numpy.typing import NDArray
 from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig
-from openant_tools.errors import HardwareFault
+from openant_tools.comms.restart import Interlock, MotionStopped, Restart, StopCause
+from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
 from openant_tools.robot.joints import JOINTS
@@ -36,8 +38,8 @@ SWING_RAD, LIMIT_SHARE = 0.25, 0.8
 #: s of swinging and of rest in one piece; Hz of the joints, no two alike, none a multiple of another
 MOVE_S, REST_S = 24.0, 6.0
 SLOWEST_HZ, FASTEST_HZ = 0.23, 1.1
-#: s to wait before going on after a stop, and stops in a row without a whole piece in between that end the soak
-PAUSE_S, MOST_STOPS = 5.0, 12
+#: s to wait before going on after a stop
+PAUSE_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class Soaked:
         path: the recording. cycles: rows kept in it. seconds: of soaking, earlier parts included.
         statistics: of the bus, as `openant comms watch` has them, of this part.
         stops: what stopped it meanwhile.
+        ended: why motion ended for good; "" where it did not, or nothing was to move.
         whole: whether it lasted as long as was asked for.
     """
 
@@ -56,6 +59,7 @@ class Soaked:
     seconds: float
     statistics: Mapping[str, Any]
     stops: tuple[str, ...]
+    ended: str
     whole: bool
 
 
@@ -126,28 +130,30 @@ def soak(
         facts = Facts(joints=joints, setup="stand", protocol="comms soak", extra={"rate_hz": config.rate_hz})
         engine.ask(messages.Record(str(out), facts, robot_toml, resume=resume and out.exists(), thin_s=thin_s))
         statistics: Mapping[str, Any] = engine.ask(messages.Statistics())
-        piece, in_a_row = int(before // (MOVE_S + REST_S)), 0
-        moving = False
-        while done < seconds and in_a_row < MOST_STOPS:
-            length = min(MOVE_S + REST_S, seconds - done)
+        piece = int(before // (MOVE_S + REST_S))
+        interlock, restart = Interlock("comms soak"), None
+        moving, pause_s = False, 0.0
+        while done < seconds:
+            length = min(pause_s or MOVE_S + REST_S, seconds - done)
             try:
-                if move and not moving:
-                    engine.ask(messages.Torque(True))
-                    moving = True
-                if move:
+                if move and not pause_s:
+                    if not moving:
+                        engine.ask(messages.Torque(True, restart))
+                        moving = True
                     commands = soak_motion(joints, config.limits_rad, config.rate_hz, piece)
                     engine.ask(messages.Play(commands[: max(2, round(length * config.rate_hz))], "soak"))
                 else:
                     engine.ask(messages.Look(length))
-                in_a_row = 0
-            except HardwareFault as fault:
+                pause_s = 0.0
+            except MotionStopped as fault:
                 stops.append(str(fault))
-                notice(f"{fault}; going on in {PAUSE_S:.0f} s")
-                moving, in_a_row = False, in_a_row + 1
-                if engine.ended:
-                    raise
-                engine.ask(messages.Look(PAUSE_S))
-                length = min(length, PAUSE_S)
+                moving, length = False, 0.0
+                if fault.cause in (StopCause.STORAGE, StopCause.BY_HAND):
+                    interlock.end(fault.what)
+                    break
+                restart = interlock.stopped(fault.cause, fault.what, done)
+                move, pause_s = restart is not None, PAUSE_S
+                notice(f"{fault}; {_what_follows(restart)}")
             piece += 1
             done += length
             with contextlib.suppress(HardwareFault):  # a port that is gone has nothing to add
@@ -155,6 +161,26 @@ def soak(
             progress(min(1.0, done / seconds), statistics)
         if moving:
             engine.ask(messages.Torque(False))
-        closed = engine.ask(messages.StopRecording())
-    path, cycles = (str(out), 0) if closed is None else closed
-    return Soaked(Path(path), cycles, done, statistics, tuple(stops), done >= seconds)
+        try:
+            path, cycles = engine.ask(messages.StopRecording())
+        except MotionStopped as fault:
+            if not stops:  # the last rows did not reach the disk
+                stops.append(str(fault))
+                interlock.end(fault.what)
+            path, cycles = str(out), _rows_of(out)
+    whole = done >= seconds and not interlock.ended
+    return Soaked(Path(path), cycles, done, statistics, tuple(stops), interlock.ended, whole)
+
+
+def _what_follows(restart: Restart | None) -> str:
+    if restart is None:
+        return "motion has ended for good, and the soak goes on listening, torque off"
+    return f"going on in {PAUSE_S:.0f} s, {restart.count} of {restart.times}"
+
+
+def _rows_of(path: Path) -> int:
+    """Rows that a recording holds which ended by a fault of the disk."""
+    try:
+        return len(read_recording(path).run.t)
+    except (BadInput, OSError):
+        return 0

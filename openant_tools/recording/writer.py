@@ -47,6 +47,8 @@ _log = logging.getLogger(__name__)
 class RecordingStopped(OpenAntError):
     """The disk takes no more; what was recorded before stays readable."""
 
+    exit_code = 1
+
 
 def recording_path(path: str | Path) -> Path:
     """`path` with the suffix .mcap; raises BadInput for the name of a table."""
@@ -91,7 +93,7 @@ class RecordingWriter:
         continued: the recording at `path` so far: it is gone on with, and `facts`, `registers` and `config` are its own.
 
     Raises:
-        BadInput: there is such a file already.
+        BadInput: there is such a file already, or there can be none.
         RecordingStopped: the disk is full; from any call, once, with what is kept.
     """
 
@@ -119,14 +121,23 @@ class RecordingWriter:
         self._stopped: OpenAntError | None = None
         self._reported = False
         self._closed = False
+        #: on the disk: time of the last row, and how many
         self._kept_t: float | None = None
+        self._kept = 0
         self._shift = 0.0 if continued is None else continued.shift_s
         # What is gone on with is copied beside itself, and replaced when all of it is on the disk.
         place = self.path if continued is None else self.path.with_name(f".{self.path.name}.resumed")
-        self._stream = _AppendOnly(place, overwrite or continued is not None)
-        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        facts = _completed(facts, self._telemetry, registers or {})
         try:
+            self._stream = _AppendOnly(place, overwrite or continued is not None)
+        except OSError as error:
+            if error.errno in _DISK_ERRORS:
+                raise self._stop(error) from error
+            raise BadInput(
+                f"nothing can be recorded here: {error.strerror}", where=self.path, remedy="name another file or folder"
+            ) from error
+        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        try:
+            facts = _completed(facts, self._telemetry, registers or {})
             self._begin(facts, registers or {}, config, continued)
             if continued is not None:
                 self._take_over(continued)
@@ -275,7 +286,7 @@ class RecordingWriter:
             _EVENT: lambda t, data: bytes(data),
             _ROW: lambda t, data: bytes(data),
         }
-        due, pending_t, clean = time.monotonic() + SYNC_PERIOD, None, True
+        due, pending_t, pending, clean = time.monotonic() + SYNC_PERIOD, None, self.cycles, True
         while True:
             try:
                 kind, t, item = self._queue.get(timeout=None if clean else max(0.0, due - time.monotonic()))
@@ -289,14 +300,15 @@ class RecordingWriter:
                         stamp = max(0, round(t * 1e9))
                         channel = self._channel_ids[_CYCLE if kind == _ROW else kind]
                         self._writer.add_message(channel, stamp, encode[kind](t, item), stamp)
-                        pending_t = t if kind in (_CYCLE, _ROW) else pending_t
+                        if kind in (_CYCLE, _ROW):
+                            pending_t, pending = t, pending + 1
                     if kind == _CLOSE:
                         self._writer.finish()
                         self._stream.sync()
                     elif kind == _SYNC or (not clean and time.monotonic() >= due):
                         self._writer.flush()
                         self._stream.sync()
-                        self._kept_t, clean = pending_t, True
+                        self._kept_t, self._kept, clean = pending_t, pending, True
             except OSError as error:
                 self._stopped = self._stop(error)
             except Exception as error:  # a cycle that does not fit the channels: the caller's next call raises it
@@ -310,7 +322,9 @@ class RecordingWriter:
 
     def _stop(self, error: OSError) -> RecordingStopped:
         what = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
-        kept = f"what was recorded until t = {self._kept_t:.3f} s is kept" if self._kept_t is not None else ""
+        kept = ""
+        if self._kept_t is not None:
+            kept = f"what was recorded until t = {self._kept_t:.3f} s is kept, {self._kept} rows"
         return RecordingStopped(
             f"{what}, the recording stopped" + (f"; {kept}" if kept else ""),
             where=self.path,
@@ -319,6 +333,8 @@ class RecordingWriter:
 
 
 _CYCLE, _IMU, _POSE, _EVENT, _ROW, _SYNC, _CLOSE = range(7)
+#: what a disk says that takes no more, rather than a path that cannot be
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG)
 
 _EVENT_SCHEMA = json.dumps(
     {
@@ -382,6 +398,8 @@ class _AppendOnly:
         except OSError as error:
             if error.errno != errno.EINVAL:  # a pipe or a device has nothing to sync
                 raise
+        if not os.fstat(self._descriptor).st_nlink:
+            raise FileNotFoundError(errno.ENOENT, "the file was removed while it was written", str(self._path))
 
     def close(self) -> None:
         if self._open:

@@ -6,6 +6,7 @@ The recording knows the plan, so that after a crash `resume_plan` and `soak(…,
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Generator, Mapping, Sequence
@@ -20,6 +21,7 @@ from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.guards import Guards
 from openant_tools.comms.messages import EngineConfig
+from openant_tools.comms.restart import MotionStopped, StopCause
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts, Run
@@ -36,6 +38,7 @@ __all__ = [
 Array = NDArray[np.float64]
 Load = Literal["stand", "hang", "stall", "play"]
 Phase = Literal["load", "cool-down"]
+Why = Literal["time", "margin", "shutdown", "guard"]
 
 #: The maker's advice after an overheating shutdown (facts/dynamixel C3), s.
 COOL_DOWN_S = 1200.0
@@ -136,7 +139,7 @@ class Soaked:
 
     path: Path
     cycles: int
-    why: Literal["time", "margin", "shutdown", "guard"]
+    why: Why
     joint: str | None
     words: str
     loaded_s: float
@@ -281,6 +284,8 @@ def soak(
     Raises:
         BadInput: the plan cannot be; knees that were to be stalled move.
         HardwareFault: the robot does not answer, or is too hot to begin.
+        MotionStopped: the disk is full, the port is gone, or nobody knows which joint it was; torque is off, and the
+            recording kept as far as it got.
     """
     joints = tuple(servo.joint for servo in config.servos)
     before = _so_far(out) if resume else _SoFar()
@@ -309,24 +314,36 @@ def soak(
         )
         path, _ = str(out), engine.telemetry()
         engine.ask(messages.Record(path, facts, robot_toml, resume=resume))
-        loaded, why, joint, words = before.loaded_s, "time", None, "the time is over"
+        end = _End(before.loaded_s)
         try:
-            if before.phase == "load" and loaded < plan.seconds:
-                loaded, why, joint, words = yield from _under_load(
-                    engine, config, plan, log, limits, loaded, played, stepped
-                )
-            if plan.setup == "floor" and plan.load != "stall" and why != "shutdown":
+            if before.phase == "load" and end.loaded_s < plan.seconds:
+                end = yield from _under_load(engine, config, plan, log, limits, end.loaded_s, played, stepped)
+            if plan.setup == "floor" and plan.load != "stall" and not end.released:
                 _lie_down(engine, config)
             engine.ask(messages.Torque(False))
-            yield from _cooling(engine, plan, log, limits, loaded, before.cooled_s, words, stepped)
-        finally:
+            yield from _cooling(engine, plan, log, limits, end.loaded_s, before.cooled_s, end.words, stepped)
+        except BaseException:
             if not engine.ended:
-                made, cycles = engine.ask(messages.StopRecording())
-                engine.ask(messages.Torque(False))
+                with contextlib.suppress(HardwareFault):  # what ended it says more
+                    engine.ask(messages.Torque(False))
+                    engine.ask(messages.StopRecording())
+            raise
+        made, cycles = engine.ask(messages.StopRecording())
     peaks = {name: float(value) for name, value in zip(joints, log.peak, strict=True)}
     peaks = {name: float(np.nanmax([value, before.peak_c.get(name, np.nan)])) for name, value in peaks.items()}
     glitches = {name: thermometer.glitches for name, thermometer in zip(joints, log.thermometers, strict=True)}
-    return Soaked(Path(made), cycles, why, joint, words, loaded, peaks, glitches)  # type: ignore[arg-type]
+    return Soaked(Path(made), cycles, end.why, end.joint, end.words, end.loaded_s, peaks, glitches)
+
+
+@dataclass(frozen=True)
+class _End:
+    """How the load ended: as `Soaked` has it, and whether torque went off with it."""
+
+    loaded_s: float
+    why: Why = "time"
+    joint: str | None = None
+    words: str = "the time is over"
+    released: bool = False
 
 
 def _look_around(
@@ -358,20 +375,20 @@ def _under_load(
     loaded: float,
     played: Array | None,
     stepped: bool,
-) -> Generator[Sample, None, tuple[float, str, str | None, str]]:
-    """Until the time is over, a servo is too warm, or something stops it: seconds under load, why, who, words."""
+) -> Generator[Sample, None, _End]:
+    """Until the time is over, a servo is too warm, or something stops it."""
     look = STEPPED_LOOK_S if stepped else LOOK_S
     total = plan.seconds + plan.cool_down_s
     pose, row = -1, 0
     number: int | None = None
     begun, at = log.t, loaded
     while True:
-        if plan.load in ("stand", "hang"):
-            wanted = min(int(loaded / plan.seconds * len(plan.poses)), len(plan.poses) - 1)
-            if wanted != pose:
-                pose = wanted
-                engine.ask(messages.Ramp(_within(pose_angles(plan.poses[pose], log.joints), config)))
         try:
+            if plan.load in ("stand", "hang"):
+                wanted = min(int(loaded / plan.seconds * len(plan.poses)), len(plan.poses) - 1)
+                if wanted != pose:
+                    pose = wanted
+                    engine.ask(messages.Ramp(_within(pose_angles(plan.poses[pose], log.joints), config)))
             if played is None:
                 engine.ask(messages.Hold(min(look, max(1.0 / config.rate_hz, plan.seconds - loaded))))
             elif stepped:
@@ -384,7 +401,7 @@ def _under_load(
                     engine.start(messages.Play(played, "play")) if number is None or engine.done(number) else number
                 )
                 time.sleep(look)
-        except HardwareFault as stopped:
+        except MotionStopped as stopped:
             log.take(engine.telemetry())
             return _why_stopped(engine, log, limits, at + log.t - begun, stopped)
         log.take(engine.telemetry())
@@ -394,25 +411,22 @@ def _under_load(
         k = int(np.nanargmin(near)) if np.isfinite(near).any() else 0
         if plan.margin_k >= 0 and near[k] <= plan.margin_k:
             words = f"{log.joints[k]} is at {log.temperature[k]:.0f} °C, {near[k]:.0f} K below its limit"
-            return loaded, "margin", log.joints[k], words
+            return _End(loaded, "margin", log.joints[k], words)
         if loaded >= plan.seconds - 1.5 / config.rate_hz:
-            return loaded, "time", None, "the time is over"
+            return _End(loaded)
 
 
-def _why_stopped(
-    engine: EngineProcess, log: _Log, limits: Array, loaded: float, fault: HardwareFault
-) -> tuple[float, str, str | None, str]:
+def _why_stopped(engine: EngineProcess, log: _Log, limits: Array, loaded: float, fault: MotionStopped) -> _End:
     """A servo's own shutdown is what the test was for, its limit what the margin is for; anything else is neither."""
     joint = next((e.joint for e in engine.events() if isinstance(e, messages.Stopped) and e.joint), None)
     if engine.ended or joint is None:
         raise fault
     k = log.joints.index(joint)
-    if "overheating" in fault.what:
+    if fault.cause is StopCause.HARDWARE_ERROR and "overheating" in fault.what:
         words = f"{joint} shut itself down at {log.temperature[k]:.0f} °C, its limit is {limits[k]:.0f} °C"
-        return loaded, "shutdown", joint, words
-    if "is its limit" in fault.what:
-        return loaded, "margin", joint, fault.what
-    return loaded, "guard", joint, fault.what
+        return _End(loaded, "shutdown", joint, words, released=True)
+    why: Why = "margin" if fault.cause is StopCause.HEAT else "guard"
+    return _End(loaded, why, joint, fault.what, released=True)
 
 
 def _press(
