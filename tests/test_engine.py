@@ -284,7 +284,7 @@ def test_a_silent_servo_stops_the_motion(live: dict[str, str]) -> None:
         control = VirtualControl(live["control"])
         control.ask("unplug", joint="knee_fl")
         try:
-            with pytest.raises(HardwareFault, match=r"has not answered for .* → look at its cable"):
+            with pytest.raises(HardwareFault, match=r"has not answered for .* → look at the cable between hip_fl"):
                 wait_until(lambda: engine.done(moving))
         finally:
             control.ask("plug", joint="knee_fl")

@@ -22,6 +22,7 @@ from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_opti
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from openant_tools.comms.scan import Scan
 
 __all__ = ["comms"]
 
@@ -75,15 +76,30 @@ def ports(json_file: Path | None) -> None:
 @click.option("--port", "paths", multiple=True, metavar="PATH", help="A bus; may be repeated. Default: every U2D2.")
 @virtual_option
 @click.option("--baud", "bauds", multiple=True, type=int, help="Only this rate; may be repeated. Default: all eight.")
+@click.option(
+    "--id", "wanted", multiple=True, type=click.IntRange(0, 252), help="Ask for this id, too, and why it is silent."
+)
+@click.option(
+    "--driver",
+    type=click.Choice(("own", "sdk")),
+    default="own",
+    show_default=True,
+    help="Who asks: these tools, or the vendor's SDK (ten seconds; it does not say why somebody is silent).",
+)
 @json_option
-def scan(paths: Sequence[str], virtual_source: str | None, bauds: Sequence[int], json_file: Path | None) -> None:
-    """List every servo: port, baud rate, id, model, firmware. Exit code 1 where something answers garbled."""
+def scan(
+    paths: Sequence[str], virtual_source: str | None, bauds: Sequence[int], wanted: Sequence[int], driver: str,
+    json_file: Path | None,
+) -> None:  # fmt: skip
+    """List every servo: port, baud rate, id, model, firmware. Nothing is written.
+
+    Exit code 1 where something answers garbled, or where others may be missing from the list: the reason is on stderr.
+    """
     from rich.console import Console
 
     from openant_tools.comms.ports import Host
-    from openant_tools.comms.scan import BAUDS
-    from openant_tools.comms.scan import scan as scan_bus
-    from openant_tools.comms.setup import open_bus
+    from openant_tools.comms.silence import LEVELS
+    from openant_tools.comms.troubles import SILENCE
     from openant_tools.errors import HardwareFault
 
     console = Console(stderr=True)
@@ -92,21 +108,21 @@ def scan(paths: Sequence[str], virtual_source: str | None, bauds: Sequence[int],
     with contextlib.ExitStack() as stack:
         control = None
         if virtual_source is not None:
-            robot = stack.enter_context(virtual_robot(virtual_source, clock=clock_of_its_own(virtual_source)))
+            clock = "real" if driver == "sdk" else clock_of_its_own(virtual_source)
+            robot = stack.enter_context(virtual_robot(virtual_source, clock=clock))
             paths, control = (*paths, str(robot["bus"])), robot["control"]
         buses = list(paths) or [port.stable_path for port in Host().ports() if port.kind == "bus"]
         if not buses:
             raise HardwareFault("no U2D2 is plugged in", remedy="plug it in, or name another adapter with --port")
         for path in buses:
-            bus = open_bus(path, 1_000_000, control)
-            try:
-                with console.status(f"{path}: asking at every baud rate"):
-                    result = scan_bus(bus, bauds or BAUDS)
-            finally:
-                bus.close()
+            with console.status(f"{path}: asking at every baud rate"):
+                result, silent = _scan_one(path, control, bauds, wanted, driver)
             for servo in result.servos:
                 note = "  two servos share this id?" if servo.clash else ""
-                note += "  reports a hardware error" if servo.alert else ""
+                note += "  reports a hardware error: `openant comms reboot`" if servo.alert else ""
+                if servo.return_level < 2:
+                    level, answers = servo.return_level, LEVELS[servo.return_level]
+                    note += f"  Status Return Level {level}, answers {answers}: {SILENCE['return_level'].do}"
                 click.echo(
                     f"{path}  {servo.baud:>7} baud  id {servo.id:>3}  {servo.model}  firmware {servo.firmware}{note}"
                 )
@@ -115,22 +131,46 @@ def scan(paths: Sequence[str], virtual_source: str | None, bauds: Sequence[int],
                     {
                         "id": servo.id, "baud": servo.baud, "model_number": servo.model_number,
                         "firmware": servo.firmware, "model": servo.model, "port": path, "clash": servo.clash,
-                        "alert": servo.alert,
+                        "alert": servo.alert, "return_level": servo.return_level, "certain": result.certain,
                     }
                 )  # fmt: skip
             for words in result.garbled.values():
                 bad = True
                 click.echo(words)
+            for words in result.doubts:
+                bad = True
+                click.echo(f"{path}: the list may be partial: {words}", err=True)
+            if silent:
+                bad = True
+                click.echo(f"{path}: {silent}", err=True)
     if json_file:
         _write_json(json_file, rows)
     if not rows and not bad:
-        raise HardwareFault(
-            "nothing answered at any baud rate",
-            where=", ".join(buses),
-            remedy="is the supply on, and the first cable in? A servo with a blinking LED is in shutdown: reboot it",
-        )
+        raise HardwareFault("nothing answered at any baud rate", where=", ".join(buses), remedy=SILENCE["nobody"].do)
     if bad:
         raise SystemExit(1)
+
+
+def _scan_one(
+    path: str, control: str | None, bauds: Sequence[int], wanted: Sequence[int], driver: str
+) -> tuple[Scan, str]:
+    """What one port has, and why those of `wanted` are silent that are not there."""
+    from openant_tools.comms.scan import BAUDS, KNOWN, scan, scan_by_sdk
+    from openant_tools.comms.setup import open_bus
+    from openant_tools.comms.silence import diagnose
+
+    if driver == "sdk":
+        result = scan_by_sdk(path, bauds or BAUDS)
+        missing = [id for id in wanted if all(one.id != id for one in result.servos)]
+        return result, f"no answer from {', '.join(map(str, missing))}" if missing else ""
+    bus = open_bus(path, (bauds or BAUDS)[0] if len(bauds) == 1 else BAUDS[0], control)
+    try:
+        result = scan(bus, bauds or BAUDS, known=(*wanted, *(id for id in KNOWN if id not in wanted)))
+        missing = [id for id in wanted if all(one.id != id for one in result.servos)]
+        silent = diagnose(bus, missing, [*(one.id for one in result.servos), *missing]).words if missing else ""
+    finally:
+        bus.close()
+    return result, silent
 
 
 @comms.command()
@@ -148,6 +188,7 @@ def bench(
     from openant_tools.comms.bench import measure_gap, measure_rate
     from openant_tools.comms.servos import Servos
     from openant_tools.comms.setup import open_bus
+    from openant_tools.comms.silence import explaining
 
     console = Console(stderr=True)
     # Stepped, a virtual robot shows its bus and nothing of what else this machine does.
@@ -155,14 +196,15 @@ def bench(
         bus = open_bus(config.port, config.baud, config.control)
         try:
             servos = Servos(bus, config.servos)
-            servos.identify()
-            delays = servos.read_all("return_delay_time")
-            bus.timing = replace(bus.timing, return_delay_s=max(delays.values()) * 2e-6)
-            timer = bus.measure_latency_timer(servos.ids[0])
-            with console.status("rate"):
-                rate = measure_rate(bus, servos.ids, seconds)
-            with console.status("gap after a write"):
-                trials, gap = measure_gap(bus, servos.ids)
+            with explaining(bus, config.chain):
+                servos.identify()
+                delays = servos.read_all("return_delay_time")
+                bus.timing = replace(bus.timing, return_delay_s=max(delays.values()) * 2e-6)
+                timer = bus.measure_latency_timer(servos.ids[0])
+                with console.status("rate"):
+                    rate = measure_rate(bus, servos.ids, seconds)
+                with console.status("gap after a write"):
+                    trials, gap = measure_gap(bus, servos.ids)
         finally:
             bus.close()
     click.echo(f"{rate.hz:.0f} cycles/s of write {len(servos.ids)} goals, read {len(servos.ids)} blocks of 27 bytes")

@@ -355,12 +355,15 @@ class Bus:
                 where=self.line.path,
                 remedy="a loose connector, two servos with one id, or noise: wiggle the cable before "
                 f"{self._name(broken[0].id)} and look at `openant comms watch`",
+                ids=[answer.id for answer in broken],
+                asked=[answer.id for answer in answers],
             )
         raise missing_answers(
             [self._name(answer.id) for answer in answers],
             [answer.data is not None for answer in answers],
             where=self.line.path,
             speed=f"{self.line.baud} baud",
+            ids=[answer.id for answer in answers],
         )
 
     def require_all(self, answered: Mapping[int, bool]) -> None:

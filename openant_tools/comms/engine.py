@@ -33,6 +33,7 @@ from openant_tools.comms.checked import checked
 from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
 from openant_tools.comms.faults import BrokenAnswer, Cause, NoAnswer
 from openant_tools.comms.guards import Trip, Watch
+from openant_tools.comms.lateness import REMEDY
 from openant_tools.comms.line import PortGone, SerialLine
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.comms.motion import Motion, catch, held, hold, play, ramp
@@ -40,6 +41,7 @@ from openant_tools.comms.ports import WANTED_LATENCY_MS, Host, udev_rule
 from openant_tools.comms.restart import StopCause
 from openant_tools.comms.ring import ERR_CODES, Ring
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Block, Servo, Servos
+from openant_tools.comms.silence import diagnose, explained
 from openant_tools.comms.thinning import Thinning
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
 from openant_tools.procedure.journal import EepromWrite, Journal
@@ -139,7 +141,8 @@ class Engine:
         try:
             try:
                 self._connect()
-            except OpenAntError as error:
+            except OpenAntError as fault:
+                error = self._asked_why(fault)
                 self._say(messages.Reply(0, error=(error.what, error.where, error.remedy)))
                 return
             self._say(messages.Reply(0, value=self._description()))
@@ -372,9 +375,10 @@ class Engine:
                 self._port_lost()
                 remedy = "look at the USB cable; the servos' watchdog stops them"
                 self._stopped(Trip(str(error.what), remedy, cause=StopCause.PORT))
-            except HardwareFault as error:
+            except HardwareFault as fault:
                 # A servo that had to answer did not, or refused: what its motion waits for will not come.
-                self._stopped(Trip(error.what, error.remedy or "", cause=_cause_of(error)))
+                why = self._asked_why(fault)
+                self._stopped(Trip(why.what, why.remedy or "", cause=_cause_of(fault)))
             self._end_looks()
             self._flush()
             late = int((self.clock.now() - due) / self._period)
@@ -537,6 +541,14 @@ class Engine:
         what = f"{servo.joint} (id {servo.id}) reports {names}"
         return Trip(what, errors[0].advice, trip.joint, cause=StopCause.HARDWARE_ERROR)
 
+    def _asked_why(self, fault: OpenAntError) -> OpenAntError:
+        """A servo's silence with its cause: the servos are asked, once torque is off."""
+        if not isinstance(fault, NoAnswer | BrokenAnswer) or self._lost:
+            return fault
+        if hasattr(self, "_servos"):
+            self._torque_off()
+        return explained(self._bus, fault, self.config.chain)
+
     def _who_is_silent(self, trip: Trip) -> Trip:
         """Each servo asked alone: in a common read those behind a silent one wait for it and seem silent, too."""
         silent, broken = list[Servo](), list[Servo]()
@@ -549,7 +561,10 @@ class Engine:
             elif causes == {Cause.TIMEOUT}:
                 silent.append(servo)
         if not silent or len(broken) > 1 or (broken and len(silent) > 1):
-            return trip
+            late = self.clock.lateness
+            if not late.busy or broken:
+                return trip
+            return Trip(f"{trip.what}; {late.words}", REMEDY, trip.joint, cause=trip.cause)
         first, names = silent[0], ", ".join(f"{servo.joint} (id {servo.id})" for servo in silent)
         if broken:
             [other] = broken
@@ -559,12 +574,11 @@ class Engine:
                 first.joint,
                 cause=trip.cause,
             )
-        if len(silent) > 1:
-            remedy = f"look at the cable before {first.joint} and at each servo's connectors"
-            return Trip(f"{names} do not answer", remedy, first.joint, cause=trip.cause)
-        if first.joint == trip.joint:
-            return trip
-        return Trip(f"{names} does not answer", trip.remedy, first.joint, cause=trip.cause)
+        why = diagnose(
+            self._bus, [servo.id for servo in silent], self._servos.ids, self.config.chain, was_there=True
+        )  # fmt: skip
+        before = f"{trip.what}: " if first.joint == trip.joint else ""
+        return Trip(before + why.what, why.remedy, first.joint, cause=trip.cause)
 
     def _stopped(self, trip: Trip) -> None:
         """Release everyone, tell, and only then make sure: on a bad line that may take a while."""

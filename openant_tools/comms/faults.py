@@ -23,11 +23,26 @@ class Cause(StrEnum):
     ALERT = "alert"
 
 
-class NoAnswer(HardwareFault):
-    """One or more servos stayed silent."""
+class _Unheard(HardwareFault):
+    """Answers that did not come as they should.
+
+    Attributes:
+        ids: whose, where that is known. asked: of everyone who was asked, in order.
+    """
+
+    def __init__(
+        self, what: str, *, where: str | None = None, remedy: str | None = None,
+        ids: Sequence[int] = (), asked: Sequence[int] = (),
+    ) -> None:  # fmt: skip
+        super().__init__(what, where=where, remedy=remedy)
+        self.ids, self.asked = tuple(ids), tuple(asked)
 
 
-class BrokenAnswer(HardwareFault):
+class NoAnswer(_Unheard):
+    """One or more servos stayed silent. Why is for `silence` to find out, once torque is off."""
+
+
+class BrokenAnswer(_Unheard):
     """Bytes came, but no answer could be read from them."""
 
 
@@ -70,38 +85,26 @@ def refusal_words(code: int) -> tuple[str, str]:
     return _REFUSALS.get(code, (f"it answers with the unknown error code {code}", "look at the servo's manual"))
 
 
-def missing_answers(asked: Sequence[str], answered: Sequence[bool], *, where: str, speed: str) -> NoAnswer:
-    """The error for a chain in which some servos did not answer.
+def missing_answers(
+    asked: Sequence[str], answered: Sequence[bool], *, where: str, speed: str, ids: Sequence[int] = ()
+) -> NoAnswer:
+    """The error for a chain in which some servos did not answer: who is silent, and not yet why.
 
     Args:
-        asked: the servos' names, in the order of the question.
+        asked: the servos' names, in the order of the question. ids: theirs.
         answered: whether each did.
         where: the port.
         speed: the baud rate, spelled out.
     """
     silent = [name for name, ok in zip(asked, answered, strict=True) if not ok]
-    if len(silent) == len(asked):
-        if len(asked) == 1:
-            return NoAnswer(
-                f"{asked[0]} does not answer at {speed}",
-                where=where,
-                remedy="look at its cable, id and baud rate: `openant comms scan` tries all",
-            )
-        return NoAnswer(
-            f"nothing answered at {speed}: none of {len(asked)} servos",
-            where=where,
-            remedy="is the supply on, and the first cable in? `openant comms scan` tries all baud rates",
-        )
-    first = answered.index(False)
-    if not any(answered[first:]):
-        last = asked[first - 1]
-        return NoAnswer(
-            f"the first {first} of {len(asked)} servos answered, then silence from {asked[first]}",
-            where=where,
-            remedy=f"look at the cable between {last} and {asked[first]}, then at {asked[first]} itself",
-        )
-    return NoAnswer(
-        f"{len(silent)} of {len(asked)} servos did not answer: {', '.join(silent)}",
-        where=where,
-        remedy=f"those behind them do: look at the connectors of {silent[0]}, and at its id",
-    )
+    if len(silent) == len(asked) == 1:
+        what = f"{asked[0]} does not answer at {speed}"
+    elif len(silent) == len(asked):
+        what = f"nothing answered at {speed}: none of {len(asked)} servos"
+    elif not any(answered[answered.index(False) :]):
+        first = answered.index(False)
+        what = f"the first {first} of {len(asked)} servos answered, then silence from {asked[first]}"
+    else:
+        what = f"{len(silent)} of {len(asked)} servos did not answer: {', '.join(silent)}"
+    mute = [id for id, ok in zip(ids, answered, strict=True) if not ok] if ids else []
+    return NoAnswer(what, where=where, remedy="`openant comms scan` asks why", ids=mute, asked=ids)

@@ -120,7 +120,7 @@ class Watch:
             f"{servo.joint} (id {servo.id}) has not answered for {silent:.2f} s ({causes})",
             "its answers come broken: two servos with one id, a loose connector, or noise"
             if broken
-            else "look at its cable and at the one before it in the chain",
+            else "`openant comms scan` asks why",
             servo.joint,
             "silence",
             StopCause.SILENCE,

@@ -84,17 +84,15 @@ class Lateness:
 
     @property
     def busy(self) -> bool:
-        """Whether this computer was late often enough, or so short of processors, that losses may be its own."""
-        return self.share > SHARE or self.pressure > BUSY
+        """Whether this computer was late often enough that losses may be its own."""
+        return self.share > SHARE
 
     @property
     def words(self) -> str:
         """How late it was, as a sentence; empty where it was not."""
         said = lateness_words(self.worst_s, self.late, self.cycles)
-        if self.pressure > BUSY:
-            said = (
-                said or "this computer was busy"
-            ) + f"; programs waited for a processor {self.pressure:.0%} of the time"
+        if said and self.pressure > BUSY:
+            said += f" (programs waited for a processor {self.pressure:.0%} of the time)"
         return said
 
     def close(self) -> None:

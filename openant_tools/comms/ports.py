@@ -164,6 +164,32 @@ class Host:
                 found.append(Holder(int(process.name), words or _text(process / "comm")))
         return found
 
+    def readers(self, path: str) -> list[Holder]:
+        """Other programs that have the port open: each takes some of the bytes that come.
+
+        This process, those that it started (its guardian) and the far end of a pseudo-terminal are none.
+        """
+        name, own = self._name(path), os.getpid()
+        far = name if Path(os.path.realpath(path)).parent.name == "pts" else None
+        return [
+            holder
+            for holder in self.holders(path)
+            if own not in (holder.pid, self._parent(holder.pid)) and not (far and self._is_far_end(holder.pid, far))
+        ]
+
+    def _parent(self, pid: int) -> int | None:
+        # "41 (a name) S 40 …": a name may hold blanks and brackets
+        fields = _text(self.proc / str(pid) / "stat").rpartition(")")[2].split()
+        return int(fields[1]) if len(fields) > 1 else None
+
+    def _is_far_end(self, pid: int, number: str) -> bool:
+        """Whether a process holds the master of pseudo-terminal `number`."""
+        try:
+            files = list((self.proc / str(pid) / "fdinfo").iterdir())
+        except OSError:
+            return False
+        return any(["tty-index:", number] == line.split() for file in files for line in _text(file).splitlines())
+
     def missing_group(self, path: str) -> str | None:
         """The group that owns the port, where this user is not in it."""
         try:

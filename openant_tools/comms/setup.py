@@ -12,6 +12,7 @@ from openant_tools.comms.line import SerialLine
 from openant_tools.comms.messages import EngineConfig, ImuConfig
 from openant_tools.comms.ports import Host
 from openant_tools.comms.servos import Servo
+from openant_tools.comms.silence import explaining
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.robot.config import RobotConfig
 from openant_tools.robot.joints import JOINTS
@@ -136,7 +137,8 @@ def config_of_unknown_robot(port: str, control: str | None = None, **more: objec
     try:
         bus.names = {joint.id: joint.name for joint in JOINTS.values()}
         found = {joint.name: bus.ping(joint.id, insist=True) for joint in JOINTS.values()}
-        bus.require_all({JOINTS[name].id: seen is not None for name, seen in found.items()})
+        with explaining(bus):
+            bus.require_all({JOINTS[name].id: seen is not None for name, seen in found.items()})
         servos = tuple(
             Servo(name, seen.id, servo_model(seen.model_number), 1, NOMINAL_ZERO_RAD)
             for name, seen in found.items()
