@@ -107,7 +107,7 @@ class Watch:
         ):
             return None
         everyone: Counter[Cause] = sum(self._missed.values(), Counter())
-        if len(self._missed) > len(self.servos) / 2 and _broken(everyone) > everyone.total() / 4:
+        if len(self._missed) > len(self.servos) / 2 and _broken(everyone) > everyone.total() / 25:
             return Trip(
                 f"{len(self._missed)} of {len(self.servos)} servos have not been heard for up to {silent:.2f} s, what "
                 f"comes is broken ({_words(everyone)})",
