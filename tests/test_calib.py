@@ -22,18 +22,24 @@ from openant_tools.calib.centre import centre
 from openant_tools.calib.comms_health import comms_health
 from openant_tools.calib.connect import connect
 from openant_tools.calib.estop import estop
+from openant_tools.calib.gyro_scale import KNOWN, by_camera, by_hand
 from openant_tools.calib.ids import ids
 from openant_tools.calib.imu import POSES, imu, mounting
 from openant_tools.calib.inventory import inventory
 from openant_tools.calib.legs import legs
 from openant_tools.calib.undo import undo
+from openant_tools.calib.wires import engine_config, opened_imu
 from openant_tools.calib.zeros import straight, torso_answer, zeros
+from openant_tools.comms import messages
 from openant_tools.comms.body_imu import rotation
 from openant_tools.comms.camera import CameraInfo
+from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import Journal
 from openant_tools.procedure.step import Ask, Bench, Declined, Event, Hands, Intent, Progress, drive
+from openant_tools.recording.reader import read_recording
+from openant_tools.recording.run import Facts
 from openant_tools.robot.config import Camera
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
@@ -404,6 +410,117 @@ def test_poses_that_were_not_held_give_low_confidence_and_write_nothing(tmp_path
         assert ant.folder.config().imu.acc_counts_per_g == 0.0
 
 
+#: gyro of 70 mdps a step (ST's LSM6DSO) where most have 61.035: what its counts are the share of
+ST_SENSOR = 32768 / 2000 * 0.07
+ST = {"gyro_scale": [1 / ST_SENSOR] * 3}
+
+
+def test_a_gyro_of_another_step_is_found_by_turns_kept_and_used(tmp_path):
+    with robot(tmp_path / "ant", imu={**ST, "gyro_bias": [0.0, 0.0, 0.02]}) as ant:
+        finding, builder = ant.do(imu(ant.bench))
+        assert finding.ok, finding
+        assert "the quarter turn reads 78°: a sensor of 70 mdps a step, or a turn that was not 90°?" in builder.said
+        assert "14.29 counts for 1 °/s (a sensor of 70 mdps a step), not 16.38" in finding.problems[0]
+        assert "recorded before stay as they are, 12.8 % low" in finding.problems[0]
+        kept = ant.folder.config()
+        assert kept.imu.gyro_counts_per_dps == pytest.approx(1000 / 70, abs=1e-4)
+        told = kept.provenance_of("imu.gyro_counts_per_dps")
+        assert told is not None
+        assert (told.how, told.command) == ("measured", "openant calib imu")
+        assert told.low < 1000 / 70 < told.high
+        # The bias is in the new scale, too.
+        assert kept.imu.gyro_bias_rad_s[2] == pytest.approx(0.02 * ST_SENSOR, abs=0.003)
+
+
+def rates_at_rest(ant) -> list[float]:
+    """Mean of the gyro's columns, rad/s, of a recording that the engine makes while nothing moves."""
+    path = ant.folder.recordings / "rest.mcap"
+    with EngineProcess(engine_config(ant.bench)) as engine:
+        engine.ask(messages.Torque(True))
+        engine.ask(messages.Record(str(path), Facts(joints=JOINT_NAMES, setup="stand", protocol="rest")))
+        engine.ask(messages.Hold(0.5))
+        engine.ask(messages.StopRecording())
+    columns = read_recording(path).imu.columns
+    return [float(np.mean(columns[f"gyro.{axis}"])) for axis in "xyz"]
+
+
+def test_a_scale_by_hand_in_robot_toml_acts(tmp_path):
+    with robot(tmp_path / "ant", imu={"gyro_bias": [0.0, 0.0, 0.4]}) as ant:
+        ant.folder.update({"imu.gyro_counts_per_dps": 32.768})
+        with opened_imu(ant.bench) as (driver, _):
+            assert driver.info.gyro_lsb_per_dps == 32.768
+        # In the engine, too, and with it in what is shown, recorded and given to agents: at rest it reads its bias.
+        assert rates_at_rest(ant) == pytest.approx([0.0, 0.0, 0.2], abs=0.03)
+        finding, _ = ant.do(imu(ant.bench))
+        assert finding.ok
+        assert "16.38 counts for 1 °/s (a sensor of 61.035 mdps a step), not 32.77" in finding.problems[0]
+
+
+def test_a_hand_that_stops_early_is_no_other_sensor(tmp_path):
+    with robot(tmp_path / "ant") as ant:
+        builder = ant.builder()
+        whole, turned = builder.hands.do, list[float]()
+
+        def lazy(hands: Hands) -> None:
+            turn = hands.path_rad[2] if hands.task == "tilt" else 0.0
+            if turn:
+                turned.append(turn)
+                # 78° once, as a gyro of another step would read it, and as it should be from then on.
+                hands = replace(hands, path_rad=(0.0, 0.0, turn - math.radians(12) * (len(turned) == 1)))
+            whole(hands)
+
+        builder.hands.do = lazy  # type: ignore[method-assign]
+        finding, _ = ant.do(imu(ant.bench), builder)
+        assert finding.ok, finding
+        assert len(turned) == 3
+        assert ant.folder.config().imu.gyro_counts_per_dps == pytest.approx(16.384)
+
+
+def test_turns_that_fit_no_sensor_are_asked_for_again_and_not_judged(tmp_path, monkeypatch):
+    monkeypatch.setattr("openant_tools.calib.imu.TRIES", 1)
+    with robot(tmp_path / "ant", imu={"gyro_scale": [1.25] * 3}) as ant:
+        finding, builder = ant.do(imu(ant.bench))
+        assert finding.verdict == "cannot judge"
+        assert "turns of 90° and 180° read 112°, 225°, which no sensor" in finding.unsure[0]
+        assert "turn the robot half a turn" in builder.said
+        kept = ant.folder.config()
+        assert kept.provenance_of("imu.gyro_counts_per_dps") is None
+        assert kept.imu.acc_counts_per_g == pytest.approx(2048, rel=0.01), "what was measured is kept"
+
+
+@given(
+    step=st.sampled_from(list(KNOWN)), now=st.sampled_from(list(KNOWN)), quarters=st.integers(1, 4),
+    off=st.floats(-math.radians(5), math.radians(5)),
+)  # fmt: skip
+def test_no_hand_makes_one_sensor_of_another(step, now, quarters, off):
+    read = (quarters * math.pi / 2 + off) * KNOWN[step] / KNOWN[now]
+    found = by_hand([read], KNOWN[now])
+    assert found is None or found.step == step
+    assert found is not None or abs(off) > math.radians(3)
+
+
+@pytest.mark.parametrize(
+    ("scale", "step"), [(ST_SENSOR, "70 mdps"), (1.0, "61.035 mdps"), (1.012, "61.035 mdps"), (1.3, "")]
+)
+def test_the_camera_tells_a_sensors_step_and_measures_what_has_none(scale, step):
+    found = by_camera(scale, 0.002, 16.384)
+    assert found.step == step
+    assert found.counts_per_dps == pytest.approx(16.384 / scale, rel=0.02)
+
+
+def test_an_accelerometer_a_little_off_is_measured_and_used(tmp_path):
+    with robot(tmp_path / "ant", imu={"acc_scale": [1.04] * 3}) as ant:
+        finding, _ = ant.do(imu(ant.bench))
+        assert finding.ok
+        assert ant.folder.config().imu.acc_counts_per_g == pytest.approx(1.04 * 2048, rel=0.003)
+        with opened_imu(ant.bench) as (driver, _):
+            assert driver.info.gravity == pytest.approx(9.807, abs=0.03)
+        ant.folder.update({"imu.acc_counts_per_g": 512.0})
+        with opened_imu(ant.bench) as (driver, _):
+            assert driver.info.acc_lsb_per_g == 2048
+            assert "512 had been measured (other firmware, another board?); gravity decides" in driver.info.notes[0]
+
+
 @given(vector=st.tuples(*[st.floats(-1.8, 1.8)] * 3))
 def test_three_poses_give_back_any_mounting(vector):
     known = np.array([pose.up for pose in POSES])
@@ -494,7 +611,7 @@ def test_a_board_before_the_camera_gives_the_lens_in_the_arena_step(tmp_path, mo
 
 @pytest.mark.slow
 def test_the_arena_is_measured_by_the_robot_itself(tmp_path):
-    with robot(tmp_path / "ant", sees=True, camera={"body": {"yaw": 0.3}}) as ant:
+    with robot(tmp_path / "ant", sees=True, camera={"body": {"yaw": 0.3}}, imu=ST) as ant:
         finding, _ = ant.do(arena(ant.bench))
         assert finding.ok, finding
         assert finding.data["centre_m"] == pytest.approx([0.75, -0.30], abs=0.02)
@@ -502,6 +619,15 @@ def test_the_arena_is_measured_by_the_robot_itself(tmp_path):
         assert camera.body_tag_id == 12
         assert camera.body_tag_yaw_rad == pytest.approx(0.3, abs=0.05)
         assert "glued" in finding.problems[0]
+        # Hands have not told the gyro's scale yet: the tag does. What was recorded says which scale it has, so that nobody
+        # applies the new one to it once more.
+        assert (
+            "14.29 counts for 1 °/s (a sensor of 70 mdps a step), not 16.38: the tag turned by +14"
+            in finding.problems[1]
+        )
+        assert ant.folder.config().imu.gyro_counts_per_dps == pytest.approx(1000 / 70, abs=1e-4)
+        recorded = read_recording(ant.folder.recordings / "arena.mcap")
+        assert recorded.run.facts.extra["imu"]["gyro_counts_per_dps"] == pytest.approx(16.384)
 
 
 @pytest.mark.slow

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import dataclasses
 import datetime
 import json
 import math
@@ -18,7 +20,16 @@ from hypothesis import strategies as st
 
 from openant_tools.cli import main
 from openant_tools.errors import BadInput
-from openant_tools.robot.config import ACTION_PRESETS, Effect, Motor, Provenance, parse_config, read_document
+from openant_tools.robot.config import _SECTIONS as SECTIONS
+from openant_tools.robot.config import (
+    ACTION_PRESETS,
+    Effect,
+    Motor,
+    Provenance,
+    RobotConfig,
+    parse_config,
+    read_document,
+)
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
 from openant_tools.robot.kit import KITS
@@ -184,8 +195,74 @@ def test_a_slip_of_an_optional_key_is_a_note_and_no_failure(
     assert code == 0
     assert "note:" in out
     assert "bus.watchdogs: is not known; is 'watchdog_s' meant?" in out
-    assert "colours" not in out, "keys of the owner's own are the owner's affair"
+    assert out.count("watchdogs") == 1
+    assert out.count("colours: is not known: nothing reads it") == 1, "the owner's own stays, and does nothing"
     assert ant.config().unknown == ("colours",)
+
+
+def test_a_setting_that_was_retired_says_what_took_its_place(
+    ant: RobotFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rewrite(ant, ("[bus]\n", "[bus]\nlatency_timer_ms = 1\nlatency_timer = 1\n"))
+    code, out, _ = run(capsys, "config", "check", "--robot", ant.path)
+    assert code == 0
+    assert "bus.latency_timer_ms: is read no more: the adapter itself is asked" in out
+    assert "bus.latency_timer: is not known" in out
+    assert "latency_timer_ms = 1" in ant.config_file.read_text(), "what is not known stays"
+
+
+def reads_of_settings() -> dict[str, set[str]]:
+    """Section of robot.toml → the names of its settings that some code of ours reads.
+
+    A setting is read as an attribute of what stands for its section: `config.bus.baud`, a name that a section was given to
+    (`seen = robot.camera`; `seen.focal_px`), a parameter that is declared as one (`motor: Motor`), or of itself within
+    its class.
+    """
+    sections = {one.name: type(one.default).__name__ for one in dataclasses.fields(RobotConfig) if one.name in SECTIONS}
+    classes = {name: section for section, name in sections.items()} | {"Motor": "motors", "CameraFacts": "camera"}
+    found: dict[str, set[str]] = {section: set() for section in classes.values()}
+    for root in ("openant_tools", "openant_env", "openant_agents"):
+        for path in (Path(__file__).parents[1] / root).rglob("*.py"):
+            tree = ast.parse(path.read_text())
+            stands: dict[str, str] = {"motor": "motors", "m": "motors"}
+            for node in ast.walk(tree):
+                pairs: list[tuple[ast.expr, ast.expr]] = []
+                if isinstance(node, ast.Assign):
+                    for target in node.targets:
+                        both = isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple)
+                        pairs += zip(target.elts, node.value.elts, strict=True) if both else [(target, node.value)]
+                elif isinstance(node, ast.arg) and node.annotation is not None:
+                    kind = ast.unparse(node.annotation).rpartition(".")[2]
+                    if kind in classes:
+                        stands[node.arg] = classes[kind]
+                for target, value in pairs:
+                    if isinstance(target, ast.Name) and isinstance(value, ast.Attribute) and value.attr in sections:
+                        stands[target.id] = value.attr
+            for kind in [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and node.name in classes]:
+                found[classes[kind.name]] |= {n.attr for n in ast.walk(kind) if isinstance(n, ast.Attribute)}
+            for node in ast.walk(tree):
+                if not isinstance(node, ast.Attribute):
+                    continue
+                of = node.value
+                section = (
+                    of.attr if isinstance(of, ast.Attribute) and of.attr in sections
+                    else stands.get(of.id) if isinstance(of, ast.Name)
+                    else "motors" if "motors" in ast.unparse(of) else None
+                )  # fmt: skip
+                if section in found:
+                    found[section].add(node.attr)
+    return found
+
+
+def test_no_setting_is_read_by_nobody() -> None:
+    read = reads_of_settings()
+    declared = {
+        **{name: {field.metadata.get("key") or field.name for field in dataclasses.fields(kind) if field.metadata}
+           for name, kind in SECTIONS.items()},
+        "motors": {field.name for field in dataclasses.fields(Motor) if field.metadata},
+    }  # fmt: skip
+    idle = [f"{section}.{name}" for section, names in declared.items() for name in sorted(names - read[section])]
+    assert not idle, f"settings of robot.toml that no code reads: {', '.join(idle)}; let them act, or take them away"
 
 
 @given(data=st.data())

@@ -151,7 +151,8 @@ def _sensors(report: Report, folder: RobotFolder) -> None:
     report.section("Sensors").table(
         ["what", "value", "unit"],
         [
-            ["IMU: counts per g", imu.acc_counts_per_g, ""],
+            ["IMU: counts per g", f"{imu.acc_counts_per_g:.0f}" if imu.acc_counts_per_g else "not measured", ""],
+            ["IMU: counts per °/s", f"{imu.gyro_counts_per_dps:.4g}", ""],
             ["IMU: mounted at", f"{mounted:.1f}", "°"],
             ["IMU: gyro bias", " ".join(f"{x:+.4f}" for x in imu.gyro_bias_rad_s), "rad/s"],
             ["camera: diagonal field of view", f"{math.degrees(camera.fov_diagonal_rad):.1f}", "°"],

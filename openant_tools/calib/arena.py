@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.calib.gyro_scale import SAME_SHARE, by_camera, old_rates
 from openant_tools.calib.sweep import play_watched
 from openant_tools.calib.wires import engine_config, rest
 from openant_tools.comms import messages
@@ -57,6 +58,8 @@ WIGGLE_RAD, WIGGLE_HZ, WIGGLE_S, HOLD_S = 0.35, 0.8, 6.0, 1.5
 LATE_S = 0.008
 #: The hips' share of the body's turn: feet that slide leave less, joints that turn the other way a negative one.
 TURNED_SHARE = 0.3
+#: Gyro scales differ by less than this; more is another axis.
+GYRO_FACTOR = 1.5
 #: Views of a ChArUco board, and the longest wait for the next one that differs, s.
 VIEWS, VIEW_S = 10, 60.0
 #: Share of the picture's width by which a view must differ from all before it.
@@ -217,11 +220,24 @@ def arena(bench: Bench) -> Procedure:
         evidence += [
             Evidence("stamps are late by", late.latency_s, "s", f"gyro against tag heading; stamps: {info.latency_source}",
                      late.latency_s - 2 * late.latency_error_s, late.latency_s + 2 * late.latency_error_s),
-            Evidence("camera angle over gyro angle", late.scale, "1", "the same motion"),
+            Evidence("camera angle over gyro angle", late.scale, "1", "the same motion",
+                     late.scale - 2 * late.scale_error, late.scale + 2 * late.scale_error),
         ]  # fmt: skip
-        if abs(late.scale - 1) > 0.1:
+        if not 1 / GYRO_FACTOR < late.scale < GYRO_FACTOR:
+            wrong.append(
+                f"the gyro turned by {1 / late.scale:+.2f} of what the camera saw → its board is mounted otherwise than robot.toml "
+                "says: `openant calib imu`; or the picture is mirrored"
+            )
+        elif abs(late.scale - 1) > max(SAME_SHARE, 3 * late.scale_error):
+            # The scale that was in use is the recording's own: robot.toml may have been changed meanwhile.
+            now = float(record.run.facts.extra["imu"]["gyro_counts_per_dps"])
+            gyro = by_camera(late.scale, late.scale_error, now)
+            values["imu.gyro_counts_per_dps"] = round(gyro.counts_per_dps, 4)
+            bias = [round(now / gyro.counts_per_dps * one, 6) for one in config.imu.gyro_bias_rad_s]
+            values["imu.gyro_bias_rad_s"] = bias
             problems.append(
-                f"gyro and camera disagree by {100 * (late.scale - 1):+.0f} % about the same turn → run `openant calib imu`"
+                f"the gyro has {gyro.words}, not {now:.2f}: the tag turned by {100 * (late.scale - 1):+.1f} % more than it said "
+                f"→ imu.gyro_counts_per_dps takes it into account from now on; {old_rates(now, gyro)}"
             )
         if abs(late.latency_s) > LATE_S and latency_s > 0:
             values["camera.latency_s"] = round(latency_s, 4)
@@ -238,7 +254,7 @@ def arena(bench: Bench) -> Procedure:
         f"camera at {camera_m:.2f} m, tags {origin_id} and {body_id}"
         + ("" if latency_s is None else f", picture stamps {1e3 * abs(late.latency_s):.0f} ms off"),
         tuple(evidence),
-        "" if ok else "mend what is listed and run it again",
+        "" if ok else "mend what is listed and run it again" if wrong else "see to what is listed and run it again",
         COMMAND,
         data={
             "centre_m": centre,

@@ -1,8 +1,11 @@
-"""IMU: scale, bias, noise and mounting of the flight controller, from poses that hands can hold.
+"""IMU: scales, bias, noise and mounting of the flight controller, from poses that hands can hold and turns that they make.
 
 Gravity seen from the board in three poses whose gravity in the body is known gives the rotation between the two frames
 (Wahba's problem, solved by SVD: Markley, J. Astronaut. Sci. 1988). How well the angles between the measured directions
 agree with those between the known ones says whether the poses were held: rotations leave angles alone.
+
+Gravity tells the accelerometer's scale, a turn the gyro's (`gyro_scale`). A turn that says something else than what is in
+use is made again, twice as far: what the hand was off by counts half as much then, and a sensor's step as much as before.
 """
 
 from __future__ import annotations
@@ -14,7 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.calib.gyro_scale import HAND_RAD, KNOWN, GyroScale, by_hand, old_rates
 from openant_tools.calib.wires import SETTLE_S, opened_imu, wait
+from openant_tools.comms import msp
 from openant_tools.comms.clock import Clock
 from openant_tools.comms.imu import STANDARD_GRAVITY, Imu
 from openant_tools.errors import HardwareFault
@@ -59,10 +64,10 @@ REST_S = 1.0
 STILL_M_S2, STILL_RAD_S = 0.35, 0.08
 #: Poses held by hand are a few degrees off; beyond this the answer is not to be trusted.
 AGREE_RAD, LOW_RAD = math.radians(6), math.radians(15)
-#: Share by which |acc| may miss gravity; a wrong scale is a factor of two.
+#: Share by which |acc| may miss gravity by the scale that its sensor should have; a wrong one is a factor of two.
 GRAVITY_SHARE = 0.06
-#: The yaw check: a quarter turn by hand, left.
-YAW_RAD, YAW_SHARE = math.pi / 2, 0.15
+#: rad; the short turn, and the long one (a little less than half, so that its way round is plain); s for a quarter
+QUARTER_RAD, HALF_RAD, QUARTER_S = math.pi / 2, math.pi - 1e-3, 3.0
 TRIES = 3
 
 
@@ -142,7 +147,7 @@ def imu(bench: Bench) -> Procedure:
         for note in info.notes:
             yield Say(note, "warn")
             if "gravity decides" in note.lower() or "Gravity says" in note:
-                problems.append(f"IMU scale: {note} → {info.acc_lsb_per_g} LSB/g is used")
+                problems.append(f"IMU scale: {note} → {info.acc_lsb_per_g:.0f} LSB/g is used")
         yield Look("Three poses, each held still for a second.", DRAWING)
         for attempt in range(TRIES):
             rests = list[_Rest]()
@@ -158,36 +163,57 @@ def imu(bench: Bench) -> Procedure:
         level = rests[0]
         yield Hands("Put it back on its stand, level.", "tilt", path_rad=(0.0, 0.0, 0.0))
         wait(clock, SETTLE_S)
-        turned = yield from _quarter_turn(driver, clock, found.rotation, level)
+        imu_now = bench.folder.config().imu
+        measured = bench.folder.config().provenance_of("imu.gyro_counts_per_dps") is not None
+        turns, gyro = yield from _turns(driver, clock, found.rotation, level, measured)
+    turned = turns[0]
     norms = np.array([np.linalg.norm(rest.acc) for rest in rests])
-    scale_error = float(norms.mean() / STANDARD_GRAVITY - 1)
+    acc_counts = float(norms.mean() / STANDARD_GRAVITY * info.acc_lsb_per_g)
+    nominal = min((*msp.ACC_LSB_PER_G_NEW, msp.ACC_LSB_PER_G_OLD), key=lambda lsb: abs(math.log(acc_counts / lsb)))
+    scale_error = acc_counts / nominal - 1
     axis, angle = _axis_words(found.vector_rad)
     gyro_bias = found.rotation @ level.gyro
     evidence = (
         Evidence(
-            "norm of acc over gravity", 1 + scale_error, "1", f"{len(POSES)} poses at rest, {info.acc_lsb_per_g} LSB/g"
+            "norm of acc over gravity", 1 + scale_error, "1", f"{len(POSES)} poses at rest, {nominal} LSB/g"
         ),
         Evidence("gyro bias", float(np.linalg.norm(gyro_bias)), "rad/s", "at rest, level"),
         Evidence("gyro noise", float(level.gyro_noise.max()), "rad/s", "standard deviation at rest"),
         Evidence("acc noise", float(level.acc_noise.max()), "m/s²", "standard deviation at rest"),
         Evidence("mounting", angle, "rad", f"rotation about {axis}, from gravity in {len(POSES)} poses"),
         Evidence("poses disagree by", found.disagreement_rad, "rad", "angles between measured directions"),
-        Evidence("quarter turn", turned, "rad", "integral of the gyro about the body's vertical"),
-    )
+        Evidence(
+            "quarter turn", turned, "rad",
+            f"integral of the gyro about the body's vertical, {info.gyro_lsb_per_dps:.5g} counts for 1 °/s",
+        ),
+        *([] if gyro is None else [
+            Evidence("gyro counts for 1 °/s", gyro.counts_per_dps, "1", f"{len(turns)} turns by hand", gyro.low, gyro.high)
+        ]),
+    )  # fmt: skip
+    unsure = list[str]()
     if abs(scale_error) > GRAVITY_SHARE:
         problems.append(
             f"IMU scale: |acc| at rest is {norms.mean():.2f} m/s² instead of {STANDARD_GRAVITY:.2f} → calibrate the accelerometer "
             "in Betaflight (level, still), then run this step again"
         )
-    yaw_off = abs(abs(turned) / YAW_RAD - 1)
-    if turned < 0 or yaw_off > YAW_SHARE:
+    read = ", ".join(f"{math.degrees(turn):.0f}°" for turn in turns)
+    if turned < 0:
         problems.append(
-            f"gyro: a quarter turn to the left reads {math.degrees(turned):.0f}° → "
-            + (
-                "its sign is wrong: the mounting was taken in wrong poses"
-                if turned < 0
-                else "its scale is off, or the turn was not 90°"
-            )
+            f"gyro: a quarter turn to the left reads {math.degrees(turned):.0f}° → its sign is wrong: the mounting was taken in "
+            "wrong poses, or it was turned to the right"
+        )
+    elif gyro is None:
+        steps = " or ".join(KNOWN)
+        unsure.append(
+            f"gyro scale: turns of 90° and 180° read {read}, which no sensor of {steps} a step makes of a turn that ended "
+            f"within {math.degrees(HAND_RAD):.1f}° → turn it against a table's edge, from side to side, or let `openant calib "
+            "arena` measure it against the tag"
+        )
+    elif abs(gyro.counts_per_dps / info.gyro_lsb_per_dps - 1) > 1e-3:
+        words = f"the gyro has {gyro.words}, not {info.gyro_lsb_per_dps:.2f}: a quarter turn read {math.degrees(turned):.0f}°"
+        yield Say(words, "warn")
+        problems.append(
+            f"{words} → imu.gyro_counts_per_dps takes it into account from now on; {old_rates(info.gyro_lsb_per_dps, gyro)}"
         )
     if found.confidence != "high":
         problems.append(
@@ -202,36 +228,47 @@ def imu(bench: Bench) -> Procedure:
         problems.append(
             f"the board is mounted rotated by {math.degrees(angle):.0f}° about {axis} → robot.toml takes it into account"
         )
-    ok = found.confidence == "high" and abs(scale_error) <= GRAVITY_SHARE and turned > 0 and yaw_off <= YAW_SHARE
-    if ok:
-        yield Intent("write scale, mounting and gyro bias into [imu] of robot.toml")
-        provenance = Provenance("measured", COMMAND)
-        bench.folder.update(
-            {
-                "imu.mounting_rad": [round(x, 5) for x in found.vector_rad],
-                "imu.gyro_bias_rad_s": [round(float(x), 6) for x in gyro_bias],
-                "imu.acc_counts_per_g": float(info.acc_lsb_per_g),
-            },
-            provenance=provenance,
-        )
+    sound = found.confidence == "high" and abs(scale_error) <= GRAVITY_SHARE and turned > 0
+    counts = imu_now.gyro_counts_per_dps if gyro is None else gyro.counts_per_dps
+    if sound:
+        yield Intent("write scales, mounting and gyro bias into [imu] of robot.toml")
+        # The bias was read with the scale that was in use, and is to be subtracted with the one from now on.
+        gyro_bias = gyro_bias * (info.gyro_lsb_per_dps / counts)
+        values: dict[str, object] = {
+            "imu.mounting_rad": [round(x, 5) for x in found.vector_rad],
+            "imu.gyro_bias_rad_s": [round(float(x), 6) for x in gyro_bias],
+            "imu.acc_counts_per_g": round(acc_counts, 1),
+        }
+        provenance = dict.fromkeys(values, Provenance("measured", COMMAND))
+        if gyro is not None:
+            values["imu.gyro_counts_per_dps"] = round(counts, 4)
+            provenance["imu.gyro_counts_per_dps"] = Provenance(
+                "measured", COMMAND, low=round(gyro.low, 4), high=round(gyro.high, 4)
+            )
+        bench.folder.update(values, provenance=provenance)
     return Finding(
         "imu",
-        ok,
-        f"{info.variant} {info.firmware}, {info.acc_lsb_per_g} LSB/g, mounted "
+        False if not sound else None if unsure else True,
+        f"{info.variant} {info.firmware}, {acc_counts:.0f} LSB/g, {counts:.2f} counts for 1 °/s"
+        + ("" if gyro is None else f" ({gyro.step} a step)" if gyro.step else " (as measured)")
+        + ", mounted "
         + (f"at {math.degrees(angle):.0f}° about {axis}, " if angle > math.radians(1) else "straight, ")
         + f"{info.rate_hz:.0f} samples/s",
         evidence,
-        "" if ok else "run it again; nothing was written",
+        "run it again; nothing was written" if not sound else "turn it again: run this step again" if unsure else "",
         COMMAND,
         data={
             "mounting_rad": list(found.vector_rad),
             "confidence": found.confidence,
-            "acc_lsb_per_g": info.acc_lsb_per_g,
+            "acc_lsb_per_g": acc_counts,
+            "gyro_counts_per_dps": counts,
+            "turns_rad": turns,
             "rate_hz": info.rate_hz,
             "uid": info.uid,
             "notes": list(info.notes),
         },
         problems=tuple(problems),
+        unsure=tuple(unsure),
     )
 
 
@@ -268,16 +305,43 @@ def _samples(driver: Imu, clock: Clock, seconds: float) -> Array:
     return np.array(rows)
 
 
-def _quarter_turn(driver: Imu, clock: Clock, rotation: Array, level: _Rest) -> Generator[Event, Answer, float]:
-    """Integral of the body's yaw rate, less its bias, over a quarter turn to the left, rad."""
+def _turns(
+    driver: Imu, clock: Clock, rotation: Array, level: _Rest, measured: bool
+) -> Generator[Event, Answer, tuple[list[float], GyroScale | None]]:
+    """What the gyro read of the turns, rad, and the scale that they say together; None where they say none."""
+    now = driver.info.gyro_lsb_per_dps
     yield Progress(0.85, "yaw check")
+    for attempt in range(TRIES):
+        turns = [(yield from _turn(driver, clock, rotation, level, QUARTER_RAD))]
+        if turns[0] < 0:
+            return turns, None
+        gyro = by_hand(turns, now, measured=measured)
+        if gyro is not None and abs(gyro.counts_per_dps / now - 1) < 1e-3:
+            return turns, gyro
+        # A sensor of another step, or a hand that stopped early: of twice the turn it is told.
+        yield Say(
+            f"the quarter turn reads {math.degrees(turns[0]):.0f}°: " + ("a turn that was not 90°?" if gyro is None
+            else f"a sensor of {gyro.step} a step, or a turn that was not 90°?"), "warn",
+        )  # fmt: skip
+        turns.append((yield from _turn(driver, clock, rotation, level, HALF_RAD)))
+        gyro = by_hand(turns, now, measured=measured)
+        if gyro is not None or attempt == TRIES - 1:
+            break
+        yield Say(f"the half turn reads {math.degrees(turns[1]):.0f}°: that does not fit together; once more", "warn")
+    return turns, gyro
+
+
+def _turn(driver: Imu, clock: Clock, rotation: Array, level: _Rest, turn_rad: float) -> Generator[Event, Answer, float]:
+    """Integral of the body's yaw rate, less its bias, over a turn to the left, rad."""
+    much, seconds = ("half a turn", 2 * QUARTER_S) if turn_rad > 2 else ("a quarter turn", QUARTER_S)
     yield Hands(
-        "Within three seconds turn the robot a quarter turn to the left (counter-clockwise seen from above), level.",
+        f"Within {seconds:.0f} seconds turn the robot {much} to the left (counter-clockwise seen from above), level, from one "
+        "straight edge to the next.",
         "tilt",
-        path_rad=(0.0, 0.0, YAW_RAD),
+        path_rad=(0.0, 0.0, turn_rad),
         while_watching=True,
     )
-    samples = _samples(driver, clock, 3.0)
+    samples = _samples(driver, clock, seconds)
     rate = (samples[:, 4:7] - level.gyro) @ rotation.T
     turned = float(np.sum(np.diff(samples[:, 0]) * (rate[1:, 2] + rate[:-1, 2]) / 2))
     yield Hands("Turn it back.", "tilt", path_rad=(0.0, 0.0, 0.0))

@@ -65,6 +65,7 @@ def opened_imu(bench: Bench) -> Iterator[tuple[Imu, Clock]]:
             "no flight controller is known", remedy="plug it in and run `openant calib connect`, or name it with --imu"
         )
     clock: Clock = RealClock()
+    imu: Imu | None = None
     if bench.control:
         remote = VirtualControl(bench.control)
         if remote.ask("now")["stepped"]:
@@ -75,13 +76,16 @@ def opened_imu(bench: Bench) -> Iterator[tuple[Imu, Clock]]:
                 stepped.attach(imu=line)
                 return line
 
-            imu = Imu(attached, stepped, where=named.port)
+            imu = Imu(
+                attached, stepped, where=named.port,
+                gyro_counts_per_dps=named.gyro_counts_per_dps, acc_counts_per_g=named.acc_counts_per_g,
+            )  # fmt: skip
             imu.connect()
             clock = stepped
-        else:
-            imu = open_imu(named.port, clock)
-    else:
-        imu = open_imu(named.port, clock)
+    if imu is None:
+        imu = open_imu(
+            named.port, clock, gyro_counts_per_dps=named.gyro_counts_per_dps, acc_counts_per_g=named.acc_counts_per_g
+        )
     try:
         yield imu, clock
     finally:

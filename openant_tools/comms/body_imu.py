@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.comms.clock import Clock, SteppedClock
-from openant_tools.comms.imu import IMU_BAUD, Imu, ImuSample
+from openant_tools.comms.imu import IMU_BAUD, Imu, ImuInfo, ImuSample
 from openant_tools.comms.line import Line, SerialLine
 from openant_tools.comms.messages import ImuConfig
 from openant_tools.errors import HardwareFault
@@ -36,6 +36,7 @@ class BodyImu:
     """One flight controller, connected.
 
     Attributes:
+        info: what it is, and the scales in use.
         notes: what a builder should know of it.
 
     Raises:
@@ -50,8 +51,12 @@ class BodyImu:
         self._t = -np.inf
         self._sample: ImuSample | None = None
         self._said: tuple[str, float] = ("", -np.inf)
-        self._imu = Imu(lambda: self._open(config.port), clock, where=config.port)
-        self.notes = self._imu.connect().notes
+        self._imu = Imu(
+            lambda: self._open(config.port), clock, where=config.port,
+            gyro_counts_per_dps=config.gyro_counts_per_dps, acc_counts_per_g=config.acc_counts_per_g,
+        )  # fmt: skip
+        self.info: ImuInfo = self._imu.connect()
+        self.notes = self.info.notes
 
     def _open(self, port: str) -> Line:
         line = SerialLine(port, IMU_BAUD)

@@ -844,6 +844,9 @@ class Engine:
             "latency_timer_ms": self._bus.timing.latency_timer_s * 1e3,
             "return_delay_s": self._bus.timing.return_delay_s,
         }
+        if self._imu is not None:
+            scales = self._imu.info
+            extra["imu"] = {"gyro_counts_per_dps": scales.gyro_lsb_per_dps, "acc_counts_per_g": scales.acc_lsb_per_g}
         if self.config.chain:
             extra["chain"] = [list(cable) for cable in self.config.chain]
         facts = replace(command.facts, joints=self._servos.joints, extra={**extra, **command.facts.extra})

@@ -7,9 +7,11 @@ leaves at once: its values are as old as the way back, however long the request 
 measures the bare way there and back (the shortest of a few polls at different phases of the task) and stamps samples
 `reply time − shortest round trip / 2`; a request's midpoint would be early by half its wait, up to 5 ms.
 
-Scales. The gyro is always 2000/32768 °/s per LSB. The accelerometer's scale belongs to the firmware (API ≤ 1.45: 512
-LSB/g; later: the sensor's own, 1024, 2048 or 4096), so it is taken from the API version and held against gravity:
-where the two disagree, gravity decides and the notes say so.
+Scales. Most gyros have 2000/32768 °/s per LSB, some (ST's) 0.070 °/s, and no message tells which: nothing at rest shows
+it, so `openant calib imu` measures it by a turn and `openant calib arena` against the tag, and who opens the driver passes
+on what was measured. The accelerometer's scale belongs to the firmware (API ≤ 1.45: 512 LSB/g; later: the sensor's own,
+1024, 2048 or 4096), so it is taken from the API version and held against gravity: where the two disagree, gravity decides
+and the notes say so. Where it was measured, that is used, as long as gravity does not say that it is another by now.
 
 Nothing here waits longer than it is told: `service` never waits, `read` waits until its deadline. A reply that lay
 unread between two calls of `service` came at an unknown time between them: whoever wants sharp stamps reads, or serves
@@ -91,7 +93,7 @@ class ImuInfo:
 
     Attributes:
         polling: "multiple" (one request for all) or "alternate".
-        acc_lsb_per_g: the scale in use. gravity: |acc| at rest with it, m/s², or None where the robot moved.
+        acc_lsb_per_g, gyro_lsb_per_dps: the scales in use. gravity: |acc| at rest with it, m/s², or None where the robot moved.
         rate_hz: samples a second when polled back to back. round_trip_s: the shortest one.
         gyro_bias: mean rate at rest in rad/s, or None where the robot moved; samples are not corrected by it.
         notes: what a builder should know, in whole sentences.
@@ -104,7 +106,8 @@ class ImuInfo:
     uid: str
     polling: str
     has_magnetometer: bool
-    acc_lsb_per_g: int
+    acc_lsb_per_g: float
+    gyro_lsb_per_dps: float
     gravity: float | None
     gyro_bias: Vector | None
     rate_hz: float
@@ -139,13 +142,16 @@ class ImuStatistics:
             self.recent.popleft()
 
 
-def open_imu(path: str, clock: Clock) -> Imu:
-    """Connect to the flight controller at `path`.
+def open_imu(path: str, clock: Clock, *, gyro_counts_per_dps: float = 0.0, acc_counts_per_g: float = 0.0) -> Imu:
+    """Connect to the flight controller at `path`; scales as `Imu` takes them.
 
     Raises:
         HardwareFault: no such port, silence, another kind of device, or the controller's command line is open.
     """
-    imu = Imu(lambda: SerialLine(path, IMU_BAUD), clock, where=path)
+    imu = Imu(
+        lambda: SerialLine(path, IMU_BAUD), clock, where=path,
+        gyro_counts_per_dps=gyro_counts_per_dps, acc_counts_per_g=acc_counts_per_g,
+    )  # fmt: skip
     imu.connect()
     return imu
 
@@ -157,10 +163,17 @@ class Imu:
         open_line: opens the port; called again after an unplug.
         clock: the time that samples are stamped with.
         where: what the port is called in messages.
+        gyro_counts_per_dps, acc_counts_per_g: raw counts for 1 °/s and for 1 g, as they were measured; 0 where they were
+            not: then the gyro has the step that most have, and gravity tells the accelerometer's among the known ones.
     """
 
-    def __init__(self, open_line: Callable[[], Line], clock: Clock, *, where: str) -> None:
+    def __init__(
+        self, open_line: Callable[[], Line], clock: Clock, *, where: str, gyro_counts_per_dps: float = 0.0,
+        acc_counts_per_g: float = 0.0,
+    ) -> None:  # fmt: skip
         self.where = where
+        self._gyro_lsb_per_dps = gyro_counts_per_dps or msp.RAD_PER_DEG / msp.GYRO_RAD_S_PER_LSB
+        self._acc_measured = acc_counts_per_g
         self.statistics = ImuStatistics()
         self._open_line = open_line
         self._clock = clock
@@ -295,6 +308,7 @@ class Imu:
             polling="multiple" if multiple else "alternate",
             has_magnetometer=status.has_magnetometer,
             acc_lsb_per_g=scale,
+            gyro_lsb_per_dps=self._gyro_lsb_per_dps,
             gravity=gravity,
             gyro_bias=bias,
             rate_hz=rate,
@@ -423,24 +437,29 @@ class Imu:
 
     def _scale(
         self, api: msp.ApiVersion, samples: Sequence[msp.RawImu], notes: list[str]
-    ) -> tuple[int, float | None, Vector | None]:
+    ) -> tuple[float, float | None, Vector | None]:
         """Accelerometer scale, |acc| with it and the gyro's mean; the latter two are None where the robot moved."""
         mean = math.fsum(math.hypot(*raw.acc) for raw in samples) / len(samples)
-        rates = [tuple(v * msp.GYRO_RAD_S_PER_LSB for v in raw.gyro) for raw in samples]
+        to_rad = msp.RAD_PER_DEG / self._gyro_lsb_per_dps
+        rates = [tuple(v * to_rad for v in raw.gyro) for raw in samples]
         bias = (_mean(rates, 0), _mean(rates, 1), _mean(rates, 2))
+        measured = self._acc_measured
         expected = msp.acc_scales(api)
         if mean == 0.0:
             raise HardwareFault(
                 "the accelerometer reads zero on all axes", where=self.where, remedy="it is switched off or broken"
             )
         if not _at_rest(samples):
+            inherited = measured or float(expected[0])
             notes.append(
-                f"The robot moved while connecting, so the accelerometer scale ({expected[0]} LSB/g by API {api}) is "
-                "not checked against gravity."
+                f"The robot moved while connecting, so the accelerometer scale ({inherited:.0f} LSB/g "
+                f"{'as measured' if measured else f'by API {api}'}) is not checked against gravity."
             )
-            return expected[0], None, None
+            return inherited, None, None
+        if measured and abs(math.log(mean / measured)) <= math.log1p(SCALE_TOLERANCE):
+            return measured, mean / measured * STANDARD_GRAVITY, bias
         known = sorted({msp.ACC_LSB_PER_G_OLD, *msp.ACC_LSB_PER_G_NEW})
-        scale = min(known, key=lambda lsb: abs(math.log(mean / lsb)))
+        scale: float = min(known, key=lambda lsb: abs(math.log(mean / lsb)))
         if abs(math.log(mean / scale)) > math.log1p(SCALE_TOLERANCE):
             raise HardwareFault(
                 f"the accelerometer reads {mean:.0f} LSB at rest, which is 1 g in no known scale "
@@ -448,9 +467,14 @@ class Imu:
                 where=self.where,
                 remedy="calibrate the accelerometer in Betaflight, board level and still, then connect again",
             )
-        if scale not in expected:
+        if measured:
             notes.append(
-                f"Gravity says {scale} LSB/g where API {api} promises {' or '.join(map(str, expected))}; "
+                f"Gravity says {scale:.0f} LSB/g where {measured:.0f} had been measured (other firmware, another board?); "
+                "gravity decides: run `openant calib imu` again."
+            )
+        elif scale not in expected:
+            notes.append(
+                f"Gravity says {scale:.0f} LSB/g where API {api} promises {' or '.join(map(str, expected))}; "
                 "gravity decides."
             )
         return scale, mean / scale * STANDARD_GRAVITY, bias
@@ -542,16 +566,12 @@ class Imu:
             self._same += 1
         else:
             self._raw, self._changed_at, self._same = raw, t, 0
-        to_si = STANDARD_GRAVITY / info.acc_lsb_per_g
+        to_si, to_rad = STANDARD_GRAVITY / info.acc_lsb_per_g, msp.RAD_PER_DEG / info.gyro_lsb_per_dps
         attitude = self._attitude
         sample = ImuSample(
             t=t,
             acc=(raw.acc[0] * to_si, raw.acc[1] * to_si, raw.acc[2] * to_si),
-            gyro=(
-                raw.gyro[0] * msp.GYRO_RAD_S_PER_LSB,
-                raw.gyro[1] * msp.GYRO_RAD_S_PER_LSB,
-                raw.gyro[2] * msp.GYRO_RAD_S_PER_LSB,
-            ),
+            gyro=(raw.gyro[0] * to_rad, raw.gyro[1] * to_rad, raw.gyro[2] * to_rad),
             roll=attitude.roll if attitude else None,
             pitch=attitude.pitch if attitude else None,
             yaw=attitude.yaw if attitude else None,

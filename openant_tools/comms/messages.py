@@ -48,12 +48,15 @@ class ImuConfig:
     Attributes:
         mounting_rad: rotation vector from the sensor's frame to the body's.
         gyro_bias_rad_s, acc_bias_m_s2: what it reads too much, in the body's frame.
+        gyro_counts_per_dps, acc_counts_per_g: its scales as measured; 0 where they were not.
     """
 
     port: str
     mounting_rad: tuple[float, ...] = (0.0, 0.0, 0.0)
     gyro_bias_rad_s: tuple[float, ...] = (0.0, 0.0, 0.0)
     acc_bias_m_s2: tuple[float, ...] = (0.0, 0.0, 0.0)
+    gyro_counts_per_dps: float = 0.0
+    acc_counts_per_g: float = 0.0
 
 
 @dataclass(frozen=True)

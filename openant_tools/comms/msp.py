@@ -300,7 +300,7 @@ def _decode_v2(direction: Direction, body: bytearray, framing: Framing) -> Frame
 # --- messages ----------------------------------------------------------------------------------------------------
 
 RAD_PER_DEG = 3.141592653589793 / 180.0
-GYRO_RAD_S_PER_LSB = 2000.0 / 32768.0 * RAD_PER_DEG  # ±2000 deg/s parts; always raw LSB (facts/imu.md D2)
+GYRO_RAD_S_PER_LSB = 2000.0 / 32768.0 * RAD_PER_DEG  # most ±2000 deg/s parts; always raw LSB (facts/imu.md D2)
 ACC_LSB_PER_G_OLD = 512  # until API 1.45 the firmware itself divided every sensor down to this (Betaflight #13026)
 ACC_LSB_PER_G_NEW = (2048, 1024, 4096)  # from API 1.46 the sensor's own scale, most common first
 QUATERNION_LSB = 32767.0

@@ -63,7 +63,10 @@ def imu_of_robot(robot: RobotConfig | None, port: str | None = None) -> ImuConfi
     where = port or (str(robot.ports.imu) if robot is not None and robot.ports.imu else None)
     if where is None or robot is None:
         return None if where is None else ImuConfig(where)
-    return ImuConfig(where, robot.imu.mounting_rad, robot.imu.gyro_bias_rad_s, robot.imu.acc_bias_m_s2)
+    imu = robot.imu
+    return ImuConfig(
+        where, imu.mounting_rad, imu.gyro_bias_rad_s, imu.acc_bias_m_s2, imu.gyro_counts_per_dps, imu.acc_counts_per_g
+    )
 
 
 def camera_of_robot(robot: RobotConfig | None, source: str | int | None = None) -> CameraConfig | None:

@@ -18,7 +18,7 @@ import tomlkit
 from tomlkit.exceptions import ParseError, TOMLKitError
 
 from openant_tools.errors import BadInput
-from openant_tools.robot.fields import Problem, choice, number, port, read, switch, text, vector, whole
+from openant_tools.robot.fields import Problem, choice, number, port, read, stranger, switch, text, vector, whole
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS, Kind
 from openant_tools.robot.kit import KITS, PLATFORM_PWM_LIMIT
 from openant_tools.robot.servo import BAUD_CODES, SERVO_MODELS, ServoModel
@@ -61,7 +61,6 @@ class Bus:
     Attributes:
         baud: bits per second, of every servo.
         return_delay_s: what each servo waits before it answers (register 9).
-        latency_timer_ms: of the adapter; its driver's default of 16 ms costs that much per read.
         write_read_gap_s: from the last byte of a write to the next read; below 0.2 ms servos miss the read.
         pwm_limit: share of full duty that the servos may use (register 36).
         watchdog_s: servos stop by themselves after this long without an instruction (register 98); 0 is off.
@@ -70,7 +69,6 @@ class Bus:
 
     baud: int = choice(tuple(BAUD_CODES.values()), "baud rate that servos have", 1_000_000)
     return_delay_s: float = number(0, 508e-6, "s", 0.0)
-    latency_timer_ms: int = whole(1, 255, 1)
     write_read_gap_s: float = number(0, 0.1, "s", 0.0002)
     pwm_limit: float = number(0, 1, "", PLATFORM_PWM_LIMIT)
     watchdog_s: float = number(0, 2.54, "s", 0.2)
@@ -135,14 +133,14 @@ class Imu:
         mounting_rad: rotation vector from the sensor's frame to the body's.
         gyro_bias_rad_s, acc_bias_m_s2: what it reads too much, in the body's frame.
         acc_counts_per_g: raw accelerometer counts for 1 g, which differs by firmware; 0 while unknown.
-        gyro_counts_per_dps: raw gyro counts for 1 °/s, 16.4 for the range of 2000 °/s.
+        gyro_counts_per_dps: raw gyro counts for 1 °/s: 16.384 where a step is 61.035 mdps, 14.286 where it is 70 mdps.
     """
 
     mounting_rad: tuple[float, ...] = vector(3, -TURN, TURN, "rad", (0.0, 0.0, 0.0))
     gyro_bias_rad_s: tuple[float, ...] = vector(3, -2, 2, "rad/s", (0.0, 0.0, 0.0))
     acc_bias_m_s2: tuple[float, ...] = vector(3, -5, 5, "m/s²", (0.0, 0.0, 0.0))
     acc_counts_per_g: float = number(0, 32768, "", 0.0)
-    gyro_counts_per_dps: float = number(1, 1000, "", 16.4)
+    gyro_counts_per_dps: float = number(1, 1000, "", 16.384)
 
 
 @dataclass(frozen=True)
@@ -352,6 +350,8 @@ _SECTIONS: Mapping[str, type[Any]] = {
     "ports": Ports, "bus": Bus, "imu": Imu, "camera": Camera, "arena": Arena, "timing": Timing,
     "actions": Actions,
 }  # fmt: skip
+#: settings of files of before that are read no more → why
+RETIRED: Mapping[str, str] = {"bus.latency_timer_ms": "the adapter itself is asked, and set to 1 ms"}
 _KNOWN = {"schema", "name", "kit", "model", *_SECTIONS, "motors", "observation", "effect", "provenance", "platform"}
 
 
@@ -540,6 +540,12 @@ def read_document(data: bytes, where: str | Path) -> tomlkit.TOMLDocument:
         raise BadInput(f"is no TOML: {error}", where=where, remedy=remedy) from None
 
 
+def retired(problem: Problem) -> Problem:
+    """A key that nobody reads any more says so, instead of that nobody knows it."""
+    why = RETIRED.get(problem.key)
+    return problem if why is None else Problem(problem.key, f"is read no more: {why}", "the line can go", "note")
+
+
 def parse_config(document: Mapping[str, Any]) -> tuple[RobotConfig | None, list[Problem]]:
     """What a document says, and everything in it that cannot be or is probably not meant.
 
@@ -565,10 +571,7 @@ def parse_config(document: Mapping[str, Any]) -> tuple[RobotConfig | None, list[
             given["chain"] = _chain(document["bus"]["chain"], problems)
         parts[name] = read(kind, document.get(name, {}), name, problems, **given)
     unknown = tuple(key for key in document if key not in _KNOWN)
-    for key in unknown:
-        close = difflib.get_close_matches(key, sorted(_KNOWN), n=1, cutoff=0.8)
-        if close:
-            problems.append(Problem(key, f"is not known; is {close[0]!r} meant?", None, "note"))
+    problems += [stranger(key, key, sorted(_KNOWN)) for key in unknown]
     config = read(
         RobotConfig,
         document,
@@ -581,5 +584,6 @@ def parse_config(document: Mapping[str, Any]) -> tuple[RobotConfig | None, list[
         provenance=_provenance(document.get("provenance", {}), problems),
         unknown=unknown,
     )
+    problems = [retired(problem) for problem in problems]
     errors = any(problem.severity == "error" for problem in problems)
     return (None if errors else config), problems

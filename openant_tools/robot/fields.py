@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from typing import Any, Literal, TypeVar
 
-__all__ = ["Problem", "choice", "number", "port", "read", "switch", "text", "vector", "whole"]
+__all__ = ["Problem", "choice", "number", "port", "read", "stranger", "switch", "text", "vector", "whole"]
 
 T = TypeVar("T")
 
@@ -169,6 +169,14 @@ def vector(size: int, low: float, high: float, unit: str = "", default: Any = MI
     return _field(parse, default, key)
 
 
+def stranger(path: str, key: str, known: Sequence[str]) -> Problem:
+    """The note about a key that nobody reads: it stays in the file, and does nothing."""
+    close = difflib.get_close_matches(key, list(known), n=1, cutoff=0.8)
+    return Problem(
+        path, f"is not known; is {close[0]!r} meant?" if close else "is not known: nothing reads it", None, "note"
+    )
+
+
 def read(kind: type[T], table: Any, path: str, problems: list[Problem], **given: Any) -> T | None:
     """An instance of the dataclass `kind` from a TOML table, or None where a field stayed empty.
 
@@ -200,6 +208,7 @@ def read(kind: type[T], table: Any, path: str, problems: list[Problem], **given:
         elif field.default is MISSING:
             problems.append(Problem(full(key), "is missing", f"is {full(slip[0])!r} a slip of it?" if slip else None))
             whole_instance = False
-        elif slip:
-            problems.append(Problem(full(slip[0]), f"is not known; is {key!r} meant?", None, "note"))
+    named = list(given) + [field.name for field in dataclasses.fields(kind) if not field.metadata]  # type: ignore[arg-type]
+    if path:
+        problems += [stranger(full(key), key, list(declared)) for key in strangers if key not in named]
     return kind(**values) if whole_instance else None

@@ -446,7 +446,6 @@ camera = ""  # number or device of the overhead camera
 [bus]
 baud = 1_000_000
 return_delay_s = 0.0  # the factory's 500 µs cost 4 ms a read of eight servos
-latency_timer_ms = 1  # of the adapter
 write_read_gap_s = 0.0002  # from the end of a write to the next read
 pwm_limit = 0.5  # share of full duty; it bounds torque and speed alike
 watchdog_s = 0.2  # the servos stop by themselves after this long without a word from us
@@ -459,6 +458,7 @@ watchdog_s = 0.2  # the servos stop by themselves after this long without a word
 mounting_rad = [0.0, 0.0, 0.0]  # rotation vector from the sensor's frame to the body's
 gyro_bias_rad_s = [0.0, 0.0, 0.0]
 acc_bias_m_s2 = [0.0, 0.0, 0.0]
+gyro_counts_per_dps = 16.384  # raw counts for 1 °/s; 14.286 of sensors of 70 mdps a step; `openant calib imu` measures it
 
 [camera]
 fov_diagonal_rad = 1.0471975511965976  # 60 degrees
