@@ -21,6 +21,7 @@ from openant_tools.comms import messages
 from openant_tools.comms.body_imu import rotation
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.imu import STANDARD_GRAVITY
+from openant_tools.comms.lateness import REMEDY, losses
 from openant_tools.comms.servos import Servos
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.gap.measure import measure
@@ -105,6 +106,7 @@ def check(bench: Bench) -> Procedure:
     now = analyse(run, limits)
     problems += changed(baseline, now)
     problems += loose(_lost(run), config.bus.chain)
+    problems += yield from _of_this_computer(run)
     problems += _warm_or_weak(now, config)
     for joint, one in now.items():
         evidence.append(
@@ -116,6 +118,7 @@ def check(bench: Bench) -> Procedure:
         problems.append(str(fault))
     else:
         problems += loose(_lost(twitch), config.bus.chain, problems)
+        problems += yield from _of_this_computer(twitch)
         problems += yield from _against_model(bench, twitch, evidence, problems)
         outside = _outside(twitch, config)
         for name, share in outside.items():
@@ -216,15 +219,25 @@ def loose(lost: Mapping[str, float], chain: Sequence[Sequence[str]], known: Sequ
 
 
 def _lost(run: Run) -> dict[str, float]:
-    """Joint → share of its answers that it lost by itself.
+    """Joint → share of its answers that it lost by itself, while this computer was punctual.
 
     Servos answer one after another: one that waits in vain for the one before it is lost with it, which says nothing of its
     own cable. Where most are lost together, it is none of theirs.
     """
-    lost = run.signal("ok", default=1.0) < 0.5
+    seen = losses(run)
+    lost = seen.lost[seen.rows] if seen.judged else np.zeros((1, len(run.joints)), bool)
     before = np.column_stack([np.zeros(len(lost), bool), lost[:, :-1]])
     own = lost & (~before | (lost.mean(axis=1) > 0.5)[:, None])
     return dict(zip(run.joints, own.mean(axis=0).tolist(), strict=True))
+
+
+def _of_this_computer(run: Run) -> Generator[Event, Answer, list[str]]:
+    """What it missed itself: said, and a problem where nothing is left to judge the connectors by."""
+    seen = losses(run)
+    if not seen.words:
+        return []
+    yield Say(f"{seen.words} → {REMEDY}", "warn")
+    return [] if seen.judged else [f"cannot judge the connectors, because {seen.words} → {REMEDY}"]
 
 
 def _at_rest(bench: Bench, config: RobotConfig, evidence: list[Evidence]) -> list[str]:
@@ -234,12 +247,12 @@ def _at_rest(bench: Bench, config: RobotConfig, evidence: list[Evidence]) -> lis
         servos = Servos(bus, robot_servos(config))
         found = {motor.joint: bus.ping(motor.id, insist=True) for motor in config.motors.values()}
         for joint, seen in found.items():
-            if seen is None:
-                problems.append(silence_words(bus, config.motors[joint], config))
-            elif seen.model_number != config.motors[joint].servo.number:
+            if seen is not None and seen.model_number != config.motors[joint].servo.number:
                 problems.append(
                     f"{joint}: another servo model answers than the passport's → were two motors exchanged?"
                 )
+        silent = [config.motors[joint] for joint, seen in found.items() if seen is None]
+        problems = silence_words(bus, silent, config) + problems
         if problems:
             return problems
         servos.set_torque(False)

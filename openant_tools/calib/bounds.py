@@ -16,6 +16,7 @@ from openant_tools.calib.wires import SETTLE_S, engine_config, opened_bus, rest,
 from openant_tools.comms import messages
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.lateness import REMEDY, losses
 from openant_tools.comms.servos import Servos
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.finding import Evidence, Finding
@@ -30,6 +31,7 @@ from openant_tools.procedure.step import (
     Look,
     Procedure,
     Progress,
+    Say,
 )  # fmt: skip
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run
@@ -139,6 +141,9 @@ def bounds(bench: Bench) -> Procedure:
             Evidence(f"friction of {one.joint}", one.friction_nm, "N·m", "slow sweep, from duty and back-EMF")
         )
     problems += _sweep_words(sweeps)
+    missed = losses(swept)
+    if missed.words:
+        yield Say(f"{missed.words} → {REMEDY}", "warn")
 
     runs = [(yield from _library(bench, "stand"))]
     if (

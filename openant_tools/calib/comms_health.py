@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from openant_tools.calib.wires import opened_bus, robot_servos, wait
-from openant_tools.comms.bench import bus_limit_hz, measure_gap, measure_rate
+from openant_tools.comms.bench import measure_gap, measure_rate
+from openant_tools.comms.faults import Cause
+from openant_tools.comms.lateness import ENOUGH, LATE_S, REMEDY
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servos
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.step import Bench, Procedure, Progress
+from openant_tools.procedure.step import Bench, Procedure, Progress, Say
 from openant_tools.robot.config import Provenance
 
 __all__ = ["comms_health"]
@@ -32,27 +36,45 @@ def comms_health(bench: Bench) -> Procedure:
         servos.identify()
         servos.set_torque(False)
         yield Progress(0.1, f"{CYCLES} reads at {RATE_HZ:g} Hz")
-        lost = dict.fromkeys(servos.joints, 0)
+        delays = servos.read_all("return_delay_time")
+        bus.timing = replace(bus.timing, return_delay_s=max(delays.values()) * 2e-6)
+        lost, missed, punctual = dict.fromkeys(servos.joints, 0), 0, 0
         for _ in range(CYCLES):
-            for servo, answer in zip(servos.servos, bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, servos.ids), strict=True):
-                lost[servo.joint] += not answer.ok
+            answers = bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, servos.ids)
+            late = bus.clock.lateness.cycle() > LATE_S
+            punctual += not late
+            for servo, answer in zip(servos.servos, answers, strict=True):
+                if late or answer.cause is Cause.LATE:
+                    missed += not answer.ok
+                else:
+                    lost[servo.joint] += not answer.ok
             wait(bus.clock, 1 / RATE_HZ)
+        host = bus.clock.lateness.words or "answers came late"
         yield Progress(0.5, "as fast as it goes")
         rate = measure_rate(bus, servos.ids, 2.0)
         yield Progress(0.8, "the quiet that is needed between a write and a read")
         trials, gap = measure_gap(bus, servos.ids)
+        busy = bus.clock.lateness.busy
+    if missed:
+        words = f"{host}: {missed} of {CYCLES * len(lost)} answers were missed by that, and say nothing of servos and cables"
+        yield Say(f"{words} → {REMEDY}", "warn")
+        if punctual < CYCLES * ENOUGH:
+            problems.append(f"cannot judge the cables, because {words} → {REMEDY}")
     for joint, count in lost.items():
-        if count > LOST_SHARE * CYCLES:
+        if count > LOST_SHARE * punctual and punctual >= CYCLES * ENOUGH:
             problems.append(
-                f"{joint}: {count} of {CYCLES} answers were lost → look at the cable before it, and at its plugs"
+                f"{joint}: {count} of {punctual} answers were lost → look at the cable before it, and at its plugs"
             )
-    limit = bus_limit_hz(config.bus.baud, len(lost), fast=False, gap_s=config.bus.write_read_gap_s)
-    if rate.hz < RATE_SHARE * limit:
+    if rate.hz < RATE_SHARE * rate.limit_hz and busy:
+        problems.append(f"cannot judge the rate, because {host} → {REMEDY}")
+    elif rate.hz < RATE_SHARE * rate.limit_hz:
         problems.append(
-            f"the bus manages {rate.hz:.0f} cycles/s of {limit:.0f} → the adapter's latency timer (`openant calib connect`) or "
+            f"the bus manages {rate.hz:.0f} cycles/s of {rate.limit_hz:.0f} → the adapter's latency timer (`openant calib connect`) or "
             "the servos' return delay (`openant calib inventory`)"
         )
-    if gap is None:
+    if gap is None and busy:
+        problems.append(f"cannot judge the pause after a write, because {host} → {REMEDY}")
+    elif gap is None:
         problems.append("reads fail whatever the pause after a write → noise on the bus, or a bad cable")
     elif abs(gap - config.bus.write_read_gap_s) > 1e-6:
         # Never below what robots in the field were found to need.
@@ -60,16 +82,20 @@ def comms_health(bench: Bench) -> Procedure:
     return Finding(
         "comms",
         not problems,
-        f"{sum(lost.values())} of {CYCLES * len(lost)} answers lost at {RATE_HZ:g} Hz; up to {rate.hz:.0f} cycles/s",
+        f"{sum(lost.values())} of {CYCLES * len(lost)} answers lost at {RATE_HZ:g} Hz; {rate.words}",
         (
             Evidence(
                 "answers lost", sum(lost.values()) / (CYCLES * len(lost)), "1", f"{CYCLES} reads at {RATE_HZ:g} Hz"
             ),
-            Evidence("cycles a second", rate.hz, "Hz", f"write and read; the wire allows {rate.limit_hz:.0f}"),
+            *(
+                [Evidence("cycles a second", rate.hz, "Hz", f"write and read; the wire allows {rate.limit_hz:.0f}")]
+                if rate.believable
+                else []
+            ),
             Evidence("quiet after a write", gap, "s", f"{trials[0].tries} reads for each gap"),
         ),
         "mend what is listed and run it again" if problems else "",
         COMMAND,
-        data={"lost": lost, "rate_hz": rate.hz},
+        data={"lost": lost} | ({"rate_hz": rate.hz} if rate.believable else {}),
         problems=tuple(problems),
     )

@@ -6,10 +6,12 @@ from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
 
 from openant_tools.calib.ids import locate
+from openant_tools.calib.mute import let_answer, silenced
 from openant_tools.calib.wires import journalled, opened_bus, robot_servos, wait
 from openant_tools.comms.bus import Bus, Found
 from openant_tools.comms.faults import NoAnswer
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servo, Servos
+from openant_tools.comms.silence import diagnose
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import (
@@ -66,11 +68,15 @@ def inventory(bench: Bench) -> Procedure:
     problems, evidence = list[str](), list[Evidence]()
     table: dict[str, dict[str, int]] = {}
     with opened_bus(bench) as bus:
+        bus.names = {motor.id: motor.joint for motor in config.motors.values()}
         yield Progress(None, "who answers")
         found, missing = _ping_all(bus, config)
         if len(missing) == len(config.motors):
             yield Hands("Connect the whole robot: all eight servos on the cable, 12 V on.", "plug")
             wait(bus.clock, 0.8)
+            found, missing = _ping_all(bus, config)
+        if len(missing) < len(config.motors):
+            yield from let_answer(bench, bus, silenced(bus, config.motors.values()), COMMAND)
             found, missing = _ping_all(bus, config)
         if missing:
             problems += yield from _missing(bench, bus, config, missing)
@@ -169,24 +175,22 @@ def _missing(
                 _set_baud(bench, bus, config.motors[joint], baud, config)
                 words.append(f"{joint}: was left at {baud} baud → set to {config.bus.baud}")
             bus.line.set_baud(config.bus.baud)
-    for motor in missing:
-        if motor.joint not in elsewhere:
-            words.append(silence_words(bus, motor, config))
-            yield Say(words[-1], "fail")
+    silent = [motor for motor in missing if motor.joint not in elsewhere]
+    for line in silence_words(bus, silent, config):
+        words.append(line)
+        yield Say(line, "fail")
     return words
 
 
-def silence_words(bus: Bus, motor: Motor, config: RobotConfig) -> str:
-    """Where to look for a servo that answers at no rate: the cable before it in its leg."""
-    joint = JOINTS[motor.joint]
-    hip = config.motors[f"hip_{joint.leg.name}"]
-    if joint.kind == "knee" and bus.ping(hip.id, insist=True) is not None:
-        where = f"look at the cable between {hip.joint} and {motor.joint}, then at {motor.joint} itself"
-    elif joint.kind == "knee":
-        where = f"its hip is silent, too: look at the cable to {hip.joint}"
-    else:
-        where = f"look at the cable to {motor.joint} and its id"
-    return f"{motor.joint} (id {motor.id}) answers at no baud rate → {where}"
+def silence_words(bus: Bus, silent: Sequence[Motor], config: RobotConfig) -> list[str]:
+    """Why servos are silent: what can be asked is asked; else the cable before the first in its leg."""
+    if not silent:
+        return []
+    legs = dict.fromkeys(JOINTS[joint].leg.name for joint in config.motors)
+    chain = config.bus.chain or [[f"hip_{leg}", f"knee_{leg}"] for leg in legs]
+    bus.names = {motor.id: motor.joint for motor in config.motors.values()}
+    found = diagnose(bus, [motor.id for motor in silent], list(bus.names), chain)
+    return [f"{one.what} → {one.remedy}" for one in (found, *found.rest)]
 
 
 def _set_baud(bench: Bench, bus: Bus, motor: Motor, baud: int, config: RobotConfig) -> None:

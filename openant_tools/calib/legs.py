@@ -11,6 +11,8 @@ from openant_tools.calib.bounds import Unwrapped
 from openant_tools.calib.ids import nudge
 from openant_tools.calib.wires import BOOT_S, opened_bus, robot_servos, servo_angles, wait
 from openant_tools.comms.bus import Bus
+from openant_tools.comms.faults import Cause
+from openant_tools.comms.lateness import LATE_S, REMEDY
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servos
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.finding import Evidence, Finding
@@ -91,7 +93,9 @@ def _one(bus: Bus, leg: Leg, config: RobotConfig) -> Generator[Event, Answer, li
         end = bus.clock.now() + READ_S
         while bus.clock.now() < end:
             answers = bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, servos.ids)
-            asked, lost = asked + len(answers), lost + sum(not answer.ok for answer in answers)
+            if bus.clock.lateness.cycle() <= LATE_S:
+                lost += sum(answer.cause not in (None, Cause.LATE) for answer in answers)
+            asked += len(answers)
             if asked % 20 == 0:
                 try:
                     now = servos.joint_rad(
@@ -108,6 +112,9 @@ def _one(bus: Bus, leg: Leg, config: RobotConfig) -> Generator[Event, Answer, li
                     break
             wait(bus.clock, 0.005)
         yield Hands("Let go.", "free")
+        late = bus.clock.lateness.words
+        if late:
+            yield Say(f"{late}: what was lost meanwhile says nothing of cables → {REMEDY}", "warn")
         if lost > LOST_SHARE * asked:
             raise HardwareFault(
                 f"{lost} of {asked} answers were lost while {joint} moved",

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.guards import Guards
+from openant_tools.comms.lateness import losses
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.step import Answer, Event, Live, Progress, Say
@@ -57,7 +58,7 @@ class JointSweep:
     Attributes:
         friction_nm: f of the module's formula, with its standard error.
         weight_nm: g. low_stop_rad, high_stop_rad: where it was held.
-        lost: share of reads that brought no valid answer. temperature_c: at the end. volts: lowest.
+        lost: share of reads that brought no valid answer while this computer was punctual. temperature_c: at the end. volts: lowest.
     """
 
     joint: str
@@ -183,13 +184,13 @@ def analyse(run: Run, limits: Mapping[str, tuple[float, float]]) -> dict[str, Jo
     Args:
         run: a recording of `sweep`, with cmd, pos, pwm. limits: joint → the limits that the sweep was made with, rad.
     """
-    return {joint: _joint(run, joint, *limits[joint]) for joint in run.joints}
+    lost = losses(run).shares
+    return {joint: _joint(run, joint, *limits[joint], lost[joint]) for joint in run.joints}
 
 
-def _joint(run: Run, joint: str, low: float, high: float) -> JointSweep:
+def _joint(run: Run, joint: str, low: float, high: float, lost: float) -> JointSweep:
     cmd, pos, duty = (run.signal(name, [joint])[:, 0] for name in ("cmd", "pos", "pwm"))
     volt, temperature = (run.signal(name, [joint])[:, 0] for name in ("volt", "temp"))
-    ok = run.signal("ok", [joint], default=1.0)[:, 0]
     model = servo_model(run.facts.motors[joint])
     rate = np.gradient(cmd, run.t)
     inside = (np.abs(rate) > 0.8 * SPEED_RAD_S) & (pos > low + MARGIN_RAD) & (pos < high - MARGIN_RAD)
@@ -206,7 +207,7 @@ def _joint(run: Run, joint: str, low: float, high: float) -> JointSweep:
     return JointSweep(
         joint, friction, friction_error, weight, weight_error,
         _stop(cmd, pos, -1), _stop(cmd, pos, 1),
-        float(np.mean(ok < 0.5)),
+        lost,
         float(np.nanmax(temperature[-200:])) if np.isfinite(temperature[-200:]).any() else None,
         float(np.nanmin(volt)) if np.isfinite(volt).any() else None,
     )  # fmt: skip

@@ -8,6 +8,7 @@ from openant_tools.comms.servos import Servo
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.journal import EepromWrite, Entry, Journal
 from openant_tools.procedure.step import Bench, Intent, Procedure, Progress, RegisterChange, Say
+from openant_tools.robot.registers import EEPROM_END
 from openant_tools.robot.servo import BAUD_CODES, ServoModel
 
 __all__ = ["undo"]
@@ -31,7 +32,12 @@ def undo(bench: Bench, *, everything: bool = False) -> Procedure:
     if not left:
         return Finding("undo", True, "the journal holds nothing that could be undone", (), "", COMMAND)
     models = {servo.joint: servo.model for servo in robot_servos(bench.folder.config())}
-    backwards = [entry for entry in reversed(left) if entry.write.joint in models]
+    # Memory that forgets falls back by itself with the next power-off.
+    backwards = [
+        entry
+        for entry in reversed(left)
+        if entry.write.joint in models and models[entry.write.joint].register(entry.write.register).address < EEPROM_END
+    ]
     yield Intent(
         f"take back {len(backwards)} writes of `{left[-1].command}`",
         tuple(RegisterChange(e.write.joint, e.write.register, e.write.new, e.write.old) for e in backwards),

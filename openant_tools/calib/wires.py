@@ -17,6 +17,7 @@ from openant_tools.comms.messages import EngineConfig
 from openant_tools.comms.protocol2 import BROADCAST, write
 from openant_tools.comms.servos import Servo, Servos
 from openant_tools.comms.setup import config_of_robot, find_bus, imu_of_robot, open_bus
+from openant_tools.comms.silence import explaining
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.procedure.step import Bench
@@ -43,7 +44,8 @@ def opened_bus(bench: Bench, baud: int | None = None) -> Iterator[Bus]:
     bus = open_bus(find_bus(bench.bus, config), baud or config.bus.baud, bench.control)
     bus.timing = replace(bus.timing, write_read_gap_s=config.bus.write_read_gap_s, return_delay_s=508e-6)
     try:
-        yield bus
+        with explaining(bus, config.bus.chain):
+            yield bus
     finally:
         with contextlib.suppress(HardwareFault):  # the port may be what has gone
             for _ in range(RELEASES):

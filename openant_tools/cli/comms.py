@@ -14,6 +14,7 @@ import click
 
 from openant_tools.cli.comms_blind import blind
 from openant_tools.cli.comms_diagnose import diagnose, timing
+from openant_tools.cli.comms_reboot import reboot
 from openant_tools.cli.comms_soak import soak
 from openant_tools.cli.hardware import engine_config, port_option, robot_of
 from openant_tools.cli.options import json_option, robot_option
@@ -36,10 +37,11 @@ def comms() -> None:
       openant comms scan --port /dev/ttyUSB0  every servo at every baud rate, in two seconds
       openant comms watch                     live: angles, losses by cause, round trips
       openant comms diagnose soak.mcap        what loses the communication, and what to do about it
+      openant comms reboot --id 31            clears a hardware error that a servo has latched
     """
 
 
-for _command in (blind, diagnose, soak, timing):
+for _command in (blind, diagnose, reboot, soak, timing):
     comms.add_command(_command)
 
 
@@ -186,6 +188,7 @@ def bench(
     from rich.console import Console
 
     from openant_tools.comms.bench import measure_gap, measure_rate
+    from openant_tools.comms.lateness import REMEDY
     from openant_tools.comms.servos import Servos
     from openant_tools.comms.setup import open_bus
     from openant_tools.comms.silence import explaining
@@ -205,10 +208,14 @@ def bench(
                     rate = measure_rate(bus, servos.ids, seconds)
                 with console.status("gap after a write"):
                     trials, gap = measure_gap(bus, servos.ids)
+            late = bus.clock.lateness.words
         finally:
             bus.close()
-    click.echo(f"{rate.hz:.0f} cycles/s of write {len(servos.ids)} goals, read {len(servos.ids)} blocks of 27 bytes")
-    click.echo(f"  {rate.share:.0%} of the {rate.limit_hz:.0f} Hz that the wire allows; {rate.lost:.2%} lost")
+    click.echo(f"{rate.words}: write {len(servos.ids)} goals, read {len(servos.ids)} blocks of 27 bytes")
+    if rate.believable:
+        click.echo(f"  {rate.share:.0%} of the {rate.limit_hz:.0f} Hz that the wire allows; {rate.lost:.2%} lost")
+    if late:
+        click.echo(f"{late}: losses and rate are in part its own → {REMEDY}", err=True)
     click.echo(f"  latency timer about {timer * 1e3:.0f} ms; return delay {max(delays.values()) * 2} µs at most")
     click.echo("quiet time after a write → failed reads")
     for trial in trials:
@@ -261,6 +268,8 @@ def _table(columns: Sequence[str], row: Sequence[float], statistics: Mapping[str
     values = dict(zip(columns, row, strict=True))
     comb = statistics["comb_period_s"]
     title = f"{statistics['cycles']} cycles, worst wake-up {statistics['worst_wake_s'] * 1e3:.1f} ms late"
+    if statistics["late"]:
+        title += f"; {statistics['late']}: losses are in part its own"
     if comb:
         title += f"; answers come in the beat of a {comb * 1e3:.0f} ms latency timer: see `openant comms ports`"
     table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)

@@ -127,6 +127,8 @@ def _on_the_bus(
     for servo in done.statistics["servos"]:
         lost = ", ".join(f"{cause} {count}" for cause, count in servo["lost"].items())
         click.echo(f"  {servo['joint']:8} {servo['loss']:7.3%} of {servo['asked']} lost  {lost}")
+    if done.statistics.get("late"):
+        click.echo(f"{done.statistics['late']}: losses are in part its own")
     for stop in done.stops:
         click.echo(f"stopped: {stop}")
     if json_file:

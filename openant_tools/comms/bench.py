@@ -36,6 +36,22 @@ class RateTrial:
     def share(self) -> float:
         return self.hz / self.limit_hz
 
+    @property
+    def believable(self) -> bool:
+        """Whether a wire of this baud rate can be so fast. Cycles whose answers are lost take no time on it."""
+        return self.hz <= self.limit_hz * 1.02 and self.lost < 0.5
+
+    @property
+    def words(self) -> str:
+        """The rate as a sentence; none that the wire does not allow."""
+        if self.believable:
+            return f"up to {self.hz:.0f} cycles/s"
+        if self.lost >= 0.5:
+            return f"no rate, as {self.lost:.0%} of the answers were lost"
+        return (
+            f"no rate, as this port is faster than a wire of its baud rate, which allows {self.limit_hz:.0f} cycles/s"
+        )
+
     def as_dict(self) -> dict[str, float]:
         return asdict(self) | {"share": self.share}
 

@@ -15,7 +15,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LATE_S", "REMEDY", "Lateness", "late_rows", "lateness_words", "of_wake"]
+from openant_tools.recording.run import Run
+
+__all__ = ["LATE_S", "REMEDY", "Lateness", "Losses", "late_rows", "lateness_words", "losses", "of_wake"]
 
 #: What a deadline leaves to the operating system (`bus.Timing.margin_s`): later than that, answers are missed.
 LATE_S = 4e-3
@@ -23,6 +25,8 @@ LATE_S = 4e-3
 SHARE = 0.005
 #: Share of time in which somebody waited for a processor, from which on a computer is called busy.
 BUSY = 0.25
+#: Rows, and share of all rows, that must be left to conclude anything about servos and cables.
+FEWEST, ENOUGH = 100, 0.05
 REMEDY = "close what keeps this computer busy, and run it again"
 #: of a thread: ns on a processor, ns of readiness without one, time slices
 _OWN, _OF = "/proc/thread-self/schedstat", "/proc/{}/schedstat"
@@ -117,6 +121,47 @@ def of_wake(wake: NDArray[np.float64]) -> str:
     """How late the computer was that recorded these wake-ups, (n,) s, as a sentence; empty where it was not."""
     known = wake[np.isfinite(wake)]
     return lateness_words(float(known.max()), int((known > LATE_S).sum()), len(known)) if len(known) else ""
+
+
+@dataclass(frozen=True)
+class Losses:
+    """What a run says of the bus, apart from what this computer missed.
+
+    Attributes:
+        lost: (n, joints) answers that did not come while this computer was punctual.
+        rows: (n,) the rows in which it was.
+        words: how late it was and what it missed by that, as a sentence; empty where that is nothing.
+        judged: whether enough rows are left to conclude anything from.
+    """
+
+    joints: tuple[str, ...]
+    lost: NDArray[np.bool_]
+    rows: NDArray[np.bool_]
+    words: str
+    judged: bool
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Joint → share of its answers lost; 0 where nothing can be concluded."""
+        if not self.judged:
+            return dict.fromkeys(self.joints, 0.0)
+        return dict(zip(self.joints, self.lost[self.rows].mean(axis=0).tolist(), strict=True))
+
+
+def losses(run: Run) -> Losses:
+    """The losses of a recording that are no fault of this computer: a late answer is none, either."""
+    missed = run.signal("ok", default=1.0) < 0.5
+    wake = run.column("wake")
+    late = late_rows(wake)
+    word = np.column_stack([run.columns.get(f"err.{joint}", np.full(len(run.t), "")) == "late" for joint in run.joints])
+    lost = missed & ~late[:, None] & ~word
+    excused = float((missed & ~lost).mean()) if missed.size else 0.0
+    words = ""
+    if excused > 0:
+        how = of_wake(wake) or "answers came late"
+        words = f"{how}: {excused:.1%} of all answers were missed by that, and say nothing of servos and cables"
+    enough = int((~late).sum()) >= max(FEWEST, ENOUGH * len(late))
+    return Losses(run.joints, lost, ~late, words, enough or not excused)
 
 
 def late_rows(wake: NDArray[np.float64]) -> NDArray[np.bool_]:

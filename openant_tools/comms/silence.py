@@ -264,7 +264,7 @@ class _Questions:
         value = read_register(self.bus, id, ERROR_STATUS, 1)
         errors = hardware_errors(value[0]) if value else ()
         names = " and ".join(error.name for error in errors) or "a hardware error"
-        advice = errors[0].advice if errors else "let it cool, free the joint, look at the supply"
+        advice = errors[0].advice if errors else "let it cool, free the joint, look at the supply; then reboot it"
         return self._say("hardware_error", (id,), error=names, advice=advice, id=id, port=self.bus.line.path)
 
     def _of_silent(self, silent: tuple[int, ...]) -> list[Silence]:
@@ -282,27 +282,24 @@ class _Questions:
             out.append(self._say("shared_id", garbled))
         left = tuple(id for id in silent if id not in elsewhere and id not in garbled)
         if left:
-            out.append(self._of_mute(left))
+            out += self._of_mute(left)
         return out
 
-    def _of_mute(self, left: tuple[int, ...]) -> Silence:
+    def _of_mute(self, left: tuple[int, ...]) -> list[Silence]:
         """For those that answer at no rate and in no protocol."""
-        others = [id for id in self.asked if id not in left]
-        supply = self._supply(others)
+        supply = self._supply([id for id in self.asked if id not in left])
         if supply is not None:
             volts, low, high = supply
-            return self._say("supply", left, volts=volts, low=low, high=high)
+            return [self._say("supply", left, volts=volts, low=low, high=high)]
         if all(self.heard[id].late_s > 0.5 for id in left):
-            return self._say("host_late", left, late=self._lateness.words or "this computer was late")
-        if len(left) == len(self.asked) and len(left) > 1 and not self.seen:
+            return [self._say("host_late", left, late=self._lateness.words or "this computer was late")]
+        if len(left) == len(self.asked):
             if all(self.heard[id].echo for id in left):
-                return self._say("echo_only", left)
-            cause = "all_lost" if self.was_there else "nobody"
-            return self._say(cause, left, count=len(left), speed=f"{self.bus.line.baud} baud")
-        if len(left) == 1 == len(self.asked) and self.heard[left[0]].echo:
-            return self._say("echo_only", left)
-        first, before = self._place(left)
-        return self._say("lost" if self.was_there else "cable", left, first=first, before=before)
+                return [self._say("echo_only", left)]
+            if len(left) > 1:
+                return [self._say("all_lost" if self.was_there else "nobody", left)]
+        cause = "lost" if self.was_there else "cable"
+        return [self._say(cause, ids, first=first, before=before) for ids, first, before in self._places(left)]
 
     def _supply(self, others: Sequence[int]) -> tuple[float, float, float] | None:
         """(V, lowest and highest allowed) of one that answers and is out of its range."""
@@ -320,15 +317,16 @@ class _Questions:
                 return volts, low, high
         return None
 
-    def _place(self, left: Sequence[int]) -> tuple[str, str]:
-        """The first silent servo, and what comes before it on its cable."""
+    def _places(self, left: Sequence[int]) -> Iterator[tuple[tuple[int, ...], str, str]]:
+        """Cable by cable: its silent servos, the first of them, and what comes before that."""
         names = {self.bus.names.get(id, ""): id for id in self.asked}
         cables = [[names[name] for name in cable if name in names] for cable in self.chain]
         for cable in [cable for cable in cables if cable] or [list(self.asked)]:
-            for k, id in enumerate(cable):
-                if id in left:
-                    return _who(self.bus, (id,)), _who(self.bus, (cable[k - 1],)) if k else "the adapter or board"
-        return _who(self.bus, left[:1]), "what is before it"
+            silent = tuple(id for id in cable if id in left)
+            if silent:
+                at = cable.index(silent[0])
+                before = _who(self.bus, (cable[at - 1],)) if at else "the adapter or board"
+                yield silent, _who(self.bus, silent[:1]), before
 
     def _say(self, cause: str, ids: tuple[int, ...], **values: Any) -> Silence:
         trouble = SILENCE[cause]

@@ -71,7 +71,7 @@ SILENCE: Mapping[str, Trouble] = {
         "a servo answers a ping, its LED may blink, and it neither moves nor takes torque",
         "{who} has switched itself off after {error}",
         "it protects itself until it is started again; what brought it there must end first",
-        "{advice}; then `openant comms reboot --port {port} --id {id}`, or power it off and on",
+        "{advice} (`openant comms reboot --port {port} --id {id}`)",
     ),
     "return_level": Trouble(
         "a servo answers pings and perhaps reads, but no write",

@@ -52,25 +52,31 @@ HARDWARE_ERRORS: tuple[HardwareError, ...] = (
         0,
         "input voltage",
         "the supply left the servo's voltage limits: look at the power connector and the supply under load, then "
-        "reboot the servo",
+        "`openant comms reboot`, or power it off and on",
     ),
     HardwareError(
         2,
         "overheating",
-        "the servo passed its temperature limit: let it cool for 20 minutes and take load off this joint",
+        "the servo passed its temperature limit: let it cool for 20 minutes and take load off this joint, then "
+        "`openant comms reboot`, or power it off and on",
     ),
     HardwareError(
-        3, "motor encoder", "the servo cannot read its encoder: reboot it, and replace the servo if it comes back"
+        3,
+        "motor encoder",
+        "the servo cannot read its encoder: `openant comms reboot`, or power it off and on; replace the servo if it comes "
+        "back",
     ),
     HardwareError(
         4,
         "electrical shock",
-        "the servo's circuit saw a shock or too little power to drive the motor: look at cable and supply, then reboot",
+        "the servo's circuit saw a shock or too little power to drive the motor: look at cable and supply, then "
+        "`openant comms reboot`, or power it off and on",
     ),
     HardwareError(
         5,
         "overload",
-        "a load beyond the servo's strength stood too long: free the joint, look for a blocked leg, then reboot",
+        "a load beyond the servo's strength stood too long: free the joint, look for a blocked leg, then "
+        "`openant comms reboot`, or power it off and on",
     ),
 )
 

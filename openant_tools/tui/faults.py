@@ -47,7 +47,7 @@ def _condition(history: History, joint: str) -> Condition:
         last = history.t[answered][-1] if answered.any() else history.t[0]
         silent = float(history.t[-1] - last)
         if silent >= SILENT_S:
-            return Condition("fail", "silent", f"does not answer ({word or 'no word'}): look at its cable")
+            return Condition("fail", "silent", f"does not answer ({word or 'no word'}): `openant comms scan`")
         return Condition("warn", word or "late")
     outside = history.outside(f"pos.{joint}") or history.outside(f"vel.{joint}")
     if outside:

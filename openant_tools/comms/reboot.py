@@ -1,0 +1,97 @@
+"""Clearing a latched hardware error: which one stands, whether its cause does, and whether it comes back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from openant_tools.comms import protocol2 as p2
+from openant_tools.comms.bus import Bus
+from openant_tools.comms.silence import ERROR_STATUS, VOLTAGE, ask, diagnose, patient_ping, read_register
+from openant_tools.errors import HardwareFault
+from openant_tools.robot.servo import HardwareError, hardware_errors
+
+__all__ = ["Latched", "latched", "reboot"]
+
+TEMPERATURE, TEMPERATURE_LIMIT, VOLTAGE_LIMITS, TORQUE_ENABLE = 146, 31, 32, 64
+#: K below its limit a servo must be, or it is back there at once
+COOL_K = 5
+#: s that a servo is mute while it starts (0.3 to 0.5), with a margin; and how long an error takes to show again
+BOOT_S, LONGEST_S, SHOWS_S = 0.5, 3.0, 0.2
+OTHER_REMEDY = "power it off and on"
+
+
+@dataclass(frozen=True)
+class Latched:
+    """What keeps a servo from working.
+
+    Attributes:
+        errors: the hardware errors that stand; empty for none.
+        refusal: why a reboot would not help now, in words; empty where it may.
+    """
+
+    errors: tuple[HardwareError, ...]
+    refusal: str = ""
+
+    @property
+    def names(self) -> str:
+        return " and ".join(error.name for error in self.errors)
+
+
+def latched(bus: Bus, id: int) -> Latched:
+    """The errors of a servo, and whether what caused them still stands.
+
+    Raises:
+        HardwareFault: it does not answer; the message says why.
+    """
+    status, _ = patient_ping(bus, id)
+    value = None if status is None else read_register(bus, id, ERROR_STATUS, 1)
+    if status is None or value is None:
+        raise diagnose(bus, [id]).fault(bus.line.path)
+    return Latched(hardware_errors(value[0]), _cause(bus, id) if value[0] else "")
+
+
+def reboot(bus: Bus, id: int) -> tuple[HardwareError, ...]:
+    """Start it anew; its torque is off afterwards. The errors that came back at once.
+
+    Raises:
+        HardwareFault: it does not come back, or its torque is not off.
+    """
+    where = f"{bus.line.path}, servo {id}"
+    bus.send(p2.reboot(id).encode())  # whether it answers depends on its Status Return Level
+    started = bus.clock.now()
+    bus.clock.sleep_until(started + BOOT_S)
+    while patient_ping(bus, id, (0.1,))[0] is None:
+        if bus.clock.now() - started > LONGEST_S:
+            raise HardwareFault("it does not come back from its reboot", where=where, remedy=OTHER_REMEDY)
+    for _ in range(3):
+        # Startup Configuration (60) may have switched torque on.
+        ask(bus, p2.write(id, TORQUE_ENABLE, b"\0").encode(), 0.1, lambda heard: bool(heard.statuses))
+        if read_register(bus, id, TORQUE_ENABLE, 1) == b"\0":
+            break
+    else:
+        raise HardwareFault("it does not say that its torque is off", where=where, remedy="cut its power")
+    bus.clock.sleep_until(bus.clock.now() + SHOWS_S)
+    value = read_register(bus, id, ERROR_STATUS, 1)
+    if value is None:
+        raise HardwareFault("it does not say whether its error is gone", where=where, remedy=OTHER_REMEDY)
+    return hardware_errors(value[0])
+
+
+def _cause(bus: Bus, id: int) -> str:
+    """What would bring the error back at once; empty for nothing."""
+    temperature, limit = read_register(bus, id, TEMPERATURE, 1), read_register(bus, id, TEMPERATURE_LIMIT, 1)
+    if temperature and limit and temperature[0] > limit[0] - COOL_K:
+        return (
+            f"it is at {temperature[0]} °C and its limit is {limit[0]} °C → let it cool below {limit[0] - COOL_K} °C (20 "
+            "minutes), and take load off this joint"
+        )
+    volts, limits = read_register(bus, id, VOLTAGE, 2), read_register(bus, id, VOLTAGE_LIMITS, 4)
+    if volts and limits:
+        now = int.from_bytes(volts, "little")
+        high, low = int.from_bytes(limits[:2], "little"), int.from_bytes(limits[2:], "little")
+        if not low <= now <= high:
+            return (
+                f"it is supplied with {now / 10:.1f} V and is set to bear {low / 10:.1f} to {high / 10:.1f} V → look at the "
+                "power connector and at the supply under load"
+            )
+    return ""
