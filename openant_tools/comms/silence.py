@@ -325,8 +325,8 @@ class _Questions:
             silent = tuple(id for id in cable if id in left)
             if silent:
                 at = cable.index(silent[0])
-                before = _who(self.bus, (cable[at - 1],)) if at else "the adapter or board"
-                yield silent, _who(self.bus, silent[:1]), before
+                before = _name(self.bus, cable[at - 1]) if at else "the adapter or board"
+                yield silent, _name(self.bus, silent[0]), before
 
     def _say(self, cause: str, ids: tuple[int, ...], **values: Any) -> Silence:
         trouble = SILENCE[cause]
@@ -355,6 +355,10 @@ def find_elsewhere(bus: Bus, ids: Sequence[int]) -> dict[int, tuple[int, int]]:
     finally:
         bus.line.set_baud(own)
     return found
+
+
+def _name(bus: Bus, id: int) -> str:
+    return bus.names.get(id, f"servo {id}")
 
 
 def _who(bus: Bus, ids: Sequence[int]) -> str:
