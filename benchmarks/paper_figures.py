@@ -26,6 +26,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from joblib import Parallel, delayed
 
+from openant_tools.workers import tied
+
 #: m/s that the project asks of each agent within an hour
 ASKED_M_S = {"sac": 0.05, "sarsa": 0.01}
 HOUR = {"sac": 30_000, "sarsa": 72_000}
@@ -103,7 +105,7 @@ def main() -> None:
         for name, changed in figure.variants.items()
     ]
     times = Parallel(n_jobs=chosen.jobs, return_as="generator")(
-        delayed(train_one)(figure.agent, folder, steps, seed, changed) for folder, seed, changed in work
+        delayed(tied(train_one))(figure.agent, folder, steps, seed, changed) for folder, seed, changed in work
     )
     for (folder, _, _), seconds in zip(work, times, strict=True):
         print(f"{folder}: {seconds:.0f} s of processor time", flush=True)

@@ -34,6 +34,7 @@ from scipy.stats import beta
 from openant_tools.errors import BadInput
 from openant_tools.recording.run import Facts, Run
 from openant_tools.sysid.identify import identify
+from openant_tools.workers import end_with
 
 Array = NDArray[np.float64]
 
@@ -246,7 +247,7 @@ def main() -> None:
     began = time.monotonic()
     left = [seed for seed in wanted if seed not in done]
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(options.jobs, context) as pool, options.out.open("a") as file:
+    with ProcessPoolExecutor(options.jobs, context, end_with, (os.getpid(),)) as pool, options.out.open("a") as file:
         running = {pool.submit(fit, seed) for seed in left}
         for k, one in enumerate(as_completed(running)):
             if one.cancelled():

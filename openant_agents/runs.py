@@ -9,19 +9,19 @@
 
 A checkpoint replaces the last one in one stroke, after the transitions and the curve that belong to it are on the disk;
 it says how long both files were. Whatever a killed process had appended beyond is cut off on resuming, so that a
-resumed run goes on as if it had never been stopped. One process at a time trains in a folder: it holds a lock on `run.json`,
-which ends with it, however it ends. Where learning runs beside acting, transitions stand in the file as
+resumed run goes on as if it had never been stopped. One process at a time trains in a folder: it holds a lock there
+(`openant_tools.lock`), which ends with it, however it ends. Where learning runs beside acting, transitions stand in the file as
 soon as they are made, and a run goes on with all of them, those after the last checkpoint included.
 """
 
 from __future__ import annotations
 
 import csv
-import fcntl
 import io
 import json
 import math
 import os
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,10 +33,12 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.files import write_bytes, write_text
+from openant_tools.lock import Claim
 
 __all__ = ["SCHEMA", "CurvePoint", "Run", "load_checkpoint", "read_curve", "read_facts", "save_checkpoint"]
 
 SCHEMA = "openant.train/1"
+LOCK = ".run.lock"
 CURVE_COLUMNS = ("step", "seconds", "average_reward_m_s")
 INTERVENTION_COLUMNS = ("step", "seconds", "reason")
 
@@ -72,21 +74,20 @@ class Run:
         self.folder = folder
         # As it will be read back: tuples as lists, keys as texts.
         self.facts: dict[str, Any] = json.loads(json.dumps({"schema": SCHEMA, **facts}))
+        self._claim = Claim(
+            folder / LOCK,
+            "another process trains in this folder: {}",
+            remedy="wait for it, stop it, or name another --out",
+        )
         path = folder / "run.json"
-        if path.is_file():
-            _check_same(path, read_facts(folder), self.facts)
-        else:
-            write_text(path, json.dumps(self.facts, indent=2, ensure_ascii=False) + "\n")
-        self._claim = path.open("rb")
         try:
-            fcntl.flock(self._claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            self._claim.close()
-            raise BadInput(
-                "another process trains in this folder",
-                where=folder,
-                remedy="wait for it, stop it, or name another --out",
-            ) from None
+            if path.is_file():
+                _check_same(path, read_facts(folder), self.facts)
+            else:
+                write_text(path, json.dumps(self.facts, indent=2, ensure_ascii=False) + "\n")
+        except BaseException:
+            self._claim.release()
+            raise
         self._saved_rows = 0
         self._curve: io.TextIOWrapper | None = None
         self._log: io.FileIO | None = None
@@ -200,10 +201,11 @@ class Run:
         self._curve.flush()
 
     def close(self) -> None:
-        for stream in (self._curve, self._log, self._claim):
+        for stream in (self._curve, self._log):
             if stream is not None:
                 stream.close()
         self._curve = self._log = None
+        self._claim.release()
 
 
 def save_checkpoint(folder: Path, state: Mapping[str, Any], transitions: int, width: int, curve_bytes: int) -> None:
@@ -252,6 +254,9 @@ def load_checkpoint(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         raise BadInput("there is no checkpoint yet", where=folder, remedy="train a little longer (`openant train sac`)")
     try:
+        with zipfile.ZipFile(path) as archive:  # older forms of torch's files are none of ours, nor compressed ones
+            if sum(entry.file_size for entry in archive.infolist()) > path.stat().st_size:
+                raise ValueError("it is compressed")
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises a dozen kinds for a file that is cut, foreign or not a zip at all
         raise BadInput(

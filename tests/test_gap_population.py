@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import os
+import pickle
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -10,12 +13,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from openant_tools.errors import BadInput
 from openant_tools.gap.cause import catalogue
 from openant_tools.gap.features import COLUMNS
 from openant_tools.gap.judge import Judge, metric_of, train
 from openant_tools.gap.kept import judge_of
 from openant_tools.gap.population import Case, draw, play, robot_of, templates
-from openant_tools.gap.prepare import CACHE_VARIABLE, Prepared, cache_folder, prepare
+from openant_tools.gap.prepare import CACHE_VARIABLE, Kept, Prepared, cache_folder, prepare
 from openant_tools.gap.protocol import Protocol, same
 from openant_tools.gap.robot import Form, Robot
 from openant_tools.gap.simulation import simulate
@@ -147,7 +151,7 @@ def prepare_few(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Pr
 def test_what_was_prepared_in_full_serves_a_part_of_it(
     protocol: Protocol, prepare_few: Callable[[Protocol, int, list[Case]], Prepared]
 ) -> None:
-    whole = prepare_few(protocol, 4, [Case({}, -1)])
+    whole = prepare_few(protocol, 4, templates(protocol)[:4])
     assert 4 <= len(whole.cases) < 2400, "the time was over at once"
     backwards = dataclasses.replace(protocol, runs=protocol.runs[::-1])
     assert len(prepare(backwards).cases) == len(whole.cases), "and stays over"
@@ -157,7 +161,7 @@ def test_what_was_prepared_in_full_serves_a_part_of_it(
     assert len(list(cache_folder().iterdir())) == 1
 
 
-def test_the_first_judge_brings_that_of_robots_with_other_sensors(
+def test_a_judge_is_taught_once_in_a_process_and_written_nowhere(
     protocol: Protocol,
     prepare_few: Callable[[Protocol, int, list[Case]], Prepared],
     monkeypatch: pytest.MonkeyPatch,
@@ -174,12 +178,73 @@ def test_the_first_judge_brings_that_of_robots_with_other_sensors(
         return dataclasses.replace(protocol, runs=tuple(runs))
 
     monkeypatch.setattr("openant_tools.gap.kept.train", train)
-    few, told = prepare_few(protocol, 4, [Case({}, -1)]), lambda share, words: None
-    for signals, judges in [((), 2), ((), 2), (("base", "yaw"), 2), (("gyro",), 3), (("gyro", "base", "yaw"), 4)]:
+    few, told = prepare_few(protocol, 4, templates(protocol)[:4]), lambda share, words: None
+    for signals, judges in [((), 1), ((), 1), (("base", "yaw"), 2), (("gyro",), 3), (("base", "yaw"), 3)]:
         judge_of(few, seeing(*signals), progress=told)
         assert len(taught) == judges, f"with {signals}"
     assert len(set(taught)) == len(taught)
     assert taught[0] == min(taught), "what saw positions alone"
+    assert {path.suffix for path in few.folder.iterdir()} <= {".npz", ".json", ""}
+
+
+def test_what_was_altered_in_the_cache_is_made_anew_and_runs_no_code(
+    protocol: Protocol,
+    prepare_few: Callable[[Protocol, int, list[Case]], Prepared],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def simulate(kept: Kept, coarse: Protocol, parts: Sequence[int], *_: object) -> None:
+        for part in parts:  # four robots of two features, of each of two runs
+            name = f"part-{part:04d}.npz" if part >= 0 else f"bank-{-part:04d}.npz"
+            if not (kept.folder / name).exists():
+                np.savez(kept.folder / name, run0=np.full((4, 2), part, np.float16), run1=np.ones((4, 2), np.float16))
+
+    monkeypatch.setattr("openant_tools.gap.prepare._simulate", simulate)
+    monkeypatch.setattr("openant_tools.gap.prepare.ROBOTS", 8)
+    bank = templates(protocol)[:4]
+    whole = prepare_few(protocol, 4, bank)
+    before = [x.copy() for x in whole.features]
+    assert whole.folder.stat().st_mode & 0o777 == whole.folder.parent.stat().st_mode & 0o777 == 0o700
+    ran = whole.folder.parent / "code ran"
+    attacks: dict[str, Callable[[Path], object]] = {
+        "cut": lambda path: os.truncate(path, path.stat().st_size // 2),
+        "emptied": lambda path: os.truncate(path, 0),
+        "an array of objects": lambda path: np.savez(path, run0=np.array([Touches(ran)], object)),
+        "a pickle": lambda path: path.write_bytes(pickle.dumps(Touches(ran))),
+        "compressed a thousandfold": lambda path: np.savez_compressed(path, run0=np.zeros((999_000, 2))),
+        "of another width": lambda path: np.savez(path, run0=np.zeros((4, 3), np.float16)),
+    }
+    files = itertools.cycle(("part-0001.npz", "first.npz", "bank-0001.npz", "protocol.npz"))
+    for (attack, spoil), name in zip(attacks.items(), files, strict=False):
+        spoil(whole.folder / name)
+        caplog.clear()
+        again = prepare_few(protocol, 4, bank)
+        assert all(np.array_equal(x, y) for x, y in zip(again.features, before, strict=True)), (name, attack)
+        assert len(caplog.records) == 1, (name, attack)
+        assert name in caplog.text
+        assert "anew" in caplog.text
+    assert not ran.exists()
+
+
+class Touches:
+    """Unpickled, it makes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (self.path,)
+
+
+def test_the_cache_of_another_user_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    (tmp_path / "gap").mkdir(mode=0o777)
+    assert cache_folder().stat().st_mode & 0o777 == 0o700
+    monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
+    with pytest.raises(
+        BadInput, match=r"the cache belongs to another user .* → name a folder of your own by OPENANT_CACHE"
+    ):
+        cache_folder()
 
 
 def test_a_judge_says_how_strange_robots_are(

@@ -264,7 +264,8 @@ def test_one_process_at_a_time_trains_in_a_folder(tmp_path):
     train(ant(), folder=tmp_path, steps=5, seed=3, settings=SMALL)
     there = runs.Run(tmp_path, {k: v for k, v in runs.read_facts(tmp_path).items() if k != "schema"})
     with pytest.raises(
-        BadInput, match="another process trains in this folder → wait for it, stop it, or name another --out"
+        BadInput,
+        match=r"another process trains in this folder: .*\(process \d+\) → wait for it, stop it, or name another --out",
     ):
         train(ant(), folder=tmp_path, steps=10, seed=3, settings=SMALL)
     there.close()

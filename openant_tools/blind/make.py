@@ -22,6 +22,7 @@ from openant_tools.errors import BadInput
 from openant_tools.files import write_text
 from openant_tools.recording.tables import write_table
 from openant_tools.robot.mjcf import nominal_mjcf
+from openant_tools.workers import tied
 
 __all__ = ["SCHEMA", "make_set", "seed_of_commit"]
 
@@ -90,7 +91,7 @@ def make_set(
     by_batch = [k for k in todo if drawn[k].maker == "batch"]
     batches = [by_batch[at : at + BATCH] for at in range(0, len(by_batch), BATCH)]
     batches += [[k] for k in todo if drawn[k].maker == "virtual"]
-    work = (delayed(_make_batch)(out, [(k, drawn[k]) for k in batch], played) for batch in batches)
+    work = (delayed(tied(_make_batch))(out, [(k, drawn[k]) for k in batch], played) for batch in batches)
     progress("simulating", 0.0)
     # A robot of the bus takes about as long as a batch of the others.
     for done, _ in enumerate(Parallel(n_jobs=jobs, return_as="generator_unordered")(work), 1):

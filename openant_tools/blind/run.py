@@ -20,6 +20,7 @@ from joblib import Parallel, delayed, parallel_config
 from openant_tools.errors import BadInput, OpenAntError
 from openant_tools.files import write_text
 from openant_tools.recording.tables import read_run
+from openant_tools.workers import tied
 
 __all__ = ["Backend", "Diagnose", "folders_of", "run_set", "verdict_path"]
 
@@ -85,7 +86,8 @@ def run_set(
         progress(todo[0].name, 0.0)
         _judge(folder, todo[0], diagnose, True)
         progress(todo[0].name, 1 / len(todo))
-        work = (delayed(_judge)(folder, robot, diagnose, False) for robot in todo[1:])
+        judge = tied(_judge) if backend == "loky" else _judge  # the others' workers may be on other machines
+        work = (delayed(judge)(folder, robot, diagnose, False) for robot in todo[1:])
         for done, name in enumerate(Parallel(return_as="generator_unordered")(work), 2):
             progress(name, done / len(todo))
     return len(todo)

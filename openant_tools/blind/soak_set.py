@@ -22,6 +22,7 @@ from openant_tools.errors import BadInput, OpenAntError
 from openant_tools.files import write_text
 from openant_tools.recording.tables import read_run, write_table
 from openant_tools.virtual.seal import commitment_of, seal
+from openant_tools.workers import tied
 
 __all__ = ["SCHEMA", "make_soaks", "read_soak_answers", "read_verdicts", "run_soaks", "soak_facts"]
 
@@ -79,7 +80,7 @@ def make_soaks(
             commitment = seal(plain, key, out / SEALED)
         write_text(out / "set.toml", tomlkit.dumps({**facts, "commitment": commitment}))
     todo = [k for k in range(count) if not (out / f"{_name(k)}.parquet").exists()]
-    work = (delayed(_make)(out, _name(k), answers[k]) for k in todo)
+    work = (delayed(tied(_make))(out, _name(k), answers[k]) for k in todo)
     for done, name in enumerate(Parallel(n_jobs=jobs, return_as="generator_unordered")(work), 1):
         progress(name, done / len(todo))
     return commitment
@@ -128,7 +129,7 @@ def run_soaks(folder: Path, *, jobs: int = 1, progress: Progress = _quiet) -> in
     """
     soak_facts(folder)
     todo = [path for path in sorted(folder.glob("soak-*.parquet")) if not _verdict(folder, path.stem).exists()]
-    work = (delayed(_diagnose)(folder, path) for path in todo)
+    work = (delayed(tied(_diagnose))(folder, path) for path in todo)
     for done, name in enumerate(Parallel(n_jobs=jobs, return_as="generator_unordered")(work), 1):
         progress(name, done / len(todo))
     return len(todo)

@@ -20,6 +20,7 @@ from pathlib import Path
 from openant_tools.errors import BadInput, OpenAntError
 from openant_tools.files import write_text
 from openant_tools.robot.config import CONFIG_NAME
+from openant_tools.workers import environment
 
 __all__ = ["Demo", "Stage", "StageFailed", "openant"]
 
@@ -317,7 +318,10 @@ def openant(command: Sequence[str]) -> int:
     waits until it has ended in its own way (torque off, checkpoint saved) and raises KeyboardInterrupt.
     """
     process = subprocess.Popen(
-        [sys.executable, "-m", "openant_tools.cli", *command], stdin=subprocess.DEVNULL, process_group=0
+        [sys.executable, "-m", "openant_tools.cli", *command],
+        stdin=subprocess.DEVNULL,
+        process_group=0,
+        env=environment(),
     )
     interrupted = False
     while True:

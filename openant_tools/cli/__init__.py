@@ -14,6 +14,7 @@ from types import FrameType
 import click
 
 from openant_tools.errors import OpenAntError
+from openant_tools.workers import end_with_who_started_us
 
 __all__ = ["main"]
 
@@ -136,6 +137,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
             signal.signal(number, _interrupt)
+    end_with_who_started_us()
     try:
         code = openant.main(args=argv, prog_name="openant", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)

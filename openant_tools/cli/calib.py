@@ -73,13 +73,14 @@ def bench_of(
     joints: tuple[str, ...] = (), *, sees: bool = False,
 ) -> Iterator[tuple[Bench, Any]]:  # fmt: skip
     """The bench and the face that a step runs with; a virtual robot started for it, with a camera where the step `sees`,
-    ends with the block."""
+    ends with the block. No other program moves the robot or writes into its folder meanwhile."""
     from openant_tools.bringup.virtual_hands import VirtualHands
     from openant_tools.cli.face import CommandFace
     from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_robot
 
     folder = _folder_of(robot)
     with contextlib.ExitStack() as stack:
+        stack.enter_context(folder.hold())
         if virtual_source is None:
             yield Bench(folder, port, imu, camera, None, joints), CommandFace(yes=yes)
             return

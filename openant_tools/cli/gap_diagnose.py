@@ -112,12 +112,11 @@ def diagnose(
 def prepare(
     runs: tuple[Path, ...], model: Path | None, joints: tuple[str, ...], robots: int | None, robot: Path | None
 ) -> None:
-    """Simulate the robots that diagnoses of what RUNs played will be judged by, and teach the judge, so that each takes a minute.
+    """Simulate the robots that diagnoses of what RUNs played will be judged by, so that each takes a minute or two.
 
     What is done is kept: interrupt it and start it again as you like. The same commands count as the same protocol
     whatever their time stamps.
     """
-    from openant_tools.gap.kept import judge_of
     from openant_tools.gap.prepare import prepare as prepared
     from openant_tools.gap.protocol import Protocol
     from openant_tools.recording.tables import read_run
@@ -128,8 +127,7 @@ def prepare(
     wanted = joints_in_common(recordings, model, joints or None)
     protocol = Protocol.of(recordings, model, wanted, [own_model(run) for run in recordings])
     with progress() as tell:
-        made = prepared(protocol, robots, progress=lambda share, words: tell(0.9 * share, words))
-        judge_of(made, protocol, progress=lambda share, words: tell(0.9 + 0.1 * share, words))
+        made = prepared(protocol, robots, progress=tell)
     click.echo(f"ready: {len(made.cases)} simulated robots of {len(wanted)} joints in {made.folder}")
 
 

@@ -55,7 +55,8 @@ def engine_config(
     camera: bool = False,
     **more: object,
 ) -> Iterator[EngineConfig]:
-    """The robot meant, as the engine wants it; a virtual one that is started for this command ends with the block.
+    """The robot meant, as the engine wants it; a virtual one that is started for this command ends with the block, in which
+    no other program works on the robot.
 
     Args:
         folder: None for an Ant that nobody has described.
@@ -73,6 +74,8 @@ def engine_config(
     )
 
     with contextlib.ExitStack() as stack:
+        if folder is not None:
+            stack.enter_context(folder.hold())
         found: Mapping[str, str | None] = {}
         if virtual_source is not None:
             clock = clock or clock_of_its_own(virtual_source)

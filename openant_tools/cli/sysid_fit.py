@@ -83,6 +83,8 @@ def fit(
     from openant_tools.sysid.result import WITH_EFFECTS, write_fit, write_robot
 
     folder = None if robot is None else RobotFolder.at(robot)
+    if folder is not None:
+        folder.refuse_if_held()  # now, not after minutes
     described = folder
     if model is None:
         described = folder or _robot_here()

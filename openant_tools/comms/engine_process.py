@@ -17,6 +17,7 @@ import weakref
 from collections import deque
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
+from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar
 
@@ -24,6 +25,7 @@ from openant_tools.comms.messages import Command, EngineConfig, Event, Finished,
 from openant_tools.comms.restart import MotionStopped
 from openant_tools.comms.ring import Ring, columns
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.robot.folder import RobotFolder
 
 __all__ = ["EngineProcess"]
 
@@ -44,6 +46,7 @@ class EngineProcess:
             its own moves in another thread.
 
     Raises:
+        BadInput: another program holds the robot's folder; it is named.
         HardwareFault: it could not connect; the message is the engine's.
     """
 
@@ -59,6 +62,10 @@ class EngineProcess:
         #: commands' numbers; taken from it in one stroke, whichever thread does
         self._numbers = itertools.count(1)
         self._ended = False
+        #: the robot's folder, for as long as its bus is ours
+        self._held = contextlib.ExitStack()
+        if config.journal is not None:
+            self._held.enter_context(RobotFolder(Path(config.journal).parent).hold())
         ours, theirs = socket.socketpair()
         self._process = subprocess.Popen(
             [sys.executable, "-m", "openant_tools.comms.engine", str(theirs.fileno()), str(self._ring.fd)],
@@ -203,6 +210,7 @@ class EngineProcess:
         finally:
             self._connection.close()
             self._ring.close()
+            self._held.close()
 
     def _drain_until_gone(self) -> None:
         give_up = time.monotonic() + CLOSE_TIMEOUT_S

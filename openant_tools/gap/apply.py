@@ -62,6 +62,8 @@ def apply(found: Diagnosis, model: Path, out: Path, *, robot: Path | None = None
         BadInput: the model lacks a joint of the diagnosis, or keeps one where it cannot be edited.
     """
     folder = None if robot is None else RobotFolder.at(robot)
+    if folder is not None:
+        folder.refuse_if_held()
     plant = load_plant(model, None, Setup.FLOOR)
     selected = [one for one in found.effects if one.effect in found.selected and (one.parameters or one.coordinates)]
     improved = robot_of(plant, selected, found.calibration)
@@ -209,12 +211,13 @@ def _into_folder(folder: RobotFolder, out: Path, entries: list[Effect], found: D
     now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
     recording = ", ".join(found.runs)
     considered = {one.effect for one in found.effects}
-    beside = [entry for entry in folder.config().effects if entry.effect not in considered]
-    folder.update(
-        {"model": folder.relative(out.resolve())},
-        provenance={"model": Provenance("fitted", "openant gap apply", recording, now)},
-        effects=[*beside, *entries],
-    )
+    with folder.hold():  # between what is read of the effects and what is written
+        beside = [entry for entry in folder.config().effects if entry.effect not in considered]
+        folder.update(
+            {"model": folder.relative(out.resolve())},
+            provenance={"model": Provenance("fitted", "openant gap apply", recording, now)},
+            effects=[*beside, *entries],
+        )
 
 
 def _rows(plant: Plant, joints: tuple[str, ...], what: str) -> NDArray[np.int64]:

@@ -8,33 +8,39 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import os
 import shutil
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import joblib
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.files import atomic_writer, write_text
+from openant_tools.arrays import read_arrays, write_arrays
+from openant_tools.errors import BadInput
+from openant_tools.files import write_text
 from openant_tools.gap.features import Floats
 from openant_tools.gap.population import Case, applicable, draw, play, templates
 from openant_tools.gap.protocol import Protocol, same, shown
 from openant_tools.recording.run import Run
+from openant_tools.workers import tied
 
 __all__ = ["Prepared", "cache_folder", "find", "finished_since", "prepare"]
+
+_log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
 #: the environment variable that names the cache, and how large it may grow
 CACHE_VARIABLE = "OPENANT_CACHE"
 LARGEST_BYTES = 4 * 2**30
+PRIVATE = 0o700
 #: what is stored is bound to the code that made it: raise it when simulated robots change
 VERSION = 19
 #: robots of a part, and of a whole preparation where the robot has many joints and where it has one or two
@@ -76,9 +82,9 @@ class Prepared:
     def _read(self, parts: Sequence[int]) -> tuple[Floats, ...]:
         found: list[list[Floats]] = [[] for _ in self.which]
         for part in parts:
-            with np.load(_part(self.folder, part)) as stored:
-                for mine, k in zip(found, self.which, strict=True):
-                    mine.append(stored[f"run{k}"].astype(np.float32))
+            stored = read_arrays(_part(self.folder, part))
+            for mine, k in zip(found, self.which, strict=True):
+                mine.append(stored[f"run{k}"].astype(np.float32))
         return tuple(np.concatenate(mine) for mine in found)
 
     @property
@@ -92,10 +98,23 @@ class Prepared:
 
 
 def cache_folder() -> Path:
-    """Where prepared protocols are kept."""
+    """Where prepared protocols are kept, for nobody but this user.
+
+    Raises:
+        BadInput: the folder is another user's.
+    """
     given = os.environ.get(CACHE_VARIABLE)
     base = Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "openant"
-    return base / "gap"
+    folder = base / "gap"
+    if folder.exists() and (mode := folder.stat()).st_uid != os.geteuid():
+        raise BadInput(
+            f"the cache belongs to another user (number {mode.st_uid})",
+            where=folder,
+            remedy=f"name a folder of your own by {CACHE_VARIABLE}",
+        )
+    folder.mkdir(mode=PRIVATE, parents=True, exist_ok=True)
+    folder.chmod(PRIVATE)  # where an older version made it
+    return folder
 
 
 def finished_since(when: float) -> bool:
@@ -125,8 +144,11 @@ def prepare(
     parts = -(-(robots or robots_of(protocol)) // size)
     bank = templates(coarse)
     banks = -(-len(bank) // size)
+    broken = _drop_broken(kept.folder, range(-banks, parts), size, len(bank))
     if robots is not None or not (kept.folder / CLOSED).exists():
         _simulate(kept, coarse, range(-banks, parts), size, seconds, progress)
+    elif broken:
+        _simulate(kept, coarse, broken, size, None, progress)
     os.utime(kept.folder)
     there = [part for part in range(parts) if _part(kept.folder, part).is_file()]
     if len(there) * size >= robots_of(protocol) and not (kept.folder / CLOSED).exists():
@@ -138,8 +160,37 @@ def prepare(
     )
 
 
+def _drop_broken(folder: Path, parts: Sequence[int], size: int, bank: int) -> list[int]:
+    """Remove the parts that are not what `_make` wrote, and say which: they are to be made anew.
+
+    Args:
+        size: robots of a part. bank: robots of the whole bank.
+    """
+    runs = len(_protocol(folder)[0])
+    widths: list[int] | None = None
+    broken = []
+    for part in parts:
+        path = _part(folder, part)
+        if not path.is_file():
+            continue
+        rows = size if part >= 0 else min(size, bank - (-part - 1) * size)
+        try:
+            stored = read_arrays(path)
+            seen = [stored[f"run{k}"] for k in range(runs)]
+            if not all(x.dtype == np.float16 and x.ndim == 2 and len(x) == rows for x in seen):
+                raise BadInput("holds other arrays", where=path)
+            widths = widths or [x.shape[1] for x in seen]
+            if [x.shape[1] for x in seen] != widths:
+                raise BadInput("holds other arrays", where=path)
+        except (BadInput, KeyError) as error:
+            _log.warning("%s; it is made anew", error if isinstance(error, BadInput) else f"{path}: it lacks a run")
+            path.unlink()
+            broken.append(part)
+    return broken
+
+
 def _simulate(
-    kept: Kept, coarse: Protocol, parts: range, size: int, seconds: float | None, progress: Progress | None
+    kept: Kept, coarse: Protocol, parts: Sequence[int], size: int, seconds: float | None, progress: Progress | None
 ) -> None:
     """Make the parts that are missing."""
     folder, begun = kept.folder, time.monotonic()
@@ -152,7 +203,7 @@ def _simulate(
     with warnings.catch_warnings():
         # That a process which has grown is replaced is no one's concern, and that what was begun is dropped in the end is meant.
         warnings.simplefilter("ignore", UserWarning)
-        made = jobs(joblib.delayed(_make)(ordered, n, size, _part(folder, n)) for n in missing)
+        made = jobs(joblib.delayed(tied(_make))(ordered, n, size, _part(folder, n)) for n in missing)
         for done, _ in enumerate(made, 1):
             if progress is not None:
                 progress(done / len(missing), f"{there + done * size} of {whole} simulated robots")
@@ -172,7 +223,7 @@ def _make(protocol: Protocol, part: int, size: int, path: Path) -> None:
         causes = applicable(protocol)
         cases = [draw(protocol, part * size + k, causes) for k in range(size)]
     found = play(protocol, cases, max(part, 0))
-    _write(path, {f"run{k}": x.astype(np.float16) for k, x in enumerate(found)})
+    write_arrays(path, {f"run{k}": x.astype(np.float16) for k, x in enumerate(found)})
 
 
 @dataclass(frozen=True)
@@ -197,10 +248,13 @@ def find(protocol: Protocol, *, whole: bool = False) -> Kept | None:
     more: Kept | None = None
     for folder in sorted(cache_folder().glob(f"v{VERSION}-{protocol.fingerprint()}-*")):
         try:
-            with np.load(folder / "protocol.npz") as stored:
-                stood = stored["places"]
-                known = [stored[f"cmd{k}"] for k in range(len(stood))]
-        except (OSError, KeyError, ValueError):
+            stood, known = _protocol(folder)
+            _first(folder, len(stood))
+        except OSError:
+            continue  # being made
+        except BadInput as error:
+            _log.warning("%s; the robots are simulated anew", error)
+            shutil.rmtree(folder, ignore_errors=True)
             continue
         which: list[int] = []
         for one, place in zip(commands, places, strict=True):
@@ -215,15 +269,43 @@ def find(protocol: Protocol, *, whole: bool = False) -> Kept | None:
     return None if whole else more
 
 
+def _protocol(folder: Path) -> tuple[Array, list[Array]]:
+    """(runs, 2) the places, and of each run the commands, that were prepared in a folder; raises BadInput."""
+    path = folder / "protocol.npz"
+    stored = read_arrays(path)
+    places = stored.pop("places", np.empty(0))
+    commands = [stored.get(f"cmd{k}", np.empty(0)) for k in range(len(stored))]
+    good = len(commands) > 0 and places.shape == (len(commands), 2)
+    if not good or any(x.dtype != np.float64 for x in (places, *commands)) or any(x.ndim != 2 for x in commands):
+        raise BadInput("holds no protocol", where=path)
+    return places, commands
+
+
+def _first(folder: Path, runs: int) -> list[dict[str, Array]]:
+    """Of each run that was prepared in a folder its columns, t among them; raises BadInput."""
+    path = folder / "first.npz"
+    columns: list[dict[str, Array]] = [{} for _ in range(runs)]
+    for key, values in read_arrays(path).items():
+        number, _, name = key.partition("|")
+        mine = dict(zip(map(str, range(runs)), columns, strict=True)).get(number)
+        if mine is None or values.dtype != np.float64:
+            raise BadInput("holds other columns", where=path)
+        mine[name] = values
+    for mine in columns:
+        t = mine.get("t", np.empty((0, 0)))
+        if t.ndim != 1 or any(values.shape != t.shape for values in mine.values()) or not (np.diff(t) > 0).all():
+            raise BadInput("holds other columns", where=path)
+    return columns
+
+
 def _new(protocol: Protocol) -> Kept:
     base = cache_folder()
-    base.mkdir(parents=True, exist_ok=True)
     stem = f"v{VERSION}-{protocol.fingerprint()}"
     number = 0
     while True:
         folder = base / f"{stem}-{number}"
         try:
-            folder.mkdir()
+            folder.mkdir(mode=PRIVATE)
             break
         except FileExistsError:
             number += 1
@@ -233,42 +315,31 @@ def _new(protocol: Protocol) -> Kept:
         for name, values in one.run.columns.items():
             if values.dtype.kind == "f":
                 columns[f"{k}|{name}"] = values
-    _write(folder / "first.npz", columns)
+    write_arrays(folder / "first.npz", columns)
     facts = {"model": str(protocol.model), "runs": [one.run.name for one in protocol.runs], "made": time.strftime("%F")}
     write_text(folder / "facts.json", json.dumps(facts, indent=2) + "\n")
     # Last: by it others find the folder.
     tables = {f"cmd{k}": table for k, table in enumerate(protocol.commands())}
-    _write(folder / "protocol.npz", {"places": protocol.places(), **tables})
+    write_arrays(folder / "protocol.npz", {"places": protocol.places(), **tables})
     return Kept(folder, tuple(range(len(protocol.runs))))
 
 
 def _as_first(kept: Kept, protocol: Protocol) -> Protocol:
     """The protocol as it was prepared: its runs' times and commands are those of whoever came first."""
-    runs = []
-    with np.load(kept.folder / "first.npz") as stored:
-        for k, one in zip(kept.which, protocol.runs, strict=True):
-            run = Run(one.run.name, one.run.facts, stored[f"{k}|t"], _columns(stored, k), one.run.path)
-            runs.append(dataclasses.replace(one, run=run))
-        everything = [
-            Run(str(k), protocol.runs[0].run.facts, stored[f"{k}|t"], _columns(stored, k))
-            for k in range(sum(name.endswith("|t") for name in stored.files))
-        ]
+    columns = _first(kept.folder, len(_protocol(kept.folder)[0]))
+    times = [mine.pop("t") for mine in columns]
+    runs = [
+        dataclasses.replace(one, run=Run(one.run.name, one.run.facts, times[k], columns[k], one.run.path))
+        for k, one in zip(kept.which, protocol.runs, strict=True)
+    ]
+    facts = protocol.runs[0].run.facts
+    everything = [Run(str(k), facts, t, mine) for k, (t, mine) in enumerate(zip(times, columns, strict=True))]
     reference = dataclasses.replace(protocol.reference, seen=shown(everything, protocol.joints))
     return dataclasses.replace(protocol, runs=tuple(runs), reference=reference)
 
 
-def _columns(stored: Mapping[str, NDArray[np.float64]], k: int) -> dict[str, NDArray[np.float64]]:
-    """The columns of the k-th run kept."""
-    return {name.partition("|")[2]: stored[name] for name in stored if name.startswith(f"{k}|") and name != f"{k}|t"}
-
-
 def _part(folder: Path, part: int) -> Path:
     return folder / (f"part-{part:04d}.npz" if part >= 0 else f"bank-{-part:04d}.npz")
-
-
-def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    with atomic_writer(path) as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]  # its stub takes the names for options
 
 
 def _keep_small(kept: Path) -> None:

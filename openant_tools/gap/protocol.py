@@ -55,8 +55,6 @@ REST_S, REST_ROW_S = 2.0, 0.02
 OFTEN, LEAST_OF_MOST = 0.9, 0.2
 #: smaller changes of a supply's share are rounding of numbers
 LEAST_CHANGE = 1e-6
-#: signals of a tracker
-TRACKED = ("base", "yaw")
 #: s, steps of simulated populations, in which they cost the least that does not show beside tolerances
 STAND_STEP_S, FLOOR_STEP_S = 0.0025, 0.004
 
@@ -266,15 +264,9 @@ class Protocol:
         """Of each run, its features against the model (or another robot) and which of them its log has."""
         return [one.features(nominal) for one, nominal in zip(self.runs, self.nominal(robot), strict=True)]
 
-    def logs(self) -> list[list[NDArray[np.bool_]]]:
-        """Of each run which features its log has; on the floor then of another robot's, with a tracker where this has none."""
-        own = [one.there(one.seen) for one in self.runs]
-        if not self.reference.floor:
-            return [own]
-        tracker, seen = set(TRACKED), [set(one.seen) for one in self.runs]
-        tracked = any(tracker & mine for mine in seen)
-        others = [mine - tracker if tracked else mine | tracker for mine in seen]
-        return [own, [one.there(mine) for one, mine in zip(self.runs, others, strict=True)]]
+    def logs(self) -> list[NDArray[np.bool_]]:
+        """Of each run which features its log has."""
+        return [one.there(one.seen) for one in self.runs]
 
     def commands(self) -> list[Array]:
         """Of each run (times, joints) rad on a grid."""

@@ -206,9 +206,13 @@ def keep(finding: Finding, folder: RobotFolder, recording: str | None = None) ->
 
     They stand apart from what `openant sysid fit` puts below `identified`: the calibrated model holds the latter, and two
     estimators that disagree are to be seen side by side.
+
+    Raises:
+        BadInput: another program works on the robot; it is named.
     """
     from openant_tools.robot.config import Provenance
 
+    folder.refuse_if_held()
     stamp = finding.date.strftime("%Y%m%dT%H%M%SZ")
     path = folder.findings / f"{finding.step}-{stamp}.json"
     write_text(path, json_text(finding.as_json()))

@@ -6,6 +6,7 @@ may then name a write that did not happen, which undoing finds out by reading.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 from collections.abc import Iterable
@@ -74,6 +75,7 @@ class Journal:
             line["undoes"] = undoes
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with open(self.path, "ab+") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)  # until it is closed: two programs' lines follow each other
             # A line torn by a power cut is ended, so that it does not swallow this one.
             torn = file.seek(0, os.SEEK_END) > 0 and _last_byte(file) != b"\n"
             file.write((b"\n" if torn else b"") + json.dumps(line).encode() + b"\n")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from tomlkit.items import AoT, InlineTable, Table
 
 from openant_tools.errors import BadInput
 from openant_tools.files import write_bytes, write_text
+from openant_tools.lock import Claim, Holder, held, holder
 from openant_tools.robot.config import (
     CONFIG_NAME,
     Effect,
@@ -33,6 +35,10 @@ from openant_tools.robot.mjcf import nominal_mjcf
 __all__ = ["Located", "RobotFolder", "create_robot"]
 
 NOMINAL_MODEL = "nominal.xml"
+#: s for which a change of `robot.toml` waits for another's to be done
+CHANGE_PATIENCE_S = 30.0
+HELD = "this robot is held by {}"
+WAIT = "wait for it, or stop it; what only reads goes on"
 
 
 @dataclass(frozen=True)
@@ -109,6 +115,43 @@ class RobotFolder:
     def passport(self) -> Path:
         return self.path / "passport.html"
 
+    @contextlib.contextmanager
+    def hold(self) -> Iterator[None]:
+        """Work on the robot itself for a block: no other program moves it, nor writes into its folder, meanwhile.
+
+        Raises:
+            BadInput: another program does; it is named.
+        """
+        with held(self._lock, HELD, remedy=WAIT):
+            yield
+
+    @property
+    def holder(self) -> Holder | None:
+        """The other program that works on the robot itself, if one does: to us the folder is then read only."""
+        return holder(self._lock)
+
+    def refuse_if_held(self) -> None:
+        """Raise BadInput, which names it, where another program works on the robot itself: for who will write."""
+        who = self.holder
+        if who is not None:
+            raise BadInput(f"{HELD.format(who)}; nothing was written", where=self.path, remedy=WAIT)
+
+    @property
+    def _lock(self) -> Path:
+        return self.path / ".robot.lock"
+
+    @contextlib.contextmanager
+    def _changing(self) -> Iterator[None]:
+        """One change of the folder's files at a time, and none while another program holds the robot."""
+        claim = Claim(
+            self.path / ".change.lock", "its files are being changed by {}", remedy=WAIT, wait_s=CHANGE_PATIENCE_S
+        )
+        try:
+            self.refuse_if_held()
+            yield
+        finally:
+            claim.release()
+
     def model_path(self, config: RobotConfig | None = None) -> Path:
         """The MJCF that simulates this robot."""
         return self.path / (config or self.config()).model
@@ -169,7 +212,8 @@ class RobotFolder:
     ) -> RobotConfig:
         """Change values in `robot.toml`; comments, order, unknown keys and everything else stay byte for byte.
 
-        What stood there before is kept in `backups/` under its date. Nothing is written where nothing changes.
+        What stood there before is kept in `backups/` under its date. Nothing is written where nothing changes. Of several
+        programs that do this at once one waits for the other, so that no change is lost.
 
         Args:
             values: dotted path → value, such as {"motors.hip_rr.zero_offset_rad": 0.79}.
@@ -181,25 +225,28 @@ class RobotFolder:
             The configuration as it now stands.
 
         Raises:
-            BadInput: the file cannot be read, or would hold something that cannot be; it is left as it was.
+            BadInput: the file cannot be read, or would hold something that cannot be, or another program holds the robot;
+                it is left as it was.
         """
-        before = self._bytes()
         values = dict(values or {})
         if isinstance(provenance, Provenance):
             provenance = dict.fromkeys(values, provenance)
-        try:
-            after, config = _edited(self._document(before), self.config_file, values, provenance or {}, effects)
-        except BadInput as error:
-            raise BadInput(
-                f"{error.what}; the file was left as it is", where=error.where, remedy=error.remedy
-            ) from None
-        if "model" in values and not (self.path / config.model).is_file():
-            raise BadInput(f"there is no model {config.model} to name", where=self.path)
-        if after is not None:
-            self._back_up(before)
-            # A link to a configuration kept elsewhere stays a link.
-            write_bytes(self.config_file.resolve(), after)
-        return config
+        self._bytes()  # a folder that is none gets no lock
+        with self._changing():
+            before = self._bytes()
+            try:
+                after, config = _edited(self._document(before), self.config_file, values, provenance or {}, effects)
+            except BadInput as error:
+                raise BadInput(
+                    f"{error.what}; the file was left as it is", where=error.where, remedy=error.remedy
+                ) from None
+            if "model" in values and not (self.path / config.model).is_file():
+                raise BadInput(f"there is no model {config.model} to name", where=self.path)
+            if after is not None:
+                self._back_up(before)
+                # A link to a configuration kept elsewhere stays a link.
+                write_bytes(self.config_file.resolve(), after)
+            return config
 
     def _bytes(self) -> bytes:
         try:
@@ -512,18 +559,22 @@ def create_robot(
     folder = RobotFolder(Path(path))
     if folder.path.exists() and not folder.path.is_dir():
         raise BadInput("is a file, but a robot is a folder", where=folder.path, remedy="name another one")
+    there = BadInput(
+        f"there is a {CONFIG_NAME} already",
+        where=folder.path,
+        remedy="choose another folder, or edit what stands there",
+    )
     if folder.config_file.exists():
-        raise BadInput(
-            f"there is a {CONFIG_NAME} already",
-            where=folder.path,
-            remedy="choose another folder, or edit what stands there",
-        )
+        raise there
     date = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
     text = _template(name or folder.path.resolve().name, parts, date).encode("utf-8")
     changed, _ = _edited(tomlkit.parse(text.decode("utf-8")), folder.config_file, values or {}, provenance or {})
-    for part in (folder.recordings, folder.findings):
-        part.mkdir(parents=True, exist_ok=True)
-    write_text(folder.path / NOMINAL_MODEL, nominal_mjcf(parts.name))
-    # Last, because it is what makes the folder a robot's.
-    write_bytes(folder.config_file, text if changed is None else changed)
+    with folder._changing():
+        if folder.config_file.exists():
+            raise there
+        for part in (folder.recordings, folder.findings):
+            part.mkdir(parents=True, exist_ok=True)
+        write_text(folder.path / NOMINAL_MODEL, nominal_mjcf(parts.name))
+        # Last, because it is what makes the folder a robot's.
+        write_bytes(folder.config_file, text if changed is None else changed)
     return folder

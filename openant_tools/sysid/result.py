@@ -120,7 +120,8 @@ def write_robot(result: Identification, folder: RobotFolder) -> None:
         json.dumps(finding, indent=1, ensure_ascii=False) + "\n",
     )
     found = entries_of(result.effects_found, result.joints)
-    folder.update(values, provenance=provenance, effects=[*effects_beside(result, folder), *found])
+    with folder.hold():  # between what is read of the effects and what is written
+        folder.update(values, provenance=provenance, effects=[*effects_beside(result, folder), *found])
 
 
 def effects_beside(result: Identification, folder: RobotFolder) -> list[Effect]:

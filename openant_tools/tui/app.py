@@ -169,7 +169,7 @@ class OpenAnt(App[int]):
         notices, self.session.notices = self.session.notices, []
         if notices:
             more = f" (and {len(notices) - 1} more)" if len(notices) > 1 else ""
-            self.notify(f"{notices[0]}{more}", title="Engine", timeout=8)
+            self.notify(f"{notices[0]}{more}", title="Robot", timeout=8)
         if isinstance(self.screen, Page) and (
             self.session.feed is not None or before is not None or self._running_step
         ):

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from openant_tools.workers import environment
+
 __all__ = ["Process"]
 
 CLOSE_TIMEOUT_S = 30.0
@@ -38,7 +40,7 @@ class Process:
             # A session of its own: Ctrl-C in the terminal is for the program, which then stops it.
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "openant_tools.cli", *self.arguments],
-                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, env=environment(),
             )  # fmt: skip
 
     @property

@@ -57,6 +57,7 @@ class Session:
         self._virtual_process = contextlib.ExitStack()
         #: one thread connects or starts a robot at a time
         self._busy = threading.Lock()
+        self._say_who_holds()
 
     # ---- the robot -----------------------------------------------------------------------------------------------
 
@@ -73,6 +74,12 @@ class Session:
         """Work on another robot's folder."""
         self.disconnect()
         self.path = path
+        self._say_who_holds()
+
+    def _say_who_holds(self) -> None:
+        who = None if self.folder is None else self.folder.holder
+        if who is not None:
+            self.notices.append(f"this robot is held by {who}: you can look at it here, not move nor change it")
 
     def create(self, path: Path, kit: str) -> None:
         """Make a robot's folder with the nominal values of its kit; raises BadInput."""

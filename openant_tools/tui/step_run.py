@@ -103,8 +103,9 @@ class StepRun:
 
     def _run(self) -> None:
         try:
-            finding = drive(self.step.start(self._bench), self)
-            keep(finding, self._bench.folder)
+            with self._bench.folder.hold():
+                finding = drive(self.step.start(self._bench), self)
+                keep(finding, self._bench.folder)
         except (OpenAntError, OSError) as error:
             self._done(None, str(error))
         except ModuleNotFoundError as error:

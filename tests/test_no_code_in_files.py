@@ -1,0 +1,85 @@
+"""No file that we read can run code: neither our own modules nor what they call unpickle or evaluate anything."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import openant_agents
+import openant_env
+import openant_tools
+
+PACKAGES = [Path(str(package.__file__)).parent for package in (openant_tools, openant_env, openant_agents)]
+MODULES = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "marshal", "shelve", "yaml", "runpy", "code", "imp"}
+CALLS = {"eval", "exec", "compile", "__import__"}
+#: attribute calls by their last names: module.function
+READERS = {
+    ("joblib", "load"),
+    ("joblib", "dump"),
+    ("np", "load"),
+    ("numpy", "load"),
+    ("pd", "read_pickle"),
+    ("yaml", "load"),
+}
+#: what may stand where, and why
+ALLOWED = {
+    # torch's restricted unpickler of tensors, numbers and texts; another test hands it malicious files
+    ("openant_agents/runs.py", "torch.load"),
+}
+
+
+def found(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, name.name) for name in node.names if name.name.partition(".")[0] in MODULES)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            module = str(node.module)
+            taken = {(module, name.name) for name in node.names}
+            if module.partition(".")[0] in MODULES or taken & READERS:
+                yield node.lineno, module
+        elif isinstance(node, ast.Call):
+            called = node.func
+            if isinstance(called, ast.Name) and called.id in CALLS:
+                yield node.lineno, called.id
+            elif isinstance(called, ast.Attribute) and isinstance(called.value, ast.Name):
+                name = (called.value.id, called.attr)
+                if name in READERS or name == ("torch", "load"):
+                    yield node.lineno, ".".join(name)
+            for keyword in node.keywords:
+                if keyword.arg == "allow_pickle" or (keyword.arg == "weights_only" and not _true(keyword.value)):
+                    yield node.lineno, keyword.arg
+
+
+def _true(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and node.value is True
+
+
+def test_no_module_of_ours_unpickles_or_evaluates() -> None:
+    wrong = []
+    for package in PACKAGES:
+        for path in sorted(package.rglob("*.py")):
+            name = path.relative_to(package.parent).as_posix()
+            for line, what in found(ast.parse(path.read_text(encoding="utf-8"))):
+                if (name, what) not in ALLOWED:
+                    wrong.append(f"{name}:{line}: {what}")
+    assert not wrong
+
+
+def test_checkpoints_are_loaded_by_the_restricted_unpickler_alone() -> None:
+    calls = [
+        node
+        for package in PACKAGES
+        for path in package.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Attribute)
+        and ast.unparse(node.func) == "torch.load"
+    ]
+    assert len(calls) == 1
+    assert [_true(k.value) for k in calls[0].keywords if k.arg == "weights_only"] == [True]
+
+
+def test_the_search_finds_what_it_looks_for() -> None:
+    text = "import pickle\nfrom joblib import load\nnp.load('x', allow_pickle=True)\neval('1')\ntorch.load('x', weights_only=False)"
+    assert [line for line, _ in found(ast.parse(text))] == [1, 2, 3, 3, 4, 5, 5]
