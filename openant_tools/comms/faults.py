@@ -8,7 +8,7 @@ from enum import StrEnum
 from openant_tools.comms.protocol2 import Error
 from openant_tools.errors import HardwareFault
 
-__all__ = ["BrokenAnswer", "Cause", "NoAnswer", "Refused", "missing_answers", "refusal_words"]
+__all__ = ["REFUSALS", "BrokenAnswer", "Cause", "NoAnswer", "Refused", "missing_answers", "refusal_words"]
 
 
 class Cause(StrEnum):
@@ -60,7 +60,8 @@ class Refused(HardwareFault):
         self.code = code
 
 
-_REFUSALS: Mapping[int, tuple[str, str]] = {
+#: error code → what it says, and what to do about it
+REFUSALS: Mapping[int, tuple[str, str]] = {
     Error.RESULT_FAIL: (
         "it could not do it",
         "stop the motion and switch torque off first; after a shutdown reboot the servo",
@@ -82,7 +83,7 @@ _REFUSALS: Mapping[int, tuple[str, str]] = {
 
 def refusal_words(code: int) -> tuple[str, str]:
     """What an error code says, and what to do about it."""
-    return _REFUSALS.get(code, (f"it answers with the unknown error code {code}", "look at the servo's manual"))
+    return REFUSALS.get(code, (f"it answers with the unknown error code {code}", "look at the servo's manual"))
 
 
 def missing_answers(

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from openant_tools.comms.troubles import PORT
 from openant_tools.errors import HardwareFault
 
 __all__ = ["FLIGHT_CONTROLLER", "U2D2", "Holder", "Host", "Port", "explain_open_error", "udev_rule"]
@@ -25,6 +26,8 @@ U2D2 = ("0403", "6014")
 FLIGHT_CONTROLLER = ("0483", "5740")
 #: 1 ms instead of the driver's 16: every reply of a servo is shorter than the adapter's buffer.
 WANTED_LATENCY_MS = 1
+#: what the command line of an engine's guardian holds
+GUARDIAN = "guardian"
 _TTY_MAJOR_NAMES = ("ttyUSB", "ttyACM")
 
 Kind = Literal["bus", "imu", "unknown"]
@@ -167,14 +170,16 @@ class Host:
     def readers(self, path: str) -> list[Holder]:
         """Other programs that have the port open: each takes some of the bytes that come.
 
-        This process, those that it started (its guardian) and the far end of a pseudo-terminal are none.
+        This process, its guardian and the far end of a pseudo-terminal are none.
         """
         name, own = self._name(path), os.getpid()
         far = name if Path(os.path.realpath(path)).parent.name == "pts" else None
         return [
             holder
             for holder in self.holders(path)
-            if own not in (holder.pid, self._parent(holder.pid)) and not (far and self._is_far_end(holder.pid, far))
+            if holder.pid != own
+            and not (GUARDIAN in holder.command and self._parent(holder.pid) == own)
+            and not (far and self._is_far_end(holder.pid, far))
         ]
 
     def _parent(self, pid: int) -> int | None:
@@ -215,29 +220,31 @@ def udev_rule() -> str:
 
 def explain_open_error(path: str, error: Exception, host: Host | None = None) -> HardwareFault:
     """Why a port does not open, and what to do: missing, busy and by whom, or forbidden and which group."""
-    host = host or Host()
-    code = getattr(error, "errno", None)
+    cause, values = _why_closed(path, error, host or Host())
+    trouble = PORT[cause]
+    return HardwareFault(trouble.says.format(**values), where=path, remedy=trouble.do.format(**values))
+
+
+def _why_closed(path: str, error: Exception, host: Host) -> tuple[str, dict[str, str]]:
+    """The key of `troubles.PORT`, and what its words need."""
+    code, values = getattr(error, "errno", None), {"error": str(error)}
     if "://" in path:
-        return HardwareFault(f"nobody answers there ({error})", where=path, remedy="start the virtual robot first")
+        return "nobody_listens", values
     if code == errno.ENOENT or not os.path.lexists(path):
         known = [port.stable_path for port in host.ports() if port.kind == "bus"]
-        remedy = f"the bus that is plugged in is {known[0]}" if known else "plug the adapter in: `openant comms ports`"
-        if not known and host.adapters_without_driver():
-            remedy = "the adapter is plugged in, but its driver is missing: `sudo modprobe ftdi_sio`"
-        return HardwareFault("there is no such port", where=path, remedy=remedy)
+        if known:
+            return "elsewhere", {"other": known[0]}
+        return "no_driver" if host.adapters_without_driver() else "missing", {}
     if code in (errno.EACCES, errno.EPERM):
         group = host.missing_group(path)
-        remedy = f"run `sudo usermod -aG {group} $USER` and log in again" if group else "look at its permissions"
-        return HardwareFault("this user may not open it", where=path, remedy=remedy)
+        return ("forbidden", {"group": group}) if group else ("forbidden_by_mode", {})
     if code in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "lock" in str(error).lower():
         holders = [holder for holder in host.holders(path) if holder.pid != os.getpid()]
-        if holders:
-            who = ", ".join(f"{holder.command} (process {holder.pid})" for holder in holders)
-            return HardwareFault(f"it is held by {who}", where=path, remedy="close that program first")
-        return HardwareFault("another program holds it", where=path, remedy="close that program first")
+        who = ", ".join(f"{holder.command} (process {holder.pid})" for holder in holders)
+        return ("held", {"who": who}) if holders else ("held_by_unseen", {})
     if sys.platform == "darwin" and "/tty." in path:
-        return HardwareFault(str(error), where=path, remedy=f"use {path.replace('/tty.', '/cu.')}")
-    return HardwareFault(f"it does not open ({error})", where=path, remedy="is this a serial port?")
+        return "dial_in", {**values, "other": path.replace("/tty.", "/cu.")}
+    return "no_port", values
 
 
 def _by_pyserial() -> Iterator[Port]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-__all__ = ["SILENCE", "Trouble"]
+__all__ = ["PORT", "SILENCE", "Trouble"]
 
 
 @dataclass(frozen=True)
@@ -156,3 +156,48 @@ SILENCE: Mapping[str, Trouble] = {
         "has switched itself off: power it off and on",
     ),
 }
+
+#: why a port does not open → its words
+PORT: Mapping[str, Trouble] = {
+    "missing": Trouble(
+        "a command finds no port", "there is no such port",
+        "the adapter is not plugged in, or has another name since it was", "plug the adapter in: `openant comms ports`",
+    ),
+    "elsewhere": Trouble(
+        "a command finds no port", "there is no such port",
+        "the adapter has another name since it was plugged in; its name under /dev/serial/by-id stays",
+        "the bus that is plugged in is {other}",
+    ),
+    "no_driver": Trouble(
+        "a command finds no port although the adapter is plugged in", "there is no such port",
+        "the system has not loaded the adapter's driver",
+        "the adapter is plugged in, but its driver is missing: `sudo modprobe ftdi_sio`",
+    ),
+    "forbidden": Trouble(
+        "the port is there and cannot be opened", "this user may not open it",
+        "serial ports belong to a group, and this user is not in it",
+        "run `sudo usermod -aG {group} $USER` and log in again",
+    ),
+    "forbidden_by_mode": Trouble(
+        "the port is there and cannot be opened", "this user may not open it",
+        "its permissions were changed", "look at its permissions",
+    ),
+    "held": Trouble(
+        "the port is there and cannot be opened", "it is held by {who}",
+        "two programs on one bus would take each other's answers", "close that program first",
+    ),
+    "held_by_unseen": Trouble(
+        "the port is there and cannot be opened", "another program holds it",
+        "as above; it is another user's or lives in a container", "close that program first",
+    ),
+    "dial_in": Trouble(
+        "on macOS a port does not open", "{error}", "/dev/tty.… waits for a carrier that never comes", "use {other}",
+    ),
+    "no_port": Trouble(
+        "the path is there and does not open as a port", "it does not open ({error})", "", "is this a serial port?",
+    ),
+    "nobody_listens": Trouble(
+        "a virtual robot's address does not open", "nobody answers there ({error})",
+        "the virtual robot has ended, or was never started", "start the virtual robot first",
+    ),
+}  # fmt: skip
