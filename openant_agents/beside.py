@@ -37,7 +37,7 @@ from openant_agents.training import (
     stop_on_signal,
 )
 from openant_env.metrics import AverageReward
-from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.errors import BadInput, HardwareFault, StorageFault
 
 __all__ = ["train_beside"]
 
@@ -131,9 +131,9 @@ class _LearnerProcess:
                 where=self._folder,
                 remedy="repeat the command: every transition is kept",
             ) from None
-        if what == "error":
+        if what in ("error", "disk"):
             words, where, remedy = value
-            raise BadInput(words, where=where, remedy=remedy)
+            raise (StorageFault if what == "disk" else BadInput)(words, where=where, remedy=remedy)
         self.updates = int(value)
         return str(what)
 

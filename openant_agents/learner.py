@@ -224,11 +224,11 @@ def main() -> None:
         Learner(job, connection, weights).run()
         return
     except OpenAntError as error:
-        words = error.what, error.where, error.remedy
+        kind, words = "error", (error.what, error.where, error.remedy)
     except OSError as error:
-        words = f"the run cannot be saved: {error.strerror}", str(job.folder), "make room there"
+        kind, words = "disk", (f"the run cannot be saved: {error.strerror}", str(job.folder), "make room there")
     with contextlib.suppress(OSError):  # nobody is there to be told
-        connection.send(("error", words))
+        connection.send((kind, words))
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ soon as they are made, and a run goes on with all of them, those after the last 
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import json
 import math
@@ -135,7 +136,10 @@ class Run:
     def append(self, row: NDArray[np.float32]) -> None:
         """Put one transition, (width,), at the end of the file, where a kill no longer reaches it."""
         assert self._log is not None
-        self._log.write(row.tobytes())
+        data = row.tobytes()
+        if self._log.write(data) != len(data):
+            # A part of it took the last of the disk; it is cut off where the run goes on.
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder / "transitions.f32"))
 
     def _cut_interventions(self, step: int) -> None:
         path = self.folder / "interventions.csv"

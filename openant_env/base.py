@@ -121,18 +121,24 @@ class AntBase(gymnasium.Env[Observation, NDArray[Any]]):  # type: ignore[misc]
         }
 
     def _set_command(self, action: NDArray[Any]) -> None:
-        """Work out what an action commands, (joints,) rad, into `_command`."""
+        """Work out what an action commands, (joints,) rad, into `_command`; finite ones are clipped, others refused."""
         command, actions = self._command, self.actions
         action = np.asarray(action)
         if action.shape != command.shape:
             raise BadInput(f"an action has shape {action.shape}", remedy=f"give {len(command)} numbers")
+        if action.dtype.kind not in "fiu":
+            raise BadInput(f"an action is of {action.dtype}, no numbers", remedy=f"give {len(command)} numbers")
+        if not np.isfinite(action).all():
+            joint = int(np.flatnonzero(~np.isfinite(action))[0])
+            raise BadInput(
+                f"an action is not finite: {action[joint]} for {self.robot.joints[joint]}",
+                remedy="look for NaN in the agent's networks",
+            )
         np.minimum(np.maximum(action, self._least, out=command), self._most, out=command)
         command *= actions.half
         command += actions.centre
         if actions.clipped:
             np.minimum(np.maximum(command, actions.low, out=command), actions.high, out=command)
-        if not math.isfinite(command.dot(command)):
-            raise BadInput(f"an action is not finite: {action}", remedy="look for NaN in the agent's networks")
 
     def _info(self, x: float, y: float, hx: float, hy: float, observation: Any) -> dict[str, Any]:
         task = self.task

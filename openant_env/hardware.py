@@ -5,8 +5,10 @@ cycles; the observation returned is what the last of them measured. Who answers 
 action leave exactly `dt` after the last one. Who takes longer makes the period longer: that is measured from command to
 command (`info["period_s"]`), counted (`info["overruns"]`) and told, and `info["dt"]` is the time that really passed.
 
-What a robot cannot do is a truncation with a reason; `reset` then waits until it can, and says what for. A virtual robot
-has nobody beside it: one that walked out of the camera's view, fell or wound up its cable is put back after a while.
+What a robot cannot do is a truncation with a reason. What `comms.restart.RULES` lets begin again by itself, `reset` waits
+for, and says what for; what has ended for good begins again by the builder's word alone, and `reset` raises until then. A
+virtual robot has nobody beside it: one that walked out of the camera's view, fell or wound up its cable is put back after
+a while.
 """
 
 from __future__ import annotations
@@ -17,7 +19,6 @@ import math
 import threading
 import time
 import tomllib
-from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from openant_env.base import AntBase, Observation, OnFall
 from openant_env.link import RobotLink, engine_config, engine_rate
 from openant_env.robots import simulated_robot
 from openant_env.tasks import BackAndForth
+from openant_tools.comms.restart import Interlock, MotionStopped, Restart, StopCause
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.recording.run import Facts
 from openant_tools.robot.derating import derating_of
@@ -56,8 +58,8 @@ COOLED_K = 15.0
 LOOK_S, REPEAT_S = 0.25, 30.0
 #: s after which someone is there who puts a virtual robot back
 HELP_S = 5.0
-#: servos that shut down so often within so many seconds are not started again without someone looking
-REBOOTS, REBOOTS_S = 3, 600.0
+#: after which a robot that was seen must not have been moved by hands, to stand up by itself
+_SAME_POSE = (StopCause.SILENCE, StopCause.STALL)
 
 _log = logging.getLogger("openant_env")
 
@@ -69,8 +71,9 @@ class AntHardware(AntBase):
     the last command to this one), `overruns` (steps so far that began late), `observation_age_s` (s, of joints, IMU and
     position, as of the step's end), `missed` (answers of servos that did not come in this step), `joint_temperatures`
     (°C), `joint_loads` (A or share of full load, as the servos measure) and `supply_v`; `derating`, the share of each joint's
-    way from its rest that is left to it by the `[derating]` rules of robot.toml, 1 for a cool servo; and `void` where a stop
-    came in the way of a step: its action was not carried out, so that there is nothing to learn from it.
+    way from its rest that is left to it by the `[derating]` rules of robot.toml, 1 for a cool servo; `stop_cause` where a
+    stop ended it, a `comms.restart.StopCause`; and `void` where that came in the way of a step: its action was not carried
+    out, so that there is nothing to learn from it.
 
     Args:
         robot: a robot's folder (or its robot.toml). None only with `virtual`: an Ant as the guide says.
@@ -84,6 +87,8 @@ class AntHardware(AntBase):
         recordings: folder for the recording of every connection; None: `recordings/` of the robot's folder.
         tag_patience_s: s without a pose, which keeps its last value meanwhile, after which the robot counts as lost.
         patience_s: s that `reset` waits for a robot that needs help before it gives up; None: for ever.
+        attended: somebody is there who calls `resume` (as the space bar of our commands does): where motion has ended for
+            good, `reset` waits for that instead of raising.
         notice: called with what the user should know; default: the log.
 
     Raises:
@@ -111,6 +116,7 @@ class AntHardware(AntBase):
         recordings: str | Path | None = None,
         tag_patience_s: float = 2.0,
         patience_s: float | None = None,
+        attended: bool = False,
         notice: Callable[[str], None] | None = None,
         render_mode: None = None,
     ) -> None:
@@ -128,7 +134,13 @@ class AntHardware(AntBase):
             (self.task.ox, self.task.oy), self._chosen_origin = centre, True
         self._tag_patience_s = float(tag_patience_s)
         self._patience_s = math.inf if patience_s is None else float(patience_s)
+        self._attended = attended
         self._notice = notice or _log.warning
+        self._interlock = Interlock("openant_env")
+        #: why motion may begin again, where it was stopped
+        self._restart: Restart | None = None
+        self._stop_cause: StopCause | None = None
+        self._said_why = ""
         self._paused = threading.Event()
         self._why_paused = ""
         self._held = contextlib.ExitStack()
@@ -207,7 +219,6 @@ class AntHardware(AntBase):
         self._overruns = 0
         self._told_late = self._told_warm = -math.inf
         self._shares = np.ones(len(joints))
-        self._reboots: deque[float] = deque(maxlen=REBOOTS)
         #: joint → whether it is left to cool down
         self._cooling: dict[str, bool] = {}
         self._reason = ""
@@ -221,9 +232,13 @@ class AntHardware(AntBase):
         self._paused.set()
 
     def resume(self) -> None:
-        """Go on after a pause; whoever does that has looked at the robot, so its cable counts as unwound."""
+        """The builder's word that motion may go on, after a pause or an end for good; from any thread.
+
+        Whoever gives it has looked at the robot, so its cable counts as unwound.
+        """
         self._wound_rad = 0.0
-        self._reboots.clear()
+        self._restart = self._interlock.word()
+        self.link.forget_stop()
         self._paused.clear()
 
     @property
@@ -244,19 +259,25 @@ class AntHardware(AntBase):
 
         Args:
             seed: of the reward direction.
-            options: `direction_rad`, the first reward direction.
+            options: `direction_rad`, the first reward direction; `resume`, True for the builder's word, see `resume`.
 
         Raises:
+            MotionStopped: motion has ended for good, and nobody has said that it may go on.
             HardwareFault: it still needs help after `patience_s`.
         """
         super().reset(seed=seed)
         chosen = options or {}
-        unknown = set(chosen) - {"direction_rad"}
+        unknown = set(chosen) - {"direction_rad", "resume"}
         if unknown:
             raise BadInput(
                 f"no such reset option on a robot: {sorted(unknown)[0]}",
-                remedy="direction_rad; a robot stands where it is",
+                remedy="direction_rad or resume; a robot stands where it is",
             )
+        word = chosen.get("resume", False)
+        if not isinstance(word, bool):
+            raise BadInput(f"the reset option resume is {word!r}", remedy="True, where you have looked at the robot")
+        if word:
+            self.resume()
         self._stand_up()
         x, y, yaw = self._pose.tolist()
         if not self._chosen_origin and isinstance(self.task, BackAndForth):
@@ -283,10 +304,10 @@ class AntHardware(AntBase):
         try:
             rows, number = self.link.go(self._command, self.dt, (self._observed_at, chosen_at))
         except HardwareFault as fault:
-            return self._stopped(str(fault))
+            return self._stopped(str(fault), _cause(fault))
         mine = rows[rows[:, self.link.columns["goal"]] == number]
         if not len(mine):
-            return self._stopped("the engine played nothing of this step")
+            return self._stopped("the engine played nothing of this step", StopCause.STALL)
         self._take(rows)
         period = self._timed(float(mine[0, self.link.columns["cmd_t"]]))
         elapsed = self._t - before
@@ -318,13 +339,16 @@ class AntHardware(AntBase):
                 "the way that it is told"
             )
 
-    def _stopped(self, why: str) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def _stopped(self, why: str, cause: StopCause) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """A step that torque off ended: what was seen last stands in, and no reward is given for it."""
         self._reason, self._ready = why, False
+        self._ended_by(cause, why)
         self._seconds += self.dt
         x, y, yaw = self._pose.tolist()
         hx, hy = math.cos(yaw), math.sin(yaw)
-        info = self._info(x, y, hx, hy, self._observation) | self._more(math.nan, 0) | {"reason": why, "void": True}
+        info = self._info(x, y, hx, hy, self._observation) | self._more(math.nan, 0) | {
+            "reason": why, "stop_cause": cause.value, "void": True,
+        }  # fmt: skip
         return self._observation.astype(np.float32), 0.0, False, True, info
 
     def _take(self, rows: Array) -> None:
@@ -375,20 +399,35 @@ class AntHardware(AntBase):
         self._fallen_s = self._fallen_s + elapsed if up < 0.0 else 0.0
         lost, silent = self._t - self._pose_t, self._t - self._imu_t
         if self._fallen_s >= FALLEN_S and self._on_fall != "ignore":
-            info["reason"] = "the robot lies on its back"
+            self.link.release()
+            self._truncate(info, StopCause.FALL, "the robot lies on its back")
             return self._on_fall == "terminate", self._on_fall == "truncate"
         if lost > self._tag_patience_s:
-            info["reason"] = f"the camera has not seen the robot for {lost:.1f} s"
+            self._truncate(info, StopCause.TAG, f"the camera has not seen the robot for {lost:.1f} s")
         elif silent > IMU_PATIENCE_S:
-            info["reason"] = f"the IMU has sent nothing for {silent:.1f} s"
+            self._truncate(info, StopCause.IMU, f"the IMU has sent nothing for {silent:.1f} s")
         elif self._wound:
             turns, side = abs(self._wound_rad) / (2.0 * math.pi), "left" if self._wound_rad > 0 else "right"
-            info["reason"] = f"the cable is wound up by {turns:.1f} turns to the {side}"
+            self._truncate(info, StopCause.CABLE, f"the cable is wound up by {turns:.1f} turns to the {side}")
         elif self._paused.is_set():
-            info["reason"] = self._why_paused
+            info["reason"], info["stop_cause"] = self._why_paused, StopCause.BY_HAND.value
         elif self._seconds >= self._time_limit_s - 0.5 * self.dt:
             info["reason"] = "time limit"
         return False, "reason" in info
+
+    def _truncate(self, info: dict[str, Any], cause: StopCause, why: str) -> None:
+        info["reason"], info["stop_cause"] = why, cause.value
+        self._ended_by(cause, why)
+
+    def _ended_by(self, cause: StopCause, why: str) -> None:
+        """What the table makes of a stop."""
+        self._stop_cause, self._said_why = cause, why
+        if cause is StopCause.HARDWARE_ERROR:
+            return  # counted for each servo that is rebooted
+        if self.link.virtual and cause in (StopCause.FALL, StopCause.CABLE):
+            self._restart = Restart()  # who puts it back gives the word
+            return
+        self._restart = self._interlock.stopped(cause, why, self.link.now())
 
     def _observe(self, hx: float, hy: float) -> Observation:
         at = self._direction_at
@@ -420,10 +459,15 @@ class AntHardware(AntBase):
         """Wait until nothing is in the way, saying what it is, and stand."""
         said, said_at, waited, helped_at = "", -math.inf, 0.0, 0.0
         while True:
+            self._need_word()
             why = self._in_the_way()
-            if why is None:
+            if why is None and self._stop_cause is StopCause.HARDWARE_ERROR and self._restart is None:
+                # Its alert bit said so, but no servo owns to an error: no reboot was counted.
+                self._restart = self._interlock.stopped(self._stop_cause, self._said_why, self.link.now())
+            if why is None and not self._interlock.ended:
                 try:
-                    rows = self.link.stand(self.actions.rest, SETTLE_S)
+                    rows = self.link.stand(self.actions.rest, SETTLE_S, self._restart)
+                    self._restart = None
                     self._take(rows)
                     why = self._unseen()
                     if why is None:
@@ -431,7 +475,11 @@ class AntHardware(AntBase):
                     self.link.let_down()  # it may wait for long
                 except HardwareFault as fault:
                     why = str(fault)
+                    self._reason = why
+                    self._ended_by(_cause(fault), why)
                     self.link.drop()
+            self._need_word()
+            why = why or self._why_paused
             if waited > self._patience_s:
                 raise HardwareFault(f"the robot cannot go on: {why}", remedy="help it, and start again")
             kind = why[:24]
@@ -446,7 +494,22 @@ class AntHardware(AntBase):
             waited += LOOK_S if self.link.stepped else time.monotonic() - began
         if said:
             self._notice(f"going on after {waited:.0f} s")
-        self._fallen_s = 0.0
+        self._fallen_s, self._stop_cause = 0.0, None
+
+    def _need_word(self) -> None:
+        """Where motion has ended for good: have whoever is there asked, or refuse."""
+        if not self._interlock.ended:
+            return
+        why = f"motion has ended for good: {self._interlock.ended}"
+        if not self._attended:
+            self.link.let_down()
+            raise MotionStopped(
+                why,
+                remedy="look at the robot, then reset(options={'resume': True}), or start the command again",
+                cause=self._stop_cause or StopCause.UNKNOWN,
+            )
+        if not self._paused.is_set():
+            self.pause(f"{why}; look at the robot, then resume")
 
     def _in_the_way(self) -> str | None:
         """Why the robot cannot stand up yet; what software can do about it has been done."""
@@ -458,6 +521,11 @@ class AntHardware(AntBase):
                 # After a stop everything is looked at anew: ids, registers, turns that a power cut has forgotten.
                 self.link.connect()
                 self._reason = ""
+                if self._restart is not None and self._restart.cause in _SAME_POSE:
+                    moved = self.link.moved()
+                    if moved is not None:
+                        self._interlock.end(moved)
+                        return moved
             if self.link.standing and not self._reason:
                 return None
             rows = self.link.look(LOOK_S)
@@ -466,6 +534,8 @@ class AntHardware(AntBase):
             self._take(rows)
             return self._trouble()
         except HardwareFault as fault:
+            if _cause(fault) is StopCause.STORAGE:
+                self._ended_by(StopCause.STORAGE, str(fault))
             self.link.drop()
             return str(fault)
 
@@ -494,19 +564,25 @@ class AntHardware(AntBase):
             return hot
         errors = self.link.errors()
         if errors:
-            if len(self._reboots) == REBOOTS and time.monotonic() - self._reboots[0] < REBOOTS_S:
-                self.pause(f"{', '.join(errors)} shut down again and again: look at them, then go on")
-                return self._why_paused
-            self._reboots.append(time.monotonic())
+            for joint in errors:
+                self._stop_cause = StopCause.HARDWARE_ERROR
+                why = f"{joint} has shut itself down again after its reboot"
+                self._restart = self._interlock.stopped(self._stop_cause, why, self.link.now(), joint)
+                if self._restart is None:
+                    return why
             self.link.reboot(list(errors))
             return f"{', '.join(errors)} had shut down, and are started again"
         if self._wound:
             self.link.let_down()
             turns = abs(self._wound_rad) / (2.0 * math.pi)
-            return f"the cable is wound up by {turns:.1f} turns: turn the robot back by hand, in the camera's view"
+            why = f"the cable is wound up by {turns:.1f} turns: turn the robot back by hand, in the camera's view"
+            self._ended_by(StopCause.CABLE, why)
+            return why
         if self._lying:
-            self.link.let_down()
-            return "the robot lies on its back or side: put it on its feet"
+            self.link.release()
+            why = "the robot lies on its back or side: put it on its feet"
+            self._ended_by(StopCause.FALL, why)
+            return why
         why = self._unseen()
         if why is not None:
             self.link.let_down()
@@ -540,6 +616,10 @@ class AntHardware(AntBase):
         """Lay the robot down, torque off, recording closed; a virtual robot that was started here ends."""
         self._ready = False
         self._held.close()
+
+
+def _cause(fault: HardwareFault) -> StopCause:
+    return fault.cause if isinstance(fault, MotionStopped) else StopCause.UNKNOWN
 
 
 def _last_sound(values: Array) -> Array:

@@ -19,6 +19,7 @@ from openant_tools.comms import messages
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig
+from openant_tools.comms.restart import POSE_RAD, MotionStopped, Restart, StopCause
 from openant_tools.comms.setup import camera_of_robot, config_of_robot, config_of_unknown_robot, imu_of_robot, open_bus
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.recording.run import Facts
@@ -32,6 +33,8 @@ Array = NDArray[np.float64]
 ENGINE_HZ = 100.0
 #: s from a reboot to the first answer of a servo, with a margin
 BOOT_S = 0.8
+#: s for the legs to sink after a stop, until it is noted where they lie
+SINK_S = 1.0
 
 
 def engine_rate(dt: float) -> float:
@@ -103,6 +106,7 @@ class RobotLink:
     Attributes:
         columns: name → place in a row of telemetry.
         limits_c: joint → °C at which its servo would shut down.
+        virtual: whether it is a virtual robot, which has nobody beside it.
     """
 
     def __init__(
@@ -119,7 +123,10 @@ class RobotLink:
         self._control = VirtualControl(config.control) if config.control else None
         self.stepped = bool(self._control is not None and self._control.ask("now")["stepped"])
         self._engine: EngineProcess | None = None
+        self.virtual = self._control is not None
         self._found: Array | None = None
+        #: joint → rad, where those that were heard after a stop came to rest; None where there was no stop
+        self._sunk: dict[str, float] | None = None
         self._standing = False
         self.recorded: list[Path] = []
 
@@ -139,6 +146,7 @@ class RobotLink:
         """Open the hardware anew: who is there, registers, turns, sensors; a recording begins. Torque stays off.
 
         Raises:
+            MotionStopped: what is done from here on cannot be recorded any more.
             HardwareFault: it is not there, or not all of it.
         """
         self.drop()
@@ -150,11 +158,19 @@ class RobotLink:
             self._found = np.asarray(engine.description["position"], float)
         self._tell()
         if self._recordings is not None:
-            self._recordings.mkdir(parents=True, exist_ok=True)
             volts = engine.ask(messages.ReadRegister("present_input_voltage"))
             facts = replace(self._facts, supply_v=round(sum(volts.values()) / len(volts) * 0.1, 2))
-            path = _free_name(self._recordings)
-            engine.ask(messages.Record(str(path), facts, self._robot_toml))
+            try:
+                self._recordings.mkdir(parents=True, exist_ok=True)
+                path = _free_name(self._recordings)
+                engine.ask(messages.Record(str(path), facts, self._robot_toml))
+            except (OSError, HardwareFault) as error:
+                if not self.recorded:  # nothing was begun yet: the place is wrong from the start
+                    raise
+                where = str(self._recordings)
+                raise MotionStopped(
+                    f"nothing more is recorded: {error}", where=where, cause=StopCause.STORAGE
+                ) from error
             self.recorded.append(path)
 
     def drop(self) -> None:
@@ -175,8 +191,11 @@ class RobotLink:
 
     # ---- moving --------------------------------------------------------------------------------------------------
 
-    def stand(self, pose: Array, settle_s: float) -> Array:
+    def stand(self, pose: Array, settle_s: float, restart: Restart | None = None) -> Array:
         """Torque on, slowly to a pose (joints,) rad, and wait for the legs to come to rest.
+
+        Args:
+            restart: after a stop, why motion may begin again.
 
         Returns:
             Telemetry rows of the waiting.
@@ -186,8 +205,11 @@ class RobotLink:
         """
         engine = self._need_engine()
         if not self._standing:
-            engine.ask(messages.Torque(True))
+            engine.ask(messages.Torque(True, restart))
             self._standing = True
+        elif restart is not None:
+            self._notice(str(restart))
+        self._sunk = None
         with self._noticing_stops():
             engine.ask(messages.Ramp(pose))
             engine.telemetry()
@@ -224,6 +246,34 @@ class RobotLink:
             self._engine.ask(messages.Ramp(np.clip(self._found, low, high)))
             self._engine.ask(messages.Torque(False))
         self._standing = False
+
+    def release(self) -> None:
+        """Torque off now, wherever the robot is: it is no place to lie down slowly from."""
+        if self._engine is not None:
+            with contextlib.suppress(HardwareFault):
+                self._engine.ask(messages.Torque(False))
+        self._standing = False
+
+    def moved(self) -> str | None:
+        """Whether hands have moved the robot between a stop and this connection, in words; None where it lies as it lay."""
+        if self._sunk is None or self._engine is None:
+            return None
+        if not self._sunk:
+            return "no servo was heard between the stop and now: nobody knows whether it is as it was"
+        here = np.asarray(self._engine.description["position"], float).tolist()
+        seen = {servo.joint: angle for servo, angle in zip(self.config.servos, here, strict=True)}
+        apart, joint = max((abs(seen[joint] - angle), joint) for joint, angle in self._sunk.items())
+        return f"{joint} was moved by {apart:.2f} rad since the stop" if apart > POSE_RAD else None
+
+    def forget_stop(self) -> None:
+        """The builder has looked: where the robot lay after the last stop does not count."""
+        self._sunk = None
+
+    def now(self) -> float:
+        """s, the robot's clock."""
+        if self.stepped and self._control is not None:
+            return float(self._control.ask("now")["t"])
+        return time.monotonic()
 
     def look(self, seconds: float) -> Array | None:
         """Let time pass; telemetry rows of it, None where the robot is not connected."""
@@ -292,9 +342,24 @@ class RobotLink:
             yield
         except HardwareFault:
             self._standing = False
+            self._note_where_it_lies()
             raise
         finally:
             self._tell()
+
+    def _note_where_it_lies(self) -> None:
+        self._sunk = {}
+        engine = self._engine
+        if engine is None or engine.ended:
+            return
+        with contextlib.suppress(HardwareFault):
+            engine.telemetry()
+            engine.ask(messages.Look(SINK_S))
+            rows = engine.telemetry()
+            for servo in self.config.servos:
+                angles = rows[:, self.columns[f"pos.{servo.joint}"]]
+                if np.isfinite(angles).any():
+                    self._sunk[servo.joint] = float(angles[np.isfinite(angles)][-1])
 
     def _rows(self) -> Array:
         rows: Array = self._need_engine().telemetry()

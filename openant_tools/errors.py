@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["BadInput", "HardwareFault", "OpenAntError"]
+__all__ = ["BadInput", "HardwareFault", "OpenAntError", "StorageFault"]
 
 
 class OpenAntError(Exception):
@@ -31,6 +31,12 @@ class OpenAntError(Exception):
 
 class BadInput(OpenAntError):
     """Something given to us (a file, an option, a model) cannot be used as it is."""
+
+
+class StorageFault(OpenAntError):
+    """The disk takes no more of what is being made; what it took before is kept."""
+
+    exit_code = 1
 
 
 class HardwareFault(OpenAntError):

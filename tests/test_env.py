@@ -403,7 +403,15 @@ def test_a_model_that_does_not_fit_the_robot_is_refused(robot):
 
 
 @pytest.mark.parametrize(
-    ("action", "words"), [(np.zeros(7), "shape (7,)"), (np.full(8, np.nan), "not finite"), (0.5, "shape ()")]
+    ("action", "words"),
+    [
+        (np.zeros(7), "shape (7,)"),
+        (np.full(8, np.nan), "not finite: nan for hip_rr"),
+        (0.5, "shape ()"),
+        (np.full(8, np.inf), "not finite: inf"),
+        (np.full(8, -np.inf), "not finite: -inf"),
+        (["a"] * 8, "no numbers"),
+    ],
 )
 def test_an_action_that_is_none_is_refused(ant, action, words):
     ant.reset(seed=0)

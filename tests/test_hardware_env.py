@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import resource
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +23,7 @@ import openant_env  # noqa: F401
 from openant_env.link import engine_rate
 from openant_tools.cli import main
 from openant_tools.comms.clock import VirtualControl
+from openant_tools.comms.restart import MotionStopped, StopCause
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.recording.reader import read_recording
 from openant_tools.robot.config import Provenance
@@ -78,6 +81,10 @@ class Walker:
             yield
         finally:
             self._control.ask("fault", cause=cause, on=False, **more)
+
+    def torque(self) -> int:
+        """How many servos have it on."""
+        return sum(self._control.ask("state")["torque_enable"].values())
 
     def until_it_ends(self, steps: int = 20) -> dict[str, object]:
         for _ in range(steps):
@@ -275,6 +282,95 @@ def test_a_warm_servo_goes_less_far_by_the_rule_of_robot_toml(walker: Walker, mo
     assert any("knee_fl is at 66 °C: it goes 70 % of the way" in words for words in walker.said)
 
 
+# ----------------------------------------------------------------------------- what begins again by the builder's word
+
+
+@pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="limits of another process are Linux'")
+def test_a_full_disk_ends_walking_until_the_builder_says_otherwise(walker: Walker) -> None:
+    env = walker.env
+    limits = resource.prlimit(env.link._engine.pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(env.link._engine.pid, resource.RLIMIT_FSIZE, (1, limits[1]))
+    info = walker.until_it_ends(200)
+    assert info["stop_cause"] == "storage"
+    assert info["void"]
+    for _ in range(2):
+        with pytest.raises(
+            MotionStopped, match=r"motion has ended for good: .*the recording stopped.* → .*resume"
+        ) as no:
+            env.reset()
+        assert (no.value.cause, no.value.exit_code) == (StopCause.STORAGE, 1)
+        assert walker.torque() == 0
+    recorded = list(env.link.recorded)
+    env.reset(options={"resume": True})
+    assert walker.torque() == 8
+    assert not env.step(STILL)[3]
+    assert "motion begins again by the builder's word" in walker.said
+    assert len(env.link.recorded) == len(recorded) + 1
+    with pytest.raises(BadInput, match="the reset option resume is 1"):
+        env.reset(options={"resume": 1})
+
+
+def test_hands_that_moved_the_robot_after_a_stop_keep_it_down(walker: Walker) -> None:
+    with walker.fault("broken_wire", where="knee_fl"):
+        info = walker.until_it_ends()
+    assert info["stop_cause"] == "silence"
+    sunk = walker.env.link._sunk
+    assert {"hip_fl", "knee_rr"} < set(sunk)
+    sunk["hip_fl"] += 0.6  # what it will find is not where it was
+    with pytest.raises(MotionStopped, match=r"hip_fl was moved by 0\.\d+ rad since the stop"):
+        walker.env.reset()
+    assert walker.torque() == 0
+    walker.env.resume()
+    walker.env.reset()
+
+
+def test_a_servo_that_shuts_down_again_after_its_reboot_ends_walking(
+    walker: Walker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link, rebooted = walker.env.link, list[str]()
+    walker.env.pause()
+    walker.until_it_ends(1)
+    walker.env._paused.clear()
+    link.let_down()
+    monkeypatch.setattr(link, "errors", lambda: {"knee_rl": 32})
+    monkeypatch.setattr(link, "reboot", rebooted.extend)
+    with pytest.raises(
+        MotionStopped, match="knee_rl has shut itself down again after its reboot .the second time"
+    ) as no:
+        walker.env.reset()
+    assert no.value.cause is StopCause.HARDWARE_ERROR
+    assert rebooted == ["knee_rl"]
+    monkeypatch.undo()
+    with pytest.raises(MotionStopped):
+        walker.env.reset()
+    walker.env.reset(options={"resume": True})
+
+
+def test_a_robot_that_fell_stands_up_only_once_somebody_has_looked(
+    walker: Walker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A real one: nobody may have his hands in it when it stands up. Attended, reset waits for the word."""
+    env = walker.env
+    monkeypatch.setattr(env.link, "virtual", False)
+    env.link.let_down()
+    walker._control.ask("put", rotation_rad=[math.pi, 0.0, 0.0])
+    env.link.look(1.0)
+    with pytest.raises(MotionStopped, match="the robot lies on its back or side: put it on its feet"):
+        env.reset()
+    walker._control.ask("put")
+    with pytest.raises(MotionStopped, match="the robot lies on its back or side"):
+        env.reset()  # it is on its feet again, in somebody's hands
+    assert walker.torque() == 0
+    monkeypatch.setattr(env, "_attended", True)
+    env._patience_s = 0.3
+    with pytest.raises(HardwareFault, match=r"the robot cannot go on: motion has ended for good: .* then resume"):
+        env.reset()
+    env._patience_s = 20.0
+    threading.Timer(0.3, env.resume).start()
+    env.reset()
+    assert walker.torque() == 8
+
+
 # ---------------------------------------------------------------------------------------------------- what is refused
 
 
@@ -298,9 +394,22 @@ def test_what_cannot_walk_is_refused_in_one_line(scenario: Path, folder: RobotFo
 
 
 def test_actions_that_are_none_are_refused(walker: Walker) -> None:
-    for action, words in ((np.full(8, np.nan), "an action is not finite"), (np.zeros(7), "an action has shape")):
+    up, down = np.zeros(8, np.float32), np.zeros(8)
+    up[2], down[7] = np.inf, -np.inf
+    cases = [
+        (np.full(8, np.nan), "an action is not finite: nan for hip_rr"), (np.zeros(7), "an action has shape"),
+        (up, "an action is not finite: inf for hip_fr"), (down, "an action is not finite: -inf for knee_rl"),
+        (np.float32(0.0), "an action has shape"), (np.zeros((1, 8)), "an action has shape"),
+        (np.array(["0"] * 8), "no numbers"), (np.array([None] * 8), "no numbers"),
+    ]  # fmt: skip
+    before = walker.env.command
+    for action, words in cases:
         with pytest.raises(BadInput, match=words):
             walker.env.step(action)
+    assert walker.torque() == 8
+    assert (walker.env.command == before).all()
+    assert not walker.env.step(np.full(8, 1e30))[3], "what is finite is clipped to -1…1"
+    assert walker.env.command == pytest.approx(walker.env.actions.centre + walker.env.actions.half, abs=1e-5)
     with pytest.raises(BadInput, match="no such reset option on a robot: heading_rad"):
         walker.env.reset(options={"heading_rad": 1.0})
 

@@ -20,7 +20,7 @@ from openant_tools.cli.walking import (
     hardware_robot,
     may_walk,
 )
-from openant_tools.errors import BadInput
+from openant_tools.errors import BadInput, StorageFault
 
 if TYPE_CHECKING:
     from openant_agents.training import Progress
@@ -110,6 +110,14 @@ def training(
         except KeyboardInterrupt:
             click.echo(f"saved in {out}; the same command goes on from there", err=True)
             raise
+        except OSError as error:
+            if name != HARDWARE_ID:
+                raise
+            raise StorageFault(
+                f"nothing more is saved, and the robot stops: {error.strerror or error}",
+                where=error.filename or out,
+                remedy="make room there; the same command goes on",
+            ) from error
 
 
 def show_result(

@@ -97,7 +97,8 @@ def environment(name: str, options: Mapping[str, Any], recordings: Path, **more:
         finally:
             env.close()
         return
-    env = gymnasium.make(name, **options, recordings=recordings, notice=_notice)
+    # With a terminal the space bar is the word that motion may go on where it has ended for good; without one nobody gives it.
+    env = gymnasium.make(name, **options, recordings=recordings, notice=_notice, attended=sys.stdin.isatty())
     try:
         with _pause_key(env.unwrapped):
             yield env

@@ -25,7 +25,7 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
-from openant_tools.errors import BadInput, OpenAntError
+from openant_tools.errors import BadInput, OpenAntError, StorageFault
 from openant_tools.recording.facts import facts_to_json
 from openant_tools.recording.run import Facts
 from openant_tools.recording.telemetry import AGENT_TIMES, Cycle, ServoChannel, Telemetry
@@ -44,10 +44,8 @@ SYNC_PERIOD = 1.0
 _log = logging.getLogger(__name__)
 
 
-class RecordingStopped(OpenAntError):
+class RecordingStopped(StorageFault):
     """The disk takes no more; what was recorded before stays readable."""
-
-    exit_code = 1
 
 
 def recording_path(path: str | Path) -> Path:
