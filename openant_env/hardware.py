@@ -583,10 +583,10 @@ class AntHardware(AntBase):
             why = "the robot lies on its back or side: put it on its feet"
             self._ended_by(StopCause.FALL, why)
             return why
-        why = self._unseen()
-        if why is not None:
+        unseen = self._unseen()
+        if unseen is not None:
             self.link.let_down()
-        return why
+        return unseen
 
     def _hot(self) -> str | None:
         guards = self.link.config.guards

@@ -334,9 +334,7 @@ def test_a_servo_that_shuts_down_again_after_its_reboot_ends_walking(
     link.let_down()
     monkeypatch.setattr(link, "errors", lambda: {"knee_rl": 32})
     monkeypatch.setattr(link, "reboot", rebooted.extend)
-    with pytest.raises(
-        MotionStopped, match="knee_rl has shut itself down again after its reboot .the second time"
-    ) as no:
+    with pytest.raises(MotionStopped, match=r"knee_rl has shut itself down again .*the second time") as no:
         walker.env.reset()
     assert no.value.cause is StopCause.HARDWARE_ERROR
     assert rebooted == ["knee_rl"]
