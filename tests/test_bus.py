@@ -78,7 +78,8 @@ def test_fast_reads_come_back_once_the_silent_servo_has_answered_for_a_while() -
         for _ in range(20):
             bytes_of_a_read()
         line.wire.settings.lost.clear()
-        assert [bytes_of_a_read() for _ in range(wait)] == [plain] * wait
+        # The first answer of a servo that was silent for so long may be a late one: it counts for nothing.
+        assert [bytes_of_a_read() for _ in range(1 + wait)] == [plain] * (1 + wait)
         assert bytes_of_a_read() == joined
         assert (bus.statistics.fast_read_fallbacks, bus.statistics.fast_read_returns) == (fallbacks, fallbacks)
 
@@ -91,6 +92,9 @@ def cycles_until_stopped(byte_error: float, seed: int, cycles: int) -> tuple[flo
     bus, line = ant(settings=BusSettings(byte_error=byte_error), seed=seed)
     servos = Servos(bus, [Servo(joint.name, joint.id, kit("standard").servo(joint.kind)) for joint in JOINTS.values()])
     bus.fast = set(IDS)
+    for _ in range(20):  # torque is off for a while first
+        line.sleep_until(line.now() + 0.01)
+        servos.read_blocks()
     start = line.now()
     watch = Watch(Guards(), servos.servos, {})
     watch.reset(start)
@@ -216,10 +220,10 @@ def test_the_write_to_read_gap_is_kept() -> None:
         assert all(answer.ok for answer in bus.sync_read(132, 4, IDS))
         assert bus.request_at >= left + 0.2e-3 - 1e-9
     bus, _ = ant(Timing(return_delay_s=0.0, latency_timer_s=1e-3, write_read_gap_s=0.0))
-    heard = []
+    heard = [all(answer.ok for answer in bus.sync_read(120, 27, IDS))]
     for _ in range(50):
         bus.sync_write(116, 4, dict.fromkeys(IDS, bytes(4)))
-        heard.append(all(answer.ok for answer in bus.sync_read(132, 4, IDS)))
+        heard.append(all(answer.ok for answer in bus.sync_read(120, 27, IDS)))
     assert sum(heard) < 10
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
-from openant_tools.comms.bus import STATUS_OVERHEAD, Bus
+from openant_tools.comms.bus import Bus
+from openant_tools.comms.reply import STATUS_OVERHEAD
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE
 
 __all__ = ["GapTrial", "RateTrial", "bus_limit_hz", "measure_gap", "measure_rate"]

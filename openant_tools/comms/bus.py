@@ -10,23 +10,21 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 from weakref import WeakValueDictionary
 
 from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.clock import Clock
-from openant_tools.comms.faults import BrokenAnswer, Cause, Refused, missing_answers, refusal_words
-from openant_tools.comms.line import Line, PortGone
-from openant_tools.comms.protocol2 import Garbage, Instruction, JoinedStatus, Parser, Reason, Status
+from openant_tools.comms.faults import BrokenAnswer, Cause, NeverSilent, Refused, missing_answers, refusal_words
+from openant_tools.comms.line import BUFFER, Line
+from openant_tools.comms.pending import Pending
+from openant_tools.comms.protocol2 import Garbage, Instruction, Parser, Status
+from openant_tools.comms.reply import BITS_PER_BYTE, STATUS_OVERHEAD, Answer, Edge, Request, Sorting, whole_answers
 from openant_tools.comms.statistics import BusStatistics
+from openant_tools.comms.ticks import TickClock
 
 __all__ = ["Answer", "Bus", "Found", "Timing"]
 
-#: 8N1: a byte is ten bits on the wire.
-BITS_PER_BYTE = 10
-#: A status carries this many bytes besides its data.
-STATUS_OVERHEAD = 11
 #: How much longer each further try waits: a busy host may have been late, not the servo.
 RETRY_PATIENCE_S = 25e-3
 #: Model number (2) and firmware.
@@ -37,7 +35,11 @@ LONGEST_LATENCY_S = 16e-3
 FAST_READ_FIRMWARE = 45
 #: Whole plain reads in a row after which joined ones are tried again (a second at 100 Hz), and at most after failures.
 FAST_AGAIN, FAST_AGAIN_LONGEST = 100, 6400
-_MARK = p2.HEADER[:3]
+#: A line is quiet once nothing has come for so long, s; one that has not been for RESTLESS_S never falls silent.
+QUIET_S = 20e-3
+RESTLESS_S = 0.2
+#: The turn of one servo's answer to a broadcast ping that ROBOTIS' SDK allows for, s, and how many there are.
+PING_TURN_S, PING_TURNS = 3e-3, 253
 
 
 @dataclass(frozen=True)
@@ -60,86 +62,8 @@ class Timing:
     write_read_gap_s: float = 0.2e-3
 
 
-class Answer(NamedTuple):
-    """What one servo answered to one request.
-
-    Attributes:
-        data: its parameters; None where no valid answer came. A late answer's data are kept.
-        error: the raw error byte: alert bit and refusal code.
-        cause: None where a valid answer came in time.
-        rtt: s from the request's first byte to this answer's last, where it came.
-    """
-
-    id: int
-    data: bytes | None
-    error: int = 0
-    cause: Cause | None = None
-    rtt: float | None = None
-
-    @property
-    def ok(self) -> bool:
-        """A valid answer came in time, alert or not."""
-        return self.cause is None
-
-    @property
-    def alert(self) -> bool:
-        return bool(self.error & p2.ALERT_BIT)
-
-    @property
-    def refusal(self) -> int:
-        """The error code without the alert bit; 0 where the instruction was done."""
-        return self.error & ~p2.ALERT_BIT & 0xFF
-
-    @property
-    def word(self) -> str:
-        """As `err.J` of a run table wants it."""
-        if self.cause is not None:
-            return self.cause.value
-        return Cause.ALERT.value if self.alert else ""
-
-
-@dataclass(slots=True)
-class _Request:
-    """A request and what it takes, made once and sent often.
-
-    Attributes:
-        counts: bytes of data wanted from each of `ids`. sizes: bytes of each answer as it should be.
-        heads: each answer's first eight bytes. crcs: their CRC.
-        whole: s from the request's first byte to the last answer's last.
-        quiet: s without a byte that mean none will come.
-    """
-
-    packet: bytes
-    ids: tuple[int, ...]
-    counts: tuple[int, ...]
-    sizes: tuple[int, ...]
-    expected: int
-    heads: tuple[bytes, ...]
-    crcs: tuple[int, ...]
-    timing: Timing | None = None
-    baud: int = 0
-    wire: float = 0.0
-    whole: float = 0.0
-    quiet: float = 0.0
-
-    @classmethod
-    def of(cls, instruction: Instruction, ids: Sequence[int], counts: Sequence[int]) -> _Request:
-        heads = tuple(
-            p2.HEADER + struct.pack("<BHB", id, count + 4, p2.Inst.STATUS)
-            for id, count in zip(ids, counts, strict=True)
-        )
-        sizes = tuple(count + STATUS_OVERHEAD for count in counts)
-        crcs = tuple(p2.crc16(head) for head in heads)
-        return cls(instruction.encode(), tuple(ids), tuple(counts), sizes, sum(sizes), heads, crcs)
-
-    def fit(self, timing: Timing, baud: int) -> None:
-        """Compute the deadlines for this timing and rate."""
-        self.timing, self.baud = timing, baud
-        byte_s = BITS_PER_BYTE / baud
-        spare = timing.latency_timer_s + timing.margin_s
-        self.wire = byte_s * len(self.packet)
-        self.whole = self.wire + byte_s * self.expected + len(self.ids) * timing.return_delay_s + spare
-        self.quiet = byte_s * max(self.sizes) + timing.return_delay_s + spare
+#: What becomes of those whose part of a joined reply is missing: they are asked again.
+_BROKEN_OFF = (Cause.TIMEOUT, Cause.SHORT, Cause.CRC)
 
 
 @dataclass(frozen=True)
@@ -184,22 +108,28 @@ class Bus:
     def __post_init__(self) -> None:
         self.opened[id(self)] = self
         self._quiet_from = 0.0
-        #: something was lost: what it left on the line may still come
+        #: something was lost or came unasked: what lies on the line before the next question is looked at
         self._unsettled = False
-        self._last_request = b""
+        self._pending = Pending()
+        self._clocks: dict[int, TickClock] = {}
+        #: since when and with how many bytes the line has talked unasked without a pause, s
+        self._restless_from: float | None = None
+        self._restless_bytes = 0
         #: whole plain reads in a row wanted before joined ones are tried again; twice as many after each failure
         self._plain_left = self._plain_wanted = 0
-        self._known: dict[tuple[int, int, int, tuple[int, ...]], _Request] = {}
+        self._known: dict[tuple[int, int, int, tuple[int, ...]], Request] = {}
 
     # ---- one instruction each ------------------------------------------------------------------------------------
 
     def ping(self, id: int, *, insist: bool = False) -> Found | None:
         """The servo with this ID, or None where none answers; asked `retries` times more where we `insist`."""
+        again = False
         for attempt in range(1 + self.retries * insist):
             self.statistics.of(id).retries += attempt > 0
-            answer = self._exchange(p2.ping(id), [id], [PING_SIZE], attempt * RETRY_PATIENCE_S)[0]
+            answer = self._exchange(p2.ping(id), [id], [PING_SIZE], attempt * RETRY_PATIENCE_S, again)[0]
             if answer.ok:
                 return _found(answer)
+            again = answer.cause is not Cause.LATE
         return None
 
     def broadcast_ping(self, *, first_s: float = 0.2, quiet_s: float = 0.1) -> list[Found]:
@@ -211,17 +141,22 @@ class Bus:
 
         Raises:
             BrokenAnswer: answers collide: several servos share an ID.
+            NeverSilent: the line goes on talking when all have had their turn.
         """
-        started = self._begin(p2.ping(p2.BROADCAST).encode())
+        self._settle(self.clock.now())
+        started = self._send(p2.ping(p2.BROADCAST).encode())
         self._unsettled = True
         parser, found, garbage = Parser(), dict[int, Found](), 0
         deadline = started + first_s + self.wire_s(STATUS_OVERHEAD + PING_SIZE)
-        while self.clock.wait_readable(self.line, deadline):
-            for item in parser.feed(self._readable()):
-                if isinstance(item, Status) and len(item.params) >= 3:
+        give_up = deadline + PING_TURNS * PING_TURN_S + quiet_s
+        while self.clock.wait_readable(self.line, min(deadline, give_up)):
+            for item in parser.feed(self.line.read()):
+                if isinstance(item, Status) and len(item.params) == PING_SIZE and item.id not in found:
                     found[item.id] = _found(Answer(item.id, item.params, item.error))
                 elif isinstance(item, Garbage):
                     garbage += len(item.data)
+            if self.clock.now() > give_up:
+                raise self.never_silent(garbage, self.clock.now() - started)
             deadline = max(deadline, self.clock.now() + quiet_s)
         garbage += sum(len(item.data) for item in parser.flush() if isinstance(item, Garbage))
         self.statistics.noise_bytes += garbage
@@ -288,33 +223,42 @@ class Bus:
         self._send(packet)
         return self._quiet_from
 
-    def sync_read(self, address: int, count: int, ids: Sequence[int]) -> list[Answer]:
-        """The same registers of several servos, in the order of `ids`. Never raises for a silent servo."""
+    def sync_read(self, address: int, count: int, ids: Sequence[int], *, again: bool = False) -> list[Answer]:
+        """The same registers of several servos, in the order of `ids`. Never raises for a silent servo.
+
+        An answer that is late is not taken for one to this question: where the servos' ticks are among the registers,
+        by them; else a question waits until none can come any more, at most `pending.LATEST_S`. `again` waves that:
+        the question is the same as the one before, and the answer to either will do.
+        """
         ids = tuple(ids)
         able = bool(self.fast) and len(ids) > 1 and self.fast.issuperset(ids)
         if able and not self._plain_left:
-            answers = self._fast_sync_read(address, count, ids)
-            rest = [id for id, answer in zip(ids, answers, strict=True) if answer is None]
-            if not rest:
-                return [answer for answer in answers if answer is not None]
-            # A joined reply ends at the first silent servo: ask those behind it one by one, and not joined for a while.
-            self.statistics.fast_read_fallbacks += 1
-            self._plain_wanted = min(2 * self._plain_wanted or FAST_AGAIN, FAST_AGAIN_LONGEST)
-            self._plain_left = self._plain_wanted
-            others = iter(self._exchange(p2.sync_read(address, count, rest), rest, [count] * len(rest)))
-            return [answer or next(others) for answer in answers]
-        plain = self._transact(self._request(p2.Inst.SYNC_READ, address, count, ids))
+            request = self._request(p2.Inst.FAST_SYNC_READ, address, count, ids)
+            answers = self._transact(request, again=again)
+            rest = [answer.id for answer in answers if answer.cause in _BROKEN_OFF]
+            if rest:
+                # A joined reply ends at the first silent servo: ask those behind it alone, and not joined for a while.
+                self.statistics.fast_read_fallbacks += 1
+                self._plain_wanted = min(2 * self._plain_wanted or FAST_AGAIN, FAST_AGAIN_LONGEST)
+                self._plain_left = self._plain_wanted
+                plain = self._transact(self._request(p2.Inst.SYNC_READ, address, count, tuple(rest)))
+                by_id = {answer.id: answer for answer in plain}
+                answers = [by_id.get(answer.id, answer) for answer in answers]
+            return answers
+        answers = self._transact(self._request(p2.Inst.SYNC_READ, address, count, ids), again=again)
         if able:
-            self._plain_left = self._plain_left - 1 if all(answer.ok for answer in plain) else self._plain_wanted
+            self._plain_left = self._plain_left - 1 if all(answer.ok for answer in answers) else self._plain_wanted
             self.statistics.fast_read_returns += self._plain_left == 0
-        return plain
+        return answers
 
-    def _request(self, code: p2.Inst, address: int, count: int, ids: tuple[int, ...]) -> _Request:
+    def _request(self, code: p2.Inst, address: int, count: int, ids: tuple[int, ...]) -> Request:
         key = (code, address, count, ids)
         request = self._known.get(key)
         if request is None:
             make = p2.sync_read if code == p2.Inst.SYNC_READ else p2.fast_sync_read
-            request = self._known[key] = _Request.of(make(address, count, ids), ids, (count,) * len(ids))
+            request = self._known[key] = Request.of(make(address, count, ids), ids, (count,) * len(ids), address)
+            for id in ids:
+                self._clocks.setdefault(id, TickClock())
         return request
 
     def bulk_read(self, items: Sequence[tuple[int, int, int]]) -> list[Answer]:
@@ -392,8 +336,6 @@ class Bus:
             gap = self._quiet_from + self.timing.write_read_gap_s
             if self.clock.now() < gap:
                 self.clock.sleep_until(gap)
-        if self._unsettled:
-            self._count_stale(self.line.read())
         started = self.request_at = self.clock.now()
         self.line.write(packet)
         # Counted from when the system has the bytes: whoever was held up before that must not cut the gap short.
@@ -401,233 +343,191 @@ class Bus:
         self._quiet_from = left + len(packet) * BITS_PER_BYTE / self.line.baud
         return started
 
-    def _readable(self) -> bytes:
-        """The bytes that the line is said to have. A terminal that has hung up is readable for ever, and empty."""
-        data = self.line.read()
-        if not data:
-            raise PortGone(self.line.path, "it hung up")
-        return data
+    @property
+    def restless(self) -> bool:
+        """Whether the line has been talking unasked for RESTLESS_S and more, without a pause."""
+        return self._restless_from is not None and self.clock.now() - self._restless_from >= RESTLESS_S
 
-    def _begin(self, packet: bytes) -> float:
-        """Send a request that is answered; returns when its first byte left.
+    def never_silent(self, count: int = 0, seconds: float = 0.0) -> NeverSilent:
+        """The error that says so: of so many bytes in so many seconds, or of what was noticed last."""
+        if not seconds and self._restless_from is not None:
+            count, seconds = self._restless_bytes, self.clock.now() - self._restless_from
+        return NeverSilent(self.line.path, self.line.baud, count, seconds)
 
-        Answers carry no number: one that comes too late could pass for the answer to the next request. So after a
-        loss another question waits until the line has been quiet; the same question again may take either answer.
-        """
-        if self._unsettled and packet != self._last_request:
-            quiet = self.timing.latency_timer_s + self.timing.margin_s
-            while self.clock.wait_readable(self.line, self.clock.now() + quiet):
-                self._count_stale(self._readable())
-            self._unsettled = False
-        self._last_request = packet
-        return self._send(packet)
+    def _settle(self, until: float) -> None:
+        """Take what comes until then (s), answers to earlier questions or noise, and look whether the line falls silent."""
+        began = heard_at = self.clock.now()
+        parser, noise, lain = Parser(), 0, 0
+        while self.clock.wait_readable(self.line, until):
+            data = self.line.read()
+            now = self.clock.now()
+            stale = self._count_stale(parser.feed(data))
+            if stale:
+                noise, heard_at = noise + stale, now
+            lain += len(data) if now > until else 0
+            if lain > BUFFER or not data:
+                break  # no pause to wait for
+        noise += self._count_stale(parser.flush())
+        if noise and self.clock.now() - heard_at < QUIET_S:
+            self._restless_from = began if self._restless_from is None else self._restless_from
+            self._restless_bytes += noise
+        else:
+            self._restless_from, self._restless_bytes = None, 0
 
-    def _count_stale(self, data: bytes) -> None:
-        """Bytes nobody waits for any more: answers too late even for the grace, or noise."""
-        parser = Parser()
-        for item in parser.feed(data) + parser.flush():
+    def _count_stale(self, items: Iterable[object]) -> int:
+        """What nobody waits for any more: answers too late even for the grace, and noise, of which the bytes."""
+        noise = 0
+        for item in items:
             if isinstance(item, Garbage):
-                self.statistics.noise_bytes += len(item.data)
+                noise += len(item.data)
             elif isinstance(item, Status):
-                servo = self.statistics.of(item.id)
-                servo.lost[Cause.LATE] = servo.lost.get(Cause.LATE, 0) + 1
-                if servo.lost.get(Cause.TIMEOUT, 0):
-                    servo.lost[Cause.TIMEOUT] -= 1
+                self._count_late(item.id)
+        self.statistics.noise_bytes += noise
+        return noise
+
+    def _count_late(self, id: int) -> None:
+        """An answer has come after it had been given up: it was late, not lost."""
+        servo = self.statistics.of(id)
+        servo.lost[Cause.LATE] = servo.lost.get(Cause.LATE, 0) + 1
+        if servo.lost.get(Cause.TIMEOUT, 0):
+            servo.lost[Cause.TIMEOUT] -= 1
+        self._pending.distrust(self.clock.now())
 
     def _exchange(
-        self, instruction: Instruction, ids: Sequence[int], counts: Sequence[int], extra_s: float = 0.0
-    ) -> list[Answer]:
+        self, instruction: Instruction, ids: Sequence[int], counts: Sequence[int], extra_s: float = 0.0,
+        again: bool = False,
+    ) -> list[Answer]:  # fmt: skip
         """Send a request and collect one answer, of so many bytes of data, from each of `ids`."""
-        return self._transact(_Request.of(instruction, ids, counts), extra_s)
+        return self._transact(Request.of(instruction, ids, counts), extra_s, again)
 
-    def _transact(self, request: _Request, extra_s: float = 0.0) -> list[Answer]:
-        if request.timing is not self.timing or request.baud != self.line.baud:
-            request.fit(self.timing, self.line.baud)
-        started = self._begin(request.packet)
-        data, edges = self._collect(request, started, extra_s)
-        answers = self._whole_answers(request, data, edges, started)
-        if answers is None:
-            answers = self._sort_out(data, request, edges, started)
-            for answer in answers:
-                self.statistics.count(answer.id, answer.cause, answer.rtt, answer.alert)
-            self._unsettled = not all(answer.ok for answer in answers)
-            if self._unsettled:
-                self.failed = request.packet, data
-        if data:
-            self._quiet_from = edges[-1][1] - self.timing.write_read_gap_s
+    def _transact(self, request: Request, extra_s: float = 0.0, again: bool = False) -> list[Answer]:
+        """Send a request and collect its answers; `again` where the one before was the same, and its answer will do."""
+        if request.fitted_to != (self.timing, self.line.baud):
+            self._fit(request)
+        plan = None if again else self._pending.plan(request, self.clock.now(), self._told)
+        if plan is not None or self._unsettled:
+            self._settle(self.clock.now() if plan is None else plan.wait_until)
+        started = self._send(request.packet)
+        listen_on = plan is not None and plan.listen_on
+        doubtful = frozenset[int]() if plan is None else plan.doubtful
+        answers = self._collect(request, started, extra_s, listen_on, doubtful)
         rtt = answers[-1].rtt
         if rtt is not None:
             self.statistics.arrivals.append((started + rtt, rtt))
         return answers
 
+    def _told(self, id: int) -> bool:
+        """Whether a servo's own clock tells which question its answer belongs to."""
+        clock = self._clocks.get(id)
+        return clock is not None and clock.usable(self.clock.now())
+
+    def _fit(self, request: Request) -> None:
+        """Compute the deadlines for this timing and rate."""
+        timing = self.timing
+        request.fitted_to = timing, self.line.baud
+        byte_s = BITS_PER_BYTE / self.line.baud
+        spare = timing.latency_timer_s + timing.margin_s
+        request.wire = byte_s * len(request.packet)
+        request.whole = request.wire + byte_s * request.expected + len(request.ids) * timing.return_delay_s + spare
+        request.quiet = byte_s * (max(request.counts) + STATUS_OVERHEAD) + timing.return_delay_s + spare
+
     def _collect(
-        self, request: _Request, started: float, extra_s: float
-    ) -> tuple[bytes, list[tuple[int, float, bool]]]:
-        """All bytes that come for a request, and (bytes so far, when, whether in time) of each portion."""
-        data, edges = b"", list[tuple[int, float, bool]]()
-        ids, quiet = request.ids, request.quiet + extra_s
-        deadline, sent = started + request.whole + extra_s, started + request.wire
-        # A refusal is shorter than an answer and stuffing makes it longer: the length field tells, once it is there.
-        known, at_known, expected = 0, 0, request.expected
-        in_time, line, before = True, self.line, self.line.received
-        while len(data) < expected:
-            if not self.clock.wait_readable(line, deadline):
+        self, request: Request, started: float, extra_s: float, listen_on: bool, doubtful: frozenset[int]
+    ) -> list[Answer]:
+        """The answers to a request that has been sent, counted."""
+        line, clock = self.line, self.clock
+        data, edges = b"", list[Edge]()
+        sorting: Sorting | None = None
+        sorted_to = 0
+        quiet, deadline, sent = request.quiet + extra_s, started + request.whole + extra_s, started + request.wire
+        in_time, before, lain = True, line.received, 0
+        while True:
+            if not clock.wait_readable(line, deadline):
                 if not in_time or self.timing.grace_s <= 0:
                     break
                 in_time, deadline = False, deadline + self.timing.grace_s
                 continue
-            data += self._readable()
-            for total, at in self.clock.arrivals(line):
-                edges.append((total - before, at, in_time and self.clock.in_time(at, deadline)))
-            if len(data) == expected:
+            portion = line.read()
+            if not portion:
+                if clock.now() > deadline:
+                    break
+                continue  # somebody else on this port was quicker
+            data += portion
+            for total, at in clock.arrivals(line):
+                edges.append((total - before, at, in_time and clock.in_time(at, deadline)))
+            if clock.now() > deadline:
+                # What lies there counts: this process was late. But a line that never falls silent must end, too.
+                lain += len(portion)
+                if lain > BUFFER:
+                    break
+            if sorting is None:
+                if len(data) < request.expected and data.startswith(request.heads[0][: len(data)]):
+                    if in_time:
+                        deadline = min(deadline, max(edges[-1][1], sent) + quiet)
+                    continue
+                if not listen_on and not doubtful:
+                    answers = whole_answers(request, data, edges, started, self._clocks)
+                    if answers is not None:
+                        return self._whole(request, answers, edges, started)
+                sorting = Sorting(request, started, self._clocks, doubtful)
+            sorting.feed(data[sorted_to:], edges)
+            sorted_to = len(data)
+            if sorting.complete and not listen_on:
                 break
-            while (
-                known < len(ids) and len(data) >= at_known + 7 and data.startswith(request.heads[known][:5], at_known)
-            ):
-                actual = 7 + (data[at_known + 5] | data[at_known + 6] << 8)
-                expected += actual - request.sizes[known]
-                known, at_known = known + 1, at_known + actual
-            if len(data) < expected and in_time:
+            if in_time:
                 deadline = min(deadline, max(edges[-1][1], sent) + quiet)
-        return data, edges
+        if sorting is None:
+            sorting = Sorting(request, started, self._clocks, doubtful)
+            sorting.feed(data, edges)
+        return self._sorted(request, sorting.answers(edges), sorting, data, edges, started)
 
-    def _whole_answers(
-        self, request: _Request, data: bytes, edges: list[tuple[int, float, bool]], started: float
-    ) -> list[Answer] | None:
-        """The usual case: every answer where it should be, none stuffed, none late. None where anything is not."""
-        ids = request.ids
-        if len(data) != request.expected or not edges[-1][2] or data.count(_MARK) != len(ids):
-            return None
-        at, alerts = 0, 0
+    def _whole(self, request: Request, answers: list[Answer], edges: Sequence[Edge], started: float) -> list[Answer]:
+        """Take in that all answered as they should."""
         at_once = len(edges) == 1
         rtt = edges[0][1] - started
-        answers: list[Answer] = []
-        for id, size, head, crc in zip(ids, request.sizes, request.heads, request.crcs, strict=True):
-            end = at + size
-            part = data[at + 8 : end - 2]
-            if not data.startswith(head, at) or p2.crc16(part, crc) != data[end - 2] | data[end - 1] << 8:
-                return None
-            error = part[0]
-            alerts |= error
-            if not at_once:
-                rtt = _when(end, edges)[0] - started
-            answers.append(Answer(id, part[1:], error, None, rtt))
-            at = end
-        if alerts & p2.ALERT_BIT:
-            return None  # counted one by one
-        self.statistics.count_whole(ids, rtt if at_once else [answer[4] for answer in answers])  # type: ignore[misc]
+        self.statistics.count_whole(request.ids, rtt if at_once else [answer[4] for answer in answers])  # type: ignore[misc]
+        self._pending.answered(request, started)
         self._unsettled = False
+        self._restless_from, self._restless_bytes = None, 0
+        self._quiet_from = edges[-1][1] - self.timing.write_read_gap_s
         return answers
 
-    def _sort_out(
-        self, data: bytes, request: _Request, edges: list[tuple[int, float, bool]], started: float
-    ) -> list[Answer]:
-        """Answers from a stream in which something is missing, broken, stuffed or late."""
-        parser, ids = Parser(), request.ids
-        got: dict[int, Answer] = {}
-        broken: list[tuple[int, Cause]] = []  # (position in `ids` behind which it stands, cause)
-        position, at = 0, 0
-        for item in parser.feed(data) + parser.flush():
-            if isinstance(item, Status):
-                at += len(item.encode())
-                # An answer of another length was meant for an earlier question; a refusal is empty.
-                wanted = request.counts[ids.index(item.id)] if item.id in ids else None
-                fits = len(item.params) == wanted or (item.code and not item.params)
-                if wanted is not None and item.id not in got and fits:
-                    when, in_time = _when(at, edges)
-                    cause = None if in_time else Cause.LATE
-                    got[item.id] = Answer(item.id, item.params, item.error, cause, when - started)
-                    position = ids.index(item.id) + 1
-                else:
-                    self.statistics.noise_bytes += len(item.encode())
-            elif isinstance(item, Garbage):
-                at += len(item.data)
-                self.statistics.noise_bytes += len(item.data)
-                broken.append((position, Cause.SHORT if item.reason is Reason.SHORT else Cause.CRC))
-            elif isinstance(item, JoinedStatus):
-                at += len(item.raw)
-            else:
-                at += len(item.encode())  # our own request, echoed by an adapter without echo suppression
-        answers: list[Answer] = []
-        for k, id in enumerate(ids):
-            answer = got.get(id)
-            if answer is None:
-                # Garbage belongs to the first silent servo behind whose predecessor it stands.
-                mine = next((entry for entry in broken if entry[0] <= k), None)
-                if mine is not None:
-                    broken.remove(mine)
-                answer = Answer(id, None, 0, Cause.TIMEOUT if mine is None else mine[1])
-            answers.append(answer)
-        return answers
-
-    def _fast_sync_read(self, address: int, count: int, ids: tuple[int, ...]) -> Sequence[Answer | None]:
-        """The verified part of a joined reply; None for those it does not reach."""
-        request = self._request(p2.Inst.FAST_SYNC_READ, address, count, ids)
-        if request.timing is not self.timing or request.baud != self.line.baud:
-            request.fit(self.timing, self.line.baud)
-        started = self._begin(request.packet)
-        deadline, sent = started + request.whole, started + request.wire
-        expected, data = 8 + len(ids) * (count + 4), b""
-        edges: list[tuple[int, float, bool]] = []
-        before = self.line.received
-        while len(data) < expected and self.clock.wait_readable(self.line, deadline):
-            data += self._readable()
-            edges += [(total - before, at, True) for total, at in self.clock.arrivals(self.line)]
-            deadline = min(deadline, max(edges[-1][1], sent) + request.quiet)
+    def _sorted(
+        self, request: Request, answers: list[Answer], sorting: Sorting, data: bytes, edges: Sequence[Edge], started: float
+    ) -> list[Answer]:  # fmt: skip
+        """Take in what was sorted out: count it, and remember what may still come."""
+        statistics = self.statistics
+        statistics.noise_bytes += sorting.noise_bytes
+        statistics.echoes += sorting.echoed
+        broken_off = False
+        for answer in answers:
+            # Of a joined reply that broke off, those behind the first silent one are asked again.
+            if not (broken_off and answer.cause in _BROKEN_OFF):
+                statistics.count(answer.id, answer.cause, answer.rtt, answer.alert)
+            broken_off = broken_off or (request.joined and answer.cause in _BROKEN_OFF)
+        for id in sorting.surplus:
+            self._count_late(id)
+        self._pending.note(request, answers, started, surplus=bool(sorting.surplus))
+        self._unsettled = bool(sorting.noise_bytes or sorting.surplus) or not all(answer.ok for answer in answers)
+        if not all(answer.ok for answer in answers):
+            self.failed = request.packet, data
         if data:
             self._quiet_from = edges[-1][1] - self.timing.write_read_gap_s
-        whole = self._whole_joined(request, data, edges, started)
-        if whole is not None:
-            return whole
-        at = max(data.find(p2.HEADER), 0)
-        parts = p2.split_joined(data[at:], [(id, count) for id in ids])
-        answers: list[Answer | None] = [None] * len(ids)
-        for k, part in enumerate(parts):
-            when, _ = _when(at + 8 + (k + 1) * (count + 4), edges)
-            answers[k] = Answer(part.id, part.params, part.error, None, when - started)
-        for answer in answers:
-            if answer is not None:
-                self.statistics.count(answer.id, None, answer.rtt, answer.alert)
-        if len(parts) < len(ids):
-            broken = len(data) - at - 8 - len(parts) * (count + 4)
-            cause = Cause.TIMEOUT if broken <= 0 else Cause.SHORT if len(data) < expected else Cause.CRC
-            self.statistics.count(ids[len(parts)], cause, None, False)
-            self._unsettled = True
-            self.failed = request.packet, data
-        return answers
-
-    def _whole_joined(
-        self, request: _Request, data: bytes, edges: list[tuple[int, float, bool]], started: float
-    ) -> list[Answer] | None:
-        """The usual case of a joined reply: all there, the last CRC, which covers the earlier ones, right."""
-        ids, count = request.ids, request.counts[0]
-        step = count + 4
-        if len(data) != 8 + len(ids) * step or len(edges) != 1:
-            return None
-        head = _joined_head(len(ids), count)
-        if not data.startswith(head) or p2.crc16(data[:-2]) != data[-2] | data[-1] << 8:
-            return None
-        at, rtt = len(head), edges[0][1] - started
-        answers: list[Answer] = []
-        for id in ids:
-            if data[at + 1] != id or data[at]:
-                return None  # out of turn, refused or with an alert: taken apart and counted one by one
-            answers.append(Answer(id, data[at + 2 : at + step - 2], 0, None, rtt))
-            at += step
-        self.statistics.count_whole(ids, rtt)
-        self.statistics.arrivals.append((edges[0][1], rtt))
-        self._unsettled = False
         return answers
 
     def _insist(self, instruction: Instruction, id: int, count: int, what: str) -> Answer:
         """One servo's answer, asked for again up to `retries` times; raises where it says no or nothing."""
+        again = False
         for attempt in range(1 + self.retries):
             if attempt:
                 self.statistics.of(id).retries += 1
-            answer = self._exchange(instruction, [id], [count], attempt * RETRY_PATIENCE_S)[0]
+            answer = self._exchange(instruction, [id], [count], attempt * RETRY_PATIENCE_S, again)[0]
             if answer.data is not None:
                 break
+            again = answer.cause is not Cause.LATE
         else:
+            if self.restless:
+                raise self.never_silent()
             self.require([answer])
         self._check(answer, what)
         return answer
@@ -650,20 +550,7 @@ class Bus:
             )
 
 
-@cache
-def _joined_head(servos: int, count: int) -> bytes:
-    return p2.HEADER + struct.pack("<BHB", p2.BROADCAST, 1 + servos * (count + 4), p2.Inst.STATUS)
-
-
 def _found(answer: Answer) -> Found:
     assert answer.data is not None
     model, firmware = struct.unpack("<HB", answer.data[:3])
     return Found(answer.id, model, firmware, answer.alert)
-
-
-def _when(count: int, edges: Sequence[tuple[int, float, bool]]) -> tuple[float, bool]:
-    """When the byte number `count` had arrived, and whether in time."""
-    for total, at, in_time in edges:
-        if total >= count:
-            return at, in_time
-    return edges[-1][1], edges[-1][2]

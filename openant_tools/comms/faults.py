@@ -8,7 +8,9 @@ from enum import StrEnum
 from openant_tools.comms.protocol2 import Error
 from openant_tools.errors import HardwareFault
 
-__all__ = ["REFUSALS", "BrokenAnswer", "Cause", "NoAnswer", "Refused", "missing_answers", "refusal_words"]
+__all__ = [
+    "REFUSALS", "BrokenAnswer", "Cause", "NeverSilent", "NoAnswer", "Refused", "missing_answers", "refusal_words",
+]  # fmt: skip
 
 
 class Cause(StrEnum):
@@ -44,6 +46,18 @@ class NoAnswer(_Unheard):
 
 class BrokenAnswer(_Unheard):
     """Bytes came, but no answer could be read from them."""
+
+
+class NeverSilent(BrokenAnswer):
+    """The line talks without a pause: nobody's answer can be heard on it."""
+
+    def __init__(self, path: str, baud: int, count: int, seconds: float) -> None:
+        super().__init__(
+            f"the line never falls silent: {count} bytes that are no answer in {seconds:.1f} s at {baud} baud",
+            where=path,
+            remedy="something talks unasked: another program on this port, a wrong adapter, or an open wire that picks up "
+            "noise; unplug the servos' cable: where it goes on, it is the adapter or this computer",
+        )
 
 
 class Refused(HardwareFault):

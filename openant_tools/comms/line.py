@@ -12,11 +12,12 @@ import serial
 
 from openant_tools.errors import HardwareFault
 
-__all__ = ["Line", "PortGone", "SerialLine"]
+__all__ = ["BUFFER", "Line", "PortGone", "SerialLine"]
 
-_CHUNK = 4096
-#: A full buffer of an adapter drains within this at the slowest baud rate a servo has (4096 bytes at 9600).
-WRITE_TIMEOUT_S = 5.0
+#: What the system keeps of a line that nobody reads, bytes: more can only come meanwhile.
+BUFFER = 4096
+#: How long a full buffer of an adapter may take, as a multiple of what it takes on the wire, and at least, s.
+WRITE_PATIENCE, SHORTEST_WRITE_S = 1.2, 0.1
 
 
 class PortGone(HardwareFault):
@@ -79,8 +80,9 @@ class SerialLine:
             try:
                 sent = os.write(self._fd, rest)
             except BlockingIOError:
-                give_up = give_up or time.monotonic() + WRITE_TIMEOUT_S
-                select.select([], [self._fd], [], WRITE_TIMEOUT_S)
+                patience = max(SHORTEST_WRITE_S, WRITE_PATIENCE * 10 * BUFFER / self.baud)
+                give_up = give_up or time.monotonic() + patience
+                select.select([], [self._fd], [], patience)
                 if time.monotonic() > give_up:
                     raise PortGone(self.path, "it takes no more bytes") from None
                 continue
@@ -92,15 +94,23 @@ class SerialLine:
     def read(self) -> bytes:
         """What has arrived, perhaps nothing."""
         try:
-            data = os.read(self._fd, _CHUNK)
+            data = os.read(self._fd, BUFFER)
         except BlockingIOError:
             return b""
         except OSError as error:
             raise PortGone(self.path, error.strerror or "") from None
-        if not data and self.path.startswith("socket://"):
-            raise PortGone(self.path, "the other end closed")
+        if not data and self._hung_up():
+            raise PortGone(self.path, "it hung up")
         self.received += len(data)
         return data
+
+    def _hung_up(self) -> bool:
+        """Whether there is nothing to read because nobody is there: else another reader of this port took it."""
+        if self.path.startswith("socket://"):
+            return True
+        poll = select.poll()
+        poll.register(self._fd, select.POLLIN)
+        return any(event & (select.POLLHUP | select.POLLERR | select.POLLNVAL) for _, event in poll.poll(0))
 
     def set_baud(self, baud: int) -> None:
         try:
@@ -119,7 +129,7 @@ class SerialLine:
 
 
 def _open(path: str, baud: int) -> serial.SerialBase:
-    options = {"timeout": 0, "write_timeout": WRITE_TIMEOUT_S}
+    options = {"timeout": 0, "write_timeout": 0}
     if "://" not in path:
         options["exclusive"] = True
     try:

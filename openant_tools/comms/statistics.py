@@ -96,6 +96,8 @@ class BusStatistics:
     """All servos of a bus, and bytes that belonged to none."""
 
     noise_bytes: int = 0
+    #: requests that came back to the host beside their answers
+    echoes: int = 0
     #: joined reads that ended early, and returns to them after a while of whole plain ones
     fast_read_fallbacks: int = 0
     fast_read_returns: int = 0
@@ -151,6 +153,7 @@ class BusStatistics:
         return {
             "comb_period_s": comb.period_s if comb else None,
             "noise_bytes": self.noise_bytes,
+            "echoes": self.echoes,
             "fast_read_fallbacks": self.fast_read_fallbacks,
             "fast_read_returns": self.fast_read_returns,
             "servos": [
