@@ -21,7 +21,7 @@ from openant_tools.comms.bus import Bus, Timing
 from openant_tools.comms.faults import BrokenAnswer, NoAnswer, Refused
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
-from faulty_line import HOLE, IDS, WRITABLE, FaultyLine, register_bytes  # noqa: E402
+from faulty_line import HOLE, IDS, WRITABLE, FaultyLine, register_bytes
 
 KINDS = ("late", "doubled", "lost", "stolen", "flipped", "swapped", "noise", "echoed")
 #: A tick is a millisecond, and the servo's clock drifts: what was read this long before counts as now, s.

@@ -155,7 +155,9 @@ class FaultyLine:
             at += ANSWER_S + len(data) * 10 / self.baud
             t = at + self._chance.uniform(0.0, self.latest_s) if self._happens("late") else at
             if self._happens("doubled"):
-                self._put(data, t + self._chance.choice((0.0, 0.5e-3, 2e-3, 10e-3, self._chance.uniform(0, self.latest_s))))
+                self._put(
+                    data, t + self._chance.choice((0.0, 0.5e-3, 2e-3, 10e-3, self._chance.uniform(0, self.latest_s)))
+                )
             if self._happens("lost"):
                 continue
             if self._happens("stolen"):

@@ -19,7 +19,16 @@ from openant_tools.comms.faults import BrokenAnswer, Cause, NeverSilent, Refused
 from openant_tools.comms.line import BUFFER, Line
 from openant_tools.comms.pending import Pending
 from openant_tools.comms.protocol2 import Garbage, Instruction, Parser, Status
-from openant_tools.comms.reply import BITS_PER_BYTE, STATUS_OVERHEAD, Answer, Edge, Request, Sorting, whole_answers
+from openant_tools.comms.reply import (
+    BITS_PER_BYTE,
+    STATUS_OVERHEAD,
+    Answer,
+    Edge,
+    Plan,
+    Request,
+    Sorting,
+    whole_answers,
+)
 from openant_tools.comms.statistics import BusStatistics
 from openant_tools.comms.ticks import TickClock
 
@@ -62,6 +71,7 @@ class Timing:
     write_read_gap_s: float = 0.2e-3
 
 
+NOTHING_PENDING = Plan()
 #: What becomes of those whose part of a joined reply is missing: they are asked again.
 _BROKEN_OFF = (Cause.TIMEOUT, Cause.SHORT, Cause.CRC)
 
@@ -404,13 +414,11 @@ class Bus:
         """Send a request and collect its answers; `again` where the one before was the same, and its answer will do."""
         if request.fitted_to != (self.timing, self.line.baud):
             self._fit(request)
-        plan = None if again else self._pending.plan(request, self.clock.now(), self._told)
-        if plan is not None or self._unsettled:
-            self._settle(self.clock.now() if plan is None else plan.wait_until)
+        plan = (None if again else self._pending.plan(request, self.clock.now(), self._told)) or NOTHING_PENDING
+        if plan.wait_until > 0 or self._unsettled:
+            self._settle(max(plan.wait_until, self.clock.now()))
         started = self._send(request.packet)
-        listen_on = plan is not None and plan.listen_on
-        doubtful = frozenset[int]() if plan is None else plan.doubtful
-        answers = self._collect(request, started, extra_s, listen_on, doubtful)
+        answers = self._collect(request, started, extra_s, plan)
         rtt = answers[-1].rtt
         if rtt is not None:
             self.statistics.arrivals.append((started + rtt, rtt))
@@ -431,9 +439,7 @@ class Bus:
         request.whole = request.wire + byte_s * request.expected + len(request.ids) * timing.return_delay_s + spare
         request.quiet = byte_s * (max(request.counts) + STATUS_OVERHEAD) + timing.return_delay_s + spare
 
-    def _collect(
-        self, request: Request, started: float, extra_s: float, listen_on: bool, doubtful: frozenset[int]
-    ) -> list[Answer]:
+    def _collect(self, request: Request, started: float, extra_s: float, plan: Plan) -> list[Answer]:
         """The answers to a request that has been sent, counted."""
         line, clock = self.line, self.clock
         data, edges = b"", list[Edge]()
@@ -465,19 +471,19 @@ class Bus:
                     if in_time:
                         deadline = min(deadline, max(edges[-1][1], sent) + quiet)
                     continue
-                if not listen_on and not doubtful:
+                if not plan.listen_on and not plan.doubtful:
                     answers = whole_answers(request, data, edges, started, self._clocks)
                     if answers is not None:
                         return self._whole(request, answers, edges, started)
-                sorting = Sorting(request, started, self._clocks, doubtful)
+                sorting = Sorting(request, started, self._clocks, plan)
             sorting.feed(data[sorted_to:], edges)
             sorted_to = len(data)
-            if sorting.complete and not listen_on:
+            if sorting.complete and not plan.listen_on:
                 break
             if in_time:
                 deadline = min(deadline, max(edges[-1][1], sent) + quiet)
         if sorting is None:
-            sorting = Sorting(request, started, self._clocks, doubtful)
+            sorting = Sorting(request, started, self._clocks, plan)
             sorting.feed(data, edges)
         return self._sorted(request, sorting.answers(edges), sorting, data, edges, started)
 

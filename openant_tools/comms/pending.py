@@ -8,12 +8,11 @@ the next question of the same servo and length. So every question is remembered 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from openant_tools.comms.faults import Cause
-from openant_tools.comms.reply import Answer, Request, Shape
+from openant_tools.comms.reply import Answer, Plan, Request, Shape
 
-__all__ = ["LATEST_S", "Pending", "Plan"]
+__all__ = ["LATEST_S", "Pending"]
 
 #: How late an answer may be, beyond the time that it takes, and is still not taken for another's, s.
 LATEST_S = 0.1
@@ -21,21 +20,6 @@ LATEST_S = 0.1
 DISTRUST_S = 60.0
 #: A servo that has not been heard for so long, s, is waited for by nobody.
 HEARD_S = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """What has to be done so that the answers to a question are its own.
-
-    Attributes:
-        wait_until: s, before it is asked.
-        listen_on: whether to listen for a second answer, of which one would be an earlier question's.
-        doubtful: ids of which an answer to an earlier question may come nevertheless.
-    """
-
-    wait_until: float
-    listen_on: bool = False
-    doubtful: frozenset[int] = frozenset()
 
 
 class Pending:
@@ -58,12 +42,14 @@ class Pending:
         """
         if request.tick_at is not None and now >= self._owed_until:
             return None
-        wait, listen, doubtful = now, False, set[int]()
+        wait, listen, doubtful, refusing = now, False, set[int](), dict[int, float]()
         for id, shape in zip(request.ids, request.shapes, strict=True):
             owed = self._owed.get(id)
             if owed is not None and now < self._owed_until:
-                # A refusal has no data: only of a question that could not be refused does the length tell.
-                until = max(owed.values()) if request.alone else owed.get(shape, 0.0)
+                # A refusal has no data, so that its length does not tell to which question it is.
+                latest = max(owed.values())
+                until = latest if request.alone else owed.get(shape, 0.0)
+                refusing[id] = latest
                 if until > now:
                     by_tick = request.tick_at is not None and told(id)
                     if request.alone or (not by_tick and now - self._heard.get(id, now) < HEARD_S):
@@ -76,7 +62,8 @@ class Pending:
                     wait = max(wait, before[1])
                 elif before[0] != request.packet:
                     listen = True
-        return Plan(wait, listen, frozenset(doubtful)) if wait > now or listen or doubtful else None
+        may_refuse = frozenset(id for id, until in refusing.items() if until > wait)
+        return Plan(wait, listen, frozenset(doubtful), may_refuse) if wait > now or listen or may_refuse else None
 
     def answered(self, request: Request, started: float) -> None:
         """All of them, each once."""
@@ -89,12 +76,11 @@ class Pending:
         """What became of a question; `surplus` where answers came that were none to it."""
         until = started + request.whole + LATEST_S
         for answer, shape in zip(answers, request.shapes, strict=True):
-            if answer.data is not None:
+            if answer.data is not None or answer.cause is Cause.LATE:
                 self._heard[answer.id] = started
+            if answer.data is not None:
                 self._asked[answer.id, shape] = request.packet, until
-            else:
-                if answer.cause is Cause.LATE:
-                    self._heard[answer.id] = started  # something came of it, to whichever question
+            if answer.data is None or answer.refusal:
                 self._heard.setdefault(answer.id, started)
                 self._owed.setdefault(answer.id, {})[shape] = until
                 self._owed_until = max(self._owed_until, until)

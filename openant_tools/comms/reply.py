@@ -12,7 +12,7 @@ from openant_tools.comms.faults import Cause
 from openant_tools.comms.protocol2 import Garbage, Instruction, JoinedStatus, Parser, Reason, Status
 from openant_tools.comms.ticks import TICK_ADDRESS, TICK_SIZE, TickClock
 
-__all__ = ["Answer", "Edge", "Request", "Shape", "Sorting", "whole_answers"]
+__all__ = ["Answer", "Edge", "Plan", "Request", "Shape", "Sorting", "whole_answers"]
 
 #: 8N1: a byte is ten bits on the wire.
 BITS_PER_BYTE = 10
@@ -132,6 +132,23 @@ class Request:
         return data[at] | data[at + 1] << 8
 
 
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What has to be done so that the answers to a question are its own.
+
+    Attributes:
+        wait_until: s, before it is asked.
+        listen_on: whether to listen for a second answer, of which one would be an earlier question's.
+        doubtful: ids of which an answer to an earlier question may come nevertheless.
+        refusing: ids of which a refusal may come that was meant for one.
+    """
+
+    wait_until: float = 0.0
+    listen_on: bool = False
+    doubtful: frozenset[int] = frozenset()
+    refusing: frozenset[int] = frozenset()
+
+
 def whole_answers(
     request: Request, data: bytes, edges: Sequence[Edge], started: float, clocks: Mapping[int, TickClock]
 ) -> list[Answer] | None:
@@ -171,8 +188,9 @@ def whole_answers(
         at = end
     if request.tick_at is not None:
         where = request.tick_at
-        for id, got, _, _, rtt in answers:
-            if not clocks[id].follow(got[where] | got[where + 1] << 8, started, started + rtt):  # type: ignore[index,operator]
+        for answer in answers:
+            data, arrived = answer[1] or b"", started + (answer[4] or 0.0)
+            if not clocks[answer[0]].follow(data[where] | data[where + 1] << 8, started, arrived):
                 return None
     return answers
 
@@ -183,7 +201,7 @@ class Sorting:
     Args:
         started: when the request's first byte left, s.
         clocks: of all ids, where the request reads their ticks.
-        doubtful: ids of which an answer to an earlier question may still come.
+        plan: of which ids an answer to an earlier question may still come.
 
     Attributes:
         complete: an answer of every servo has come.
@@ -191,14 +209,12 @@ class Sorting:
         noise_bytes: bytes that were none. echoed: whether the host's own packet came back.
     """
 
-    def __init__(
-        self, request: Request, started: float, clocks: Mapping[int, TickClock], doubtful: frozenset[int] = frozenset()
-    ) -> None:
+    def __init__(self, request: Request, started: float, clocks: Mapping[int, TickClock], plan: Plan) -> None:
         self.request = request
         self.surplus: list[int] = []
         self.noise_bytes = 0
         self.echoed = False
-        self._started, self._clocks, self._doubtful = started, clocks, doubtful
+        self._started, self._clocks, self._plan = started, clocks, plan
         self._parser = Parser()
         self._at = 0
         self._got: dict[int, list[Answer]] = {}
@@ -296,7 +312,7 @@ class Sorting:
             return
         self._position = k + 1
         clock = self._clocks.get(id) if request.tick_at is not None and not refused else None
-        doubtful = id in self._doubtful
+        doubtful = id in (self._plan.refusing if refused else self._plan.doubtful)
         if clock is not None and (clock.usable if doubtful else clock.proven)(self._started):
             if clock.stale(request.tick(params), self._started, when):
                 self.surplus.append(id)
