@@ -101,6 +101,14 @@ def inventory(bench: Bench) -> Procedure:
             for name, wanted in expected_eeprom(config.motors[joint], config).items()
             if name in items and items[name] != wanted and not _harmless(name, items[name])
         ]
+        # What is to be told or written does not rest on one reading.
+        for change in differences:
+            table[change.joint][change.register] = servos.confirmed_counts(change.register, change.joint)
+        differences = [
+            replace(change, old=value)
+            for change in differences
+            if (value := table[change.joint][change.register]) != change.new and not _harmless(change.register, value)
+        ]
         accepted: list[RegisterChange] = []
         if differences:
             yield Say(f"{len(differences)} items differ from what they should be", "warn")

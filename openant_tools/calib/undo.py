@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from openant_tools.calib.wires import opened_bus, robot_servos
-from openant_tools.comms.faults import NoAnswer
-from openant_tools.comms.servos import Servo
+from openant_tools.comms.bus import Bus
+from openant_tools.comms.faults import BrokenAnswer, NoAnswer
+from openant_tools.comms.servos import Servo, Servos
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.journal import EepromWrite, Entry, Journal
 from openant_tools.procedure.step import Bench, Intent, Procedure, Progress, RegisterChange, Say
@@ -14,6 +15,12 @@ from openant_tools.robot.servo import BAUD_CODES, ServoModel
 __all__ = ["undo"]
 
 COMMAND = "openant calib undo"
+#: Registers that protect a servo, or who stands beside it, by a bound from above or from below.
+UPPER_BOUNDS = frozenset(
+    {"temperature_limit", "max_voltage_limit", "pwm_limit", "current_limit", "velocity_limit", "max_position_limit",
+     "startup_configuration"}
+)  # fmt: skip
+LOWER_BOUNDS = frozenset({"min_voltage_limit", "min_position_limit"})
 
 
 def undo(bench: Bench, *, everything: bool = False) -> Procedure:
@@ -69,11 +76,8 @@ def _baud_after(write: EepromWrite, now: int) -> int:
     return BAUD_CODES[write.new] if write.register == "baud_rate" else write.baud or now
 
 
-def _take_back(bus: object, entry: Entry, model: ServoModel, journal: Journal) -> str:
+def _take_back(bus: Bus, entry: Entry, model: ServoModel, journal: Journal) -> str:
     """Undo one write; what keeps it from being undone, or nothing."""
-    from openant_tools.comms.bus import Bus
-
-    assert isinstance(bus, Bus)
     write, item = entry.write, model.register(entry.write.register)
     servo = Servo(write.joint, write.id_after, model)
     place = f"{write.joint} (id {servo.id})"
@@ -85,15 +89,23 @@ def _take_back(bus: object, entry: Entry, model: ServoModel, journal: Journal) -
                 )
                 return ""  # the program died before the write was sent
             return f"{place} does not answer at {bus.line.baud} baud → plug it in and run undo again"
-        now = item.decode(bus.read(servo.id, item.address, item.size))
+        now = Servos(bus, [servo]).confirmed_counts(write.register, write.joint)
         if now == write.new:
             if write.register == "id" and bus.ping(write.old) is not None:
                 return (
                     f"{place} cannot have id {write.old} again, another servo has it → leave only this one on the cable"
                 )
+            if not write.confirmed and _lowers_protection(write):
+                return (
+                    f"{place}: {write.register} would go from {now} to {write.old}, less protection, and the journal's line "
+                    f"{entry.number} does not say that {write.old} was read twice → left as it is; `openant calib inventory` "
+                    "sets what it should be"
+                )
             bus.write(servo.id, 64, b"\0", "torque off")
             journal.append(
-                EepromWrite(write.joint, servo.id, write.register, now, write.old, bus.line.baud), COMMAND, entry.number
+                EepromWrite(write.joint, servo.id, write.register, now, write.old, bus.line.baud, confirmed=True),
+                COMMAND,
+                entry.number,
             )
             bus.write(servo.id, item.address, item.encode(write.old), f"{write.register} = {write.old}")
             if write.register == "baud_rate":
@@ -103,6 +115,15 @@ def _take_back(bus: object, entry: Entry, model: ServoModel, journal: Journal) -
                 return f"{place}: {write.register} does not read back {write.old} → run undo again"
         elif now != write.old:
             return f"{place}: {write.register} is {now} by now, not {write.new} as the journal says → left as it is"
-    except NoAnswer as error:
+    except (NoAnswer, BrokenAnswer) as error:
         return str(error)
     return ""
+
+
+def _lowers_protection(write: EepromWrite) -> bool:
+    """Whether the old value lets the servo do or bear more than the new one."""
+    if write.register == "shutdown":
+        return bool(write.new & ~write.old)  # a bit each: what switches torque off
+    return (write.register in UPPER_BOUNDS and write.old > write.new) or (
+        write.register in LOWER_BOUNDS and write.old < write.new
+    )

@@ -17,7 +17,7 @@ from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.clock import Clock
 from openant_tools.comms.faults import BrokenAnswer, Cause, NeverSilent, Refused, missing_answers, refusal_words
 from openant_tools.comms.line import BUFFER, Line
-from openant_tools.comms.pending import Pending
+from openant_tools.comms.pending import LATEST_S, Pending
 from openant_tools.comms.protocol2 import Garbage, Instruction, Parser, Status
 from openant_tools.comms.reply import (
     BITS_PER_BYTE,
@@ -323,6 +323,10 @@ class Bus:
     def require_all(self, answered: Mapping[int, bool]) -> None:
         """Raise NoAnswer unless every one of these ids answered, in the order asked."""
         self.require([Answer(id, b"" if ok else None, 0, None if ok else Cause.TIMEOUT) for id, ok in answered.items()])
+
+    def settle(self) -> None:
+        """Wait until no answer to an earlier question can come any more."""
+        self._settle(self.clock.now() + self.timing.latency_timer_s + self.timing.margin_s + LATEST_S)
 
     def close(self) -> None:
         self.opened.pop(id(self), None)

@@ -12,14 +12,15 @@ import select
 import socket
 import struct
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
 from openant_tools.comms.lateness import Lateness
-from openant_tools.comms.line import Line
+from openant_tools.comms.line import BUFFER, Line
 from openant_tools.errors import HardwareFault
 
-__all__ = ["Clock", "RealClock", "SteppedClock", "VirtualControl"]
+__all__ = ["Clock", "RealClock", "SteppedClock", "VirtualControl", "portions"]
 
 #: `sleep` overshoots by 0.1 ms at best on Linux: the last stretch is spun where a deadline is to be met.
 SPIN_S = 0.15e-3
@@ -60,6 +61,22 @@ class Clock(Protocol):
         """Whether a portion that came at `at` (s, see `arrivals`) lay there by a deadline: this process may have come late
         to it."""
         ...
+
+
+def portions(clock: Clock, line: Line, deadline: float) -> Iterator[bytes]:
+    """What a line says, as it comes, until `deadline` (s).
+
+    What lies there when the deadline has passed counts, too: this process was late. But that is one buffer at most, so that
+    a line that never falls silent ends it as well.
+    """
+    lain = 0
+    while lain <= BUFFER and clock.wait_readable(line, deadline):
+        data = line.read()
+        lain += len(data) if clock.now() > deadline else 0
+        if data:
+            yield data
+        elif clock.now() >= deadline:
+            return
 
 
 class RealClock:

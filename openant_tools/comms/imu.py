@@ -26,7 +26,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from openant_tools.comms import msp
-from openant_tools.comms.clock import Clock
+from openant_tools.comms.clock import Clock, portions
 from openant_tools.comms.line import Line, PortGone, SerialLine
 from openant_tools.comms.msp import Command, Direction, Framing, Parser
 from openant_tools.errors import HardwareFault
@@ -355,9 +355,8 @@ class Imu:
     def _frames(self, deadline: float) -> Iterator[msp.Frame]:
         """Frames as they come until the deadline."""
         line = self._port()
-        while self._clock.wait_readable(line, deadline):
+        for data in portions(self._clock, line, deadline):
             self._empty_at = self._clock.now()
-            data = line.read()
             self._heard(line)
             self._seen += data
             del self._seen[:-512]
@@ -495,10 +494,7 @@ class Imu:
             return None
         line, newest = self._line, None
         try:
-            while self._line is line and self._clock.wait_readable(line, now):
-                data = line.read()
-                if not data:
-                    break
+            for data in portions(self._clock, line, now):
                 self._heard(line)
                 broken = self._parser.broken
                 frames = self._parser.feed(data)
@@ -508,6 +504,8 @@ class Imu:
                     continue
                 for frame in frames:
                     newest = self._receive(frame, info) or newest
+                if self._line is not line:
+                    break
             self._empty_at = now
             if self._outstanding is not None and self._clock.now() - self._sent_at > REPLY_TIMEOUT_S:
                 self._time_out()

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from openant_tools.comms.bus import FAST_READ_FIRMWARE, Answer, Bus, Found
-from openant_tools.comms.faults import Cause, Refused
+from openant_tools.comms.faults import BrokenAnswer, Cause, Refused
 from openant_tools.comms.protocol2 import BROADCAST, SyncWriteTemplate, write
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.procedure.journal import EepromWrite
@@ -28,6 +28,8 @@ BLOCK_SIZE = 27
 BLOCK = struct.Struct("<HBBhhiiiiHB")
 #: A clear of the watchdog and its trip value (register 98).
 WATCHDOG_TRIPPED = -1
+#: Pairs of readings of one register, of which one must agree.
+CONFIRMATIONS = 3
 #: Broadcasts of torque off: where one byte in ten breaks, one of 13 bytes arrives in four times.
 RELEASES = 6
 
@@ -141,6 +143,35 @@ class Servos:
         """A register in its SI unit, in the servo's own frame."""
         return float(self._item(register, joint)[1].to_si(self.read_counts(register, joint)))
 
+    def confirmed_counts(self, register: str, joint: str) -> int:
+        """As `read_counts`, for what is written down or acted upon: read twice, in two ways, until both agree.
+
+        The second reading has another length, so that no answer can serve both; where nothing stands beside the register,
+        it waits until no answer to the first can come any more.
+
+        Raises:
+            BrokenAnswer: they go on disagreeing.
+        """
+        servo, item = self._item(register, joint)
+        beside = _beside(servo, item)
+        seen: list[int] = []
+        for _ in range(CONFIRMATIONS):
+            seen.append(item.decode(self.bus.read(servo.id, item.address, item.size)))
+            if beside is None:
+                self.bus.settle()
+                seen.append(item.decode(self.bus.read(servo.id, item.address, item.size)))
+            else:
+                start, size = min(item.address, beside.address), item.size + beside.size
+                data = self.bus.read(servo.id, start, size)
+                seen.append(item.decode(data[item.address - start :][: item.size]))
+            if seen[-1] == seen[-2]:
+                return seen[-1]
+        raise BrokenAnswer(
+            f"{register} of {joint} (id {servo.id}) reads {', '.join(map(str, dict.fromkeys(seen)))} by turns",
+            where=self.bus.line.path,
+            remedy="the line is not to be trusted: look at `openant comms watch` before anything is written",
+        )
+
     def read_all(self, register: str, joints: Iterable[str] | None = None) -> dict[str, int]:
         """A register of many joints, joint → counts, by one sync read where its address is the same everywhere."""
         wanted = [self[joint] for joint in (self.joints if joints is None else joints)]
@@ -175,10 +206,10 @@ class Servos:
         item.check(counts)
         old = None
         if item.address < EEPROM_END:
-            old = item.decode(self.bus.read(servo.id, item.address, item.size))
+            old = self.confirmed_counts(register, joint)
             if old == counts:
                 return
-            change = EepromWrite(joint, servo.id, register, old, counts, self.bus.line.baud)
+            change = EepromWrite(joint, servo.id, register, old, counts, self.bus.line.baud, confirmed=True)
             if self.before_write is not None:
                 self.before_write(change)
         data = item.encode(counts)
@@ -203,8 +234,8 @@ class Servos:
             HardwareFault: it does not answer at the new rate; the line is back at the old one.
         """
         servo, item = self._item("baud_rate", joint)
-        old, before = self.read_counts("baud_rate", joint), self.bus.line.baud
-        change = EepromWrite(joint, servo.id, "baud_rate", old, baud_code(baud), before)
+        old, before = self.confirmed_counts("baud_rate", joint), self.bus.line.baud
+        change = EepromWrite(joint, servo.id, "baud_rate", old, baud_code(baud), before, confirmed=True)
         if change.old != change.new:
             if self.before_write is not None:
                 self.before_write(change)
@@ -303,7 +334,7 @@ class Servos:
     def still_on(self, joints: Sequence[str]) -> list[str]:
         """Those of `joints` that do not say that their torque is off: on, or silent. Never raises for a silent one."""
         ids = [self[joint].id for joint in joints]
-        answers = self.bus.sync_read(64, 1, ids)
+        answers = self.bus.sync_read(64, 1, ids, again=True)  # asked between two orders to let go: it must not wait
         return [joint for joint, answer in zip(joints, answers, strict=True) if answer.data != b"\0"]
 
     def hardware_errors(self, joint: str) -> tuple[HardwareError, ...]:
@@ -314,6 +345,14 @@ class Servos:
         """Joints whose Bus Watchdog has tripped: their goals are locked and torque is still on."""
         able = [servo.joint for servo in self.servos if (servo.firmware or 99) >= 38]
         return [joint for joint, value in self.read_all("bus_watchdog", able).items() if value == WATCHDOG_TRIPPED]
+
+
+def _beside(servo: Servo, item: Register) -> Register | None:
+    """A register that can be read together with this one: next to it, in the same memory, in this firmware."""
+    able = [
+        r for r in servo.model.registers.values() if r.area == item.area and r.min_firmware <= (servo.firmware or 0)
+    ]
+    return next((other for other in able if other.address == item.end or other.end == item.address), None)
 
 
 def _model_name(number: int) -> str:

@@ -27,6 +27,7 @@ class EepromWrite:
     Attributes:
         id: under which the servo was spoken to, before the write.
         baud: at which rate, bit/s; None in the lines of older versions.
+        confirmed: `old` was read twice, in two ways; False in the lines of older versions.
     """
 
     joint: str
@@ -35,6 +36,7 @@ class EepromWrite:
     old: int
     new: int
     baud: int | None = None
+    confirmed: bool = False
 
     @property
     def id_after(self) -> int:
