@@ -31,7 +31,7 @@ from openant_tools.comms.body_imu import BodyImu
 from openant_tools.comms.bus import Answer, Bus, Timing
 from openant_tools.comms.checked import checked
 from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
-from openant_tools.comms.faults import BrokenAnswer, Cause, NoAnswer
+from openant_tools.comms.faults import BrokenAnswer, Cause, NeverSilent, NoAnswer
 from openant_tools.comms.guards import Trip, Watch
 from openant_tools.comms.lateness import REMEDY
 from openant_tools.comms.line import PortGone, SerialLine
@@ -127,6 +127,8 @@ class Engine:
         self._playing = 0
         self._guardian: subprocess.Popen[bytes] | None = None
         self._lost = False
+        #: the line talks without a pause, and it has been told
+        self._restless = False
         self._imu: BodyImu | None = None
         self._camera: BodyCamera | None = None
 
@@ -461,6 +463,14 @@ class Engine:
         if self._recorder is not None:
             self._record(t, cmd_t, late, answers, agent)
         self._telemetry(t, cmd_t, wake, answers)
+        if self._bus.restless and not self._restless:
+            # Told once an episode; where something moves, it ends: what is heard on such a line is chance.
+            fault = self._bus.never_silent()
+            if self._torque:
+                self._stopped(Trip(fault.what, fault.remedy or "", cause=StopCause.PORT))
+            else:
+                self._notice(str(fault))
+        self._restless = self._bus.restless
         if self._torque:
             trip = self._watch.check(t, answers) or self._stood_still(t - before)
             if trip is not None:
@@ -525,7 +535,7 @@ class Engine:
 
     def _explained(self, trip: Trip) -> Trip:
         """What a cycle's answers alone do not tell, asked once everyone is released."""
-        if trip.joint is None or not trip.examine:
+        if trip.joint is None or not trip.examine or self._bus.restless:
             return trip
         try:
             self._servos.torque_off_now()
@@ -543,7 +553,7 @@ class Engine:
 
     def _asked_why(self, fault: OpenAntError) -> OpenAntError:
         """A servo's silence with its cause: the servos are asked, once torque is off."""
-        if not isinstance(fault, NoAnswer | BrokenAnswer) or self._lost:
+        if not isinstance(fault, NoAnswer | BrokenAnswer) or isinstance(fault, NeverSilent) or self._lost:
             return fault
         if hasattr(self, "_servos"):
             self._torque_off()
@@ -812,8 +822,8 @@ class Engine:
         self._watch.reset(self._asked_at)
 
     def _do_move(self, number: int, command: messages.Ramp | messages.Play | messages.Hold) -> None:
-        if not self._torque or self._goal is None:
-            raise BadInput("torque is off", remedy="switch it on first")
+        if self._refused_limp(number) or self._goal is None:
+            return
         rate = self.config.rate_hz
         if isinstance(command, messages.Hold):
             motions = [hold(self._goal, command.seconds, rate)]
@@ -824,9 +834,19 @@ class Engine:
         self._motions.extend(motions)
         self._waiting.append((number, motions[-1]))
 
-    def _do_goal(self, number: int, command: messages.Goal) -> None:
-        if not self._torque:
+    def _refused_limp(self, number: int) -> bool:
+        """Whether torque is off, so that nothing can move: whoever has not yet heard why it went off is told now."""
+        if self._torque:
+            return False
+        if self._trip is None:
             raise BadInput("torque is off", remedy="switch it on first")
+        error = (self._trip.what, None, self._trip.remedy)
+        self._say(messages.Reply(number, error=error, cause=self._trip.cause))
+        return True
+
+    def _do_goal(self, number: int, command: messages.Goal) -> None:
+        if self._refused_limp(number):
+            return
         rows = held(command.target, command.seconds, self.config.rate_hz)
         motion = Motion("goal", rows, number=number, measured=command.measured)
         motion.agent = command.agent

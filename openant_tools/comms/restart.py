@@ -79,7 +79,7 @@ RULES: Mapping[StopCause, Rule] = {
         Rule(StopCause.OVERLOAD, "a servo pushes near its stall for longer than it may"),
         Rule(StopCause.VOLTAGE, "the supply leaves the range of a servo"),
         Rule(StopCause.NOT_FOLLOWING, "a joint stands where its command does not explain it"),
-        Rule(StopCause.PORT, "the bus adapter is gone, or its port"),
+        Rule(StopCause.PORT, "the bus adapter is gone, or its line never falls silent"),
         Rule(StopCause.GUARDIAN, "the guardian process has died"),
         Rule(StopCause.FALL, "the robot lies on its back or side"),
         Rule(StopCause.CABLE, "the cable is wound up by two turns"),
