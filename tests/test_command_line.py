@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from plants import drive, pendulum, run_of, sweep
 
+from openant_tools.cli import main
 from openant_tools.cli import openant as manual
 from openant_tools.recording.tables import write_table
 
@@ -383,3 +384,43 @@ def test_being_told_to_go_is_as_good_as_ctrl_c(
     process.send_signal(number)
     process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
+
+
+# ---- numbers ----
+
+
+def paths(command: click.Command, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], click.Command]]:
+    """Every command of the program with the words that call it, so that a new one is included by itself."""
+    if isinstance(command, click.Group):
+        context = click.Context(command)
+        for name in command.list_commands(context):
+            one = command.get_command(context, name)
+            assert one is not None
+            yield from paths(one, (*path, name))
+    else:
+        yield path, command
+
+
+NUMBERS = [
+    (words, option.opts[0])
+    for words, command in paths(manual)
+    for option in command.params
+    if isinstance(option.type, click.FloatRange | click.types.FloatParamType)
+]
+
+
+@pytest.mark.parametrize(("words", "option"), NUMBERS, ids=lambda one: " ".join(one) if isinstance(one, tuple) else one)
+def test_what_is_no_number_is_refused_by_name_on_every_command(
+    words: tuple[str, ...], option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    times = option in ("--seconds", "--minutes", "--rate", "--hz", "--dt")
+    for value in ("nan", "inf", "-inf", "1e300", "-1e300", "x", *(("0", "-1") if times else ())):
+        with pytest.raises(SystemExit) as end:
+            main([*words, f"{option}={value}"])
+        said = capsys.readouterr()
+        assert end.value.code == 2, (value, said)
+        [line] = said.err.strip().splitlines()
+        # Where the value may be left out, click takes what begins with a minus for options.
+        assert option in line or "No such option" in line, line
+        assert "→" in line
+        assert said.out == ""

@@ -17,7 +17,7 @@ from openant_tools.cli.comms_diagnose import diagnose, timing
 from openant_tools.cli.comms_reboot import reboot
 from openant_tools.cli.comms_soak import soak
 from openant_tools.cli.hardware import engine_config, port_option, robot_of
-from openant_tools.cli.options import json_option, robot_option
+from openant_tools.cli.options import SECONDS, json_option, robot_option
 from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_option, virtual_robot
 
 if TYPE_CHECKING:
@@ -179,7 +179,7 @@ def _scan_one(
 @port_option
 @virtual_option
 @robot_option
-@click.option("--seconds", default=3.0, show_default=True, help="How long to measure the rate.")
+@click.option("--seconds", type=SECONDS, default=3.0, show_default=True, help="How long to measure the rate.")
 @json_option
 def bench(
     port: str | None, virtual_source: str | None, robot: Path | None, seconds: float, json_file: Path | None
@@ -233,7 +233,7 @@ def bench(
 @port_option
 @virtual_option
 @robot_option
-@click.option("--seconds", type=float, metavar="S", help="Stop after so long. Default: until Ctrl-C.")
+@click.option("--seconds", type=SECONDS, metavar="S", help="Stop after so long. Default: until Ctrl-C.")
 @json_option
 def watch(
     port: str | None, virtual_source: str | None, robot: Path | None, seconds: float | None, json_file: Path | None

@@ -17,7 +17,7 @@ from openant_tools.cli.blind_sets import (
     seed_option,
     set_argument,
 )
-from openant_tools.cli.options import json_option, out_option
+from openant_tools.cli.options import Number, json_option, out_option
 from openant_tools.cli.progress import progress_bar
 
 __all__ = ["blind"]
@@ -33,8 +33,8 @@ def blind() -> None:
 @click.option("--soaks", "count", type=click.IntRange(1, 10_000), default=320, show_default=True, metavar="N")
 @seed_option
 @seed_from_option
-@click.option("--healthy", type=click.FloatRange(0, 1), metavar="SHARE", help="Healthy soaks. Default a third.")
-@click.option("--virtual", type=click.FloatRange(0, 1), metavar="SHARE", help="From the virtual robot. Default 0.25.")
+@click.option("--healthy", type=Number(0, 1), metavar="SHARE", help="Healthy soaks. Default a third.")
+@click.option("--virtual", type=Number(0, 1), metavar="SHARE", help="From the virtual robot. Default 0.25.")
 @key_option
 @click.option("--open", "unsealed", is_flag=True, help="Leave the answers open: for development.")
 @jobs_option("Soaks")

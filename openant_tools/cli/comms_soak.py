@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from openant_tools.cli.hardware import engine_config, may_move, port_option, robot_of, yes_option
-from openant_tools.cli.options import finite, json_option, rate_option, robot_option
+from openant_tools.cli.options import MINUTES, json_option, rate_option, robot_option
 from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option
 
@@ -28,9 +28,7 @@ TRANSACTIONS_HZ = 10.0
 @click.option(
     "--out", type=click.Path(path_type=Path, dir_okay=False), required=True, metavar="RUN", help="What to make."
 )
-@click.option(
-    "--minutes", type=click.FloatRange(min=0.02), callback=finite, default=15.0, show_default=True, metavar="M"
-)
+@click.option("--minutes", type=MINUTES, default=15.0, show_default=True, metavar="M")
 @click.option("--still", is_flag=True, help="Do not move: torque stays off.")
 @click.option("--resume", is_flag=True, help="Go on with the soak that was cut short at --out, as one recording.")
 @click.option(

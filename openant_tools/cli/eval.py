@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from openant_tools.cli.options import json_option
+from openant_tools.cli.options import SECONDS, json_option
 from openant_tools.cli.walking import (
     HARDWARE_ID,
     SIMULATED_ID,
@@ -27,7 +27,7 @@ STRIP_FROM_S = 6.0
 
 @click.command()
 @click.argument("run", type=click.Path(path_type=Path, file_okay=False), metavar="DIR")
-@click.option("--seconds", type=float, default=120.0, show_default=True, help="Robot time.")
+@click.option("--seconds", type=SECONDS, default=120.0, show_default=True, help="Robot time.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @click.option(
     "--robot", type=click.Path(path_type=Path), metavar="DIR",

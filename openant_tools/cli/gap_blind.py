@@ -20,7 +20,7 @@ from openant_tools.cli.blind_sets import (
     seed_option,
     set_argument,
 )
-from openant_tools.cli.options import json_option, out_option, report_option
+from openant_tools.cli.options import Number, json_option, out_option, report_option
 from openant_tools.cli.progress import progress_bar
 from openant_tools.errors import BadInput
 
@@ -33,7 +33,7 @@ def blind() -> None:
 
 
 def _share(name: str, words: str) -> Callable[[click.decorators.FC], click.decorators.FC]:
-    return click.option(name, type=click.FloatRange(0, 1), metavar="SHARE", help=words)
+    return click.option(name, type=Number(0, 1), metavar="SHARE", help=words)
 
 
 @blind.command()

@@ -2,25 +2,45 @@
 
 from __future__ import annotations
 
-import math
 import os
 from pathlib import Path
+from typing import Any
 
 import click
 
 from openant_tools.errors import BadInput
 
 __all__ = [
-    "finite", "joint_option", "json_option", "model_option", "out_option", "rate_option", "report_option", "robot_folder",
+    "MINUTES", "POSITIVE", "SECONDS", "Number", "joint_option", "json_option", "model_option", "out_option", "rate_option", "report_option", "robot_folder",
     "robot_option", "seconds_option", "tie_option",
 ]  # fmt: skip
 
 
-def finite(context: click.Context, option: click.Parameter, value: float | None) -> float | None:
-    """What click takes for a number need not be one: nan is within every range."""
-    if value is not None and not math.isfinite(value):
-        raise BadInput(f"{option.opts[0]} is {value:g}", remedy="give it a number")
-    return value
+#: beyond it nothing of a robot is measured, counted or waited for: 1e300 is a slip of the hand
+LARGEST = 1e9
+
+
+class Number(click.FloatRange):
+    """A number on the command line, the type of every option that takes one: finite, and within a range where it has one.
+
+    What click takes for a number need not be one: nan is within every range.
+    """
+
+    name = "number"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number: float = click.FLOAT.convert(value, param, ctx)
+        if not abs(number) <= LARGEST:
+            option = param.opts[0] if param is not None else "it"
+            raise BadInput(f"{option} is {number:g}", remedy="give it a number")
+        return float(super().convert(number, param, ctx))
+
+
+#: a length, a mass, a voltage
+POSITIVE = Number(0.0, min_open=True)
+#: s that a command moves, measures or plays, a day at most; and the same of a soak, min, a week at most
+SECONDS = Number(0.0, 86_400.0, min_open=True)
+MINUTES = Number(0.02, 7 * 24 * 60.0)
 
 
 robot_option = click.option(
@@ -52,15 +72,14 @@ out_option = click.option("--out", type=click.Path(path_type=Path), required=Tru
 rate_option = click.option(
     "--rate",
     "rate_hz",
-    type=click.FloatRange(10, 1000),
-    callback=finite,
+    type=Number(10, 1000),
     default=100.0,
     show_default=True,
     metavar="HZ",
     help="Commands and reads a second.",
 )
 seconds_option = click.option(
-    "--seconds", type=float, callback=finite, metavar="S", help="How long to play. Default: the protocol's own time."
+    "--seconds", type=POSITIVE, metavar="S", help="How long to play. Default: the protocol's own time."
 )
 tie_option = click.option(
     "--tie",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from openant_tools.cli.learning import need_agents
-from openant_tools.cli.options import json_option, report_option
+from openant_tools.cli.options import SECONDS, json_option, report_option
 from openant_tools.errors import BadInput
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ policies_option = click.option(
 )  # fmt: skip
 play_options = (
     click.option(
-        "--seconds", type=click.FloatRange(min=0.0, min_open=True), default=60.0, show_default=True,
+        "--seconds", type=SECONDS, default=60.0, show_default=True,
         help="Robot time of a play.",
     ),
     click.option("--plays", type=click.IntRange(min=1), default=3, show_default=True, help="Of each policy."),

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from openant_tools.cli.hardware import engine_config, may_move, port_option, robot_of, yes_option
-from openant_tools.cli.options import json_option, report_option, robot_option
+from openant_tools.cli.options import POSITIVE, SECONDS, Number, json_option, report_option, robot_option
 from openant_tools.cli.virtual_for_command import virtual_option
 
 if TYPE_CHECKING:
@@ -49,17 +49,24 @@ ANGLE = Angle()
 @click.option("--kit", type=click.Choice(["standard", "lite"]), help="Mass, knees and supply of a kit.")
 @robot_option
 @click.option("--servo", metavar="MODEL", help="Knee servo, such as XL430-W250-T. Default: the kit's or robot's.")
-@click.option("--mass", "mass_kg", type=float, metavar="KG", help="Of the whole robot. Default: the kit's, as weighed.")
+@click.option(
+    "--mass", "mass_kg", type=POSITIVE, metavar="KG", help="Of the whole robot. Default: the kit's, as weighed."
+)
 @click.option("--legs", type=int, multiple=True, metavar="N", help="In stance; repeatable. Default: 4, 3 and 2.")
 @click.option(
     "--angle", "angles", type=ANGLE, multiple=True, metavar="RAD",
     help="Of the lower leg from the vertical, or 45deg; repeatable. Default: the home stand's 40° and the paper's 45°.",
 )  # fmt: skip
 @click.option(
-    "--length", "length_m", type=float, metavar="M", help="From the knee's axis to the ground. Default: 0.159."
+    "--length", "length_m", type=POSITIVE, metavar="M", help="From the knee's axis to the ground. Default: 0.159."
 )
-@click.option("--supply", "supply_v", type=float, metavar="V", help="At the servos. Default: the kit's.")
-@click.option("--pwm-limit", type=float, metavar="SHARE", help="Share of full duty. Default: the robot's, else 0.5.")
+@click.option("--supply", "supply_v", type=POSITIVE, metavar="V", help="At the servos. Default: the kit's.")
+@click.option(
+    "--pwm-limit",
+    type=Number(0.0, 1.0, min_open=True),
+    metavar="SHARE",
+    help="Share of full duty. Default: the robot's, else 0.5.",
+)
 @json_option
 def torque(
     kit: str | None,
@@ -146,13 +153,18 @@ def torque(
 @click.option("--steps", default=5, show_default=True, metavar="N", help="How many.")
 @click.option("--up", is_flag=True, help="Press in the positive direction. Default: a knee presses its foot down.")
 @click.option(
-    "--length", "length_m", type=float, metavar="M", help="Knee's axis to the foot's contact. Default: 0.159."
+    "--length", "length_m", type=POSITIVE, metavar="M", help="Knee's axis to the foot's contact. Default: 0.159."
 )
-@click.option("--arm", "arm_m", type=float, metavar="M", help="Lever arm of the force, if you measured it instead.")
+@click.option("--arm", "arm_m", type=POSITIVE, metavar="M", help="Lever arm of the force, if you measured it instead.")
 @click.option("--servo", metavar="MODEL", help="Default: the robot's, else XM430-W350-T.")
-@click.option("--p-gain", type=float, metavar="P", help="position_p_gain, without a robot. Default: the factory's.")
-@click.option("--supply", "supply_v", type=float, metavar="V", help="Without a robot. Default: the servo's nominal.")
-@click.option("--pwm-limit", type=float, metavar="SHARE", help="Without a robot. Default: the robot's, else 0.5.")
+@click.option("--p-gain", type=POSITIVE, metavar="P", help="position_p_gain, without a robot. Default: the factory's.")
+@click.option("--supply", "supply_v", type=POSITIVE, metavar="V", help="Without a robot. Default: the servo's nominal.")
+@click.option(
+    "--pwm-limit",
+    type=Number(0.0, 1.0, min_open=True),
+    metavar="SHARE",
+    help="Without a robot. Default: the robot's, else 0.5.",
+)
 @yes_option
 @json_option
 @report_option
@@ -323,7 +335,7 @@ def _show_stiffness(finding: Finding, report: Path | None) -> None:
 )
 @click.option(
     "--seconds",
-    type=float,
+    type=SECONDS,
     default=3.0,
     show_default=True,
     metavar="S",

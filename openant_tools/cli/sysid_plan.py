@@ -9,7 +9,7 @@ import click
 
 from openant_tools.cli.hardware import robot_of
 from openant_tools.cli.options import (
-    finite,
+    Number,
     json_option,
     rate_option,
     report_option,
@@ -55,16 +55,14 @@ __all__ = ["plan"]
 @click.option(
     "--noise",
     "noise_mrad",
-    type=click.FloatRange(min=0, min_open=True),
-    callback=finite,
+    type=Number(min=0, min_open=True),
     metavar="MRAD",
     help="What a fit will leave on the stand.  [default: 1.5, as the virtual robot; real ones leave 3 to 20]",
 )
 @click.option(
     "--memory",
     "memory_s",
-    type=click.FloatRange(min=0),
-    callback=finite,
+    type=Number(min=0),
     metavar="S",
     help="For how long such an error lasts.  [default: 0.05]",
 )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from openant_tools.cli.hardware import engine_config, may_move, port_option, robot_of, yes_option
-from openant_tools.cli.options import finite, rate_option, robot_option, seconds_option
+from openant_tools.cli.options import Number, rate_option, robot_option, seconds_option
 from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
 
 if TYPE_CHECKING:
@@ -60,8 +60,7 @@ setup_option = click.option(
 @click.option(
     "--hot",
     "hot_s",
-    type=click.FloatRange(min=0, max=3600),
-    callback=finite,
+    type=Number(min=0, max=3600),
     is_flag=False,
     flag_value=60.0,
     default=0.0,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from openant_tools.cli.options import json_option, model_option, robot_option
+from openant_tools.cli.options import Number, json_option, model_option, robot_option
 
 __all__ = ["twitch"]
 
@@ -15,7 +15,7 @@ __all__ = ["twitch"]
 @click.command()
 @model_option
 @robot_option
-@click.option("--seconds", type=click.FloatRange(1.0, 600.0), default=6.0, show_default=True, help="Of twitching.")
+@click.option("--seconds", type=Number(1.0, 600.0), default=6.0, show_default=True, help="Of twitching.")
 @json_option
 def twitch(model: Path | None, robot: Path | None, seconds: float, json_file: Path | None) -> int:
     """Twitch fast on the simulated floor and see whether the robot travels, as a real one would not.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from openant_tools.cli.options import finite, json_option, report_option, robot_option
+from openant_tools.cli.options import Number, json_option, report_option, robot_option
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
@@ -111,7 +111,7 @@ SHOWN = ("case_j_k", "air_w_k", "winding_w_k", "scale", "leg_w_k", "room_c", "ex
 @click.command()
 @click.argument("run", type=click.Path(path_type=Path), metavar="RUN")
 @click.option(
-    "--at", "at_min", type=click.FloatRange(min=0.5), callback=finite, metavar="MIN",
+    "--at", "at_min", type=Number(min=0.5), metavar="MIN",
     help="Know only the run's first MIN minutes.  [default: all of it, looked at from the end of its load]",
 )  # fmt: skip
 @click.option("--load", "loads", multiple=True, metavar="JOINT=NM", help="Hold this torque instead; repeatable.")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from openant_tools.cli.hardware import engine_config, may_move, port_option, robot_of, yes_option
-from openant_tools.cli.options import finite, json_option, robot_option
+from openant_tools.cli.options import Number, json_option, robot_option
 from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
 
 if TYPE_CHECKING:
@@ -49,19 +49,19 @@ DRAW_S, LINE_S = 0.25, 20.0
     help="home, low, tall, straight, or knee=-0.32,hip=0; repeat it to hold several in turn.  [default: home]",
 )  # fmt: skip
 @click.option(
-    "--effort", type=click.FloatRange(0.02, 1.0), callback=finite, default=0.5, show_default=True, metavar="SHARE",
+    "--effort", type=Number(0.02, 1.0), default=0.5, show_default=True, metavar="SHARE",
     help="Of full duty, with which stalled knees press.",
 )  # fmt: skip
 @click.option(
-    "--minutes", type=click.FloatRange(0.05, 24 * 60), callback=finite, default=60.0, show_default=True, metavar="MIN",
+    "--minutes", type=Number(0.05, 24 * 60), default=60.0, show_default=True, metavar="MIN",
     help="Under load.",
 )  # fmt: skip
 @click.option(
-    "--cool-down", type=click.FloatRange(0, 24 * 60), callback=finite, default=20.0, show_default=True, metavar="MIN",
+    "--cool-down", type=Number(0, 24 * 60), default=20.0, show_default=True, metavar="MIN",
     help="Recorded afterwards, torque off.",
 )  # fmt: skip
 @click.option(
-    "--margin", type=click.FloatRange(0, 60), callback=finite, default=3.0, show_default=True, metavar="K",
+    "--margin", type=Number(0, 60), default=3.0, show_default=True, metavar="K",
     help="The load ends so far below a servo's own limit.",
 )  # fmt: skip
 @click.option("--to-shutdown", is_flag=True, help="Let the servos shut down by themselves, as the paper's test did.")
@@ -71,15 +71,14 @@ DRAW_S, LINE_S = 0.25, 20.0
 @click.option(
     "--ambient",
     "ambient_c",
-    type=click.FloatRange(-20, 60),
-    callback=finite,
+    type=Number(-20, 60),
     metavar="°C",
     help="Of the room, if known.",
 )
 @click.option("--note", metavar="TEXT", help="What is special, kept with the recording.")
 @click.option("--resume", is_flag=True, help="Go on with a soak that was cut short; its plan stands in its recording.")
 @click.option(
-    "--rate", "rate_hz", type=click.FloatRange(2, 100), callback=finite, metavar="HZ",
+    "--rate", "rate_hz", type=Number(2, 100), metavar="HZ",
     help="Reads a second.  [default: 5, or 50 where motions are played]",
 )  # fmt: skip
 @virtual_option

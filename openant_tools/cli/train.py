@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from openant_tools.cli.learning import need_agents, settings_of, settings_option
-from openant_tools.cli.options import json_option
+from openant_tools.cli.options import Number, json_option
 from openant_tools.cli.train_sarsa import sarsa
 from openant_tools.cli.training import (
     effects_option,
@@ -31,7 +31,9 @@ def train() -> None:
 
 @train.command()
 @training_options(30_000, 0.12, "checkpoints, transitions, learning curve")
-@click.option("--dt", type=float, metavar="S", help="Length of a step. Default: the robot's, 0.12 s.")
+@click.option(
+    "--dt", type=Number(0.0, 10.0, min_open=True), metavar="S", help="Length of a step. Default: the robot's, 0.12 s."
+)
 @click.option("--action-range", metavar="NAME", help="paper, platform, sac, sarsa or limits. Default: the robot's.")
 @effects_option
 @click.option("--randomise", is_flag=True, help="Each reset another robot, from the intervals of the identification.")
@@ -39,7 +41,7 @@ def train() -> None:
     "--learning-start", type=click.IntRange(min=1), help="Steps with random actions before learning.  [default: 2000]"
 )
 @click.option(
-    "--entropy-start", type=click.FloatRange(min=0.0, min_open=True), metavar="ALPHA",
+    "--entropy-start", type=Number(min=0.0, min_open=True), metavar="ALPHA",
     help="Weight of the entropy at first; 0.1 explores less and walks sooner.  [default: 1]",
 )  # fmt: skip
 @settings_option
@@ -49,7 +51,7 @@ def train() -> None:
     "[default: between in the simulation, beside on a robot]",
 )  # fmt: skip
 @click.option(
-    "--updates-per-step", type=click.FloatRange(min=0.0, min_open=True), default=1.0, show_default=True,
+    "--updates-per-step", type=Number(min=0.0, min_open=True), default=1.0, show_default=True,
     help="With --learn beside: updates for each step at most.",
 )  # fmt: skip
 @click.option("--device", default="cpu", show_default=True, help="Where torch computes, such as cpu or cuda.")

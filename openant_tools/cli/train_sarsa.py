@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from openant_tools.cli.learning import need_agents, settings_of, settings_option
-from openant_tools.cli.options import json_option
+from openant_tools.cli.options import Number, json_option
 from openant_tools.cli.training import (
     effects_option,
     place_of,
@@ -22,14 +22,21 @@ __all__ = ["sarsa"]
 
 @click.command()
 @training_options(72_000, 0.05, "the log of decisions, learning curve")
-@click.option("--dt", type=float, default=0.05, show_default=True, metavar="S", help="Length of a step.")
+@click.option(
+    "--dt",
+    type=Number(0.0, 10.0, min_open=True),
+    default=0.05,
+    show_default=True,
+    metavar="S",
+    help="Length of a step.",
+)
 @click.option(
     "--action-range", default="sarsa", show_default=True, metavar="NAME", help="paper, platform, sac, sarsa or limits."
 )
 @effects_option
-@click.option("--epsilon", type=click.FloatRange(0.0, 1.0), help="Share of chance.  [default: 0.255]")
-@click.option("--step-size", type=click.FloatRange(min=0.0, min_open=True), help="Of each weight.  [default: 0.0001]")
-@click.option("--reward-scale", type=click.FloatRange(min=0.0, min_open=True), help="Factor on rewards.  [default: 5]")
+@click.option("--epsilon", type=Number(0.0, 1.0), help="Share of chance.  [default: 0.255]")
+@click.option("--step-size", type=Number(min=0.0, min_open=True), help="Of each weight.  [default: 0.0001]")
+@click.option("--reward-scale", type=Number(min=0.0, min_open=True), help="Factor on rewards.  [default: 5]")
 @settings_option
 @tensorboard_option
 @json_option
