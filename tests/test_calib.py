@@ -244,6 +244,20 @@ def test_what_differs_is_shown_mended_and_can_be_undone(tmp_path):
         assert ant.register("knee_fl", "drive_mode") == 1
 
 
+def test_a_servo_that_was_told_not_to_answer_writes_is_named_and_mended_in_the_journal(tmp_path):
+    with robot(tmp_path / "ant", servo=[{"joint": "knee_fl", "status_return_level": 1}]) as ant:
+        finding, builder = ant.do(inventory(ant.bench))
+        assert finding.ok
+        assert "knee_fl (id 31) has Status Return Level 1: it answers pings and reads, and no writes" in builder.said
+        assert "knee_fl: status_return_level 1 → 2" in builder.granted
+        assert ant.register("knee_fl", "status_return_level") == 2
+        writes = [entry.write for entry in Journal(ant.folder.journal).entries()]
+        assert ("knee_fl", "status_return_level", 1, 2) in [(w.joint, w.register, w.old, w.new) for w in writes]
+        finding, _ = ant.do(undo(ant.bench, everything=True))
+        assert finding.ok
+        assert ant.register("knee_fl", "status_return_level") == 2  # power-off takes it back, undo has no part in it
+
+
 def test_what_is_accepted_stays_and_is_kept(tmp_path):
     with robot(tmp_path / "ant", servo=[{"joint": "knee_fl", "shutdown": 0x3D}]) as ant:
         finding, _ = ant.do(inventory(ant.bench), ant.builder(answers={"What to do": "accept"}))

@@ -15,15 +15,20 @@ from click.testing import CliRunner, Result
 from talker import Talker, talking
 from wire import IDS, ant
 
+from openant_tools.calib.mute import let_answer, silenced
 from openant_tools.cli.comms import comms
 from openant_tools.comms import lateness, protocol1, troubleshooting
 from openant_tools.comms.bench import RateTrial
 from openant_tools.comms.clock import RealClock
 from openant_tools.comms.faults import NoAnswer
 from openant_tools.comms.scan import scan
+from openant_tools.comms.setup import open_bus
 from openant_tools.comms.silence import diagnose, explained
 from openant_tools.comms.troubles import PORT, SILENCE
+from openant_tools.procedure.journal import Journal
+from openant_tools.procedure.step import Bench, Intent
 from openant_tools.recording.run import Facts, Run
+from openant_tools.robot.folder import create_robot
 
 MEGABAUD = ("--baud", "1000000")
 
@@ -230,6 +235,28 @@ def test_an_error_that_comes_back_at_once_is_said(tmp_path: Path) -> None:
         result = run("reboot", "--port", talker.path, "--id", "31", "--yes")
     assert result.exit_code == 1
     assert "reports motor encoder again at once" in result.output
+
+
+def test_protocol_1_is_ended_after_the_question_and_stands_in_the_journal(tmp_path: Path) -> None:
+    bench = Bench(create_robot(tmp_path / "ant"))
+    with talking(tmp_path, 31, old=(31,)) as talker:
+        talker.memory[31][64] = 1  # torque on locks the memory
+        bus = open_bus(talker.path, 1_000_000)
+        try:
+            mute = silenced(bus, [bench.folder.config().motors["knee_fl"]])
+            procedure = let_answer(bench, bus, mute, "openant calib inventory")
+            said = next(procedure)
+            intent = next(procedure)
+            assert "speaks Protocol 1.0" in str(said)
+            assert not talker.written  # nothing before it is granted
+            assert isinstance(intent, Intent)
+            assert [str(change) for change in intent.registers] == ["knee_fl: protocol_type 1 → 2"]
+            procedure.send(True)
+            assert (talker.memory[31][13], talker.memory[31][64]) == (2, 0)
+        finally:
+            bus.close()
+    [entry] = Journal(bench.folder.journal).entries()
+    assert (entry.write.register, entry.write.old, entry.write.new) == ("protocol_type", 1, 2)
 
 
 # ---- protocol 1.0 --------------------------------------------------------------------------------------------------------

@@ -39,6 +39,7 @@ def comms_health(bench: Bench) -> Procedure:
         delays = servos.read_all("return_delay_time")
         bus.timing = replace(bus.timing, return_delay_s=max(delays.values()) * 2e-6)
         lost, missed, punctual = dict.fromkeys(servos.joints, 0), 0, 0
+        bus.clock.lateness.mark()
         for _ in range(CYCLES):
             answers = bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, servos.ids)
             late = bus.clock.lateness.cycle() > LATE_S

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
+from openant_tools.calib.mute import scan_and_mend
 from openant_tools.calib.wires import BOOT_S, journalled, opened_bus, wait
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.scan import BAUDS, Scan, Scanned, scan
@@ -58,7 +59,7 @@ def ids(bench: Bench) -> Procedure:
     named, problems = list[str](), list[str]()
     with opened_bus(bench) as bus:
         yield Progress(None, "who is on the cable, at every baud rate")
-        found = scan(bus)
+        found = yield from scan_and_mend(bench, bus, COMMAND)
         if _all_named(found, motors, config):
             return _finding([motor.joint for motor in motors], motors, [], "every servo has its id already")
         wired = not found.garbled and len(found.servos) > 1 and not any(one.clash for one in found.servos)
@@ -101,7 +102,7 @@ def _one(
             f"Plug in one servo for the {words} ({motor.joint}): a {motor.model}, and no other.", "plug", motor.joint
         )
         wait(bus.clock, BOOT_S)
-        found = scan(bus)
+        found = yield from scan_and_mend(bench, bus, COMMAND)
         wrong = _not_one(found, motor, motors, config)
         if wrong is None:
             break

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from openant_tools.comms import protocol1
 from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.bus import Bus
-from openant_tools.comms.scan import Scan
+from openant_tools.comms.scan import Scan, scan
 from openant_tools.comms.silence import (
     LEVELS,
     PATIENCE_S,
@@ -22,12 +22,13 @@ from openant_tools.comms.silence import (
     patient_ping,
     read_register,
 )
+from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.procedure.step import Answer, Bench, Event, Intent, RegisterChange, Say
 from openant_tools.robot.config import Motor
 
-__all__ = ["Mute", "in_scan", "let_answer", "silenced"]
+__all__ = ["Mute", "in_scan", "let_answer", "scan_and_mend", "silenced"]
 
 PROTOCOL_TYPE, TORQUE_ENABLE = 13, 64
 TRIES = 3
@@ -50,8 +51,12 @@ class Mute:
     @property
     def words(self) -> str:
         if self.register == "protocol_type":
-            return f"{self.joint} (id {self.id}) speaks Protocol 1.0 at {self.baud} baud"
-        return f"{self.joint} (id {self.id}) has Status Return Level {self.old}: it answers {LEVELS[self.old]}"
+            return SILENCE["protocol_1"].says.format(who=self.who, baud=self.baud)
+        return SILENCE["return_level"].says.format(who=self.who, level=self.old, answers=LEVELS[self.old])
+
+    @property
+    def who(self) -> str:
+        return self.joint if self.joint == f"id {self.id}" else f"{self.joint} (id {self.id})"
 
 
 def silenced(bus: Bus, motors: Iterable[Motor]) -> list[Mute]:
@@ -73,13 +78,22 @@ def silenced(bus: Bus, motors: Iterable[Motor]) -> list[Mute]:
     return found
 
 
-def in_scan(found: Scan, name: str) -> list[Mute]:
-    """The same of a scan; every servo is called `name`."""
+def in_scan(found: Scan) -> list[Mute]:
+    """The same of a scan, in which nobody has said which joint an id is."""
     return [
-        Mute(name, one.id, one.baud, "status_return_level", one.return_level)
+        Mute(f"id {one.id}", one.id, one.baud, "status_return_level", one.return_level)
         for one in found.servos
         if one.return_level < 2
-    ] + [Mute(name, id, baud, "protocol_type", 1) for id, baud in found.protocol_1]
+    ] + [Mute(f"id {id}", id, baud, "protocol_type", 1) for id, baud in found.protocol_1]
+
+
+def scan_and_mend(bench: Bench, bus: Bus, command: str) -> Generator[Event, Answer, Scan]:
+    """Who is on the bus, once those that were told to be silent answer again."""
+    found = scan(bus)
+    if in_scan(found):
+        yield from let_answer(bench, bus, in_scan(found), command)
+        found = scan(bus)
+    return found
 
 
 def let_answer(bench: Bench, bus: Bus, mute: Sequence[Mute], command: str) -> Generator[Event, Answer, list[str]]:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from openant_tools.comms import guardian, messages
 from openant_tools.comms import protocol2 as p2
+from openant_tools.comms.bench import bus_limit_hz
 from openant_tools.comms.body_imu import BodyImu
 from openant_tools.comms.bus import Answer, Bus, Timing
 from openant_tools.comms.checked import checked
@@ -41,8 +42,9 @@ from openant_tools.comms.ports import WANTED_LATENCY_MS, Host, udev_rule
 from openant_tools.comms.restart import StopCause
 from openant_tools.comms.ring import ERR_CODES, Ring
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Block, Servo, Servos
-from openant_tools.comms.silence import diagnose, explained
+from openant_tools.comms.silence import diagnose, explained, reader_words
 from openant_tools.comms.thinning import Thinning
+from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
 from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.recording.resume import continuation
@@ -172,6 +174,9 @@ class Engine:
             write_read_gap_s=config.write_read_gap_s, latency_timer_s=self._latency_timer_s or Timing.latency_timer_s
         )
         self._bus = Bus(self._line, self.clock, timing)
+        reader = reader_words(config.port)
+        if reader:
+            self._notice(f"{reader} → {SILENCE['second_reader'].do}")
         self._start_guardian()
         servos = Servos(self._bus, config.servos)
         found = servos.identify()
@@ -181,6 +186,7 @@ class Engine:
         delays = servos.read_all("return_delay_time")
         longest = max(delays.values()) * known[0].model.registers["return_delay_time"].scale
         self._bus.timing = replace(timing, return_delay_s=longest)
+        self._compare_rate()
         if self._latency_timer_s is None:
             measured = self._bus.measure_latency_timer(known[0].id)
             self._bus.timing = replace(self._bus.timing, latency_timer_s=round(measured, 3))
@@ -205,6 +211,20 @@ class Engine:
                 self._notice(f"going on without the IMU: {error}")
         if config.camera is not None:
             self._open_camera(config.camera)
+
+    def _compare_rate(self) -> None:
+        """Say where more cycles a second are wanted than the wire allows."""
+        bus, config = self._bus, self.config
+        limit = bus_limit_hz(
+            config.baud, len(config.servos), fast=bus.fast.issuperset(self._servos.ids), gap_s=config.write_read_gap_s,
+            return_delay_s=bus.timing.return_delay_s,
+        )  # fmt: skip
+        if config.rate_hz > limit:
+            self._notice(
+                f"{config.rate_hz:g} cycles/s are wanted, and {len(config.servos)} servos at {config.baud} baud allow "
+                f"{limit:.0f}: rows come as fast as they can → a higher baud rate, no return delay (`openant calib "
+                "inventory`), or a lower rate"
+            )
 
     def _open_camera(self, config: CameraConfig) -> None:
         from openant_tools.comms.body_camera import BodyCamera  # OpenCV takes its time to load
@@ -361,6 +381,7 @@ class Engine:
 
     def _loop(self) -> None:
         due, cycles = self.clock.now(), 1
+        self.clock.lateness.mark()
         while not self._ending:
             if self.clock.stepped and not self._motions and not self._looks:
                 # A virtual robot's time stands still while there is nothing to do. What is asked for within the cycle

@@ -64,6 +64,10 @@ class Lateness:
             self._noted_s = seconds
             self.worst_s = max(self.worst_s, seconds)
 
+    def mark(self) -> None:
+        """A cycle begins here: what was before belongs to none."""
+        self._queued_s, self._noted_s = self._queue(), 0.0
+
     def cycle(self, wake_s: float = 0.0) -> float:
         """How late (s) the cycle was that ends now, by its wake-up `wake_s`, its waits and the run queues; counted."""
         queued = self._queue()

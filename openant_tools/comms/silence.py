@@ -97,7 +97,7 @@ def ask(
     while clock.now() < give_up and clock.wait_readable(line, clock.now() + QUIET_S):
         if not line.read():
             break
-    clock.lateness.cycle()
+    clock.lateness.mark()
     bus.send(packet)
     started = clock.now()
     deadline, parser = started + wait_s, p2.Parser()
@@ -369,7 +369,10 @@ def _together(found: Sequence[Silence], questions: _Questions) -> Silence:
     """One of several causes leads, in the order of the table; servos of one cause and the same words share them."""
     grouped: dict[tuple[Any, ...], Silence] = {}
     for one in found:
-        key = (one.cause, *(str(value) for name, value in one.values.items() if name not in ("who", "id", "after_ms")))
+        key = (
+            one.cause,
+            *(str(value) for name, value in one.values.items() if name not in ("who", "id", "after_ms", "late")),
+        )
         if key in grouped:
             values = {name: value for name, value in one.values.items() if name != "who"}
             grouped[key] = questions._say(one.cause, (*grouped[key].ids, *one.ids), **values)
