@@ -95,11 +95,11 @@ def test_each_family_is_found_at_five_distances_and_tilts_within_its_stated_erro
         position=(0.3, -0.2, 2.6), origin=replace(MIDDLE, family=family), body=TagOnRobot(family, 12), fps=30.0
     )
     camera = OverheadCamera(settings, seed=4)
-    tracker = BodyTracker(TagSetup(family), camera.intrinsics)
+    tracker = BodyTracker(TagSetup(family, heights=(0.0, 2.0)), camera.intrinsics)
     settle(tracker, camera)
     for k, (height, tilt) in enumerate([(0.15, 0.0), (0.5, 0.1), (0.9, -0.15), (1.3, 0.2), (1.6, -0.3)]):
         truth = scene(x=0.25, y=-0.1, z=height, roll=tilt, pitch=0.5 * tilt, yaw=0.7 * k)
-        pose = tracker.track(photo(camera, truth, 10 + k), 1.0, (tilt, 0.5 * tilt))
+        pose = tracker.track(photo(camera, truth, 10 + k), 1.0 + k, (tilt, 0.5 * tilt))
         assert isinstance(pose, BodyPose), pose
         error = pose.position - truth.position
         assert np.all(np.abs(error) < 4 * pose.position_error + 1e-3)
@@ -165,7 +165,7 @@ def test_a_body_at_the_pictures_edge_says_so() -> None:
     camera = OverheadCamera(SMALL, seed=2)
     tracker = BodyTracker(TagSetup(), camera.intrinsics)
     settle(tracker, camera)
-    inner, outer = (tracker.track(photo(camera, scene(x=x)), 1.0) for x in (0.2, 0.33))
+    inner, outer = (tracker.track(photo(camera, scene(x=x)), t) for t, x in ((1.0, 0.2), (2.0, 0.33)))
     assert isinstance(inner, BodyPose)
     assert isinstance(outer, BodyPose)
     assert (inner.near_edge, outer.near_edge) == (False, True)
@@ -493,7 +493,7 @@ def test_the_engines_camera_gives_poses_in_order_and_tells_what_is_wrong_once(st
         results, news = watch(1.5)
         assert isinstance(results[-1], BodyLost)
         assert len(news) == 1
-        assert "does not see the robot for 0.5 s: body tag 12 not seen → look at the picture" in news[0]
+        assert "no pose of the robot for 0.5 s: body tag 12 not seen → look at the picture" in news[0]
         assert eye.statistics.received > 40
     finally:
         stepped.motion = still
@@ -524,7 +524,7 @@ def test_opencv_opens_the_stream_and_its_drops_and_return_are_noticed() -> None:
     driver = Camera(CameraSettings(url), RealClock())
     try:
         info = driver.open()
-        assert (info.width, info.height, info.backend) == (640, 360, "FFMPEG")
+        assert (info.width, info.height, info.backend) == (640, 360, "MJPEG")
         assert info.latency_source == "guess"
         assert "until it is measured" in info.notes[-1]
         first = driver.wait(time.monotonic() + 5)

@@ -7,6 +7,7 @@ else, so that every run is the same.
 
 from __future__ import annotations
 
+import re
 import threading
 from collections import deque
 from dataclasses import dataclass, field
@@ -128,14 +129,17 @@ class BodyCamera:
         fault: OpenAntError | None = self._error or self._camera.fault()
         now = self._clock.now()
         if fault is None and now - self._seen_at > LOST_S and self._lost:
-            fault = HardwareFault(
-                f"the camera does not see the robot for {now - self._seen_at:.1f} s: {self._lost}",
-                remedy="look at the picture: light, focus, and both tags in view",
+            # What stands after a colon says what to do already.
+            remedy = (
+                None
+                if ": " in self._lost or "; " in self._lost
+                else "look at the picture: light, focus, and both tags in view"
             )
+            fault = HardwareFault(f"no pose of the robot for {now - self._seen_at:.1f} s: {self._lost}", remedy=remedy)
         if fault is None:
             self._said = ("", -np.inf)
             return None
-        kind = fault.what[:30]
+        kind = re.sub(r"\d", "", fault.what)
         if kind == self._said[0] and now - self._said[1] < REPEAT_S:
             return None
         self._said = (kind, now)

@@ -2,7 +2,8 @@
 
 Two kinds of source behind one face:
 
-* an OpenCV capture (`0`, `/dev/video2`, `http://…/stream.mjpg`), read by a thread that keeps the newest picture only;
+* a stream of JPEG pictures (`http://…/stream.mjpg`) or an OpenCV capture (`0`, `/dev/video2`, `rtsp://…`), read by a
+  thread that keeps the newest picture only;
 * under a stepped clock, a virtual camera's snapshots, asked for the moment in question.
 
 When was it taken? Video4Linux stamps buffers with the machine's monotonic clock, and those stamps are used where they
@@ -31,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.comms.clock import Clock
+from openant_tools.comms.mjpeg import MjpegStream
 from openant_tools.errors import BadInput, HardwareFault
 
 __all__ = ["Camera", "CameraInfo", "CameraSettings", "CameraStatistics", "DropCounter", "Frame", "Setting"]
@@ -319,12 +321,13 @@ class _Frozen:
         self._since = 0.0
         self._same = 0
 
-    def add(self, image: Image, t: float) -> None:
-        sample = image[::16, ::16].copy()
-        if self._last is not None and np.array_equal(sample, self._last):
+    def add(self, image: Image, t: float) -> bool:
+        """Whether it is another picture than the one before, not the same once more."""
+        if self._last is not None and np.array_equal(image, self._last):
             self._same += 1
-        else:
-            self._last, self._since, self._same = sample, t, 0
+            return False
+        self._last, self._since, self._same = image, t, 0
+        return True
 
     def fault(self, now: float, name: str) -> HardwareFault | None:
         if self._same < FROZEN_FRAMES or now - self._since < FROZEN_S:
@@ -349,6 +352,7 @@ class _Capture:
         self._stop = False
         self._newest: Frame | None = None
         self._given = -1
+        self._arrived = 0.0
         self._count = 0
         self._drops = DropCounter()
         self._frozen = _Frozen()
@@ -414,7 +418,7 @@ class _Capture:
         now = self._clock.now()
         name = self._settings.name
         with self._lock:
-            age = now - self._newest.arrived if self._newest else 0.0
+            age = now - self._arrived if self._newest else 0.0
             if not self._connected and not self._timed_out:
                 return HardwareFault(
                     "the camera is unplugged or closed its stream", where=name, remedy="look at its cable"
@@ -463,23 +467,30 @@ class _Capture:
         return None
 
     def _publish(self, image: Image, arrived: float, stamp: float | None) -> None:
-        latency, _ = self._latency()
         with self._lock:
+            self._arrived = arrived
+            self._connected = True
             self._drops.add(arrived if stamp is None else stamp)
-            self._frozen.add(image, arrived)
+            if not self._frozen.add(image, arrived):
+                self._lock.notify_all()
+                return  # the same picture once more is not where the robot is now
+            if (
+                stamp is not None
+                and self._newest is not None
+                and stamp - (self._settings.latency_s or 0.0) <= self._newest.t
+            ):
+                self._kernel_stamps, stamp = False, None  # stamps that stand still or run back are none
+            latency, _ = self._latency()
             if self._newest is not None and self._given < self._newest.index:
                 self._statistics.skipped += 1
             t = arrived - latency if stamp is None else stamp - (self._settings.latency_s or 0.0)
             self._newest = Frame(image, t, arrived, self._count)
             self._count += 1
-            self._connected = True
             self._lock.notify_all()
 
     def _reopen(self) -> Any:
         with self._lock:
-            self._timed_out = (
-                self._newest is not None and self._clock.now() - self._newest.arrived > 0.8 * READ_TIMEOUT_S
-            )
+            self._timed_out = self._newest is not None and self._clock.now() - self._arrived > 0.8 * READ_TIMEOUT_S
             self._connected = False
             self._drops.pause()
             self._lock.notify_all()
@@ -505,6 +516,10 @@ def _open(settings: CameraSettings) -> tuple[Any, list[Setting]]:
     source, backend = settings.source, cv2.CAP_ANY
     params: list[int] = []
     if settings.network:
+        try:
+            return MjpegStream(str(source), OPEN_TIMEOUT_S, READ_TIMEOUT_S), []
+        except (OSError, ValueError, http.client.HTTPException):
+            pass  # another kind of stream, which FFmpeg may know; what keeps it from opening is said below
         backend = cv2.CAP_FFMPEG
         params = [
             *(cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, int(OPEN_TIMEOUT_S * 1000)),
@@ -599,7 +614,7 @@ class _Snapshots:
         self._count = 0
         self._frozen = _Frozen()
         self._gone = False
-        self._began = clock.now()
+        self._began = self._arrived = clock.now()
         while (frame := self.newest()) is None:
             if clock.now() - self._began > FIRST_FRAME_TIMEOUT_S or self._gone:
                 raise HardwareFault("no picture comes", where=settings.name, remedy="look at the camera's cable")
@@ -632,10 +647,12 @@ class _Snapshots:
                 return self._frame
             self._last = number
             arrived = float(answer.headers["X-Delivered"])
+            self._arrived = arrived
+            if not self._frozen.add(np.asarray(image, np.uint8), arrived):
+                return self._frame  # the same picture once more is not where the robot is now
             latency = self._settings.latency_s
             t = float(answer.headers["X-Timestamp"]) if latency is None else arrived - latency
             self._frame = Frame(np.asarray(image, np.uint8), t, arrived, self._count)
-            self._frozen.add(self._frame.image, arrived)
             self._count += 1
         return self._frame
 
@@ -650,7 +667,7 @@ class _Snapshots:
             return HardwareFault(
                 "the camera is unplugged or closed its stream", where=self._settings.name, remedy="look at its cable"
             )
-        age = now - self._frame.arrived if self._frame else now - self._began
+        age = now - self._arrived if self._frame else now - self._began
         if age > STALLED_S:
             return HardwareFault(
                 f"the camera has sent no picture for {age:.1f} s", where=self._settings.name, remedy="look at its cable"

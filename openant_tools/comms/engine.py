@@ -132,6 +132,7 @@ class Engine:
         #: the line talks without a pause, and it has been told
         self._restless = False
         self._imu: BodyImu | None = None
+        self._pose_lost = ""
         self._camera: BodyCamera | None = None
 
     # ---- life ----------------------------------------------------------------------------------------------------
@@ -439,10 +440,16 @@ class Engine:
         if lean is not None:
             camera.lean(*lean)
         for seen in camera.poses():
-            if self._recorder is not None and isinstance(seen, BodyPose):
+            if self._recorder is None:
+                continue
+            if isinstance(seen, BodyPose):
                 self._recorder.pose(
                     seen.t, position=seen.position.tolist(), yaw=seen.yaw, quaternion=seen.quaternion.tolist()
                 )
+            reason = "" if isinstance(seen, BodyPose) else seen.reason
+            if seen.kind != self._pose_lost:
+                self._pose_lost = seen.kind
+                self._recorder.event("pose lost" if reason else "pose found", taken=seen.t, reason=reason)
 
     def _cycle(self, wake: float, cycles: int) -> None:
         if self._lost:

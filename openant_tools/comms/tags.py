@@ -14,12 +14,16 @@ The origin tag does not move, so its corners are averaged over many pictures (me
 is computed once; it may then be covered. If it is seen elsewhere for a while, the camera was bumped: poses stop until
 the new place is certain.
 
-The body tag is found in this very picture or the robot is **lost**, with the reason. No pose is ever held.
+The body tag is found in this very picture or the robot is **lost**, with the reason. No pose is ever held. Nor is one
+given where a picture can be read in two ways: two sheets with one tag, a picture of another size, an origin that is
+remembered from another view or looks larger than before (a zoom or a crop, which no lens of ours is for), a body higher than
+one can stand or leaning otherwise than the IMU says, a tag that is suddenly elsewhere.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections import deque
 from dataclasses import dataclass
@@ -28,6 +32,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.comms.doubts import View, other_reading
 from openant_tools.comms.intrinsics import Intrinsics
 from openant_tools.comms.tag_family import load_family
 from openant_tools.errors import BadInput
@@ -60,6 +65,17 @@ ORIGIN_MIN = 5
 #: The origin tag seen this far from where it was, this many pictures running: something was moved.
 ORIGIN_MOVED_PX = 2.0
 ORIGIN_MOVED_PICTURES = 10
+#: Found elsewhere, it is as far from the camera as before within this share, or the picture has another scale.
+ORIGIN_SAME_SHARE = 0.06
+#: A second sheet with the same number: not much smaller or paler than the first, or it is a pattern that looks like one.
+#: s after which one that is not seen any more is gone
+TWIN_SHARE, TWIN_S = 0.4, 10.0
+#: Between two pictures a robot goes so far at most, m and m/s; beyond, so many pictures must agree on where it is.
+JUMP_M, JUMP_M_S, JUMP_PICTURES = 0.10, 3.0, 10
+#: The tag's lean and the IMU's differ by less, rad: corners of a small tag err by a few degrees.
+LEAN_APART_RAD = math.radians(25.0)
+#: Pictures without a tag after which it is asked why.
+ASK_WHY = 15
 
 # Tag axes (up, left, out) in the frame that IPPE_SQUARE wants (right, up, out).
 _IPPE_FROM_TAG = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -73,6 +89,7 @@ class TagSetup:
         origin_size, body_size: edge length in m (`tag_family` says which square that is).
         body_position: centre of the body tag in the body, m. body_yaw: its up-direction against the body's x, rad.
         min_margin, max_hamming: what the detector must be sure of; upstream accepts a margin of 2.
+        heights: of the body's origin over the floor, m, between which it can be.
         edge: share of the picture's width and height, on each side, that counts as its edge.
         decimate: quads are searched in a picture this much smaller, corners refined in the whole one. At 2 the families
             with many cells get lost below 20 px (benchmarks/tag_pose.py).
@@ -87,6 +104,7 @@ class TagSetup:
     body_yaw: float = 0.0
     min_margin: float = 5.0
     max_hamming: int = 0
+    heights: tuple[float, float] = (-0.05, 0.45)
     edge: float = 0.10
     decimate: float = 1.5
 
@@ -165,6 +183,11 @@ class BodyPose:
     detection_s: float
 
     @property
+    def kind(self) -> str:
+        """As that of `BodyLost`: nothing is wrong."""
+        return ""
+
+    @property
     def heading(self) -> Array:
         """The body's x axis in the floor, a unit vector (2,)."""
         return np.array([math.cos(self.yaw), math.sin(self.yaw)])
@@ -184,6 +207,11 @@ class BodyLost:
 
     t: float
     reason: str
+
+    @property
+    def kind(self) -> str:
+        """The reason without its figures, which change from picture to picture."""
+        return re.sub(r"[\d.]+", "", self.reason)
 
 
 class BodyTracker:
@@ -206,6 +234,15 @@ class BodyTracker:
         self._elsewhere: list[Array] = []
         self._origin: _Origin | None = None
         self._misfits: deque[float] = deque(maxlen=CORNER_MEMORY)
+        self._size: tuple[int, int] | None = None
+        self._twin: tuple[float, str] = (-math.inf, "")
+        self._view: View | None = None
+        self._camera_m: float | None = None
+        self._scaled = ""
+        self._last: tuple[float, Array] | None = None
+        self._jumped = 0
+        self._jump_words = ""
+        self._unread, self._why = 0, ""
 
     @property
     def origin(self) -> tuple[Array, Array] | None:
@@ -226,17 +263,68 @@ class BodyTracker:
         began = time.perf_counter()
         setup = self.setup
         gray = picture if picture.ndim == 2 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
-        lens = self._intrinsics.scaled(gray.shape[1], gray.shape[0])
+        size = (gray.shape[1], gray.shape[0])
+        if self._size is not None and size != self._size:
+            before = "×".join(map(str, self._size))
+            return BodyLost(
+                t, f"the picture is {size[0]}×{size[1]} now, it was {before}: another mode, crop or turn of the camera"
+            )
+        lens = self._intrinsics.scaled(*size)
+        self._size = size
         sightings = self._detector.detect(gray)
-        self._note_origin(best(sightings, setup.origin_id, setup), lens, t)
+        for which, tag in (("origin", setup.origin_id), ("body", setup.body_id)):
+            if _twins(sightings, tag, setup):
+                self._twin = (t, f"{which} tag {tag} is seen twice: take the other sheet with this number away")
+        if abs(t - self._twin[0]) < TWIN_S:
+            return BodyLost(t, self._twin[1])
+        origin = best(sightings, setup.origin_id, setup)
+        self._note_origin(origin, lens, t)
         seen = best(sightings, setup.body_id, setup)
+        self._unread = 0 if origin is not None and seen is not None else self._unread + 1
         if self._elsewhere:
             return BodyLost(t, "the origin tag or the camera has moved")
         if self._origin is None:
-            return BodyLost(t, f"origin tag {setup.origin_id} not seen yet")
+            return BodyLost(t, f"origin tag {setup.origin_id} not seen yet" + self._other_reading(gray))
+        if self._scaled:
+            return BodyLost(t, self._scaled)
+        body = None if seen is None else (*seen.corners.mean(axis=0).tolist(), seen.size_px)
+        if origin is not None:
+            if body is not None:  # else legs could stand anywhere
+                self._view = View(gray, body)
+        elif self._view is not None and self._view.moved(gray, body):
+            return BodyLost(t, f"the view has moved while origin tag {setup.origin_id} was hidden: uncover it")
         if seen is None:
-            return BodyLost(t, self._why_not(sightings))
-        return self._pose(seen, lens, t, tilt, began)
+            return BodyLost(t, self._why_not(sightings) + self._other_reading(gray))
+        return self._steady(self._pose(seen, lens, t, tilt, began))
+
+    def _other_reading(self, gray: Gray) -> str:
+        """What else the picture may be, looked at now and then while tags are missing."""
+        if not self._unread:
+            self._why = ""
+        elif self._unread % ASK_WHY == 1 and self._unread > 1:
+            why = other_reading(gray, self.setup.family, (self.setup.origin_id, self.setup.body_id))
+            self._why = f"; {why}" if why else ""
+        return self._why
+
+    def _steady(self, found: BodyPose | BodyLost) -> BodyPose | BodyLost:
+        """The pose, unless it is farther from the last one than a robot goes; until enough pictures agree on it."""
+        if isinstance(found, BodyLost):
+            return found
+        if self._last is not None:
+            before, place = self._last
+            gone = float(np.linalg.norm(found.position - place))
+            if gone > JUMP_M + JUMP_M_S * max(0.0, found.t - before):
+                self._jumped = 1
+                self._last = (found.t, found.position)
+                words = f"body tag {self.setup.body_id} was {gone:.2f} m away {found.t - before:.2f} s ago"
+                self._jump_words = f"{words}: another sheet with its number, or was the robot carried?"
+                return BodyLost(found.t, self._jump_words)
+        self._last = (found.t, found.position)
+        if self._jumped:
+            self._jumped = 0 if self._jumped >= JUMP_PICTURES else self._jumped + 1
+            if self._jumped:
+                return BodyLost(found.t, self._jump_words)
+        return found
 
     def _why_not(self, sightings: list[Sighting]) -> str:
         tag = self.setup.body_id
@@ -269,6 +357,7 @@ class BodyTracker:
                     self._seen = deque(self._elsewhere[-ORIGIN_MIN:], maxlen=ORIGIN_MEMORY)
                     self._elsewhere = []
                     self._origin = None
+                    self._last, self._jumped = None, 0
                     self.origin_moves += 1
                     self._solve_origin(lens)
                 return
@@ -290,6 +379,19 @@ class BodyTracker:
             noise = max(self.corner_noise_px / math.sqrt(max(1, int(near.sum()))), CORNER_BIAS_PX)
             fit = refine(*poses[0], mean, self.setup.origin_size, lens, None, noise)
             self._origin = _Origin(fit.rotation, fit.position, fit.covariance)
+            self._judge_scale(float(np.linalg.norm(fit.position)), settled=len(self._seen) == ORIGIN_MEMORY)
+
+    def _judge_scale(self, far_m: float, *, settled: bool) -> None:
+        """A camera that was pushed aside is as far from the origin as before; one that zooms or crops seems nearer."""
+        if self._camera_m is None or (settled and not self._scaled):
+            self._camera_m = far_m
+        elif abs(far_m / self._camera_m - 1) > ORIGIN_SAME_SHARE:
+            self._scaled = (
+                f"origin tag {self.setup.origin_id} looks {self._camera_m / far_m:.2f} times as large as before: the camera zooms, crops, "
+                "stretches its picture or hangs elsewhere; start it again"
+            )
+        else:
+            self._scaled = ""
 
     # --- the body --------------------------------------------------------------------------------------------------
 
@@ -327,6 +429,20 @@ class BodyTracker:
         rotation, position, yaw = body(fit, still, still)
         if rotation[2, 2] <= 0.0:
             return BodyLost(t, f"body tag {setup.body_id} is seen from below: the body lies on its back")
+        low, high = setup.heights
+        if not low <= position[2] <= high:
+            return BodyLost(
+                t, f"the body would be {position[2]:.2f} m above the floor: is it carried, or are a tag's size, the lens or the "
+                "picture's size other than declared?"
+            )  # fmt: skip
+        if tilt is not None:
+            lean = fit.rotation @ prior.up_tag @ up
+            apart = math.acos(max(-1.0, min(1.0, float(lean))))
+            if apart > LEAN_APART_RAD:
+                return BodyLost(
+                    t, f"the tag leans by {math.degrees(apart):.0f}° otherwise than the IMU says: a stretched picture, or is `openant "
+                    "calib imu` still to be done?"
+                )  # fmt: skip
         variance = np.zeros(4)
         step = 1e-6
         for which, covariance in enumerate((fit.covariance, origin.covariance)):
@@ -362,6 +478,19 @@ def best(sightings: list[Sighting], tag: int, setup: TagSetup) -> Sighting | Non
     """The surest sighting of a tag that passes the gates."""
     good = [s for s in sightings if s.id == tag and s.margin >= setup.min_margin and s.hamming <= setup.max_hamming]
     return max(good, key=lambda s: s.margin, default=None)
+
+
+def _twins(sightings: list[Sighting], tag: int, setup: TagSetup) -> bool:
+    """Whether a picture shows two sheets with one number."""
+    good = [s for s in sightings if s.id == tag and s.margin >= setup.min_margin and s.hamming <= setup.max_hamming]
+    surest = max(good, key=lambda s: s.margin, default=None)
+    return surest is not None and any(
+        s is not surest
+        and s.margin > TWIN_SHARE * surest.margin
+        and TWIN_SHARE < s.size_px / surest.size_px < 1 / TWIN_SHARE
+        and float(np.linalg.norm(s.corners.mean(axis=0) - surest.corners.mean(axis=0))) > surest.size_px / 2
+        for s in good
+    )
 
 
 # --- poses -------------------------------------------------------------------------------------------------------
