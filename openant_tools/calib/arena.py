@@ -24,6 +24,7 @@ from openant_tools.comms import messages
 from openant_tools.comms.body_camera import CameraConfig
 from openant_tools.comms.camera import Camera, CameraInfo, CameraSettings
 from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
+from openant_tools.comms.doubts import other_reading
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics, calibrate
 from openant_tools.comms.latency import camera_latency
@@ -292,8 +293,18 @@ def _look(
             for tag in detector.detect(gray):
                 if tag.hamming == 0 and tag.margin >= 5.0:
                     corners.setdefault(tag.id, []).append(tag.corners)
+            gray_last = gray
     finally:
         camera.close()
+    twice = [id for id, all_ in corners.items() if len(all_) > 1.5 * PICTURES]
+    if twice:
+        raise HardwareFault(
+            f"tag {twice[0]} is in the picture twice",
+            where=str(where),
+            remedy="take the other sheet with this number away",
+        )
+    if not corners and (why := other_reading(gray_last, config.camera.tag_family, (config.camera.origin_tag_id,))):
+        raise HardwareFault(f"no tag of {config.camera.tag_family} is in the picture", where=str(where), remedy=why)
     seen = {id: np.median(np.array(all_), axis=0) for id, all_ in corners.items() if len(all_) >= PICTURES // 3}
     return info, lens, seen, [*words, *(f"camera: {note}" for note in info.notes)]
 
@@ -365,7 +376,8 @@ def _stand_and_wiggle(
     """Lie, stand, turn to and fro, lie: one recording, its phases in the facts."""
     seen = camera_of_robot(replace(config, camera=setup), where)
     assert seen is not None
-    camera: CameraConfig = replace(seen, intrinsics=lens)
+    # How high the body seems to be is what tells a wrong size here.
+    camera: CameraConfig = replace(seen, intrinsics=lens, tags=replace(seen.tags, heights=(-math.inf, math.inf)))
     path = _path(bench)
     with EngineProcess(engine_config(bench, camera=camera)) as engine:
         names = tuple(servo.joint for servo in engine.config.servos)
@@ -408,8 +420,10 @@ def _between(record: Recording, phase: str) -> dict[str, Array]:
         (t >= begin) & (t < end) & np.isfinite([columns[f"base.{name}"] for name in ("x", "y", "z", "yaw")]).all(axis=0)
     )
     if rows.sum() < 10:
+        lost = [str(event["reason"]) for event in record.events if event["kind"] == "pose lost"]
+        why = f": {max(lost, key=lost.count)}" if lost else ""
         raise HardwareFault(
-            f"the robot's tag was seen in {int(rows.sum())} pictures while it was {phase}",
+            f"the camera gave {int(rows.sum())} poses of the robot while it was {phase}{why}",
             remedy="light, focus, and both tags in view",
         )
     return {"t": record.pose.t[rows], **{name: columns[f"base.{name}"][rows] for name in ("x", "y", "z", "yaw")}}

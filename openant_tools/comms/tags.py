@@ -69,7 +69,7 @@ ORIGIN_MOVED_PICTURES = 10
 ORIGIN_SAME_SHARE = 0.06
 #: A second sheet with the same number: not much smaller or paler than the first, or it is a pattern that looks like one.
 #: s after which one that is not seen any more is gone
-TWIN_SHARE, TWIN_S = 0.4, 10.0
+TWIN_SHARE, TWIN_S = 0.25, 10.0
 #: Between two pictures a robot goes so far at most, m and m/s; beyond, so many pictures must agree on where it is.
 JUMP_M, JUMP_M_S, JUMP_PICTURES = 0.10, 3.0, 10
 #: The tag's lean and the IMU's differ by less, rad: corners of a small tag err by a few degrees.
@@ -289,7 +289,7 @@ class BodyTracker:
             return BodyLost(t, self._scaled)
         body = None if seen is None else (*seen.corners.mean(axis=0).tolist(), seen.size_px)
         if origin is not None:
-            if body is not None:  # else legs could stand anywhere
+            if body is not None or self._view is None:  # else legs could stand anywhere
                 self._view = View(gray, body)
         elif self._view is not None and self._view.moved(gray, body):
             return BodyLost(t, f"the view has moved while origin tag {setup.origin_id} was hidden: uncover it")
