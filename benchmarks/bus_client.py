@@ -59,6 +59,7 @@ def ours(path: str | None, fast: bool) -> Callable[[], list[int]]:
     line = MemoryPort() if path is None else SerialLine(path, 1_000_000)
     line.baud = 10**9  # no wire here, and none to wait for
     bus = Bus(line, MemoryClock() if path is None else RealClock(), Timing(write_read_gap_s=0.0))
+    bus.guarded = True  # no servo is there
     servos = Servos(bus, [Servo(j.name, j.id, kit("standard").servo(j.kind)) for j in JOINTS.values()])
     bus.fast = set(IDS) if fast else set()
 

@@ -44,6 +44,7 @@ def one(baud: int, *, fast: bool, seconds: float) -> dict[str, float]:
         os._exit(0)
     try:
         bus = open_bus(str(server.addresses["bus"]), baud)
+        bus.guarded = True  # these servos end with this program
         bus.timing = replace(bus.timing, return_delay_s=0.0, latency_timer_s=1e-3, write_read_gap_s=0.0)
         servos = Servos(bus, [Servo(j.name, j.id, kit("standard").servo(j.kind)) for j in JOINTS.values()])
         bus.fast = set(servos.ids) if fast else set()

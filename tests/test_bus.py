@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import pytest
 from wire import IDS, ant
 
+from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.bus import FAST_AGAIN, Answer, Timing
 from openant_tools.comms.faults import BrokenAnswer, Cause, NoAnswer, Refused
 from openant_tools.comms.guards import Guards, Trip, Watch
@@ -328,6 +330,39 @@ def test_torque_after_a_shutdown_says_why() -> None:
     device.shut_down = True
     with pytest.raises(Refused, match=r"torque stays off after overheating → .*cool"):
         servos.set_torque(True)
+
+
+def test_a_bus_that_nobody_guards_lets_no_servo_move_whatever_the_way() -> None:
+    """calib ids and centre once switched torque on over a bare bus, and a kill left it on for good."""
+    servos, line = robot()
+    bus, first = servos.bus, servos.ids[0]
+    bus.guarded = False
+    on, goal = b"\1", (2300).to_bytes(4, "little")
+    ways: list[Callable[[], object]] = [
+        lambda: servos.set_torque(True),
+        lambda: servos.write_counts("torque_enable", "hip_rr", 1),
+        lambda: servos.write_all("torque_enable", {"hip_rr": 1}),
+        lambda: servos.write_all("goal_position", {"hip_rr": 2300}),
+        lambda: servos.write("goal_position", "hip_rr", 1.0),
+        lambda: servos.write_goals([2300] * 8),
+        lambda: bus.write(first, 64, on),
+        lambda: bus.write(p2.BROADCAST, 63, b"\0\1"),
+        lambda: bus.reg_write(first, 64, on),
+        lambda: bus.sync_write(64, 1, {first: on}),
+        lambda: bus.bulk_write([(first, 65, on), (servos.ids[1], 116, goal)]),
+    ]
+    for way in ways:
+        with pytest.raises(BadInput, match="nobody would switch torque off .* through the engine"):
+            way()
+    for guarded in (False, True):
+        bus.guarded = guarded
+        with pytest.raises(BadInput, match="as it starts is guarded by nobody"):
+            servos.write_counts("startup_configuration", "hip_rr", 1)
+    assert not any(device.torque for device in line.wire.servos)  # type: ignore[attr-defined]
+    bus.guarded = False
+    servos.set_torque(False)
+    servos.write_counts("led", "hip_rr", 1)
+    bus.sync_write(112, 4, dict.fromkeys(servos.ids, bytes(4)))
 
 
 def test_a_tripped_watchdog_is_found() -> None:

@@ -121,4 +121,5 @@ def ant(
     line = WireLine(Wire(servos, settings, lambda t: None, seed=seed))
     names = {joint.id: joint.name for joint in JOINTS.values()}
     bus = Bus(line, line, timing or Timing(return_delay_s=0.0, latency_timer_s=1e-3), names)
+    bus.guarded = True  # these servos end with this process
     return bus, line

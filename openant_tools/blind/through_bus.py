@@ -210,6 +210,7 @@ class _Host:
     def __init__(self, world: World) -> None:
         self.world, self.wire = world, _Wire(world)
         self.bus = Bus(self.wire, self.wire, Timing(return_delay_s=0.0, latency_timer_s=1e-3))
+        self.bus.guarded = True  # these servos end with this process
         parts = kit("standard")
         self.servos = Servos(
             self.bus,

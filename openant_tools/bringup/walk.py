@@ -37,6 +37,7 @@ WALK: Mapping[str, Step] = {
             needs=("connect",),
             table="one servo on the cable, lying free; 12 V on",
             changes="torque on and off",
+            holds=True,
             minutes=1,
         ),
         Step(

@@ -3,11 +3,32 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Generator
 
-from openant_tools.calib.wires import BOOT_S, journalled, opened_bus, robot_servos, wait
+import numpy as np
+
+from openant_tools.calib.sweep import play_watched
+from openant_tools.calib.wires import BOOT_S, bare_config, journalled, opened_bus, robot_servos, wait
+from openant_tools.comms import messages
+from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.motion import ramp
+from openant_tools.comms.servos import Servo
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.step import Ask, Bench, Hands, Intent, Live, Look, Procedure, Progress, RegisterChange, Say
+from openant_tools.procedure.step import (
+    Answer,
+    Ask,
+    Bench,
+    Event,
+    Hands,
+    Intent,
+    Look,
+    Procedure,
+    Progress,
+    RegisterChange,
+    Say,
+)  # fmt: skip
+from openant_tools.robot.config import Motor
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import NOMINAL_ZERO_RAD
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE
@@ -15,12 +36,12 @@ from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE
 __all__ = ["centre"]
 
 COMMAND = "openant calib centre"
-#: 0.229 rpm units: 0.24 rad/s, slow enough to take a finger away
-SLOW_COUNTS = 10
+#: slow enough to take a finger away
+SLOW_RAD_S = 0.3
 CENTRE_PWM = 0.3
 #: An unloaded servo stops within friction of its goal: 23 pulses.
 CLOSE_RAD = 0.035
-LONGEST_S = 20.0
+SETTLE_S = 0.5
 POSITION_MODE = 3
 DRAWINGS = {
     "hip": """\
@@ -46,15 +67,17 @@ def centre(bench: Bench) -> Procedure:
     """
     config = bench.folder.config()
     motors = [motor for motor in config.motors.values() if not bench.joints or motor.joint in bench.joints]
-    goal = round(NOMINAL_ZERO_RAD / RAD_PER_PULSE)
     centred, problems, evidence = list[str](), list[str](), list[Evidence]()
     with opened_bus(bench) as bus:
-        if all(bus.ping(motor.id, insist=True) is None for motor in motors):
-            yield Hands("Connect the servos, still without horns, one behind the other; 12 V on.", "plug")
+        connected = any(bus.ping(motor.id, insist=True) is not None for motor in motors)
+    if not connected:
+        yield Hands("Connect the servos, still without horns, one behind the other; 12 V on.", "plug")
+        with opened_bus(bench) as bus:
             wait(bus.clock, BOOT_S)
-        for k, motor in enumerate(motors):
-            joint, kind = motor.joint, JOINTS[motor.joint].kind
-            yield Progress(k / len(motors), f"{joint} ({k + 1} of {len(motors)})")
+    for k, motor in enumerate(motors):
+        joint = motor.joint
+        yield Progress(k / len(motors), f"{joint} ({k + 1} of {len(motors)})")
+        with opened_bus(bench) as bus:
             if bus.ping(motor.id, insist=True) is None:
                 problems.append(
                     f"{joint} (id {motor.id}) does not answer → plug it in and run the step again with --joint {joint}"
@@ -63,52 +86,24 @@ def centre(bench: Bench) -> Procedure:
             servos = journalled(bus, robot_servos(config, [joint]), bench, COMMAND)
             servos.set_torque(False)
             mode, at = servos.read_counts("operating_mode", joint), servos.read_counts("present_position", joint)
-            changes = [RegisterChange(joint, "operating_mode", mode, POSITION_MODE)] if mode != POSITION_MODE else []
-            yield Look(f"{joint}: how its horn goes on", DRAWINGS[kind])
-            yield Intent(
-                f"turn {joint} slowly from {math.degrees(at * RAD_PER_PULSE):.0f}° to {math.degrees(goal * RAD_PER_PULSE):.0f}° "
-                "and hold it there; keep the shaft free",
-                tuple(changes),
-                moves=True,
-            )
+        changes = [RegisterChange(joint, "operating_mode", mode, POSITION_MODE)] if mode != POSITION_MODE else []
+        yield Look(f"{joint}: how its horn goes on", DRAWINGS[JOINTS[joint].kind])
+        yield Intent(
+            f"turn {joint} slowly from {math.degrees(at * RAD_PER_PULSE):.0f}° to {math.degrees(NOMINAL_ZERO_RAD):.0f}° "
+            "and hold it there; keep the shaft free",
+            tuple(changes),
+            moves=True,
+        )
+        with opened_bus(bench) as bus:
+            servos = journalled(bus, robot_servos(config, [joint]), bench, COMMAND)
             servos.write_counts("operating_mode", joint, POSITION_MODE)
-            try:
-                servos.write_counts("profile_velocity", joint, SLOW_COUNTS)
-                servos.set_torque(True, [joint])
-                servos.write_counts("goal_pwm", joint, round(CENTRE_PWM * PWM_FULL))
-                servos.write_counts("goal_position", joint, goal)
-                give_up = bus.clock.now() + LONGEST_S
-                while abs(servos.read_counts("present_position", joint) - goal) * RAD_PER_PULSE > CLOSE_RAD:
-                    wait(bus.clock, 0.2)
-                    at = servos.read_counts("present_position", joint)
-                    yield Live({joint: at * RAD_PER_PULSE}, "rad", "turning")
-                    if bus.clock.now() > give_up:
-                        break
-                wait(bus.clock, 0.5)
-                reached = servos.read_counts("present_position", joint)
-                off = (reached - goal) * RAD_PER_PULSE
-                if abs(off) > CLOSE_RAD:
-                    problems.append(
-                        f"{joint}: stopped {math.degrees(off):+.0f}° from its mounting angle → is the shaft blocked?"
-                    )
-                    continue
-                evidence.append(Evidence(f"{joint} off its mounting angle", off, "rad", "encoder, holding"))
-                if (
-                    yield Ask(
-                        f"{joint} holds. Put the horn on as drawn and drive its screw in. Done?",
-                        ("yes", "no"),
-                        default="yes",
-                    )
-                ) != "yes":
-                    problems.append(f"{joint}: no horn yet → run the step again with --joint {joint}")
-                    continue
-                after = (servos.read_counts("present_position", joint) - goal) * RAD_PER_PULSE
-                if abs(after - off) > CLOSE_RAD:
-                    yield Say(f"{joint} was turned by {math.degrees(after - off):+.1f}° while the horn went on", "warn")
-                centred.append(joint)
-            finally:
-                servos.set_torque(False, [joint])
-                servos.write_counts("profile_velocity", joint, 0)
+        off, trouble = yield from _one(bench, motor)
+        if abs(off) <= CLOSE_RAD:
+            evidence.append(Evidence(f"{joint} off its mounting angle", off, "rad", "encoder, holding"))
+        if trouble:
+            problems.append(trouble)
+        else:
+            centred.append(joint)
     if not motors:
         raise BadInput("no joint is named", remedy="leave out --joint")
     return Finding(
@@ -121,3 +116,31 @@ def centre(bench: Bench) -> Procedure:
         data={"centred": centred},
         problems=tuple(problems),
     )
+
+
+def _one(bench: Bench, motor: Motor) -> Generator[Event, Answer, tuple[float, str]]:
+    """Turn one servo to its mounting angle and hold it while its horn goes on; how far it is off, rad, and what is wrong."""
+    joint = motor.joint
+    config = bare_config(bench, [Servo(joint, motor.id, motor.servo)], bench.folder.config().bus.baud)
+    # The engine holds, and keeps the watchdog quiet, for as long as the builder needs.
+    with EngineProcess(config) as engine:
+        [at] = engine.ask(messages.Torque(True))
+        engine.ask(messages.WriteRegister(joint, "goal_pwm", round(CENTRE_PWM * PWM_FULL)))
+        way = ramp(np.array([at]), np.array([NOMINAL_ZERO_RAD]), config.rate_hz, speed_rad_s=SLOW_RAD_S).commands
+        yield from play_watched(engine, messages.Play(way), len(way) / config.rate_hz, "turning")
+        engine.ask(messages.Hold(SETTLE_S))
+        off = _off(engine, joint)
+        if abs(off) > CLOSE_RAD:
+            return off, f"{joint}: stopped {math.degrees(off):+.0f}° from its mounting angle → is the shaft blocked?"
+        question = f"{joint} holds. Put the horn on as drawn and drive its screw in. Done?"
+        if (yield Ask(question, ("yes", "no"), default="yes")) != "yes":
+            return off, f"{joint}: no horn yet → run the step again with --joint {joint}"
+        turned = _off(engine, joint) - off
+        if abs(turned) > CLOSE_RAD:
+            yield Say(f"{joint} was turned by {math.degrees(turned):+.1f}° while the horn went on", "warn")
+    return off, ""
+
+
+def _off(engine: EngineProcess, joint: str) -> float:
+    counts: int = engine.ask(messages.ReadRegister("present_position"))[joint]
+    return counts * RAD_PER_PULSE - NOMINAL_ZERO_RAD

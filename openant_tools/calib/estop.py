@@ -7,15 +7,12 @@ import os
 import signal
 import time
 
-from openant_tools.calib.wires import BOOT_S, opened_bus, wait
+from openant_tools.calib.wires import BOOT_S, bare_config, opened_bus, wait
 from openant_tools.comms import messages
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.engine_process import EngineProcess
-from openant_tools.comms.guards import Guards
-from openant_tools.comms.messages import EngineConfig
 from openant_tools.comms.scan import Scanned, scan
 from openant_tools.comms.servos import Servo
-from openant_tools.comms.setup import find_bus
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Ask, Bench, Hands, Intent, Procedure, Progress, RegisterChange, Say
@@ -56,16 +53,9 @@ def estop(bench: Bench) -> Procedure:
         tuple(RegisterChange(f"id {one.id}", "torque_enable", 0, 1) for one in seen),
         moves=True,
     )
-    engine_config = EngineConfig(
-        port=find_bus(bench.bus, bench.folder.config()),
-        servos=tuple(Servo(f"id {one.id}", one.id, servo_model(one.model_number)) for one in seen),
-        baud=baud,
-        control=bench.control,
-        guards=Guards(angle_margin_rad=None),
-        # A bare servo may lie anywhere on its turn; nothing is commanded but to stay.
-        limits_rad={},
-    )
-    with EngineProcess(engine_config) as engine:
+    servos = [Servo(f"id {one.id}", one.id, servo_model(one.model_number)) for one in seen]
+    config = bare_config(bench, servos, baud)
+    with EngineProcess(config) as engine:
         engine.ask(messages.Torque(True))
         on = engine.ask(messages.ReadRegister("torque_enable"))
         if not all(on.values()):
@@ -78,7 +68,7 @@ def estop(bench: Bench) -> Procedure:
     yield Say("stopped: torque is off, read back" if stopped else "torque is STILL ON", "ok" if stopped else "fail")
 
     yield Progress(0.6, "the same with the program killed")
-    killed = EngineProcess(engine_config)
+    killed = EngineProcess(config)
     try:
         killed.ask(messages.Torque(True))
         os.kill(killed.pid, signal.SIGKILL)

@@ -10,8 +10,10 @@ from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 from openant_tools.calib.mute import scan_and_mend
-from openant_tools.calib.wires import BOOT_S, journalled, opened_bus, wait
+from openant_tools.calib.wires import BOOT_S, bare_config, journalled, opened_bus, wait
+from openant_tools.comms import messages
 from openant_tools.comms.bus import Bus
+from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.scan import BAUDS, Scan, Scanned, scan
 from openant_tools.comms.servos import Servo, Servos
 from openant_tools.procedure.finding import Evidence, Finding
@@ -41,7 +43,8 @@ NUDGE_RAD = 0.2
 NUDGE_PWM = 0.2
 #: Ids that servos wait under while others are renamed; the guide's go up to 41.
 PARKING = range(200, 240)
-BLINKS = 3
+BLINKS, BLINK_S = 3, 0.15
+SETTLE_S = 0.3
 AGAIN, LEAVE = "try again", "leave it"
 
 
@@ -57,43 +60,40 @@ def ids(bench: Bench) -> Procedure:
     config = bench.folder.config()
     motors = [motor for motor in config.motors.values() if not bench.joints or motor.joint in bench.joints]
     named, problems = list[str](), list[str]()
+    yield Progress(None, "who is on the cable, at every baud rate")
     with opened_bus(bench) as bus:
-        yield Progress(None, "who is on the cable, at every baud rate")
         found = yield from scan_and_mend(bench, bus, COMMAND)
-        if _all_named(found, motors, config):
-            return _finding([motor.joint for motor in motors], motors, [], "every servo has its id already")
-        wired = not found.garbled and len(found.servos) > 1 and not any(one.clash for one in found.servos)
-        if wired:
-            answer = yield Ask(
-                f"{len(found.servos)} servos answer under ids of their own: rename them as they are wired, or set bare "
-                "servos up one at a time?",
-                ("as they are wired", "one at a time"),
-                default="as they are wired",
-            )
-            if answer == "as they are wired":
-                problems += yield from _rename(bench, bus, found, motors, config)
+    if _all_named(found, motors, config):
+        return _finding([motor.joint for motor in motors], motors, [], "every servo has its id already")
+    wired = not found.garbled and len(found.servos) > 1 and not any(one.clash for one in found.servos)
+    if wired:
+        answer = yield Ask(
+            f"{len(found.servos)} servos answer under ids of their own: rename them as they are wired, or set bare "
+            "servos up one at a time?",
+            ("as they are wired", "one at a time"),
+            default="as they are wired",
+        )
+        if answer == "as they are wired":
+            problems += yield from _rename(bench, found, motors, config)
+            with opened_bus(bench) as bus:
                 found = scan(bus)
-                named = [
-                    m.joint for m in motors if any((o.id, o.baud) == (m.id, config.bus.baud) for o in found.servos)
-                ]
-                return _finding(named, motors, problems)
-        if found.servos or found.garbled:
-            yield Hands("Take every servo off the cable; they are set up one at a time.", "unplug")
-            wait(bus.clock, BOOT_S)
-        for k, motor in enumerate(motors):
-            yield Progress(k / len(motors), f"{motor.joint} ({k + 1} of {len(motors)})")
-            trouble = yield from _one(bench, bus, motor, motors, config)
-            if trouble is None:
-                named.append(motor.joint)
-            else:
-                problems.append(trouble.words)
-            yield Hands(f"Take it off the cable, and write {motor.joint} on it.", "unplug", motor.joint)
-            wait(bus.clock, 0.1)
+            named = [m.joint for m in motors if any((o.id, o.baud) == (m.id, config.bus.baud) for o in found.servos)]
+            return _finding(named, motors, problems)
+    if found.servos or found.garbled:
+        yield Hands("Take every servo off the cable; they are set up one at a time.", "unplug")
+    for k, motor in enumerate(motors):
+        yield Progress(k / len(motors), f"{motor.joint} ({k + 1} of {len(motors)})")
+        trouble = yield from _one(bench, motor, motors, config)
+        if trouble is None:
+            named.append(motor.joint)
+        else:
+            problems.append(trouble.words)
+        yield Hands(f"Take it off the cable, and write {motor.joint} on it.", "unplug", motor.joint)
     return _finding(named, motors, problems)
 
 
 def _one(
-    bench: Bench, bus: Bus, motor: Motor, motors: Sequence[Motor], config: RobotConfig
+    bench: Bench, motor: Motor, motors: Sequence[Motor], config: RobotConfig
 ) -> Generator[Event, Answer, _Wrong | None]:
     """One servo from the box; None once it is named and has proven it."""
     words = JOINTS[motor.joint].words
@@ -101,8 +101,9 @@ def _one(
         yield Hands(
             f"Plug in one servo for the {words} ({motor.joint}): a {motor.model}, and no other.", "plug", motor.joint
         )
-        wait(bus.clock, BOOT_S)
-        found = yield from scan_and_mend(bench, bus, COMMAND)
+        with opened_bus(bench) as bus:
+            wait(bus.clock, BOOT_S)
+            found = yield from scan_and_mend(bench, bus, COMMAND)
         wrong = _not_one(found, motor, motors, config)
         if wrong is None:
             break
@@ -110,27 +111,28 @@ def _one(
         if (yield Ask(wrong.words, (AGAIN, LEAVE), default=LEAVE)) != AGAIN:
             return wrong
         yield Hands("Take everything off the cable.", "unplug")
-        wait(bus.clock, BOOT_S)
     seen = found.servos[0]
     model = servo_model(seen.model_number)
     wanted = {"id": motor.id, "baud_rate": baud_code(config.bus.baud), "return_delay_time": 0}
-    bus.line.set_baud(seen.baud)
     servo = Servo(motor.joint, seen.id, model)
-    servos = journalled(bus, [servo], bench, COMMAND)
-    servos.set_torque(False)
-    old = {name: servos.read_counts(name, motor.joint) for name in wanted}
+    with opened_bus(bench, seen.baud) as bus:
+        servos = journalled(bus, [servo], bench, COMMAND)
+        servos.set_torque(False)
+        old = {name: servos.read_counts(name, motor.joint) for name in wanted}
     yield Intent(
         f"make this {seen.model} (id {seen.id}, {seen.baud} baud, firmware {seen.firmware}) the {words}: id {motor.id}, "
         f"{config.bus.baud} baud, no return delay; then blink its LED and nudge its horn",
         tuple(RegisterChange(motor.joint, n, old[n], wanted[n]) for n in wanted if old[n] != wanted[n]),
         moves=True,
     )
-    servos.write_counts("return_delay_time", motor.joint, 0)
-    servos = _rename_to(bench, bus, servos, motor, config)
-    values = {name: servos.read_counts(name, motor.joint) for name in wanted}
+    with opened_bus(bench, seen.baud) as bus:
+        servos = journalled(bus, [servo], bench, COMMAND)
+        servos.write_counts("return_delay_time", motor.joint, 0)
+        servos = _rename_to(bench, bus, servos, motor, config)
+        values = {name: servos.read_counts(name, motor.joint) for name in wanted}
     if values != wanted:
         return _Wrong(f"{motor.joint}: reads back {values} instead of {wanted} → power it off and on and try again")
-    yield from nudge(servos, motor.joint)
+    yield from nudge(bench, servos[motor.joint], config.bus.baud)
     if (
         yield Ask(
             f"Did this servo, and only this one, blink and turn? It is the {words} from now on.",
@@ -183,49 +185,48 @@ def _rename_to(bench: Bench, bus: Bus, servos: Servos, motor: Motor, config: Rob
     return servos
 
 
-def nudge(servos: Servos, joint: str, angle_rad: float = NUDGE_RAD) -> Generator[Event, Answer, float]:
-    """Blink the LED, turn by `angle_rad` and back with little force; how far it went, rad. Torque is off afterwards."""
-    clock = servos.bus.clock
-    for _ in range(BLINKS):
-        for on in (1, 0):
-            servos.write_counts("led", joint, on)
-            wait(clock, 0.15)
-    start = servos.read_counts("present_position", joint)
-    reach = round(angle_rad / RAD_PER_PULSE)
-    if servos.read_counts("operating_mode", joint) == 3 and not 0 <= start + reach <= 4095:
-        reach = -reach
-    try:
-        servos.write_counts("profile_velocity", joint, 40)
-        servos.set_torque(True, [joint])
-        servos.write_counts("goal_pwm", joint, round(NUDGE_PWM * PWM_FULL))
-        servos.write_counts("goal_position", joint, start + reach)
-        wait(clock, 0.7)
-        there = servos.read_counts("present_position", joint)
-        yield Live({joint: (there - start) * RAD_PER_PULSE}, "rad", "nudged")
-        servos.write_counts("goal_position", joint, start)
-        wait(clock, 0.7)
-    finally:
-        servos.set_torque(False, [joint])
-    servos.write_counts("profile_velocity", joint, 0)
-    return abs(there - start) * RAD_PER_PULSE
+def nudge(bench: Bench, servo: Servo, baud: int, angle_rad: float = NUDGE_RAD) -> Generator[Event, Answer, float]:
+    """Blink the LED, turn by `angle_rad` and back with little force; how far it went, rad. Torque is off afterwards.
+
+    Raises:
+        HardwareFault: it does not answer, or a guard stopped it.
+    """
+    config = bare_config(bench, [servo], baud)
+    with EngineProcess(config) as engine:
+        for _ in range(BLINKS):
+            for on in (1, 0):
+                engine.ask(messages.WriteRegister(servo.joint, "led", on))
+                engine.ask(messages.Look(BLINK_S))
+        start = engine.ask(messages.Torque(True))
+        engine.ask(messages.WriteRegister(servo.joint, "goal_pwm", round(NUDGE_PWM * PWM_FULL)))
+        end = start + angle_rad
+        if end > config.limits_rad[servo.joint][1]:
+            end = start - angle_rad
+        for event in engine.events():
+            if isinstance(event, messages.Notice):
+                yield Say(event.text)
+        engine.ask(messages.Ramp(end))
+        engine.ask(messages.Hold(SETTLE_S))
+        counts: int = engine.ask(messages.ReadRegister("present_position"))[servo.joint]
+        went = counts * RAD_PER_PULSE - float(start[0])
+        yield Live({servo.joint: went}, "rad", "nudged")
+        engine.ask(messages.Ramp(start))
+        engine.ask(messages.Hold(SETTLE_S))
+    return abs(went)
 
 
 # ---- servos that are wired already -----------------------------------------------------------------------------------
 
 
 def _rename(
-    bench: Bench, bus: Bus, found: Scan, motors: Sequence[Motor], config: RobotConfig
+    bench: Bench, found: Scan, motors: Sequence[Motor], config: RobotConfig
 ) -> Generator[Event, Answer, list[str]]:
     """Ask of each servo which joint it is, park those whose id is another's, and name all; what could not be done."""
     left = [motor.joint for motor in motors]
     chosen: dict[str, Scanned] = {}
     for one in found.servos:
-        bus.line.set_baud(one.baud)
-        model = servo_model(one.model_number)
-        servos = Servos(bus, [Servo(f"id {one.id}", one.id, model)])
-        servos.set_torque(False)
         yield Intent(f"blink the LED of id {one.id} and nudge its horn, to see which joint it is", moves=True)
-        yield from nudge(servos, f"id {one.id}", 0.06)
+        yield from nudge(bench, Servo(f"id {one.id}", one.id, servo_model(one.model_number)), one.baud, 0.06)
         fits = [joint for joint in left if config.motors[joint].servo.number == one.model_number]
         own = config.motor_with_id(one.id)
         guess = own.joint if own is not None and own.joint in fits else fits[0] if fits else "none of them"
@@ -248,19 +249,19 @@ def _rename(
     taken = {one.id for one in found.servos} | {motor.id for motor in motors}
     parking = iter([id for id in PARKING if id not in taken])
     moved: dict[str, Servo] = {}
-    for joint, one in chosen.items():
-        bus.line.set_baud(one.baud)
-        servo = Servo(joint, one.id, servo_model(one.model_number))
-        if one.id != config.motors[joint].id:
-            parked = next(parking)
-            journalled(bus, [servo], bench, COMMAND).write_counts("id", joint, parked)
-            servo = Servo(joint, parked, servo.model)
-        moved[joint] = servo
-    for joint, servo in moved.items():
-        bus.line.set_baud(chosen[joint].baud)
-        _rename_to(bench, bus, journalled(bus, [servo], bench, COMMAND), config.motors[joint], config)
-        yield Say(f"{joint}: id {config.motors[joint].id}, {config.bus.baud} baud", "ok")
-    bus.line.set_baud(config.bus.baud)
+    with opened_bus(bench) as bus:
+        for joint, one in chosen.items():
+            bus.line.set_baud(one.baud)
+            servo = Servo(joint, one.id, servo_model(one.model_number))
+            if one.id != config.motors[joint].id:
+                parked = next(parking)
+                journalled(bus, [servo], bench, COMMAND).write_counts("id", joint, parked)
+                servo = Servo(joint, parked, servo.model)
+            moved[joint] = servo
+        for joint, servo in moved.items():
+            bus.line.set_baud(chosen[joint].baud)
+            _rename_to(bench, bus, journalled(bus, [servo], bench, COMMAND), config.motors[joint], config)
+            yield Say(f"{joint}: id {config.motors[joint].id}, {config.bus.baud} baud", "ok")
     return [f"{joint}: no servo was named so → plug it in and run the step again" for joint in left]
 
 

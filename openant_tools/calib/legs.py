@@ -13,7 +13,7 @@ from openant_tools.calib.wires import BOOT_S, opened_bus, robot_servos, servo_an
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.faults import Cause
 from openant_tools.comms.lateness import LATE_S, REMEDY
-from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servos
+from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servo, Servos
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Answer, Ask, Bench, Event, Hands, Intent, Live, Procedure, Progress, Say
@@ -37,29 +37,29 @@ def legs(bench: Bench) -> Procedure:
     config = bench.folder.config()
     wanted = [leg for leg in LEGS if not bench.joints or any(joint.endswith(leg.name) for joint in bench.joints)]
     problems, evidence, proven = list[str](), list[Evidence](), list[str]()
+    yield Hands(
+        "Build the legs one after the other; the torso stands on its stand, cables out.", "assemble", setup="stand"
+    )
+    yield Hands("Take every leg off the cable.", "unplug")
     with opened_bus(bench) as bus:
-        yield Hands(
-            "Build the legs one after the other; the torso stands on its stand, cables out.", "assemble", setup="stand"
-        )
-        yield Hands("Take every leg off the cable.", "unplug")
         wait(bus.clock, 0.2)
-        for k, leg in enumerate(wanted):
-            while True:
-                yield Progress(k / len(wanted), f"{leg.words} leg ({k + 1} of {len(wanted)})")
-                try:
-                    found = yield from _one(bus, leg, config)
-                    trouble = ""
-                except HardwareFault as fault:
-                    found, trouble = [], str(fault)
-                if not trouble:
-                    evidence += found
-                    proven.append(leg.name)
-                    yield Say(f"{leg.words} leg: cable, range and nudge are good", "ok")
-                    break
-                yield Say(trouble, "fail")
-                if (yield Ask(trouble, (AGAIN, GO_ON), default=GO_ON)) != AGAIN:
-                    problems.append(f"{leg.words} leg: {trouble}")
-                    break
+    for k, leg in enumerate(wanted):
+        while True:
+            yield Progress(k / len(wanted), f"{leg.words} leg ({k + 1} of {len(wanted)})")
+            try:
+                found = yield from _one(bench, leg, config)
+                trouble = ""
+            except HardwareFault as fault:
+                found, trouble = [], str(fault)
+            if not trouble:
+                evidence += found
+                proven.append(leg.name)
+                yield Say(f"{leg.words} leg: cable, range and nudge are good", "ok")
+                break
+            yield Say(trouble, "fail")
+            if (yield Ask(trouble, (AGAIN, GO_ON), default=GO_ON)) != AGAIN:
+                problems.append(f"{leg.words} leg: {trouble}")
+                break
     return Finding(
         "legs",
         not problems,
@@ -72,11 +72,27 @@ def legs(bench: Bench) -> Procedure:
     )
 
 
-def _one(bus: Bus, leg: Leg, config: RobotConfig) -> Generator[Event, Answer, list[Evidence]]:
+def _one(bench: Bench, leg: Leg, config: RobotConfig) -> Generator[Event, Answer, list[Evidence]]:
     """One leg; raises HardwareFault with what is wrong with it."""
     joints = [f"hip_{leg.name}", f"knee_{leg.name}"]
     for joint in joints:
         yield Hands(f"Connect {joint}.", "plug", joint)
+    with opened_bus(bench) as bus:
+        evidence = yield from _by_hand(bus, joints, config)
+    yield Intent(f"nudge {' and '.join(joints)} by {math.degrees(NUDGE_RAD):.0f}°, gently", moves=True)
+    for joint in joints:
+        motor = config.motors[joint]
+        went = yield from nudge(bench, Servo(joint, motor.id, motor.servo), config.bus.baud, NUDGE_RAD)
+        evidence.append(Evidence(f"nudge of {joint}", went, "rad", "encoder"))
+        if went < NUDGED_RAD:
+            raise HardwareFault(
+                f"{joint} does not follow its motor ({math.degrees(went):.1f}°)", remedy="is its horn screwed on?"
+            )
+    return evidence
+
+
+def _by_hand(bus: Bus, joints: list[str], config: RobotConfig) -> Generator[Event, Answer, list[Evidence]]:
+    """Each joint's range and its cables, moved and wiggled by hand, torque off."""
     wait(bus.clock, BOOT_S)
     servos = Servos(bus, robot_servos(config, joints))
     servos.identify()
@@ -130,13 +146,5 @@ def _one(bus: Bus, leg: Leg, config: RobotConfig) -> Generator[Event, Answer, li
             raise HardwareFault(
                 f"{joint} turned by {math.degrees(seen):.0f}° of {math.degrees(whole):.0f}°",
                 remedy="is a screw or a cable in its way?",
-            )
-    yield Intent(f"nudge {' and '.join(joints)} by {math.degrees(NUDGE_RAD):.0f}°, gently", moves=True)
-    for joint in joints:
-        went = yield from nudge(servos, joint, NUDGE_RAD)
-        evidence.append(Evidence(f"nudge of {joint}", went, "rad", "encoder"))
-        if went < NUDGED_RAD:
-            raise HardwareFault(
-                f"{joint} does not follow its motor ({math.degrees(went):.1f}°)", remedy="is its horn screwed on?"
             )
     return evidence

@@ -120,30 +120,18 @@ def sweep(config: EngineConfig, path: Path, words: str) -> Generator[Event, Answ
     gentle = replace(config, limits_rad=wide, guards=replace(config.guards or Guards(), angle_margin_rad=0.4))
     with EngineProcess(gentle) as engine:
         engine.ask(messages.Torque(True))
-        full = engine.ask(messages.ReadRegister("goal_pwm"))
-        try:
-            for joint in joints:
-                engine.ask(messages.WriteRegister(joint, "goal_pwm", round(SWEEP_PWM * PWM_FULL)))
-            engine.ask(messages.Ramp(played[0]))
-            volts = engine.ask(messages.ReadRegister("present_input_voltage"))
-            facts = Facts(
-                joints=joints, setup="stand", protocol="slow sweep", supply_v=float(np.mean(list(volts.values()))) * 0.1
-            )
-            engine.ask(messages.Record(str(path), facts, overwrite=True))
-            yield from play_watched(engine, messages.Play(played, "slow sweep"), len(played) / config.rate_hz, words)
-            engine.ask(messages.StopRecording())
-        finally:
-            for joint in joints:
-                _quietly(engine, messages.WriteRegister(joint, "goal_pwm", full[joint]))
+        for joint in joints:
+            engine.ask(messages.WriteRegister(joint, "goal_pwm", round(SWEEP_PWM * PWM_FULL)))
+        engine.ask(messages.Ramp(played[0]))
+        volts = engine.ask(messages.ReadRegister("present_input_voltage"))
+        facts = Facts(
+            joints=joints, setup="stand", protocol="slow sweep", supply_v=float(np.mean(list(volts.values()))) * 0.1
+        )
+        engine.ask(messages.Record(str(path), facts, overwrite=True))
+        yield from play_watched(engine, messages.Play(played, "slow sweep"), len(played) / config.rate_hz, words)
+        engine.ask(messages.StopRecording())
         engine.ask(messages.Torque(False))
     return read_run(path)
-
-
-def _quietly(engine: EngineProcess, command: messages.Command) -> None:
-    try:
-        engine.ask(command, 5.0)
-    except HardwareFault:
-        pass  # what stopped it says more than that this, too, cannot be written
 
 
 def play_watched(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
+from openant_tools.comms.guards import Guards
 from openant_tools.comms.imu import Imu, open_imu
 from openant_tools.comms.line import SerialLine
 from openant_tools.comms.messages import EngineConfig
@@ -22,9 +24,10 @@ from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.procedure.step import Bench
 from openant_tools.robot.config import Motor, RobotConfig
+from openant_tools.robot.registers import RAD_PER_PULSE
 
 __all__ = [
-    "BOOT_S", "SETTLE_S", "engine_config", "journalled", "opened_bus", "opened_imu", "rest", "robot_servos", "servo_angles", "wait",
+    "BOOT_S", "SETTLE_S", "bare_config", "engine_config", "journalled", "opened_bus", "opened_imu", "rest", "robot_servos", "servo_angles", "wait",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -38,8 +41,10 @@ RELEASES = 3
 
 @contextlib.contextmanager
 def opened_bus(bench: Bench, baud: int | None = None) -> Iterator[Bus]:
-    """The bus at its own rate, or at `baud`; however the block is left, every servo at the rate it is left with is
-    released."""
+    """The bus at its own rate, or at `baud`, to ask and to write memory: torque comes from an engine alone.
+
+    However the block is left, every servo at the rate it is left with is released.
+    """
     config = bench.folder.config()
     bus = open_bus(find_bus(bench.bus, config), baud or config.bus.baud, bench.control)
     bus.timing = replace(bus.timing, write_read_gap_s=config.bus.write_read_gap_s, return_delay_s=508e-6)
@@ -118,6 +123,20 @@ def engine_config(bench: Bench, **more: object) -> EngineConfig:
     config = bench.folder.config()
     more = {"imu": imu_of_robot(config, bench.imu), "journal": str(bench.folder.journal), **more}
     return config_of_robot(config, bench.bus, control=bench.control, **more)
+
+
+def bare_config(bench: Bench, servos: Sequence[Servo], baud: int) -> EngineConfig:
+    """The engine's config for servos as they come: each joint's angle is the servo's own, within its one turn."""
+    return EngineConfig(
+        port=find_bus(bench.bus, bench.folder.config()),
+        servos=tuple(servos),
+        baud=baud,
+        control=bench.control,
+        # A servo may lie anywhere, and hands may turn it while it is limp.
+        guards=Guards(angle_margin_rad=None),
+        limits_rad={servo.joint: (0.0, 2 * math.pi - RAD_PER_PULSE) for servo in servos},
+        journal=str(bench.folder.journal),
+    )
 
 
 def rest(bench: Bench) -> None:

@@ -10,14 +10,14 @@ from typing import Any
 
 import click
 
-from openant_tools.cli.hardware import adapter_option, camera_option, imu_option
+from openant_tools.cli.hardware import Moving, adapter_option, camera_option, imu_option
 from openant_tools.cli.options import json_option
 from openant_tools.cli.virtual_for_command import virtual_option
 
 __all__ = ["bringup"]
 
 
-@click.command()
+@click.command(cls=Moving)
 @click.option(
     "--robot",
     type=click.Path(path_type=Path),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from openant_tools.bringup.walk import WALK
-from openant_tools.cli.hardware import adapter_option, camera_option, imu_option
+from openant_tools.cli.hardware import Moving, adapter_option, camera_option, imu_option
 from openant_tools.cli.options import joint_option, json_option, robot_option
 from openant_tools.cli.virtual_for_command import virtual_option
 from openant_tools.procedure.step import Bench, Procedure, Step
@@ -114,7 +114,9 @@ def show_finding(finding: Finding, json_file: Path | None) -> int:
 
 
 def _command(step: Step) -> click.Command:
-    @click.command(step.name, help=_help(step), short_help=step.does)
+    @click.command(
+        step.name, cls=Moving if step.moves or step.holds else click.Command, help=_help(step), short_help=step.does
+    )
     @joint_option
     @step_options
     def command(

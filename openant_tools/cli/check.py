@@ -7,11 +7,12 @@ from pathlib import Path
 import click
 
 from openant_tools.cli.calib import bench_of, run_and_keep, show_finding, step_options
+from openant_tools.cli.hardware import Moving
 
 __all__ = ["check"]
 
 
-@click.command()
+@click.command(cls=Moving)
 @step_options
 def check(
     robot: Path | None,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from openant_tools.cli.hardware import engine_config, may_move, port_option, robot_of, yes_option
+from openant_tools.cli.hardware import Moving, engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import MINUTES, json_option, rate_option, robot_option
 from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option
@@ -24,7 +24,7 @@ __all__ = ["soak"]
 TRANSACTIONS_HZ = 10.0
 
 
-@click.command()
+@click.command(cls=Moving)
 @click.option(
     "--out", type=click.Path(path_type=Path, dir_okay=False), required=True, metavar="RUN", help="What to make."
 )
@@ -105,7 +105,7 @@ def _on_the_bus(
     console = Console(stderr=True)
     folder = robot_of(robot, needed=False)
     with contextlib.ExitStack() as stack:
-        config = stack.enter_context(engine_config(folder, port, virtual_source, rate_hz=rate_hz))
+        config = stack.enter_context(engine_config(folder, port, virtual_source, rate_hz=rate_hz, still=still))
         if not still:
             console.print(
                 f"all {len(config.servos)} joints swing by up to 0.25 rad; the robot must be on its stand, legs free"

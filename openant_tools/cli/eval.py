@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from openant_tools.cli.hardware import Moving
 from openant_tools.cli.options import SECONDS, json_option
 from openant_tools.cli.walking import (
     HARDWARE_ID,
@@ -25,7 +26,7 @@ STRIP_EVERY_S = 0.12
 STRIP_FROM_S = 6.0
 
 
-@click.command()
+@click.command(cls=Moving)
 @click.argument("run", type=click.Path(path_type=Path, file_okay=False), metavar="DIR")
 @click.option("--seconds", type=SECONDS, default=120.0, show_default=True, help="Robot time.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)

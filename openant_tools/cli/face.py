@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.prompt import Confirm, FloatPrompt, Prompt
 
-from openant_tools.cli.hardware import need_terminal
+from openant_tools.cli.hardware import need_moving, need_terminal
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.step import Answer, Ask, Event, Hands, Intent, Live, Look, Progress, Say
@@ -88,6 +88,8 @@ class CommandFace:
         )
         for change in intent.registers:
             self._line(f"    {escape(str(change))}")
+        if intent.moves:
+            need_moving()
         if self._yes:
             return True
         need_terminal("it would write or move")

@@ -19,9 +19,21 @@ if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
 
 __all__ = [
-    "adapter_option", "camera_option", "engine_config", "imu_option", "may_move", "need_terminal", "port_option", "robot_of",
-    "yes_option",
+    "MOVES", "Moving", "adapter_option", "camera_option", "engine_config", "imu_option", "may_move", "need_moving", "need_terminal",
+    "port_option", "robot_of", "yes_option",
 ]  # fmt: skip
+
+#: in a context's meta: the command is about to move, or does
+MOVES = "openant moves"
+
+
+class Moving(click.Command):
+    """A command that lets a robot move, or hold a pose: the one place where that is said.
+
+    Only such a command may ask for it (`may_move`, an `Intent` that moves), and only its engine gives torque
+    (`engine_config`). Ctrl-Z ends it as Ctrl-C does, and the tests kill every one of them on its way.
+    """
+
 
 port_option = click.option("--port", metavar="PATH", help="The bus. Default: robot.toml's, else the one plugged in.")
 adapter_option = click.option(
@@ -63,7 +75,7 @@ def engine_config(
         port: of the bus, where it is not the virtual robot's or robot.toml's.
         clock: "real" or "stepped" for a virtual robot; None for its own.
         imu, camera: whether they are to be read, where there are any.
-        more: to `EngineConfig`.
+        more: to `EngineConfig`; torque is refused where the command is no `Moving` one.
     """
     from openant_tools.comms.setup import (
         camera_of_robot,
@@ -80,6 +92,7 @@ def engine_config(
         if virtual_source is not None:
             clock = clock or clock_of_its_own(virtual_source)
             found = stack.enter_context(virtual_robot(virtual_source, clock=clock))
+        more.setdefault("still", not _moving())
         port, control = port or found.get("bus"), found.get("control")
         described = None if folder is None else folder.config()
         if imu:
@@ -98,6 +111,21 @@ def need_terminal(why: str, remedy: str = "add --yes if it may") -> None:
         raise BadInput(f"{why} and nobody is there to ask", remedy=remedy)
 
 
+def _moving() -> bool:
+    context = click.get_current_context(silent=True)
+    return context is None or isinstance(context.command, Moving)
+
+
+def need_moving() -> None:
+    """From here on the command moves; raises RuntimeError in one that is not declared as one that does."""
+    context = click.get_current_context(silent=True)
+    if context is None:
+        return
+    if not isinstance(context.command, Moving):
+        raise RuntimeError(f"`{context.command_path}` moves: it must be a `Moving` command")
+    context.meta[MOVES] = True
+
+
 def may_move(
     yes: bool, *, move: str = "move", question: str = "May it move?", remedy: str = "add --yes if it may"
 ) -> None:
@@ -110,6 +138,7 @@ def may_move(
         BadInput: nobody is there to ask.
         click.Abort: it may not.
     """
+    need_moving()
     if yes:
         return
     need_terminal(f"the robot would {move}", remedy)

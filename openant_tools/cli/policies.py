@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from openant_tools.cli.hardware import Moving
 from openant_tools.cli.learning import need_agents
 from openant_tools.cli.options import SECONDS, json_option, report_option
 from openant_tools.errors import BadInput
@@ -52,7 +53,7 @@ def policies() -> None:
     """
 
 
-@policies.command()
+@policies.command(cls=Moving)
 @_playing
 @click.option("--on", "place", required=True, metavar="PLACE", help="Where: see `openant policies --help`.")
 @click.option("--yes", is_flag=True, help="The robot may move: do not ask.")
@@ -75,7 +76,7 @@ def play(folder: Path, seconds: float, plays: int, place: str, yes: bool, json_f
         )
 
 
-@policies.command()
+@policies.command(cls=Moving)
 @_playing
 @click.option("--real", required=True, metavar="PLACE", help="The robot: a place, or what was measured on it.")
 @click.option(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from openant_tools.cli.hardware import engine_config, may_move, port_option, robot_of, yes_option
+from openant_tools.cli.hardware import Moving, engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import POSITIVE, SECONDS, Number, json_option, report_option, robot_option
 from openant_tools.cli.virtual_for_command import virtual_option
 
@@ -137,7 +137,7 @@ def torque(
     return _conclude(finding, folder if robot is not None else None, json_file)
 
 
-@click.command()
+@click.command(cls=Moving)
 @click.option("--joint", default="knee_fl", show_default=True, help="Whose stiffness.")
 @click.option(
     "--readings", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
@@ -321,7 +321,7 @@ def _show_stiffness(finding: Finding, report: Path | None) -> None:
         click.echo(f"{evidence.name:42}  {evidence.value:8.2f}{interval}{unit}")
 
 
-@click.command()
+@click.command(cls=Moving)
 @click.option(
     "--static", "static", type=ANGLE, multiple=True, metavar="RAD", help="Angle where it began to slide; 31deg."
 )

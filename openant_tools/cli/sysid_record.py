@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.hardware import engine_config, may_move, port_option, robot_of, yes_option
+from openant_tools.cli.hardware import Moving, engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import Number, rate_option, robot_option, seconds_option
 from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
 
@@ -30,7 +30,7 @@ setup_option = click.option(
 )
 
 
-@click.command()
+@click.command(cls=Moving)
 @click.option("--protocol", "name", metavar="NAME", help=f"What to play; see --list.  [default: {DEFAULT_PROTOCOL}]")
 @click.option(
     "--plan",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.hardware import engine_config, may_move, port_option, robot_of, yes_option
+from openant_tools.cli.hardware import Moving, engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import Number, json_option, robot_option
 from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
 
@@ -34,7 +34,7 @@ CURVE = 32
 DRAW_S, LINE_S = 0.25, 20.0
 
 
-@click.command()
+@click.command(cls=Moving)
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), required=True, metavar="RUN.mcap")
 @click.option(
     "--load", type=click.Choice(["stand", "hang", "stall"]), default="stand", show_default=True,

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from openant_tools.cli.hardware import Moving
 from openant_tools.cli.learning import need_agents, settings_of, settings_option
 from openant_tools.cli.options import Number, json_option
 from openant_tools.cli.train_sarsa import sarsa
@@ -29,7 +30,7 @@ def train() -> None:
     """
 
 
-@train.command()
+@train.command(cls=Moving)
 @training_options(30_000, 0.12, "checkpoints, transitions, learning curve")
 @click.option(
     "--dt", type=Number(0.0, 10.0, min_open=True), metavar="S", help="Length of a step. Default: the robot's, 0.12 s."

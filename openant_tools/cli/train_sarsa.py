@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from openant_tools.cli.hardware import Moving
 from openant_tools.cli.learning import need_agents, settings_of, settings_option
 from openant_tools.cli.options import Number, json_option
 from openant_tools.cli.training import (
@@ -20,7 +21,7 @@ from openant_tools.cli.training import (
 __all__ = ["sarsa"]
 
 
-@click.command()
+@click.command(cls=Moving)
 @training_options(72_000, 0.05, "the log of decisions, learning curve")
 @click.option(
     "--dt",

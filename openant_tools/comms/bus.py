@@ -31,9 +31,12 @@ from openant_tools.comms.reply import (
 )
 from openant_tools.comms.statistics import BusStatistics
 from openant_tools.comms.ticks import TickClock
+from openant_tools.errors import BadInput
 
 __all__ = ["Answer", "Bus", "Found", "Timing"]
 
+#: What lets a servo move: Startup Configuration, Torque Enable, and the goals of PWM, current, velocity; and position.
+STARTUP, TORQUE, GOALS = 60, 64, (range(100, 108), range(116, 120))
 #: How much longer each further try waits: a busy host may have been late, not the servo.
 RETRY_PATIENCE_S = 25e-3
 #: Model number (2) and firmware.
@@ -109,6 +112,9 @@ class Bus:
     fast: set[int] = field(default_factory=set)
     #: requests that may be sent again by `read` and `write` (never by sync reads); each is counted
     retries: int = 2
+    #: whether somebody switches torque off however this process ends: without that nothing is sent that would let a servo
+    #: move. The engine sets it, which has a guardian, while the servos' watchdogs are armed.
+    guarded: bool = False
 
     #: the last request of which something was lost, and all that came for it; for whoever keeps a log, who then clears it
     failed: tuple[bytes, bytes] | None = field(default=None, init=False)
@@ -193,10 +199,12 @@ class Bus:
 
     def write(self, id: int, address: int, data: bytes, what: str | None = None) -> None:
         """Write and wait for the servo's word. Raises as `read`; `what` names the register in messages."""
+        self.check_guarded(address, data)
         self._insist(p2.write(id, address, data), id, 0, what or f"register {address}")
 
     def reg_write(self, id: int, address: int, data: bytes) -> None:
         """As `write`, done once `action` comes."""
+        self.check_guarded(address, data)
         self._insist(p2.reg_write(id, address, data), id, 0, f"register {address}")
 
     def action(self, id: int = p2.BROADCAST) -> None:
@@ -222,10 +230,14 @@ class Bus:
 
     def sync_write(self, address: int, count: int, data: Mapping[int, bytes]) -> float:
         """Write the same registers of several servos; none answers. The time its last byte has left."""
+        for one in data.values():
+            self.check_guarded(address, one)
         return self.send(p2.sync_write(address, count, data).encode())
 
     def bulk_write(self, items: Sequence[tuple[int, int, bytes]]) -> float:
         """Write (id, address, data) each; none answers. The time its last byte has left."""
+        for _, address, data in items:
+            self.check_guarded(address, data)
         return self.send(p2.bulk_write(items).encode())
 
     def send(self, packet: bytes) -> float:
@@ -289,6 +301,25 @@ class Bus:
             if answer.rtt is not None:
                 waits.append(answer.rtt - self.wire_s(10 + STATUS_OVERHEAD + PING_SIZE) - self.timing.return_delay_s)
         return max(1e-3, 2 * sorted(waits)[len(waits) // 2]) if waits else self.timing.latency_timer_s
+
+    def check_guarded(self, address: int, data: bytes) -> None:
+        """Raise BadInput where writing `data` to `address` lets a servo move, now or once it has power, unguarded.
+
+        A goal counts: with a bit of Drive Mode it switches torque on.
+        """
+        end = address + len(data)
+        if address <= STARTUP < end and data[STARTUP - address] & 1:
+            raise BadInput(
+                "a servo that switches torque on as it starts is guarded by nobody", where=self.line.path,
+                remedy="leave bit 0 of startup_configuration (60) at 0",
+            )  # fmt: skip
+        torque = address <= TORQUE < end and data[TORQUE - address] != 0
+        goal = any(address < goals.stop and goals.start < end for goals in GOALS)
+        if (torque or goal) and not self.guarded:
+            raise BadInput(
+                "nobody would switch torque off if this program died", where=self.line.path,
+                remedy="switch torque on through the engine (`messages.Torque`), and move with what it offers",
+            )  # fmt: skip
 
     # ---- what must be there --------------------------------------------------------------------------------------
 

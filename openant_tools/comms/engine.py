@@ -1,8 +1,9 @@
 """The process that owns the hardware: bus and recorder in one fixed-rate loop, torque off however it ends.
 
 Run as `python -m openant_tools.comms.engine`, by `engine_process.EngineProcess`, with a socket pair to its parent: it
-takes `messages`, answers each, and tells events. When the parent dies the socket ends, and torque goes off. Should this
-process be killed, its guardian sends the same packet; should both die, each servo's Bus Watchdog stops its motion.
+takes `messages`, answers each, and tells events. When the parent dies the socket ends, and torque goes off; a suspended
+parent (Ctrl-Z) ends motion, too. Should this process be killed or suspended, its guardian sends the same packet; should
+both die, each servo's Bus Watchdog stops its motion. This is the only way to torque: a bus without all that refuses it.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import select
 import signal
 import subprocess
 import sys
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -36,7 +38,7 @@ from openant_tools.comms.faults import BrokenAnswer, Cause, NeverSilent, NoAnswe
 from openant_tools.comms.guards import Trip, Watch
 from openant_tools.comms.lateness import REMEDY
 from openant_tools.comms.line import PortGone, SerialLine
-from openant_tools.comms.messages import EngineConfig
+from openant_tools.comms.messages import WATCHDOG_UNIT_S, EngineConfig
 from openant_tools.comms.motion import Motion, catch, held, hold, play, ramp
 from openant_tools.comms.ports import WANTED_LATENCY_MS, Host, udev_rule
 from openant_tools.comms.restart import StopCause
@@ -65,8 +67,14 @@ RECORDED_REGISTERS = (
     "pwm_limit", "velocity_limit", "position_d_gain", "position_i_gain", "position_p_gain", "feedforward_2nd_gain",
     "feedforward_1st_gain", "profile_acceleration", "profile_velocity",
 )  # fmt: skip
-#: The unit of the Bus Watchdog, s.
-WATCHDOG_UNIT_S = 0.02
+#: From this firmware on servos have a Bus Watchdog.
+WATCHDOG_FIRMWARE = 38
+#: Silence of this process, s, after which its guardian switches torque off, and how often it says that it lives.
+PATIENCE_S, BEAT_S = 1.0, 0.1
+#: s. A guardian that is ended so soon after it was started: another would fare no better.
+GUARDIAN_LIFE_S = 1.0
+#: Bits with which a servo switches torque on by itself (firmware ≥ 45): at a goal, and as it starts.
+UNASKED_FIRMWARE, UNASKED = 45, {"drive_mode": 8, "startup_configuration": 1}
 #: How long torque off is sent again where servos do not confirm it.
 RELEASE_S = 0.5
 #: How long the engine waits for a port that vanished to come back, between two tries.
@@ -128,6 +136,10 @@ class Engine:
         #: number of the goal that this cycle's command belongs to, 0 for none
         self._playing = 0
         self._guardian: subprocess.Popen[bytes] | None = None
+        #: when it was started, when we last looked after it, and when we last said to it how we are, s of this computer
+        self._guarded_since = self._alive_at = self._beat_at = -np.inf
+        #: whether servos without a Bus Watchdog were named
+        self._unwatched_told = False
         self._lost = False
         #: the line talks without a pause, and it has been told
         self._restless = False
@@ -191,10 +203,12 @@ class Engine:
         if self._latency_timer_s is None:
             measured = self._bus.measure_latency_timer(known[0].id)
             self._bus.timing = replace(self._bus.timing, latency_timer_s=round(measured, 3))
-        for joint, table in config.registers.items():
-            for register, counts in table.items():
-                servos.write_counts(register, joint, counts)
-        self._ensure_position_mode()
+        if not config.still:
+            for joint, table in config.registers.items():
+                for register, counts in table.items():
+                    servos.write_counts(register, joint, counts)
+            self._ensure_position_mode()
+            self._ensure_torque_waits()
         self._eeprom_writes = list(servos.journal)
         for write in servos.journal:
             self._notice(f"{write.joint} (id {write.id}): {write.register} changed from {write.old} to {write.new}")
@@ -259,6 +273,14 @@ class Engine:
             if mode != EXTENDED_POSITION and (mode != POSITION or across_the_seam):
                 self._servos.write_counts("operating_mode", joint, EXTENDED_POSITION)
 
+    def _ensure_torque_waits(self) -> None:
+        """No servo switches torque on by itself: one that starts anew after a drop of its supply would jump, unguarded."""
+        able = [servo.joint for servo in self._servos.servos if (servo.firmware or 0) >= UNASKED_FIRMWARE]
+        for register, bit in UNASKED.items() if able else ():
+            for joint, value in self._servos.read_all(register, able).items():
+                if value & bit:
+                    self._servos.write_counts(register, joint, value & ~bit)
+
     def _report_leftovers(self) -> None:
         """What an earlier program left: torque on, tripped watchdogs, hardware errors."""
         servos = self._servos
@@ -319,12 +341,95 @@ class Engine:
         }
 
     def _start_guardian(self) -> None:
+        """Raises HardwareFault where this computer lets no process begin."""
         packet = p2.sync_write(64, 1, dict.fromkeys((servo.id for servo in self.config.servos), b"\0")).encode()
         fd = self._line.fileno()
-        self._guardian = subprocess.Popen(
-            [sys.executable, "-I", "-S", guardian.__file__, str(fd), packet.hex()],
-            stdin=subprocess.PIPE, pass_fds=(fd,), start_new_session=True,
-        )  # fmt: skip
+        # A stepped robot's time stands still while nobody asks for it: then silence means nothing.
+        patience = 0.0 if self.clock.stepped else self._patience_s
+        words = [sys.executable, "-I", "-S", guardian.__file__, str(fd), packet.hex(), f"{patience:g}"]
+        try:
+            self._guardian = subprocess.Popen(words, stdin=subprocess.PIPE, pass_fds=(fd,), start_new_session=True)
+        except OSError as error:
+            raise HardwareFault(
+                f"the guardian that switches torque off if this program dies cannot be started ({error.strerror})",
+                remedy="make room on this computer: processes, memory",
+            ) from None
+        assert self._guardian.stdin is not None
+        os.set_blocking(self._guardian.stdin.fileno(), False)
+        self._guarded_since, self._beat_at = time.monotonic(), -np.inf
+
+    @property
+    def _patience_s(self) -> float:
+        return max(PATIENCE_S, self.config.watchdog_s)
+
+    def _look_after(self) -> None:
+        """Every cycle: that the guardian lives and knows that we do, that we were not suspended, nor our parent."""
+        now, before = time.monotonic(), self._alive_at
+        self._alive_at = now
+        if self._torque and not self.clock.stepped and now - before > self._patience_s:
+            self._stopped(
+                Trip(
+                    f"this computer stood still for {now - before:.1f} s, and torque was switched off meanwhile",
+                    "close what else keeps it busy, or let it not go to sleep",
+                    cause=StopCause.STALL,
+                )
+            )
+        if self._guardian is not None and self._guardian_gone(self._guardian):
+            self._replace_guardian(self._guardian)
+        if now - self._beat_at > BEAT_S:
+            self._beat()
+            if self._torque and self._parent_suspended():
+                self._stopped(
+                    Trip(
+                        "the program that moves the robot was suspended", "bring it back with `fg`, and begin again",
+                        cause=StopCause.BY_HAND,
+                    )
+                )
+
+    @staticmethod
+    def _guardian_gone(guardian: subprocess.Popen[bytes]) -> bool:
+        """Whether it was killed, or stopped for good."""
+        try:
+            how = os.waitid(os.P_PID, guardian.pid, os.WEXITED | os.WSTOPPED | os.WNOHANG | os.WNOWAIT)
+        except ChildProcessError:
+            return True
+        return how is not None
+
+    def _replace_guardian(self, gone: subprocess.Popen[bytes]) -> None:
+        gone.kill()
+        gone.wait()
+        if gone.stdin is not None:
+            gone.stdin.close()
+        self._guardian = None
+        lived = time.monotonic() - self._guarded_since
+        why = ""
+        try:
+            self._start_guardian()
+        except HardwareFault as error:
+            why = error.what
+        if not why and lived < GUARDIAN_LIFE_S and self._torque:
+            why = "so was the one before it"
+        if why and self._torque:
+            words = f"the guardian was ended from outside, and {why}"
+            self._stopped(Trip(words, "find out what ends processes here", cause=StopCause.GUARDIAN))
+        else:
+            now = f"{why}: torque stays off" if why else "another one guards now"
+            self._notice(f"the guardian that switches torque off if this program dies was ended from outside: {now}")
+
+    def _beat(self) -> None:
+        """Tell the guardian whether torque is on."""
+        self._beat_at = self._alive_at = time.monotonic()
+        if self._guardian is not None and self._guardian.stdin is not None:
+            with contextlib.suppress(OSError):  # it has gone: the next cycle sees to it
+                os.write(self._guardian.stdin.fileno(), b"+" if self._bus.guarded else b"-")
+
+    def _parent_suspended(self) -> bool:
+        """By Ctrl-Z or SIGSTOP; where the system does not tell (no /proc), the face that gets the signal says stop."""
+        try:
+            stat = Path(f"/proc/{self._parent}/stat").read_bytes()
+        except OSError:
+            return False
+        return stat.rpartition(b")")[2].split()[:1] == [b"T"]
 
     def _dismiss_guardian(self) -> None:
         if self._guardian is not None and self._guardian.stdin is not None:
@@ -358,7 +463,7 @@ class Engine:
 
     def _torque_off(self) -> None:
         """Release every servo, again and again until each has confirmed or time is up: the line may be bad."""
-        self._torque = False
+        self._torque = self._bus.guarded = False
         self._limp[:], self._let_go = False, []
         self._motions.clear()
         self._goal = self._counts = None
@@ -387,11 +492,13 @@ class Engine:
             if self.clock.stepped and not self._motions and not self._looks:
                 # A virtual robot's time stands still while there is nothing to do. What is asked for within the cycle
                 # begins with the next one, as it would in real time.
+                self._look_after()
                 self._take_commands(block=True)
                 due = max(due, self.clock.now())
                 continue
             self._pass_time(due)
             wake = self.clock.now() - due
+            self._look_after()
             self._take_commands(block=False)
             try:
                 self._cycle(wake, cycles)
@@ -431,6 +538,11 @@ class Engine:
             news = None if sensor is None else sensor.news()
             if news is not None:
                 self._notice(news)
+        # Who reads seldom, as a soak does, hears and looks after everyone as often as others.
+        while not self.clock.stepped and not self._ending and due - self.clock.now() > BEAT_S:
+            self.clock.sleep_until(self.clock.now() + BEAT_S)
+            self._look_after()
+            self._take_commands(block=False)
         self.clock.sleep_until(due)
 
     def _take_poses(self, camera: BodyCamera) -> None:
@@ -810,6 +922,8 @@ class Engine:
         if not command.on:
             self._torque_off()
             return messages.Reply(number)
+        if self.config.still:
+            raise BadInput("torque stays off: this program only watches")
         if not self._torque:
             if self._trip is not None and command.restart is None:
                 raise BadInput(
@@ -825,29 +939,49 @@ class Engine:
         return messages.Reply(number, value=self._goal)
 
     def _switch_on(self) -> None:
-        """Torque on where the robot stands: goals are set to what is measured before and after."""
+        """Torque on where the robot stands, guarded before: goals are set to what is measured before and after."""
         servos = self._servos
-        for joint in servos.tripped_watchdogs():
-            servos.write_counts("bus_watchdog", joint, 0)  # or the goals stay locked
-        positions = servos.read_all("present_position")
-        self._counts = [positions[joint] for joint in servos.joints]
         try:
+            self._guard()
+            # A motion that was gentle, and was killed, has left its limit behind.
+            full, now = servos.read_all("pwm_limit"), servos.read_all("goal_pwm")
+            for joint in servos.joints:
+                if now[joint] != full[joint]:
+                    servos.write_counts("goal_pwm", joint, full[joint])
+            positions = servos.read_all("present_position")
+            self._counts = [positions[joint] for joint in servos.joints]
             servos.write_goals(self._counts)
             servos.set_torque(True)
             servos.write_goals(self._counts)
-            able = [servo for servo in servos.servos if (servo.firmware or 0) >= 38]
-            for servo in able:
-                servos.write_counts(
-                    "bus_watchdog", servo.joint, max(1, round(self.config.watchdog_s / WATCHDOG_UNIT_S))
-                )
         except HardwareFault:
             self._torque_off()
             raise
         self._goal = np.array(servos.joint_rad(self._counts))
         self._angles = self._goal.copy()
         self._torque = True
+        self._beat()
         self._asked_at = self.clock.now()
         self._watch.reset(self._asked_at)
+
+    def _guard(self) -> None:
+        """What must be before torque is: a guardian, and the Bus Watchdog of every servo that has one, armed."""
+        if self._guardian is None:
+            self._start_guardian()
+        servos = self._servos
+        for joint in servos.tripped_watchdogs():
+            servos.write_counts("bus_watchdog", joint, 0)  # or the goals stay locked
+        able = [servo.joint for servo in servos.servos if (servo.firmware or 0) >= WATCHDOG_FIRMWARE]
+        for joint in able:
+            servos.write_counts("bus_watchdog", joint, round(self.config.watchdog_s / WATCHDOG_UNIT_S))
+        unable = [joint for joint in servos.joints if joint not in able]
+        if unable and not self._unwatched_told:
+            self._unwatched_told = True
+            self._notice(
+                f"{', '.join(unable)} {'has' if len(unable) == 1 else 'have'} no Bus Watchdog (firmware below "
+                f"{WATCHDOG_FIRMWARE}): should this program and its guardian die at once, nothing stops the motion"
+            )
+        self._bus.guarded = True
+        self._beat()
 
     def _do_move(self, number: int, command: messages.Ramp | messages.Play | messages.Hold) -> None:
         if self._refused_limp(number) or self._goal is None:
@@ -961,6 +1095,8 @@ class Engine:
         return messages.Reply(number, value=self._servos.read_all(command.register))
 
     def _do_write(self, number: int, command: messages.WriteRegister) -> messages.Reply:
+        if command.register in ("torque_enable", "bus_watchdog"):
+            raise BadInput(f"{command.register} is the engine's own", remedy="use `messages.Torque`")
         seen = len(self._servos.journal)
         self._servos.write_counts(command.register, command.joint, command.counts)
         return messages.Reply(number, value=self._servos.journal[seen:])

@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 from openant_tools.comms.guards import Guards
 from openant_tools.comms.restart import Restart, StopCause
 from openant_tools.comms.servos import Servo
+from openant_tools.errors import BadInput
 from openant_tools.recording.run import Facts
 
 if TYPE_CHECKING:
     from openant_tools.comms.body_camera import CameraConfig
 
 __all__ = [
+    "WATCHDOG_LONGEST_S",
+    "WATCHDOG_UNIT_S",
     "Command",
     "EngineConfig",
     "Event",
@@ -39,6 +42,9 @@ __all__ = [
     "Torque",
     "WriteRegister",
 ]
+
+#: The unit of the Bus Watchdog, and the most of it (register 98).
+WATCHDOG_UNIT_S, WATCHDOG_LONGEST_S = 0.02, 2.54
 
 
 @dataclass(frozen=True)
@@ -69,8 +75,13 @@ class EngineConfig:
         limits_rad: joint → (low, high); commands beyond are refused (`checked`), measurements far beyond stop the motion.
         registers: joint → register → counts that must be in force; EEPROM is written only where it differs.
         chain: lists of joints, each in the order of its cable from the adapter outwards, where that is known.
-        watchdog_s: how long servos go on moving when nothing is heard of us any more.
+        watchdog_s: how long servos go on moving when nothing is heard of us any more; whole 20 ms are armed. 0, which is
+            off, only where nothing moves.
         journal: file that every EEPROM write stands in before it is sent.
+        still: nothing will move: torque is refused, and no register is set for a motion.
+
+    Raises:
+        BadInput: servos could move, and their watchdog would not stop them, or at once.
     """
 
     port: str
@@ -87,6 +98,17 @@ class EngineConfig:
     camera: CameraConfig | None = None
     chain: tuple[tuple[str, ...], ...] = ()
     journal: str | None = None
+    still: bool = False
+
+    def __post_init__(self) -> None:
+        seconds = self.watchdog_s
+        if self.still or WATCHDOG_UNIT_S <= seconds <= WATCHDOG_LONGEST_S:
+            return
+        why = "is off, and the robot is to move" if seconds == 0 else f"cannot be {seconds:g} s"
+        raise BadInput(
+            f"the servos' Bus Watchdog (watchdog_s) {why}",
+            remedy=f"give it {WATCHDOG_UNIT_S:g} to {WATCHDOG_LONGEST_S:g} s (0.2 is usual): [bus] watchdog_s in robot.toml",
+        )
 
 
 # ---- to the engine: each is answered by a `Reply` ------------------------------------------------------------------
@@ -94,7 +116,7 @@ class EngineConfig:
 
 @dataclass(frozen=True)
 class Torque:
-    """Torque of all servos on, at the position measured, or off.
+    """Torque of all servos on, at the position measured, their watchdogs armed before; or off.
 
     Attributes:
         restart: after a stop torque comes on only with the reason that `restart.Interlock` gives, or the builder.
@@ -198,7 +220,10 @@ class ReadRegister:
 
 @dataclass(frozen=True)
 class WriteRegister:
-    """Set a register of one joint, in counts; see `Servos.write_counts`."""
+    """Set a register of one joint, in counts; see `Servos.write_counts`.
+
+    Torque and the Bus Watchdog are the engine's own, and goals are refused while torque is off.
+    """
 
     joint: str
     register: str

@@ -303,6 +303,8 @@ class Servos:
 
     def write_goals(self, counts: Sequence[int]) -> float:
         """Goal positions of all servos in counts; the time the last byte has left (s)."""
+        if not self.bus.guarded:
+            self.bus.check_guarded(116, bytes(4))
         return self.bus.send(self._goals.encode(counts))
 
     # ---- torque, watchdog, errors --------------------------------------------------------------------------------

@@ -215,7 +215,7 @@ class Step:
         needs: steps that must have said yes before; things on the table come in `table`.
         table: what must be at hand.
         changes: what it writes (registers, robot.toml); "" where it changes nothing.
-        moves: whether the robot moves.
+        moves: whether the robot moves. holds: whether torque goes on although nothing moves.
         sees: whether it looks through the camera.
         minutes: of the builder's time, about.
         safe_to_repeat: nothing is lost by doing it again.
@@ -230,6 +230,7 @@ class Step:
     table: str = ""
     changes: str = ""
     moves: bool = False
+    holds: bool = False
     sees: bool = False
     minutes: float = 1.0
     safe_to_repeat: bool = True

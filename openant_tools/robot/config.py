@@ -63,7 +63,8 @@ class Bus:
         return_delay_s: what each servo waits before it answers (register 9).
         write_read_gap_s: from the last byte of a write to the next read; below 0.2 ms servos miss the read.
         pwm_limit: share of full duty that the servos may use (register 36).
-        watchdog_s: servos stop by themselves after this long without an instruction (register 98); 0 is off.
+        watchdog_s: servos stop by themselves after this long without an instruction (register 98); 0 is off,
+            and then the robot may be watched, but not moved.
         chain: lists of joints, each in the order of its cable, from the adapter outwards.
     """
 
@@ -71,7 +72,7 @@ class Bus:
     return_delay_s: float = number(0, 508e-6, "s", 0.0)
     write_read_gap_s: float = number(0, 0.1, "s", 0.0002)
     pwm_limit: float = number(0, 1, "", PLATFORM_PWM_LIMIT)
-    watchdog_s: float = number(0, 2.54, "s", 0.2)
+    watchdog_s: float = number(0.02, 2.54, "s", 0.2, or_zero=True)
     chain: tuple[tuple[str, ...], ...] = ()
 
 

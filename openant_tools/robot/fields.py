@@ -72,14 +72,16 @@ def _a(value: Any) -> str:
     return next((words for kind, words in kinds if isinstance(value, kind)), "a date")
 
 
-def _parse_number(low: float, high: float, unit: str) -> Parse:
+def _parse_number(low: float, high: float, unit: str, or_zero: bool = False) -> Parse:
     def parse(value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
             remedy = "leave out the quotes" if isinstance(value, str) else None
             raise Unfit(f"is {_a(value)}, but a number is needed{f' ({unit})' if unit else ''}", remedy)
         number = float(value)
-        if not low <= number <= high:
-            remedy = f"give a value from {low:.6g} to {high:.6g}{f' {unit}' if unit else ''}"
+        if not low <= number <= high and not (or_zero and number == 0):
+            remedy = (
+                f"give {'0, or ' if or_zero else ''}a value from {low:.6g} to {high:.6g}{f' {unit}' if unit else ''}"
+            )
             if unit == "rad" and math.isfinite(number) and low <= math.radians(number) <= high:
                 remedy = f"angles stand in rad; if degrees were meant write {math.radians(number):.6g}"
             raise Unfit(f"{number:.6g}{f' {unit}' if unit else ''} cannot be", remedy)
@@ -88,9 +90,11 @@ def _parse_number(low: float, high: float, unit: str) -> Parse:
     return parse
 
 
-def number(low: float, high: float, unit: str = "", default: Any = MISSING, key: str | None = None) -> Any:
-    """A finite number from low to high, in `unit`; `key` where the TOML name differs from the field's."""
-    return _field(_parse_number(low, high, unit), default, key)
+def number(
+    low: float, high: float, unit: str = "", default: Any = MISSING, key: str | None = None, *, or_zero: bool = False
+) -> Any:
+    """A finite number from low to high (or 0), in `unit`; `key` where the TOML name differs from the field's."""
+    return _field(_parse_number(low, high, unit, or_zero), default, key)
 
 
 def whole(low: int, high: int, default: Any = MISSING, key: str | None = None) -> Any:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 from openant_tools.bringup.walk import standing
@@ -157,18 +156,19 @@ class Session:
             engine.close()
 
     def _config(self) -> EngineConfig:
+        """Of who watches: nothing is written and torque stays off."""
         port = control = imu = None
         if self.virtual is not None:
             port, control, imu = self.virtual["bus"], self.virtual["control"], self.virtual["imu"]
         folder = self.folder
         if folder is None:
-            config = config_of_unknown_robot(find_bus(port), control)
+            config = config_of_unknown_robot(find_bus(port), control, still=True)
         else:
             robot = folder.config()
             journal = str(folder.journal)
-            config = config_of_robot(robot, port, control=control, imu=imu_of_robot(robot, imu), journal=journal)
-        # Who watches writes nothing: registers are set when something is to move.
-        return replace(config, registers={})
+            more = {"imu": imu_of_robot(robot, imu), "journal": journal, "still": True}
+            config = config_of_robot(robot, port, control=control, **more)
+        return config
 
     def release(self) -> int:
         """The stop key: torque off everywhere, now, from any thread; how many were told.
