@@ -352,7 +352,7 @@ def test_a_bus_that_nobody_guards_lets_no_servo_move_whatever_the_way() -> None:
         lambda: bus.bulk_write([(first, 65, on), (servos.ids[1], 116, goal)]),
     ]
     for way in ways:
-        with pytest.raises(BadInput, match="nobody would switch torque off .* through the engine"):
+        with pytest.raises(BadInput, match=r"nobody would switch torque off .* through the engine"):
             way()
     for guarded in (False, True):
         bus.guarded = guarded

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import importlib
 import os
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
 
 import click
 
+from openant_tools.cli.leaving import heed_signals
 from openant_tools.errors import OpenAntError
 from openant_tools.workers import end_with_who_started_us
 
@@ -127,16 +127,9 @@ def openant(context: click.Context, robot: Path | None, virtual_source: str | No
     return terminal.terminal(robot, virtual_source)
 
 
-def _interrupt(signum: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
-
-
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line; exits with 0, 1, 2 or 130 (formats, section 6), never a traceback for bad input."""
-    # Being told to go, and a terminal that is closed, are as good as Ctrl-C: torque goes off, what was learned is saved.
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
-            signal.signal(number, _interrupt)
+    heed_signals()
     end_with_who_started_us()
     try:
         code = openant.main(args=argv, prog_name="openant", standalone_mode=False)
@@ -160,5 +153,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         click.echo(f"openant: {where}{error.strerror or error}" + (f" → {remedy}" if remedy else ""), err=True)
         sys.exit(2)
     except (KeyboardInterrupt, click.Abort):
-        click.echo("openant: interrupted", err=True)
+        with contextlib.suppress(OSError):  # the terminal may be what has gone
+            click.echo("openant: interrupted", err=True)
         sys.exit(INTERRUPTED)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from openant_tools.cli.leaving import MOVES, end_with_the_terminal
 from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_robot
 from openant_tools.errors import BadInput
 
@@ -19,12 +20,9 @@ if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
 
 __all__ = [
-    "MOVES", "Moving", "adapter_option", "camera_option", "engine_config", "imu_option", "may_move", "need_moving", "need_terminal",
+    "Moving", "adapter_option", "camera_option", "engine_config", "imu_option", "may_move", "need_moving", "need_terminal",
     "port_option", "robot_of", "yes_option",
 ]  # fmt: skip
-
-#: in a context's meta: the command is about to move, or does
-MOVES = "openant moves"
 
 
 class Moving(click.Command):
@@ -123,7 +121,9 @@ def need_moving() -> None:
         return
     if not isinstance(context.command, Moving):
         raise RuntimeError(f"`{context.command_path}` moves: it must be a `Moving` command")
-    context.meta[MOVES] = True
+    if not context.meta.get(MOVES):
+        context.meta[MOVES] = True
+        end_with_the_terminal()
 
 
 def may_move(

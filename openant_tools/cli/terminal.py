@@ -14,8 +14,10 @@ __all__ = ["serve", "terminal"]
 
 def terminal(robot: Path | None, virtual_source: str | None) -> int:
     """Run the terminal program; its exit code."""
+    from openant_tools.cli.leaving import end_with_the_terminal
     from openant_tools.tui.app import run
 
+    end_with_the_terminal()
     return run(_folder(robot), virtual_source)
 
 

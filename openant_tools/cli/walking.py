@@ -138,4 +138,5 @@ def _pause_key(env: AntHardware) -> Iterator[None]:
     finally:
         ended.set()
         thread.join(1.0)
-        termios.tcsetattr(fd, termios.TCSADRAIN, before)
+        with contextlib.suppress(termios.error):  # the terminal has gone
+            termios.tcsetattr(fd, termios.TCSADRAIN, before)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import signal
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
+from types import FrameType
 from typing import ClassVar
 
 from textual import work
@@ -124,6 +126,7 @@ class OpenAnt(App[int]):
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("space", "stop", "STOP", priority=True, show=False),
         Binding("ctrl+c", "interrupt", show=False, priority=True),
+        Binding("ctrl+z", "suspend_process", show=False),
         # tmux makes alt+f1 of an Esc and an F1 that come soon after each other.
         Binding("f1,alt+f1", "help", "Help", key_display="F1"),
         Binding("ctrl+o", "jump", "Jump", show=False),
@@ -157,6 +160,7 @@ class OpenAnt(App[int]):
     def on_mount(self) -> None:
         if self._ticking:
             self.set_interval(TICK_S, self.tick)
+        self._stop_before_suspension()
         if self._virtual is not None:
             self.start_virtual(self._virtual)
 
@@ -194,6 +198,20 @@ class OpenAnt(App[int]):
         """Ctrl-C: torque off, everything put in order, gone."""
         self.session.release()
         self._quit(INTERRUPTED)
+
+    def _stop_before_suspension(self) -> None:
+        """Whoever suspends the program stops the robot first; nothing that moved goes on when it comes back."""
+        suspend = signal.getsignal(signal.SIGTSTP)
+        if not callable(suspend):  # no terminal: a test
+            return
+
+        def stop(number: int, frame: FrameType | None) -> None:
+            self.session.release()
+            if self._running_step is not None:
+                self._running_step.end()
+            suspend(number, frame)
+
+        signal.signal(signal.SIGTSTP, stop)
 
     async def action_quit(self) -> None:
         self.action_leave()

@@ -1,0 +1,72 @@
+"""What ends a command from outside: being told to go, Ctrl-Z, a terminal that is gone. A robot's motion ends first, always."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+import threading
+from types import FrameType
+
+import click
+
+__all__ = ["MOVES", "end_with_the_terminal", "heed_signals"]
+
+#: in a click context's meta: the command has the builder's word that it may move
+MOVES = "openant moves"
+
+
+def heed_signals() -> None:
+    """Being told to go, and a terminal that is closed, are as good as Ctrl-C: torque goes off, what was learned is saved."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+            signal.signal(number, _interrupt)
+    if signal.getsignal(signal.SIGTSTP) is not signal.SIG_IGN:
+        signal.signal(signal.SIGTSTP, _suspend)
+
+
+def end_with_the_terminal() -> None:
+    """From now on be interrupted where the terminal goes, or whoever reads what this program says: ssh tells nobody.
+
+    Under nohup, which ignores that, the program goes on.
+    """
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        return
+    poll = select.poll()
+    for fd in (0, 1, 2):
+        if fd > 0 or os.isatty(fd):  # an input that ends is no terminal that is gone
+            poll.register(fd, 0)
+
+    def wait() -> None:
+        while found := poll.poll():
+            if any(what & (select.POLLERR | select.POLLHUP) for _, what in found):
+                os.kill(os.getpid(), signal.SIGHUP)
+                return
+            for fd, _ in found:  # it was closed from the beginning
+                poll.unregister(fd)
+
+    threading.Thread(target=wait, name="terminal", daemon=True).start()
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    if number == signal.SIGHUP:  # the kernel, the shell and the watch above may all say so: once is enough
+        signal.signal(number, signal.SIG_IGN)
+    raise KeyboardInterrupt
+
+
+def _suspend(number: int, frame: FrameType | None) -> None:
+    """Torque off, then stop as Ctrl-Z wants it. What comes back does not go on moving: it ends as after Ctrl-C."""
+    context = click.get_current_context(silent=True)
+    moves = context is not None and bool(context.meta.get(MOVES))
+    if "openant_tools.comms.engine_process" in sys.modules:
+        from openant_tools.comms.engine_process import EngineProcess
+        from openant_tools.comms.release import release_all
+
+        moves = moves or any(not engine.config.still for engine in EngineProcess.running)
+        release_all()
+    signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+    os.kill(os.getpid(), signal.SIGTSTP)
+    signal.signal(signal.SIGTSTP, _suspend)
+    if moves:
+        raise KeyboardInterrupt
