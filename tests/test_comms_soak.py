@@ -67,8 +67,7 @@ def test_bytes_show_the_fault_and_are_kept_around_each_loss(tmp_path: Path) -> N
     assert done.exit_code == 0, done.output
     recording = read_recording(out)
     raw = [event for event in recording.events if event["kind"] == "bytes"]
-    assert raw
-    assert raw[0]["asked"].startswith("fffffd00fe")
+    assert any(event["asked"].startswith("fffffd00fe") for event in raw)
     counts = [event for event in recording.events if event["kind"] == "counts"]
     assert sum(event["cycles"] for event in counts) > 800
     found = diagnose_dropouts([recording.run])

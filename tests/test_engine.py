@@ -422,6 +422,7 @@ def test_killing_both_leaves_it_to_the_servos_watchdog_and_the_next_connect_says
     live: dict[str, str], moving: tuple[subprocess.Popen[str], dict[str, int], Path]
 ) -> None:
     parent, pids, _ = moving
+    os.kill(pids["engine"], signal.SIGSTOP)  # or it starts another guardian in between
     os.kill(pids["guardian"], signal.SIGKILL)
     os.kill(pids["engine"], signal.SIGKILL)
     parent.kill()

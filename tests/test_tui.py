@@ -25,6 +25,7 @@ from openant_tools.comms import messages
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.ring import columns
+from openant_tools.errors import HardwareFault
 from openant_tools.files import write_text
 from openant_tools.gap.diagnosis import Diagnosis, Found, Span
 from openant_tools.procedure.finding import Evidence, Finding, keep
@@ -660,8 +661,11 @@ def test_a_robot_is_watched_live_and_the_stop_key_lets_it_go(tmp_path: Path) -> 
             assert app.session.virtual is not None
             assert "torque off" in screen_text(app)
             assert "live" in screen_text(app)
-            engine = app.session._engine
-            assert engine is not None
+            assert app.session._engine is not None
+            with pytest.raises(HardwareFault, match="torque stays off: this program only watches"):
+                app.session._engine.ask(messages.Torque(True))
+            app.session.disconnect()
+            app.session._engine = engine = EngineProcess(engine_config(app.session.bench()))
             engine.ask(messages.Torque(True))
             assert all(torques(app.session.virtual))
             await until(pilot, lambda: "torque ON" in screen_text(app))

@@ -381,7 +381,8 @@ class Engine:
             if self._torque and self._parent_suspended():
                 self._stopped(
                     Trip(
-                        "the program that moves the robot was suspended", "bring it back with `fg`, and begin again",
+                        "the program that moves the robot was suspended",
+                        "bring it back with `fg`, and begin again",
                         cause=StopCause.BY_HAND,
                     )
                 )
@@ -944,10 +945,10 @@ class Engine:
         try:
             self._guard()
             # A motion that was gentle, and was killed, has left its limit behind.
-            full, now = servos.read_all("pwm_limit"), servos.read_all("goal_pwm")
-            for joint in servos.joints:
-                if now[joint] != full[joint]:
-                    servos.write_counts("goal_pwm", joint, full[joint])
+            for joint, counts in servos.read_all("goal_pwm").items():
+                full = self._registers[joint]["pwm_limit"]
+                if counts != full:
+                    servos.write_counts("goal_pwm", joint, full)
             positions = servos.read_all("present_position")
             self._counts = [positions[joint] for joint in servos.joints]
             servos.write_goals(self._counts)
