@@ -36,7 +36,7 @@ from openant_tools.comms.camera import CameraInfo
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics
 from openant_tools.errors import HardwareFault
-from openant_tools.procedure.journal import Journal
+from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.procedure.step import Ask, Bench, Declined, Event, Hands, Intent, Progress, drive
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
@@ -256,6 +256,25 @@ def test_a_servo_that_was_told_not_to_answer_writes_is_named_and_mended_in_the_j
         finding, _ = ant.do(undo(ant.bench, everything=True))
         assert finding.ok
         assert ant.register("knee_fl", "status_return_level") == 2  # power-off takes it back, undo has no part in it
+
+
+def test_undo_lowers_no_protection_on_a_value_that_was_read_once(tmp_path):
+    with robot(tmp_path / "ant") as ant:
+        # A line as an older version left it, and what a late answer made of it: a Shutdown that never was 0.
+        lie = EepromWrite("knee_fl", 31, "shutdown", 0, 0x34, 1_000_000)
+        higher = EepromWrite("hip_rr", 10, "temperature_limit", 100, 80, 1_000_000)
+        lower = EepromWrite("hip_fr", 20, "temperature_limit", 70, 80, 1_000_000)
+        for write in (lie, higher, lower):
+            Journal(ant.folder.journal).append(write, "calib inventory")
+        finding, _ = ant.do(undo(ant.bench))
+        assert not finding.ok
+        assert [ant.register("knee_fl", "shutdown"), ant.register("hip_rr", "temperature_limit")] == [0x34, 80]
+        assert ant.register("hip_fr", "temperature_limit") == 70, "more protection needs no proof"
+        assert "shutdown would go from 52 to 0, less protection" in finding.problems[-1]
+        # What was read twice is taken back, whatever it protects.
+        Journal(ant.folder.journal).append(replace(higher, confirmed=True), "calib inventory")
+        ant.do(undo(replace(ant.bench, joints=("hip_rr",))))
+        assert ant.register("hip_rr", "temperature_limit") == 100
 
 
 def test_what_is_accepted_stays_and_is_kept(tmp_path):

@@ -131,6 +131,7 @@ class Bus:
         #: since when and with how many bytes the line has talked unasked without a pause, s
         self._restless_from: float | None = None
         self._restless_bytes = 0
+        self._unasked_at = float("-inf")
         #: whole plain reads in a row wanted before joined ones are tried again; twice as many after each failure
         self._plain_left = self._plain_wanted = 0
         self._known: dict[tuple[int, int, int, tuple[int, ...]], Request] = {}
@@ -171,11 +172,13 @@ class Bus:
                     found[item.id] = _found(Answer(item.id, item.params, item.error))
                 elif isinstance(item, Garbage):
                     garbage += len(item.data)
-            if self.clock.now() > give_up:
-                raise self.never_silent(garbage, self.clock.now() - started)
             deadline = max(deadline, self.clock.now() + quiet_s)
+            if self.clock.now() > give_up:
+                break
         garbage += sum(len(item.data) for item in parser.flush() if isinstance(item, Garbage))
         self.statistics.noise_bytes += garbage
+        if deadline > give_up:
+            raise self.never_silent(garbage, self.clock.now() - started)
         if garbage and not found:
             raise BrokenAnswer(
                 f"answers to a broadcast ping collide ({garbage} bytes that are no packet) at {self.line.baud} baud",
@@ -401,22 +404,23 @@ class Bus:
 
     def _settle(self, until: float) -> None:
         """Take what comes until then (s), answers to earlier questions or noise, and look whether the line falls silent."""
-        began = heard_at = self.clock.now()
         parser, noise, lain = Parser(), 0, 0
         while self.clock.wait_readable(self.line, until):
             data = self.line.read()
-            now = self.clock.now()
-            stale = self._count_stale(parser.feed(data))
-            if stale:
-                noise, heard_at = noise + stale, now
-            lain += len(data) if now > until else 0
+            noise += self._count_stale(parser.feed(data))
+            lain += len(data) if self.clock.now() > until else 0
             if lain > BUFFER or not data:
                 break  # no pause to wait for
-        noise += self._count_stale(parser.flush())
-        if noise and self.clock.now() - heard_at < QUIET_S:
-            self._restless_from = began if self._restless_from is None else self._restless_from
-            self._restless_bytes += noise
-        else:
+        self._note_unasked(noise + self._count_stale(parser.flush()))
+
+    def _note_unasked(self, count: int) -> None:
+        """So many bytes have come that nobody asked for; without a pause between them they make a line restless."""
+        now = self.clock.now()
+        if count:
+            self._restless_from = now if self._restless_from is None else self._restless_from
+            self._restless_bytes += count
+            self._unasked_at = now
+        elif now - self._unasked_at > QUIET_S:
             self._restless_from, self._restless_bytes = None, 0
 
     def _count_stale(self, items: Iterable[object]) -> int:
@@ -540,6 +544,8 @@ class Bus:
         statistics = self.statistics
         statistics.noise_bytes += sorting.noise_bytes
         statistics.echoes += sorting.echoed
+        if sorting.noise_bytes > request.expected:
+            self._note_unasked(sorting.noise_bytes)  # more than broken answers can be
         broken_off = False
         for answer in answers:
             # Of a joined reply that broke off, those behind the first silent one are asked again.
