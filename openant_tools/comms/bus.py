@@ -544,8 +544,8 @@ class Bus:
         statistics = self.statistics
         statistics.noise_bytes += sorting.noise_bytes
         statistics.echoes += sorting.echoed
-        if sorting.noise_bytes > request.expected:
-            self._note_unasked(sorting.noise_bytes)  # more than broken answers can be
+        if sorting.noise_bytes > (0 if self._restless_from is not None else request.expected):
+            self._note_unasked(sorting.noise_bytes)  # more than broken answers can be, or more of the same
         broken_off = False
         for answer in answers:
             # Of a joined reply that broke off, those behind the first silent one are asked again.
