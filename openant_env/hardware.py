@@ -140,7 +140,7 @@ class AntHardware(AntBase):
         #: why motion may begin again, where it was stopped
         self._restart: Restart | None = None
         self._stop_cause: StopCause | None = None
-        self._said_why = ""
+        self._said_why, self._remedy = "", "look at the robot"
         self._paused = threading.Event()
         self._why_paused = ""
         self._held = contextlib.ExitStack()
@@ -304,7 +304,7 @@ class AntHardware(AntBase):
         try:
             rows, number = self.link.go(self._command, self.dt, (self._observed_at, chosen_at))
         except HardwareFault as fault:
-            return self._stopped(str(fault), _cause(fault))
+            return self._stopped(str(fault), _cause(fault), fault)
         mine = rows[rows[:, self.link.columns["goal"]] == number]
         if not len(mine):
             return self._stopped("the engine played nothing of this step", StopCause.STALL)
@@ -339,10 +339,12 @@ class AntHardware(AntBase):
                 "the way that it is told"
             )
 
-    def _stopped(self, why: str, cause: StopCause) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def _stopped(
+        self, why: str, cause: StopCause, fault: HardwareFault | None = None
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """A step that torque off ended: what was seen last stands in, and no reward is given for it."""
         self._reason, self._ready = why, False
-        self._ended_by(cause, why)
+        self._ended_by(cause, why, fault)
         self._seconds += self.dt
         x, y, yaw = self._pose.tolist()
         hx, hy = math.cos(yaw), math.sin(yaw)
@@ -419,8 +421,12 @@ class AntHardware(AntBase):
         info["reason"], info["stop_cause"] = why, cause.value
         self._ended_by(cause, why)
 
-    def _ended_by(self, cause: StopCause, why: str) -> None:
+    def _ended_by(self, cause: StopCause, why: str, fault: HardwareFault | None = None) -> None:
         """What the table makes of a stop."""
+        self._remedy = "look at the robot"
+        if fault is not None:
+            why = f"{fault.where}: {fault.what}" if fault.where else fault.what
+            self._remedy = fault.remedy or self._remedy
         self._stop_cause, self._said_why = cause, why
         if cause is StopCause.HARDWARE_ERROR:
             return  # counted for each servo that is rebooted
@@ -476,7 +482,7 @@ class AntHardware(AntBase):
                 except HardwareFault as fault:
                     why = str(fault)
                     self._reason = why
-                    self._ended_by(_cause(fault), why)
+                    self._ended_by(_cause(fault), why, fault)
                     self.link.drop()
             self._need_word()
             why = why or self._why_paused
@@ -505,7 +511,7 @@ class AntHardware(AntBase):
             self.link.let_down()
             raise MotionStopped(
                 why,
-                remedy="look at the robot, then reset(options={'resume': True}), or start the command again",
+                remedy=f"{self._remedy}; then reset(options={{'resume': True}}), or start the command again",
                 cause=self._stop_cause or StopCause.UNKNOWN,
             )
         if not self._paused.is_set():
@@ -535,7 +541,7 @@ class AntHardware(AntBase):
             return self._trouble()
         except HardwareFault as fault:
             if _cause(fault) is StopCause.STORAGE:
-                self._ended_by(StopCause.STORAGE, str(fault))
+                self._ended_by(StopCause.STORAGE, str(fault), fault)
             self.link.drop()
             return str(fault)
 

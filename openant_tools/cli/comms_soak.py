@@ -135,7 +135,7 @@ def _on_the_bus(
         write_text(json_file, json.dumps(content, indent=1) + "\n")
     click.echo(f"`openant comms diagnose {done.path}` says why", err=True)
     if done.ended:
-        click.echo(f"openant: motion has ended for good: {done.ended}", err=True)
+        click.echo(f"openant: {'the soak' if still else 'motion'} has ended for good: {done.ended}", err=True)
     if not done.whole:
         raise SystemExit(1)
 

@@ -731,8 +731,12 @@ class Engine:
         before = f"{trip.what}: " if first.joint == trip.joint else ""
         return Trip(before + why.what, why.remedy, first.joint, cause=trip.cause)
 
-    def _stopped(self, trip: Trip) -> None:
-        """Release everyone, tell, and only then make sure: on a bad line that may take a while."""
+    def _stopped(self, trip: Trip, where: str | None = None) -> None:
+        """Release everyone, tell, and only then make sure: on a bad line that may take a while.
+
+        Args:
+            where: what it concerns, where that is not the bus.
+        """
         if not self._lost:
             with contextlib.suppress(HardwareFault):
                 self._servos.torque_off_now()
@@ -742,7 +746,7 @@ class Engine:
         self._trip = trip
         self._say(messages.Stopped(trip.what, trip.remedy, trip.joint, trip.cause))
         for number, _ in self._waiting:
-            self._say(messages.Reply(number, error=(trip.what, None, trip.remedy), cause=trip.cause))
+            self._say(messages.Reply(number, error=(trip.what, where, trip.remedy), cause=trip.cause))
         self._waiting.clear()
         self._torque_off()
 
@@ -816,7 +820,7 @@ class Engine:
         with contextlib.suppress(RecordingStopped):
             self._close_recording()
         self._unrecorded = error
-        self._stopped(Trip(error.what, error.remedy or "", cause=StopCause.STORAGE))
+        self._stopped(Trip(error.what, error.remedy or "", cause=StopCause.STORAGE), error.where)
         # Who only lets time pass does so for this recording, too.
         for number, _ in self._looks:
             self._say(_refusal(number, None, error))
