@@ -49,6 +49,26 @@ def test_a_right_model_is_as_good_as_the_repeat(model: Path) -> None:
     assert found.gaps["pos"] < 2 * found.floors["pos"]
 
 
+def test_repeats_that_disagree_are_no_floor_to_judge_by(model: Path, tmp_path: Path) -> None:
+    runs = [recorded(model, "a"), recorded(model, "b", seed=1, repeat_of="a")]
+    assert measure(runs, model).doubt == ""
+    # Between the two plays of one motion its load has doubled: the floor that they would give hides every gap.
+    runs[1] = recorded(model, "b", seed=1, repeat_of="a", body_mass=2.0, dof_damping=0.3)
+    found = measure(runs, model)
+    assert found.doubt.startswith("the repeats disagree: two plays of one motion differ by")
+    assert "most at joint" in found.doubt
+    assert found.as_json()["doubt"] == found.doubt
+    paths = []
+    for run in runs:
+        paths.append(tmp_path / f"{run.name}.parquet")
+        write_table(run, paths[-1])
+    asked = ["measure", *map(str, paths), "--model", str(model), "--report", str(tmp_path / "report")]
+    answer = CliRunner().invoke(gap, asked, standalone_mode=False)
+    assert answer.return_value == 1
+    assert "Cannot judge the gap: the repeats disagree" in answer.output
+    assert "Cannot judge the gap" in (tmp_path / "report" / "report.html").read_text()
+
+
 def test_the_gap_of_a_servo_that_is_too_weak_lies_where_it_gives_all(model: Path) -> None:
     plant = load_plant(model)
     weak = recorded(model, actuator_forcerange=np.array([-0.8, 0.8]))  # type: ignore[arg-type]

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from openant_tools.errors import BadInput, OpenAntError
-from openant_tools.files import write_text
+from openant_tools.files import json_text, write_text
 from openant_tools.robot.config import CONFIG_NAME
 from openant_tools.workers import environment
 
@@ -295,7 +295,7 @@ class Demo:
             code = openant(command)
             if code != 0:
                 raise StageFailed(stage.name, command, code)
-        write_text(self.folder / STATE, json.dumps({**self._done(), stage.name: stage.commands}, indent=1) + "\n")
+        write_text(self.folder / STATE, json_text({**self._done(), stage.name: stage.commands}))
 
     def _done(self) -> dict[str, list[list[str]]]:
         try:

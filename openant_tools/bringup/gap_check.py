@@ -43,6 +43,7 @@ def gap_check(bench: Bench) -> Procedure:
         if math.isfinite(closed)
         else ["gap closed: the nominal model is off by no more than the floor → nothing to judge by"]
     )
+    unsure += [after.doubt] if after.doubt else []
     worst = after.places[0] if after.places else None
     return Finding(
         "gap",

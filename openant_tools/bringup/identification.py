@@ -55,7 +55,7 @@ def identification(bench: Bench) -> Procedure:
     beside = f" with {' and '.join(sorted({name for name, _ in richer.effects_found}))} beside it" if richer else ""
     return Finding(
         "identify",
-        better,
+        False if not better else None if result.doubt else True,
         f"error on a motion it has not seen: {1e3 * best.before.full:.1f} → {1e3 * best.after.full:.2f} mrad{beside} "
         f"(floor {1e3 * best.floor:.2f})",
         (
@@ -71,5 +71,6 @@ def identification(bench: Bench) -> Procedure:
             "held_out": [bench.folder.relative(take.path) for take in judge],
             "values": {v.name: [v.value, v.low, v.high, v.verdict] for v in best.values},
         },
+        unsure=(result.doubt,) if result.doubt else (),
         problems=() if better else ("no fitted value predicts better than the nominal model → it stays in use",),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -57,7 +56,7 @@ def bringup(
     """
     from openant_tools.bringup.walk import WALK, standing, walk
     from openant_tools.cli.face import CommandFace, echo_finding
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.procedure.finding import Finding
     from openant_tools.procedure.step import Bench, Step
     from openant_tools.robot.folder import RobotFolder, create_robot
@@ -98,7 +97,7 @@ def bringup(
         },
     }
     if json_file is not None:
-        write_text(json_file, json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+        write_text(json_file, json_text(result))
     if red:
         click.echo(f"not green: {', '.join(WALK[name].title for name in red)}; the findings are in {folder.findings}")
         return 1

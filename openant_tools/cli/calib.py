@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -105,11 +104,11 @@ def run_and_keep(procedure: Procedure, bench: Bench, face: Any) -> Finding:
 def show_finding(finding: Finding, json_file: Path | None) -> int:
     """Print a finding, write its JSON where it was asked for; the exit code."""
     from openant_tools.cli.face import echo_finding
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
 
     echo_finding(finding)
     if json_file is not None:
-        write_text(json_file, json.dumps(finding.as_json(), indent=1, ensure_ascii=False) + "\n")
+        write_text(json_file, json_text(finding.as_json()))
     return 0 if finding.ok else 1
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -293,6 +292,6 @@ def _table(columns: Sequence[str], row: Sequence[float], statistics: Mapping[str
 
 
 def _write_json(path: Path, content: object) -> None:
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
 
-    write_text(path, json.dumps(content, indent=2) + "\n")
+    write_text(path, json_text(content, indent=2))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
@@ -89,7 +88,7 @@ def run(folder: Path, jobs: int) -> None:
 def score(folder: Path, key_file: Path | None, docs: Path | None, so_far: bool, json_file: Path | None) -> None:
     """Open the answers of SET and compare: exit code 1 where a figure lies below what is asked for."""
     from openant_tools.blind.soak_score import score_soaks, table_lines, write_soak_docs
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.virtual.seal import read_key
 
     found = score_soaks(folder, None if key_file is None else read_key(key_file), so_far=so_far)
@@ -97,7 +96,7 @@ def score(folder: Path, key_file: Path | None, docs: Path | None, so_far: bool, 
         click.echo(line)
     click.echo(f"{len(found.failures)} of {len(found.cases)} soaks went wrong")
     if json_file:
-        write_text(json_file, json.dumps(found.as_json(), indent=1) + "\n")
+        write_text(json_file, json_text(found.as_json()))
     if docs:
         write_soak_docs(found, docs)
         click.echo(f"wrote {docs}", err=True)

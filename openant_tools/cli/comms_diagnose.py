@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
@@ -46,7 +45,7 @@ def diagnose(
     from openant_tools.comms.dropouts.diagnose import diagnose_dropouts
     from openant_tools.comms.dropouts.outcome import dropouts_finding, effects_toml
     from openant_tools.comms.dropouts.report import dropouts_report
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.procedure.finding import keep as keep_finding
     from openant_tools.recording.tables import read_run
 
@@ -65,7 +64,7 @@ def diagnose(
             click.echo(f"remedy: {found.suspects[0].remedy}")
         click.echo(f"next test: {found.next_test}")
     if json_file:
-        write_text(json_file, json.dumps(found.as_json(), indent=1) + "\n")
+        write_text(json_file, json_text(found.as_json()))
     if effects_file:
         write_text(effects_file, effects_toml(found))
     if report:
@@ -95,7 +94,7 @@ def timing(run: Path, picture: Path | None, json_file: Path | None, report: Path
       openant comms timing walk.mcap --report timing
     """
     from openant_tools.comms.step_timing import COLUMNS, sentence, step_timing, timing_figure, timing_report
-    from openant_tools.files import write_bytes, write_text
+    from openant_tools.files import json_text, write_bytes, write_text
     from openant_tools.recording.tables import read_run
     from openant_tools.report import plots
 
@@ -107,7 +106,7 @@ def timing(run: Path, picture: Path | None, json_file: Path | None, report: Path
         click.echo(row[0].ljust(widths[0]) + "  " + "  ".join(cells))
     click.echo(sentence(found))
     if json_file:
-        write_text(json_file, json.dumps(found.as_json(), indent=1) + "\n")
+        write_text(json_file, json_text(found.as_json()))
     if picture:
         figure = timing_figure(found)
         figure.set_facecolor("white")

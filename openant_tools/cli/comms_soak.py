@@ -87,14 +87,13 @@ def _on_the_bus(
     out: Path, seconds: float, still: bool, resume: bool, every_cycle: bool, yes: bool, port: str | None,
     virtual_source: str | None, robot: Path | None, rate_hz: float, json_file: Path | None,
 ) -> None:  # fmt: skip
-    import json
 
     from rich.console import Console
 
     from openant_tools.comms.soak import THIN_S
     from openant_tools.comms.soak import soak as soak_bus
     from openant_tools.errors import BadInput
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.recording.writer import recording_path
 
     path = recording_path(out)
@@ -132,7 +131,7 @@ def _on_the_bus(
     if json_file:
         content = {"run": str(done.path), "seconds": done.seconds, "rows": done.cycles, "stops": list(done.stops),
                    "ended": done.ended, "whole": done.whole, "statistics": done.statistics}  # fmt: skip
-        write_text(json_file, json.dumps(content, indent=1) + "\n")
+        write_text(json_file, json_text(content))
     click.echo(f"`openant comms diagnose {done.path}` says why", err=True)
     if done.ended:
         click.echo(f"openant: {'the soak' if still else 'motion'} has ended for good: {done.ended}", err=True)

@@ -53,7 +53,7 @@ def check(robot: Path | None, json_file: Path | None) -> int:
 
     Notes (a key that looks like a slip) are listed too, but do not fail the check.
     """
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.robot.folder import RobotFolder
 
     folder = RobotFolder.at(robot_folder(robot))
@@ -63,7 +63,7 @@ def check(robot: Path | None, json_file: Path | None) -> int:
         click.echo(str(entry) if entry.problem.severity == "error" else f"note: {entry}")
     if json_file:
         problems = [{"line": entry.line, **dataclasses.asdict(entry.problem)} for entry in located]
-        write_text(json_file, json.dumps({"consistent": not errors, "problems": problems}, indent=2) + "\n")
+        write_text(json_file, json_text({"consistent": not errors, "problems": problems}, indent=2))
     if errors:
         return FAILED
     click.echo(f"{folder.config_file} is consistent")
@@ -112,14 +112,14 @@ def import_(file: Path, robot: Path | None, kit: str | None) -> None:
 @click.option("--grid", is_flag=True, help="Round zero offsets to multiples of 45°, as the platform's own maker does.")
 def export(robot: Path | None, out: Path | None, grid: bool) -> None:
     """Write the configuration for the platform's own software (antNN.json, NN being the tag on the torso)."""
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.robot.folder import RobotFolder
     from openant_tools.robot.platform_config import export_notes, export_platform_config, imported_object
 
     folder = RobotFolder.at(robot_folder(robot))
     configuration = folder.config()
     data = export_platform_config(configuration, imported_object(folder), on_grid=grid)
-    text = json.dumps(data, indent=4, ensure_ascii=False) + "\n"
+    text = json_text(data, indent=4)
     for note in export_notes(configuration, out, on_grid=grid):
         click.echo(f"note: {note}", err=True)
     if out is None:

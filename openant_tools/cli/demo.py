@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -41,7 +40,7 @@ def demo(robot: Path, steps: int, fresh: bool, json_file: Path | None) -> None:
 
     from openant_tools.bringup.demo import Demo
     from openant_tools.bringup.demo_report import write_report
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
 
     console = Console(stderr=True, highlight=False)
     say = functools.partial(console.print, soft_wrap=True)
@@ -72,7 +71,7 @@ def demo(robot: Path, steps: int, fresh: bool, json_file: Path | None) -> None:
     )
     _print(whole, figures)
     if json_file is not None:
-        write_text(json_file, json.dumps(figures, indent=2) + "\n")
+        write_text(json_file, json_text(figures, indent=2))
 
 
 def _print(whole: Any, figures: dict[str, Any]) -> None:

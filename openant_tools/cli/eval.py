@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 
@@ -75,7 +74,7 @@ def eval_(
     from openant_agents.policies import load_policy
     from openant_agents.runs import read_facts
     from openant_env.rendering import NoOpenGL, write_strip
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
 
     facts = read_facts(run)
     options = dict(facts["env"]["options"])
@@ -136,4 +135,4 @@ def eval_(
         f" {result.path_m:.2f} m walked, {result.turns} turns{helped} (policy of step {policy.step})"
     )
     if json_file is not None:
-        write_text(json_file, json.dumps({**result.as_dict(), "run": str(run), "step": policy.step}, indent=2) + "\n")
+        write_text(json_file, json_text({**result.as_dict(), "run": str(run), "step": policy.step}, indent=2))

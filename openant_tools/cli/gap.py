@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
@@ -41,16 +40,18 @@ def measure(
     robot: Path | None,
     json_file: Path | None,
     report: Path | None,
-) -> None:
+) -> int:
     """Simulate RUNs with their own commands and say how far off the model is: per signal, joint and kind of motion.
 
     \b
       openant gap measure run.mcap --robot my-ant --report gap
       openant gap measure swing.parquet --model pendulum.xml --horizon full
+
+    Exit code 1: it cannot be judged, since repeats of one motion disagree.
     """
     from openant_tools.cli.options import robot_folder
     from openant_tools.errors import BadInput
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.gap.measure import UNITS
     from openant_tools.gap.measure import measure as measured
     from openant_tools.gap.measure_report import gap_report, sentence
@@ -76,6 +77,7 @@ def measure(
             f"{UNITS[place.signal]}"
         )
     if json_file:
-        write_text(json_file, json.dumps(found.as_json(), indent=1) + "\n")
+        write_text(json_file, json_text(found.as_json()))
     if report:
         click.echo(f"wrote {gap_report(found).write_folder(report)}", err=True)
+    return 1 if found.doubt else 0

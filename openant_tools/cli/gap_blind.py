@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -146,7 +145,7 @@ def score(
     from openant_tools.blind.score import read
     from openant_tools.blind.score import score as scored
     from openant_tools.blind.score_report import score_report, table_lines, write_docs
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.virtual.seal import read_key
 
     if key_files and len(key_files) != len(folders):
@@ -169,7 +168,7 @@ def score(
         click.echo(line)
     click.echo(f"{len(found.failures)} of {len(cases)} robots went wrong")
     if json_file:
-        write_text(json_file, json.dumps(found.as_json(), indent=1) + "\n")
+        write_text(json_file, json_text(found.as_json()))
     if report:
         click.echo(f"wrote {score_report(found).write_folder(report)}", err=True)
     if docs:

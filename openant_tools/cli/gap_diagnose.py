@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -81,7 +80,7 @@ def diagnose(
     Where the protocol was never seen, robots are simulated first (`openant gap prepare` does that ahead of time). Exit code
     0 whatever the verdict.
     """
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.gap.diagnose import diagnose as diagnosed
     from openant_tools.gap.report import diagnosis_report
     from openant_tools.recording.tables import read_run
@@ -93,7 +92,7 @@ def diagnose(
             recordings, model, hold_out=held_out, joints=joints or None, robots=robots, prior=prior, progress=tell
         )
         if json_file:
-            write_text(json_file, json.dumps(found.as_json(), indent=1, ensure_ascii=False) + "\n")
+            write_text(json_file, json_text(found.as_json()))
         written = None
         if report:
             tell(1.0, "writing the report")
@@ -165,7 +164,7 @@ def next_experiment(diagnosis: Path, model: Path | None, json_file: Path | None)
 
     Simulates what is still possible on every protocol of `openant sysid record --list`.
     """
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.gap.diagnosis import read_diagnosis
     from openant_tools.gap.next import experiments
 
@@ -176,7 +175,7 @@ def next_experiment(diagnosis: Path, model: Path | None, json_file: Path | None)
     for one in answer.experiments:
         click.echo(f"  {one.name:22}  {one.words}")
     if json_file:
-        write_text(json_file, json.dumps(answer.as_json(), indent=1, ensure_ascii=False) + "\n")
+        write_text(json_file, json_text(answer.as_json()))
 
 
 @contextlib.contextmanager

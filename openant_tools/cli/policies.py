@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -112,7 +111,7 @@ def rank(
     from openant_agents.exploits import DISTURBANCES, flag
     from openant_agents.ranking import agreement, find_policies
     from openant_agents.ranking_figure import draw_ranking
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
 
     places = _simulations(simulations)
     if flag_by is not None and flag_by != "none" and flag_by not in places:
@@ -172,7 +171,7 @@ def rank(
                 {"policy": one.policy, "keeps": dict(one.depends_on), "reversals_hz": one.reversals_hz} for one in flags
             ],
         }  # fmt: skip
-        write_text(json_file, json.dumps(answer, indent=1) + "\n")
+        write_text(json_file, json_text(answer))
 
 
 def _print(names: list[str], real: Mapping[str, Any], simulated: Mapping[str, Any], found: Mapping[str, Any]) -> None:

@@ -35,7 +35,7 @@ def info(run: Path, json_file: Path | None) -> None:
     """Show what RUN holds: joints, signals, rate and jitter, gaps, loss, facts."""
     from dataclasses import asdict
 
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.recording.facts import facts_to_json
     from openant_tools.recording.reader import read_recording
     from openant_tools.recording.summary import summarize
@@ -60,7 +60,7 @@ def info(run: Path, json_file: Path | None) -> None:
     if json_file is not None:
         facts = {"facts": json.loads(facts_to_json(read.facts))}
         result = {"path": str(path)} | asdict(summary) | facts | more
-        write_text(json_file, json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+        write_text(json_file, json_text(result))
     for line in _lines(path, read, summary, more):
         click.echo(line)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import select
@@ -454,7 +453,7 @@ def _command() -> str:
 
 def _conclude(finding: Finding, folder: RobotFolder | None, json_file: Path | None) -> int:
     """Print what was found, write it where it belongs, and say by the exit code whether it is well."""
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.procedure.finding import keep
 
     click.echo(finding.what)
@@ -466,5 +465,5 @@ def _conclude(finding: Finding, folder: RobotFolder | None, json_file: Path | No
         click.echo(f"wrote {keep(finding, folder)}", err=True)
     if json_file:
         content: Mapping[str, Any] = finding.as_json()
-        write_text(json_file, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+        write_text(json_file, json_text(content))
     return 0 if finding.ok else 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 from pathlib import Path
 
 import click
@@ -33,7 +32,7 @@ def compare(a: str, b: str, robot: Path | None, json_file: Path | None, report: 
     at 5 %. Exit code 1: something changed.
     """
     from openant_tools.cli.hardware import robot_of
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.sysid.compare import compare as compared
     from openant_tools.sysid.compare_sources import snapshot
 
@@ -53,7 +52,7 @@ def compare(a: str, b: str, robot: Path | None, json_file: Path | None, report: 
     for note in result.notes:
         click.echo(note)
     click.echo(result.sentence)
-    content = json.dumps(result.as_json(), indent=1, ensure_ascii=False) + "\n"
+    content = json_text(result.as_json())
     if robot is not None and folder is not None:
         stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
         write_text(folder.findings / f"comparison-{stamp}.json", content)

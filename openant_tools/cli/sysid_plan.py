@@ -107,10 +107,9 @@ def plan(
 
     Exit code 1: it must not be played, since the robot would touch itself or fall.
     """
-    import json
 
     from openant_tools.errors import BadInput
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.sysid.design import design
     from openant_tools.sysid.plan import Planned, Residual, make_plan
     from openant_tools.sysid.plan_file import write_plan
@@ -175,7 +174,7 @@ def plan(
         )
         click.echo(f"wrote {out}", err=True)
     if json_file is not None:
-        write_text(json_file, json.dumps(result.as_json(), indent=1, ensure_ascii=False) + "\n")
+        write_text(json_file, json_text(result.as_json()))
     if report is not None:
         click.echo(f"wrote {plan_report(result).write_folder(report)}", err=True)
     return 1 if result.objections else 0

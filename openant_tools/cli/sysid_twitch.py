@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
@@ -28,7 +27,7 @@ def twitch(model: Path | None, robot: Path | None, seconds: float, json_file: Pa
       openant sysid twitch --model calibrated.xml
     """
     from openant_tools.cli.options import robot_folder
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.model.plant import Setup, load_plant
     from openant_tools.robot.folder import RobotFolder
     from openant_tools.robot.joints import JOINT_NAMES
@@ -59,5 +58,5 @@ def twitch(model: Path | None, robot: Path | None, seconds: float, json_file: Pa
             + (", so set these" if softer.stays else ", too: look at friction, masses and the time step")
         )
     if json_file:
-        write_text(json_file, json.dumps(result, indent=1) + "\n")
+        write_text(json_file, json_text(result))
     return 0 if found.stays else 1

@@ -359,9 +359,9 @@ def _torques(loads: tuple[str, ...]) -> dict[str, float]:
 
 
 def _write(path: Path, content: dict[str, Any]) -> None:
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
 
-    write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+    write_text(path, json_text(content))
 
 
 def _command() -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import time
 from dataclasses import replace
@@ -176,9 +175,9 @@ def soak(
         )
     click.echo(f"{made.path}  {made.cycles} cycles, {made.loaded_s / 60:.1f} min under load: {made.words}")
     if json_file is not None:
-        from openant_tools.files import write_text
+        from openant_tools.files import json_text, write_text
 
-        write_text(json_file, json.dumps({**vars(made), "path": str(made.path)}, indent=1, ensure_ascii=False) + "\n")
+        write_text(json_file, json_text({**vars(made), "path": str(made.path)}))
     return 0 if made.why == "time" else 1
 
 

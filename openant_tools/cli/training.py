@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -156,10 +155,10 @@ def show_result(
     click.echo(f"run: {out}" + (f"   curve: {picture}" if curve else ""))
     click.echo(f"next: openant eval {out} --seconds 120")
     if json_file is not None:
-        from openant_tools.files import write_text
+        from openant_tools.files import json_text, write_text
 
         answer = {
             "steps": result.step, "seconds": result.robot_seconds, "average_reward_m_s": result.average_reward_m_s,
             "helped": dict(result.helped), "late": result.late, "run": str(out), **(more or {}),
         }  # fmt: skip
-        write_text(json_file, json.dumps(answer, indent=2) + "\n")
+        write_text(json_file, json_text(answer, indent=2))

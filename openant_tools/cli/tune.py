@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +66,7 @@ def tune(
 
     import openant_env  # noqa: F401  (registers the environment)
     from openant_agents.tuning import best_settings, open_study, search
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
 
     defaults, hour = DEFAULTS[agent]
     length = steps or hour
@@ -107,5 +106,5 @@ def tune(
         click.echo(f"  {key:16} {chosen:.4g}" if isinstance(chosen, float) else f"  {key:16} {chosen}")
     if json_file is not None:
         answer = {"agent": agent, "average_reward_m_s": value, "settings": settings, "study": study.study_name}
-        write_text(json_file, json.dumps(answer, indent=2) + "\n")
+        write_text(json_file, json_text(answer, indent=2))
         click.echo(f"next: openant train {agent} --settings {json_file} --out DIR")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.gap.regime import Regime, regimes
-from openant_tools.model.floor import floors, stamp_error
+from openant_tools.model.floor import disagreement, floors, stamp_error
 from openant_tools.model.gap import excess, gap
 from openant_tools.model.plant import Plant, load_plant, setup_of
 from openant_tools.model.rollout import Rollouts
@@ -70,6 +70,7 @@ class Measurement:
         from_repeats: whether the floor comes from repeats of the same commands, else from the sensors.
         stamp_error_s: as `model.floor.stamp_error`; in a floor from the sensors.
         places: largest share first, signal by signal.
+        doubt: why the floor is none, and nothing can be judged by it; "" where it holds.
     """
 
     model: Path
@@ -81,6 +82,7 @@ class Measurement:
     stamp_error_s: float
     places: tuple[Place, ...]
     played: tuple[Played, ...]
+    doubt: str = ""
 
     def excess(self, signal: str) -> float:
         return excess(self.gaps[signal], self.floors[signal])
@@ -109,6 +111,7 @@ class Measurement:
             "runs": [played.run.name for played in self.played],
             "horizon_s": self.horizon_s,
             "floor_from": "repeats" if self.from_repeats else "sensors",
+            "doubt": self.doubt,
             "stamp_error_s": self.stamp_error_s,
             "signals": {
                 signal: {"gap": self.gaps[signal], "floor": self.floors[signal], "excess": self.excess(signal),
@@ -153,7 +156,7 @@ def measure(
     return Measurement(
         model, tuple(wanted), horizon_s, gaps, {signal: rms(found[signal][0]) for signal in gaps}, found["pos"][1],
         stamp_error(runs, wanted),
-        tuple(places), played,
+        tuple(places), played, disagreement(runs, wanted),
     )  # fmt: skip
 
 

@@ -23,6 +23,8 @@ _NAMES = {"pos": "position", "vel": "velocity"}
 
 def sentence(found: Measurement) -> str:
     """What a reader should take away."""
+    if found.doubt:
+        return f"Cannot judge the gap: {found.doubt}."
     if not found.places or found.excess("pos") == 0:
         return "The gap lies within what no model could beat: nothing here is to be explained."
     first = next(place for place in found.places if place.signal == "pos")

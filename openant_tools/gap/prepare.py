@@ -7,7 +7,6 @@ where it stopped. It is found again by model and commands, whatever the time sta
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import os
 import shutil
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 
 from openant_tools.arrays import read_arrays, write_arrays
 from openant_tools.errors import BadInput
-from openant_tools.files import write_text
+from openant_tools.files import json_text, write_text
 from openant_tools.gap.features import Floats
 from openant_tools.gap.population import Case, applicable, draw, play, templates
 from openant_tools.gap.protocol import Protocol, same, shown
@@ -317,7 +316,7 @@ def _new(protocol: Protocol) -> Kept:
                 columns[f"{k}|{name}"] = values
     write_arrays(folder / "first.npz", columns)
     facts = {"model": str(protocol.model), "runs": [one.run.name for one in protocol.runs], "made": time.strftime("%F")}
-    write_text(folder / "facts.json", json.dumps(facts, indent=2) + "\n")
+    write_text(folder / "facts.json", json_text(facts, indent=2))
     # Last: by it others find the folder.
     tables = {f"cmd{k}": table for k, table in enumerate(protocol.commands())}
     write_arrays(folder / "protocol.npz", {"places": protocol.places(), **tables})

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from openant_tools.model.gap import gap
 from openant_tools.recording.run import Run
 
-__all__ = ["floors", "noise", "resolution", "stamp_error", "steps"]
+__all__ = ["disagreement", "floors", "noise", "resolution", "sensor_floors", "stamp_error", "steps"]
 
 Array = NDArray[np.float64]
 #: smaller changes are rounding of the numbers, not steps of a sensor
@@ -28,6 +28,8 @@ MOVES_RAD_S = 0.2
 HALF_WITHIN = 0.6745
 #: standard errors by which a variance of time stamps has to differ from none
 SHOWS = 3.0
+#: Repeats of the same commands that differ by more than this times what the sensors leave are no repeats: something else moved.
+AGREE = 3.0
 
 
 def resolution(run: Run, signal: str, joint: str) -> float:
@@ -111,10 +113,7 @@ def floors(runs: Sequence[Run], joints: Sequence[str], signal: str = "pos") -> t
     A joint of which no repeat says anything has what its sensor leaves: the coarsest step / √12, or its noise at rest where that is
     more than a step; and what it moves within the error of a row's time stamp.
     """
-    step, at_rest = steps(runs, signal, joints), np.max([noise(run, signal, joints) for run in runs], axis=0)
-    # Less than a step is an encoder between two of them, and what that leaves is known.
-    sensors = np.where(at_rest > step, at_rest, step / math.sqrt(12))
-    by_sensors = np.hypot(sensors, stamp_error(runs, joints) * _speeds(runs, joints, signal))
+    by_sensors = sensor_floors(runs, joints, signal)
     by_name = {run.name: run for run in runs}
     pairs = [(run, by_name[run.facts.repeat_of]) for run in runs if run.facts.repeat_of in by_name]
     squares = np.full((len(pairs), len(joints)), np.nan)
@@ -129,6 +128,30 @@ def floors(runs: Sequence[Run], joints: Sequence[str], signal: str = "pos") -> t
     known = np.isfinite(squares)
     mean = np.where(known, squares, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     return np.where(known.any(axis=0), np.sqrt(mean), by_sensors), bool(known.any())
+
+
+def sensor_floors(runs: Sequence[Run], joints: Sequence[str], signal: str = "pos") -> Array:
+    """(joints,) rms that the sensors and the rows' time stamps leave by themselves."""
+    step, at_rest = steps(runs, signal, joints), np.max([noise(run, signal, joints) for run in runs], axis=0)
+    # Less than a step is an encoder between two of them, and what that leaves is known.
+    sensors = np.where(at_rest > step, at_rest, step / math.sqrt(12))
+    return np.asarray(np.hypot(sensors, stamp_error(runs, joints) * _speeds(runs, joints, signal)), float)
+
+
+def disagreement(runs: Sequence[Run], joints: Sequence[str]) -> str:
+    """Why repeats of one motion say nothing of what a model could reach; "" where they agree, or where there are none."""
+    found, from_repeats = floors(runs, joints)
+    least = sensor_floors(runs, joints)
+    if not from_repeats or not least.any():
+        return ""
+    shown, sensors = (float(np.sqrt(np.mean(np.square(each)))) for each in (found, least))
+    if shown <= AGREE * sensors:
+        return ""
+    worst = joints[int(np.argmax(found / np.maximum(least, 1e-12)))]
+    return (
+        f"the repeats disagree: two plays of one motion differ by {1e3 * shown:.2f} mrad, {shown / sensors:.0f} times what the sensors "
+        f"leave, most at {worst} → something changed between them (heat, a loose horn, another start): record them again"
+    )
 
 
 def _speeds(runs: Sequence[Run], joints: Sequence[str], signal: str) -> Array:

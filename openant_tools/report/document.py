@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any
 
-from openant_tools.files import write_bytes, write_text
+from openant_tools.files import json_text, write_bytes, write_text
 from openant_tools.report.parts import Code, Details, Figure, KeyFigure, KeyFigures, Part, Picture, Table, Text
 
 if TYPE_CHECKING:
@@ -177,7 +176,7 @@ class Report:
             return f"figures/{name}"
 
         write_text(folder / "report.md", self._markdown(save))
-        write_text(folder / "report.json", json.dumps(self.as_json(), indent=1, ensure_ascii=False) + "\n")
+        write_text(folder / "report.json", json_text(self.as_json()))
         return self.write(folder / "report.html")
 
     def _markdown(self, save: Any) -> str:

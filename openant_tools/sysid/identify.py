@@ -21,7 +21,7 @@ from openant_tools.effects.entries import entries_of, values_of
 from openant_tools.effects.rollout import EffectValues
 from openant_tools.errors import BadInput
 from openant_tools.model.attribute import Attribute
-from openant_tools.model.floor import floors
+from openant_tools.model.floor import disagreement, floors
 from openant_tools.model.gap import HORIZON_S, Gap, share_closed
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.recording.run import Run
@@ -137,6 +137,7 @@ class Identification:
         values: every parameter.
         before, after: the gap on held-out runs, of the given and of the written model.
         floor: rad, what no model could beat on these runs, from repeats or the encoder's resolution.
+        doubt: why that floor is none; "" where it holds.
         judged_on: names of the held-out runs; where none were given, of the runs left out in turn.
         in_turn: whether runs were left out in turn, each judged by a fit to the others.
         noise: joint → rad, residual deviation of the fit.
@@ -165,6 +166,7 @@ class Identification:
     held_out: tuple[Dataset, ...]
     acting: EffectValues
     notes: tuple[str, ...]
+    doubt: str = ""
 
     @property
     def accepted(self) -> tuple[str, ...]:
@@ -213,6 +215,7 @@ class Identification:
                 "before": figures(self.before),
                 "after": figures(self.after),
                 "floor_rad": self.floor,
+                "doubt": self.doubt,
                 "share_closed": share_closed(self.before.full, self.after.full, self.floor),
             },
             "accepted": list(self.accepted),
@@ -330,6 +333,7 @@ def identify(
         before=before,
         after=after,
         floor=float(np.sqrt(np.mean(floors([*runs, *hold_out], joints)[0] ** 2))),
+        doubt=(doubt := disagreement([*runs, *hold_out], joints)),
         judged_on=tuple(run.name for run in (hold_out or tests)),
         in_turn=not hold_out,
         noise=dict(zip(joints, estimate.noise.tolist(), strict=True)),
@@ -342,6 +346,7 @@ def identify(
         held_out=tuple(judged or data),
         acting=acting,
         notes=(
+            *([doubt] if doubt else []),
             *_telemetry_notes(everything, telemetry),
             *_acting_notes(acting),
             *(() if measured_supply else _supply_notes(everything, joints)),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import json
 import os
 import shutil
 from collections.abc import Iterator, Sequence
@@ -14,7 +13,7 @@ from pathlib import Path
 
 from openant_tools.effects.catalogue import effect
 from openant_tools.effects.entries import as_toml, entries_of
-from openant_tools.files import write_text
+from openant_tools.files import json_text, write_text
 from openant_tools.model.mjcf import write_model
 from openant_tools.robot.config import Effect, Provenance
 from openant_tools.robot.folder import RobotFolder
@@ -47,7 +46,7 @@ def write_fit(result: Identification, out: Path, richer: Identification | None =
     names = (CALIBRATED, "fit.json", "report.html", *([EFFECTS] if entries else []))
     with _together(out, names) as (model, figures, report, *effects):
         write_model(result.model, calibrated(result), model, joints=result.joints, note=note, stated=restated(result))
-        write_text(figures, json.dumps(result.as_json(), indent=1, ensure_ascii=False) + "\n")
+        write_text(figures, json_text(result.as_json()))
         fit_report(result).write(report)
         for path in effects:
             write_text(path, as_toml(entries, note))
@@ -117,7 +116,7 @@ def write_robot(result: Identification, folder: RobotFolder) -> None:
     finding = {**result.as_json(), "date": now.isoformat()}
     write_text(
         folder.findings / f"sysid-fit-{now:%Y%m%dT%H%M%SZ}.json",
-        json.dumps(finding, indent=1, ensure_ascii=False) + "\n",
+        json_text(finding),
     )
     found = entries_of(result.effects_found, result.joints)
     with folder.hold():  # between what is read of the effects and what is written
