@@ -22,12 +22,14 @@ from openant_tools.comms import messages
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.guards import Guards
+from openant_tools.comms.lateness import losses
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.comms.restart import Interlock, MotionStopped, Restart, StopCause
 from openant_tools.comms.setup import camera_of_robot, config_of_unknown_robot, imu_of_robot
 from openant_tools.errors import HardwareFault
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
+from openant_tools.recording.tables import read_run
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.kit import home_angles
 
@@ -306,6 +308,22 @@ def test_a_servo_that_is_silent_just_when_a_motion_ends_stops_it_in_words(live: 
             control.ask("plug", joint="knee_fl")
             control.close()
     wait_until(lambda: answers(live))
+
+
+def test_a_computer_that_stood_still_takes_the_blame_for_what_it_missed(live: dict[str, str], tmp_path: Path) -> None:
+    with connected(live) as engine:
+        engine.ask(messages.Record(str(tmp_path / "run.mcap"), Facts(joints=tuple(JOINT_NAMES))))
+        for _ in range(5):
+            os.kill(engine.description["pid"], signal.SIGSTOP)
+            time.sleep(0.06)
+            os.kill(engine.description["pid"], signal.SIGCONT)
+            engine.ask(messages.Look(0.2))
+        engine.ask(messages.StopRecording())
+        said = engine.ask(messages.Statistics())["late"]
+    assert "this computer was late by up to" in said
+    run = read_run(tmp_path / "run.mcap", need=())
+    assert run.column("wake").max() > 0.04
+    assert max(losses(run).shares.values()) < 0.01
 
 
 def test_two_servos_with_one_id_are_told_from_a_cable(live: dict[str, str]) -> None:

@@ -21,6 +21,7 @@ from openant_tools.comms import lateness, protocol1, troubleshooting
 from openant_tools.comms.bench import RateTrial
 from openant_tools.comms.clock import RealClock
 from openant_tools.comms.faults import NoAnswer
+from openant_tools.comms.ports import Host
 from openant_tools.comms.scan import scan
 from openant_tools.comms.setup import open_bus
 from openant_tools.comms.silence import diagnose, explained
@@ -125,6 +126,22 @@ def test_another_program_that_reads_the_port_is_named(tmp_path: Path) -> None:
         finally:
             other.kill()
             other.wait()
+
+
+def test_a_reader_that_nobody_can_see_is_told_by_answers_that_vanish(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus, line = ant()
+    honest, turn = line.read, iter(range(10**6))
+
+    def robbed() -> bytes:
+        data = honest()
+        return b"" if data and next(turn) % 2 else data
+
+    monkeypatch.setattr(line, "read", robbed)
+    found = diagnose(bus, [31], IDS, host=Host(proc=tmp_path))
+    assert found.cause == "unseen_reader"
+    assert found.words.startswith("another program reads this port: answers came and were gone")
 
 
 def test_the_vendors_sdk_lists_the_same(tmp_path: Path) -> None:

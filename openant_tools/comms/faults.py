@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from enum import StrEnum
 
 from openant_tools.comms.protocol2 import Error
+from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import HardwareFault
 
 __all__ = [
@@ -53,10 +54,9 @@ class NeverSilent(BrokenAnswer):
 
     def __init__(self, path: str, baud: int, count: int, seconds: float) -> None:
         super().__init__(
-            f"the line never falls silent: {count} bytes that are no answer in {seconds:.1f} s at {baud} baud",
+            SILENCE["flood"].says.format(count=count, seconds=seconds, baud=baud),
             where=path,
-            remedy="something talks unasked: another program on this port, a wrong adapter, or an open wire that picks up "
-            "noise; unplug the servos' cable: where it goes on, it is the adapter or this computer",
+            remedy=SILENCE["flood"].do,
         )
 
 

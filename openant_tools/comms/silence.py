@@ -150,12 +150,17 @@ def patient_ping(bus: Bus, id: int, tries: Sequence[float] = PATIENCE_S) -> tupl
 
 def read_register(bus: Bus, id: int, address: int, count: int) -> bytes | None:
     """A register of a servo that may be late; None where it does not answer a read."""
-    for wait_s in PATIENCE_S[:2]:
-        heard = ask(bus, p2.read(id, address, count).encode(), wait_s, lambda h: h.answer_s is not None, id)
-        for one in heard.statuses:
-            if one.id == id and len(one.params) == count:
-                return one.params
+    for wait_s in PATIENCE_S[1:]:
+        # An earlier ping's answer, late, is none to this.
+        heard = ask(bus, p2.read(id, address, count).encode(), wait_s, lambda h: _register(h, id, count) is not None)
+        data = _register(heard, id, count)
+        if data is not None:
+            return data
     return None
+
+
+def _register(heard: Heard, id: int, count: int) -> bytes | None:
+    return next((one.params for one in heard.statuses if one.id == id and len(one.params) == count), None)
 
 
 def protocol_1_ping(bus: Bus, id: int, wait_s: float = PATIENCE_S[0]) -> list[int]:
@@ -251,7 +256,10 @@ class _Questions:
         number = 0 if level is None else level[0]
         if number < 2:
             return self._say("return_level", (id,), level=number, answers=LEVELS[number])
-        after = self.heard[id].answer_s or 0.0
+        # Alone on a quiet line: what came before may have been the answer to an earlier try.
+        bus.clock.sleep_until(bus.clock.now() + PATIENCE_S[1])
+        heard = ask(bus, p2.ping(id).encode(), PATIENCE_S[2], lambda h: h.answer_s is not None, id)
+        after = heard.answer_s or 0.0
         timing = bus.timing
         usual = timing.return_delay_s + timing.latency_timer_s + timing.margin_s + bus.wire_s(24)
         if self._lateness.busy:

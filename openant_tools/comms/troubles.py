@@ -44,9 +44,10 @@ SILENCE: Mapping[str, Trouble] = {
     ),
     "flood": Trouble(
         "nothing can be read although bytes come all the time",
-        "the line never falls silent: {count} bytes in {seconds:.1f} s that no question asked for",
+        "the line never falls silent: {count} bytes that are no answer in {seconds:.1f} s at {baud} baud",
         "something talks without being asked: another master on the bus, an IMU's port, a servo that broke, or noise",
-        "unplug the servos one by one until it is quiet; is this the servos' port (`openant comms ports`)?",
+        "something talks unasked: another program on this port, a wrong adapter, or an open wire that picks up noise; unplug "
+        "the servos' cable: where it goes on, it is the adapter or this computer",
     ),
     "host_late": Trouble(
         "answers are lost, now here, now there, while this computer is busy",
