@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from openant_tools.cli.hardware import may_move, port_option, robot_of
+from openant_tools.cli.hardware import need_terminal, port_option, robot_of
 from openant_tools.cli.options import robot_option
 from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_option, virtual_robot
 
@@ -60,7 +60,9 @@ def reboot(
             click.echo(f"not rebooted, the error would come back: {standing.refusal}")
             raise SystemExit(1)
         click.echo(f"a reboot clears it, as does another way: {OTHER_REMEDY}; its torque is off afterwards")
-        may_move(yes, move="let go of this joint", question="Reboot it?", remedy="add --yes if it may")
+        if not yes:
+            need_terminal("a reboot lets go of this joint")
+            click.confirm("Reboot it?", abort=True, err=True)
         left = start_anew(bus, servo)
         if left:
             names = " and ".join(error.name for error in left)
