@@ -67,6 +67,8 @@ ORIGIN_MOVED_PX = 2.0
 ORIGIN_MOVED_PICTURES = 10
 #: Found elsewhere, it is as far from the camera as before within this share, or the picture has another scale.
 ORIGIN_SAME_SHARE = 0.06
+#: and leans as it did within this, rad: a picture that is stretched by 2 % makes so much of a square.
+ORIGIN_SAME_LEAN_RAD = math.radians(10.0)
 #: A second sheet with the same number: not much smaller or paler than the first, or it is a pattern that looks like one.
 #: s after which one that is not seen any more is gone
 TWIN_SHARE, TWIN_S = 0.25, 10.0
@@ -237,7 +239,8 @@ class BodyTracker:
         self._size: tuple[int, int] | None = None
         self._twin: tuple[float, str] = (-math.inf, "")
         self._view: View | None = None
-        self._camera_m: float | None = None
+        self._view_moved = False
+        self._camera: tuple[float, Array] | None = None
         self._scaled = ""
         self._last: tuple[float, Array] | None = None
         self._jumped = 0
@@ -291,7 +294,11 @@ class BodyTracker:
         if origin is not None:
             if body is not None or self._view is None:  # else legs could stand anywhere
                 self._view = View(gray, body)
-        elif self._view is not None and self._view.moved(gray, body):
+            self._view_moved = False
+        elif self._view is not None:
+            # What was once seen elsewhere has moved, however little texture the next picture shows.
+            self._view_moved = self._view_moved or self._view.moved(gray, body)
+        if self._view_moved:
             return BodyLost(t, f"the view has moved while origin tag {setup.origin_id} was hidden: uncover it")
         if seen is None:
             return BodyLost(t, self._why_not(sightings) + self._other_reading(gray))
@@ -359,7 +366,7 @@ class BodyTracker:
                     self._origin = None
                     self._last, self._jumped = None, 0
                     self.origin_moves += 1
-                    self._solve_origin(lens)
+                    self._solve_origin(lens, moved=True)
                 return
         self._elsewhere = []
         self._seen.append(seen.corners)
@@ -367,7 +374,7 @@ class BodyTracker:
         if self._origin is None or len(self._seen) < ORIGIN_MEMORY:
             self._solve_origin(lens)
 
-    def _solve_origin(self, lens: Intrinsics) -> None:
+    def _solve_origin(self, lens: Intrinsics, *, moved: bool = False) -> None:
         if len(self._seen) < ORIGIN_MIN:
             return
         corners = np.asarray(self._seen)
@@ -379,19 +386,28 @@ class BodyTracker:
             noise = max(self.corner_noise_px / math.sqrt(max(1, int(near.sum()))), CORNER_BIAS_PX)
             fit = refine(*poses[0], mean, self.setup.origin_size, lens, None, noise)
             self._origin = _Origin(fit.rotation, fit.position, fit.covariance)
-            self._judge_scale(float(np.linalg.norm(fit.position)), settled=len(self._seen) == ORIGIN_MEMORY)
+            # A flat square seen from far allows two poses: either may be the one that it had before.
+            self._judge_scale(fit, [fit.rotation[:, 2], *(rotation[:, 2] for rotation, _ in poses)], moved)
 
-    def _judge_scale(self, far_m: float, *, settled: bool) -> None:
-        """A camera that was pushed aside is as far from the origin as before; one that zooms or crops seems nearer."""
-        if self._camera_m is None or (settled and not self._scaled):
-            self._camera_m = far_m
-        elif abs(far_m / self._camera_m - 1) > ORIGIN_SAME_SHARE:
+    def _judge_scale(self, fit: _Fit, ups: list[Array], moved: bool) -> None:
+        """A camera that was pushed aside is as far from the origin as before; one that zooms or crops seems nearer, one that
+        stretches its picture seems to look from the side."""
+        far_m = float(np.linalg.norm(fit.position))
+        if self._camera is None or not (moved or self._scaled):
+            self._camera = far_m, ups[0]
+            return
+        before_m, before_up = self._camera
+        turned = math.acos(max(-1.0, min(1.0, max(float(up @ before_up) for up in ups))))
+        self._scaled = ""
+        if abs(far_m / before_m - 1) > ORIGIN_SAME_SHARE:
+            self._scaled = f"looks {before_m / far_m:.2f} times as large as before"
+        elif turned > ORIGIN_SAME_LEAN_RAD:
+            self._scaled = f"leans by {math.degrees(turned):.0f}° otherwise than before"
+        if self._scaled:
             self._scaled = (
-                f"origin tag {self.setup.origin_id} looks {self._camera_m / far_m:.2f} times as large as before: the camera zooms, crops, "
-                "stretches its picture or hangs elsewhere; start it again"
+                f"origin tag {self.setup.origin_id} {self._scaled}: the camera zooms, crops, stretches its picture or hangs elsewhere; start "
+                "it again"
             )
-        else:
-            self._scaled = ""
 
     # --- the body --------------------------------------------------------------------------------------------------
 
