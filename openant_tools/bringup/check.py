@@ -362,9 +362,17 @@ def _against_model(
         return []
     model = bench.folder.model_path()
     found = yield from relayed(lambda progress, notice: measure([run], model))
-    evidence.append(Evidence("position gap of the twitch", found.gaps["pos"], "rad", f"{model.name}, 0.5 s horizon"))
-    before = gap.data["by_joint_rad"]
+    evidence.append(
+        Evidence("position gap of the twitch", found.gaps.get("pos"), "rad", f"{model.name}, 0.5 s horizon")
+    )
+    before = {joint: off for joint, off in gap.data["by_joint_rad"].items() if off is not None}
     named = {line.partition(":")[0] for line in known}
+    # A joint that was not measured is not as it was: its figure is missing, and that is said.
+    evidence += [
+        Evidence(f"position gap of {joint}", off, "rad", "the twitch against the model; its position was not read")
+        for joint, off in gap_by_joint(found).items()
+        if joint in before and not math.isfinite(off)
+    ]
     return [
         f"{joint}: moves differently from its model ({1e3 * off:.1f} mrad, it was {1e3 * before[joint]:.1f}) → screws, gear, or a "
         "part that was exchanged; `openant gap diagnose` says more"

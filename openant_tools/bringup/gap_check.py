@@ -36,6 +36,8 @@ def gap_check(bench: Bench) -> Procedure:
         one = yield from relayed(lambda progress, notice, model=model: measure(runs, model))  # type: ignore[misc]
         found.append(one)
     before, after = found
+    if "pos" not in before.gaps or "pos" not in after.gaps:
+        raise BadInput(after.doubt or before.doubt, remedy="do the step Identification again")
     closed = 1 - after.excess("pos") / before.excess("pos") if before.excess("pos") > 0 else math.nan
     better = after.gaps["pos"] <= before.gaps["pos"]
     unsure = (
@@ -67,4 +69,8 @@ def gap_check(bench: Bench) -> Procedure:
 def gap_by_joint(found: Measurement) -> dict[str, float]:
     """joint → rms of measured minus simulated position, rad."""
     off = np.concatenate([one.measured["pos"] - one.simulated["pos"] for one in found.played])
-    return {joint: float(np.sqrt(np.nanmean(off[:, k] ** 2))) for k, joint in enumerate(found.joints)}
+    known = [off[np.isfinite(off[:, k]), k] for k in range(len(found.joints))]
+    return {
+        joint: float(np.sqrt(np.mean(each**2))) if len(each) else math.nan
+        for joint, each in zip(found.joints, known, strict=True)
+    }
