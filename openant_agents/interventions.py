@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
 from openant_tools.errors import BadInput
+from openant_tools.files import read_text, reading
 
 __all__ = ["Intervention", "read_interventions"]
 
@@ -35,8 +37,8 @@ def read_interventions(folder: Path) -> list[Intervention]:
     path = folder / "interventions.csv"
     if not path.is_file():
         return []
-    with path.open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    with reading(path, "it says nothing of interventions", "name the --out of `openant train`"):
+        rows = list(csv.DictReader(io.StringIO(read_text(path))))
     found: list[Intervention] = []
     for number, row in enumerate(rows, start=2):
         try:

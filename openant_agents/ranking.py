@@ -28,7 +28,7 @@ from openant_agents.exploits import Twitch
 from openant_agents.policies import load_policy
 from openant_agents.runs import read_facts
 from openant_tools.errors import BadInput
-from openant_tools.files import write_text
+from openant_tools.files import read_json, write_text
 
 __all__ = [
     "Agreement", "Interval", "Measured", "agreement", "find_policies", "kendall", "play", "rank_violation", "read_measured", "regret",
@@ -242,7 +242,7 @@ def read_measured(file: Path) -> dict[str, Measured]:
         BadInput: the file says something else.
     """
     try:
-        policies = json.loads(file.read_text(encoding="utf-8"))["policies"]
+        policies = read_json(file, "name what `openant policies play` wrote")["policies"]
         found = {}
         for name, one in policies.items():
             one = {"average_reward_m_s": one} if isinstance(one, int | float) else one

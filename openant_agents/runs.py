@@ -24,6 +24,7 @@ import math
 import os
 import zipfile
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,10 +34,19 @@ import torch
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
-from openant_tools.files import write_bytes, write_text
+from openant_tools.files import read_json, read_text, reading, write_bytes, write_text
 from openant_tools.lock import Claim
 
-__all__ = ["SCHEMA", "CurvePoint", "Run", "load_checkpoint", "read_curve", "read_facts", "save_checkpoint"]
+__all__ = [
+    "SCHEMA",
+    "CurvePoint",
+    "Run",
+    "load_checkpoint",
+    "making_sense",
+    "read_curve",
+    "read_facts",
+    "save_checkpoint",
+]
 
 SCHEMA = "openant.train/1"
 LOCK = ".run.lock"
@@ -239,10 +249,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
         raise BadInput(
             "there is no training run here (no run.json)", where=folder, remedy="name the --out of `openant train`"
         )
-    try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, UnicodeDecodeError) as error:
-        raise BadInput(f"it is no JSON: {error}", where=path, remedy="train into another folder") from error
+    facts = read_json(path, "train into another folder")
     if not isinstance(facts, dict) or facts.get("schema") != SCHEMA:
         raise BadInput(f"its schema is not {SCHEMA}", where=path, remedy="train into another folder")
     return facts
@@ -273,6 +280,15 @@ def load_checkpoint(folder: Path) -> dict[str, Any]:
     return checkpoint
 
 
+def making_sense(folder: Path) -> AbstractContextManager[None]:
+    """A block that takes a run up from what it saved: what is missing or of another kind there is one line, BadInput."""
+    return reading(
+        folder / "checkpoint.pt",
+        "the checkpoint is not as its run.json and this program have it",
+        "train into another folder",
+    )
+
+
 def read_curve(folder: Path) -> list[CurvePoint]:
     """The learning curve of a run.
 
@@ -283,15 +299,16 @@ def read_curve(folder: Path) -> list[CurvePoint]:
     if not path.is_file():
         raise BadInput("there is no learning curve here", where=folder, remedy="name the --out of `openant train`")
     points: list[CurvePoint] = []
-    with path.open(encoding="utf-8", newline="") as stream:
-        for row in csv.DictReader(stream):
+    with reading(path, "it is no learning curve", "name the --out of `openant train`"):
+        rows = list(csv.DictReader(io.StringIO(read_text(path))))
+        for number, row in enumerate(rows, 2):
             try:
                 point = CurvePoint(int(row["step"]), float(row["seconds"]), float(row["average_reward_m_s"]))
             except (KeyError, TypeError, ValueError):
-                if stream.read(1) == "":
+                if number == len(rows) + 1:
                     break  # the last line of a run that was killed while writing it
                 raise BadInput(
-                    f"row {len(points) + 2} is not {', '.join(CURVE_COLUMNS)}", where=path, remedy="repair the row"
+                    f"row {number} is not {', '.join(CURVE_COLUMNS)}", where=path, remedy="repair the row"
                 ) from None
             if math.isfinite(point.average_reward_m_s):
                 points.append(point)

@@ -37,7 +37,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from openant_agents.by_hand import Gradients, acting, flatten, squashed
-from openant_agents.runs import CurvePoint, Run, load_checkpoint, read_facts
+from openant_agents.runs import CurvePoint, Run, load_checkpoint, making_sense, read_facts
 from openant_agents.training import (
     CHECKPOINT_EVERY_S,
     REPORT_EVERY_S,
@@ -509,14 +509,15 @@ def _train(
         raise KeyboardInterrupt
     checkpoint = run.resume()
     if checkpoint is not None:
-        step, seconds = int(checkpoint["step"]), float(checkpoint["seconds"])
-        agent.set_state(checkpoint["agent"])
-        replay.restore(run.transitions(replay.width, replay.capacity), int(checkpoint["transitions"]))
-        average.set_state(checkpoint["average"])
-        helped.update(checkpoint["helped"])
-        if checkpoint["env"] is not None:
-            env.unwrapped.set_state(checkpoint["env"])
-            observation = checkpoint["observation"].numpy()
+        with making_sense(run.folder):
+            step, seconds = int(checkpoint["step"]), float(checkpoint["seconds"])
+            agent.set_state(checkpoint["agent"])
+            replay.restore(run.transitions(replay.width, replay.capacity), int(checkpoint["transitions"]))
+            average.set_state(checkpoint["average"])
+            helped.update(checkpoint["helped"])
+            if checkpoint["env"] is not None:
+                env.unwrapped.set_state(checkpoint["env"])
+                observation = checkpoint["observation"].numpy()
 
     saved = replay.added
     last_save = last_report = time.monotonic()
@@ -595,6 +596,11 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
     Raises:
         BadInput: no such run, or one whose observations or actions are not the environment's.
     """
+    with making_sense(folder):
+        return _policy(folder, env)
+
+
+def _policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
     facts = read_facts(folder)
     observations, actions = sizes(env)
     if (facts["observations"], facts["actions"]) != (observations, actions):
@@ -615,14 +621,7 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
             )
     checkpoint = load_checkpoint(folder)
     agent = Sac(observations, actions, Settings(**{**facts["settings"], "buffer": 1}), seed=int(facts["seed"]))
-    try:
-        agent.actor.load_state_dict(checkpoint["agent"]["actor"])
-    except (KeyError, RuntimeError, ValueError) as error:
-        raise BadInput(
-            "the checkpoint does not fit the networks that run.json describes",
-            where=folder,
-            remedy="train into another folder",
-        ) from error
+    agent.actor.load_state_dict(checkpoint["agent"]["actor"])
     return agent, int(checkpoint["step"])
 
 

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from openant_agents.compiled import compiled
 from openant_agents.primitives import Gait
-from openant_agents.runs import CurvePoint, Run, load_checkpoint, read_facts
+from openant_agents.runs import CurvePoint, Run, load_checkpoint, making_sense, read_facts
 from openant_agents.tile_coding import Rows, TileCoder
 from openant_agents.training import (
     CHECKPOINT_EVERY_S,
@@ -459,15 +459,16 @@ def _train(
     checkpoint = run.resume()
     log: list[Array] = []  # decisions not yet handed to the scribe
     if checkpoint is not None:
-        step, seconds = int(checkpoint["step"]), float(checkpoint["seconds"])
-        average.set_state(checkpoint["average"])
-        helped.update(checkpoint["helped"])
-        random.bit_generator.state = checkpoint["random"]
-        bounds, agent = _learned(run.folder, checkpoint, len(gait), settings, seed)
-        if checkpoint["env"] is not None:
-            env.unwrapped.set_state(checkpoint["env"])
-            observation, action = checkpoint["observation"].numpy(), int(checkpoint["action"])
-            gait.sent(checkpoint["last"].numpy())
+        with making_sense(run.folder):
+            step, seconds = int(checkpoint["step"]), float(checkpoint["seconds"])
+            average.set_state(checkpoint["average"])
+            helped.update(checkpoint["helped"])
+            random.bit_generator.state = checkpoint["random"]
+            bounds, agent = _learned(run.folder, checkpoint, len(gait), settings, seed)
+            if checkpoint["env"] is not None:
+                env.unwrapped.set_state(checkpoint["env"])
+                observation, action = checkpoint["observation"].numpy(), int(checkpoint["action"])
+                gait.sent(checkpoint["last"].numpy())
     last_save = last_report = time.monotonic()
 
     def choose(observed: Array) -> int:
@@ -643,6 +644,11 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any], *, explore: bool = F
     Raises:
         BadInput: no such run, or one whose observations or actions are not the environment's.
     """
+    with making_sense(folder):
+        return _policy(folder, env, explore)
+
+
+def _policy(folder: Path, env: gymnasium.Env[Any, Any], explore: bool) -> tuple[SarsaPolicy, int]:
     facts = read_facts(folder)
     describe = getattr(env.unwrapped, "describe", None)
     here = dict(describe()) if describe is not None else {}

@@ -18,7 +18,6 @@ import logging
 import math
 import threading
 import time
-import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ from openant_env.robots import simulated_robot
 from openant_env.tasks import BackAndForth
 from openant_tools.comms.restart import Interlock, MotionStopped, Restart, StopCause
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.files import read_toml
 from openant_tools.recording.run import Facts
 from openant_tools.robot.derating import derating_of
 from openant_tools.robot.folder import RobotFolder
@@ -148,7 +148,7 @@ class AntHardware(AntBase):
         described = None if folder is None else folder.config()
         self._derating = None
         if folder is not None:
-            said = tomllib.loads(folder.config_file.read_text(encoding="utf-8"))
+            said = read_toml(folder.config_file)
             self._derating = derating_of(said, str(folder.config_file))
         rate_hz = engine_rate(self.dt)
         self._cycle_s = 1.0 / rate_hz

@@ -6,7 +6,6 @@ distribution, cut off at its ends; what the intervals do not say is not varied.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from openant_tools.effects.rollout import EffectValues
 from openant_tools.errors import BadInput
+from openant_tools.files import read_toml
 from openant_tools.model.plant import Plant
 from openant_tools.robot.config import RobotConfig
 from openant_tools.robot.folder import RobotFolder
@@ -52,7 +52,7 @@ def intervals_of(folder: RobotFolder, config: RobotConfig) -> tuple[Interval, ..
     Raises:
         BadInput: nothing was.
     """
-    identified = tomllib.loads(folder.config_file.read_text(encoding="utf-8")).get("identified", {})
+    identified = read_toml(folder.config_file).get("identified", {})
     found = []
     for kind, values in identified.items() if isinstance(identified, Mapping) else ():
         for joint, value in values.items() if isinstance(values, Mapping) else ():

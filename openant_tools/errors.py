@@ -6,6 +6,9 @@ from pathlib import Path
 
 __all__ = ["BadInput", "HardwareFault", "OpenAntError", "StorageFault"]
 
+#: characters of a part of a message: files may hold names of any length, and they are quoted
+LONGEST = 400
+
 
 class OpenAntError(Exception):
     """An error meant for the person at the keyboard; the command line prints it as one line, never as a traceback.
@@ -25,8 +28,17 @@ class OpenAntError(Exception):
         super().__init__(what)
 
     def __str__(self) -> str:
-        line = f"{self.where}: {self.what}" if self.where else self.what
-        return f"{line} → {self.remedy}" if self.remedy else line
+        what, where, remedy = (_one_line(part) for part in (self.what, self.where, self.remedy))
+        line = f"{where}: {what}" if where else what
+        return f"{line} → {remedy}" if remedy else line
+
+
+def _one_line(words: str | None) -> str:
+    """Words without line ends, without what would steer a terminal, and of a length that one reads."""
+    text = " ".join((words or "").split())
+    if not text.isprintable():
+        text = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} … {text[-LONGEST // 2 :]}"
 
 
 class BadInput(OpenAntError):

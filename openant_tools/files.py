@@ -1,18 +1,34 @@
-"""Writing files so that whoever looks sees the old one or the whole new one, never a part; and memory shared as a file."""
+"""Writing files so that whoever looks sees the old one or the whole new one, never a part; reading those of others; and
+memory shared as a file.
+
+What is read is bounded, in bytes, in digits and in depth, so that no file takes minutes or all memory.
+"""
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 import mmap
 import os
 import tempfile
+import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-__all__ = ["atomic_writer", "json_text", "known", "shared_memory", "write_bytes", "write_text"]
+from openant_tools.errors import BadInput, OpenAntError
+
+__all__ = [
+    "LARGEST_TOML", "atomic_writer", "decoded", "json_text", "known", "parse_json", "parse_toml", "read_json", "read_text",
+    "read_toml", "reading", "shared_memory", "write_bytes", "write_text",
+]  # fmt: skip
+
+#: bytes of a text file that is read, of a TOML file (whose readers take seconds a megabyte), and how deep its lists may nest
+LARGEST_TEXT, LARGEST_TOML, DEEPEST = 256 * 2**20, 4 * 2**20, 100
+#: digits of a whole number; those of 64 bits have 19 and fit every array
+DIGITS = 19
 
 
 @contextmanager
@@ -83,6 +99,113 @@ def json_text(content: Any, *, indent: int | None = 1) -> str:
         TypeError: there is something in it that JSON cannot hold.
     """
     return json.dumps(known(content), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+@contextmanager
+def reading(where: str | Path, what: str, remedy: str) -> Iterator[None]:
+    """A block that makes sense of a file: whatever it stumbles over becomes one line that names the file.
+
+    Args:
+        what: is wrong then, such as "this is no recording of ours". remedy: what to do.
+
+    Raises:
+        BadInput: for every error but those that name a cause already (BadInput itself, and the operating system's).
+    """
+    try:
+        yield
+    except OpenAntError:
+        raise
+    except Exception as error:  # of a dozen libraries, each with its own
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        raise BadInput(f"{what} ({type(error).__name__}: {error})", where=where, remedy=remedy) from error
+
+
+def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
+    """The text of a file in UTF-8, a byte order mark left out.
+
+    Raises:
+        BadInput: it is larger, no text, or a folder.
+        OSError: it cannot be read.
+    """
+    if path.is_dir():
+        raise BadInput("is a folder, not a file", where=path, remedy="name a file in it")
+    with path.open("rb") as stream:
+        data = stream.read(largest + 1)
+    if len(data) > largest:
+        raise BadInput(f"is larger than {largest / 2**20:.0f} MiB", where=path, remedy="is it the file that you mean?")
+    return decoded(data, path)
+
+
+def decoded(data: bytes, where: str | Path) -> str:
+    """A file's bytes as text; raises BadInput, which names the line, where they are none in UTF-8."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise BadInput("is text in UTF-16, not in UTF-8", where=where, remedy="save it as UTF-8")
+    try:
+        return data.removeprefix(codecs.BOM_UTF8).decode("utf-8")
+    except UnicodeDecodeError as error:
+        place = f"{where}, line {data[: error.start].count(10) + 1}"
+        raise BadInput("is no UTF-8 text", where=place, remedy="save it as UTF-8") from None
+
+
+def read_json(path: Path, remedy: str = "correct it there") -> Any:
+    """What a JSON file says.
+
+    Raises:
+        BadInput: it is no JSON, nests too deep or has numbers that no computer counts with; the place is named.
+        OSError: it cannot be read.
+    """
+    return parse_json(read_text(path), path, remedy)
+
+
+def parse_json(text: str | bytes, where: str | Path, remedy: str = "correct it there") -> Any:
+    """As `read_json`, of a text."""
+    try:
+        value = json.loads(text, parse_int=_whole)
+    except json.JSONDecodeError as error:
+        place = f"{where}, line {error.lineno}, column {error.colno}"
+        raise BadInput(f"this is not JSON: {error.msg}", where=place, remedy=remedy) from None
+    except RecursionError:
+        raise BadInput("its lists and tables nest too deep", where=where, remedy=remedy) from None
+    except ValueError as error:
+        raise BadInput(f"this is not JSON: {error}", where=where, remedy=remedy) from None
+    _bounded(value, where, remedy)
+    return value
+
+
+def read_toml(path: Path, remedy: str = "mend it there") -> dict[str, Any]:
+    """What a TOML file says; errors as of `read_json`."""
+    return parse_toml(read_text(path, LARGEST_TOML), path, remedy)
+
+
+def parse_toml(text: str, where: str | Path, remedy: str = "mend it there") -> dict[str, Any]:
+    """As `read_toml`, of a text."""
+    try:
+        table = tomllib.loads(text)
+    except RecursionError:
+        raise BadInput("its lists and tables nest too deep", where=where, remedy=remedy) from None
+    except ValueError as error:
+        raise BadInput(f"is not TOML: {error}", where=where, remedy=remedy) from None
+    _bounded(table, where, remedy)
+    return table
+
+
+def _bounded(whole: Any, where: str | Path, remedy: str) -> None:
+    left: list[tuple[Any, int]] = [(whole, 0)]
+    while left:
+        value, depth = left.pop()
+        if depth > DEEPEST:
+            raise BadInput("its lists and tables nest too deep", where=where, remedy=remedy)
+        if isinstance(value, dict | list):
+            left += [(inner, depth + 1) for inner in (value.values() if isinstance(value, dict) else value)]
+        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+            raise BadInput("has a whole number of more than 64 bits", where=where, remedy=remedy)
+
+
+def _whole(digits: str) -> int:
+    if len(digits.removeprefix("-")) > DIGITS:
+        raise ValueError(f"a whole number of {len(digits)} digits")
+    return int(digits)
 
 
 def shared_memory(size: int, fd: int | None = None) -> tuple[int, mmap.mmap]:

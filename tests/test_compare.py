@@ -159,7 +159,7 @@ def test_the_benchs_findings_are_compared_too(tmp_path: Path, capsys: pytest.Cap
     [
         ("nothing.json", None, "is no fit, no robot's folder and no date"),
         ("2026-03-01", None, "is a date of which robot?"),
-        ("cut.json", '{"parameters": {', "is no JSON"),
+        ("cut.json", '{"parameters": {', "this is not JSON"),
         ("empty.json", "{}", "holds no parameters"),
         ("list.json", "[1, 2]", "holds no parameters"),
         (

@@ -630,7 +630,7 @@ def test_an_import_into_a_robot_keeps_what_was_measured_otherwise(
     ("content", "message"),
     [
         ("[1, 2]", "is no JSON object"),
-        ('{"motor_list": [', "line 1, column 17: is no JSON: Expecting value → is the file cut short?"),
+        ('{"motor_list": [', "line 1, column 17: this is not JSON: Expecting value → is the file cut short?"),
         ("{}", "has no list motor_list → is this a robot's configuration?"),
         (json.dumps(platform_object(motor_list=[])), "motor_list has 0 motors → an Open Ant has 8"),
         (json.dumps(platform_object(motor_list=[1] * 8)), "motor_list[0]: is no object"),

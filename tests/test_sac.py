@@ -364,7 +364,7 @@ def test_commands_refuse_in_one_line(trained, tmp_path, capsys, monkeypatch):
     assert "the checkpoint cannot be read" in capsys.readouterr().err
     (damaged / "run.json").write_text("{")
     assert run_command("eval", damaged) == 2
-    assert "it is no JSON" in capsys.readouterr().err
+    assert "this is not JSON" in capsys.readouterr().err
 
 
 def test_tensorboard_events_are_written_when_asked_for(tmp_path):

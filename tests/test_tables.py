@@ -293,7 +293,7 @@ def test_a_parquet_file_that_was_cut(tmp_path: Path, keep: int) -> None:
 def test_a_csv_that_is_not_text(tmp_path: Path) -> None:
     path = tmp_path / "r.csv"
     path.write_bytes(b"t,pos.j\n\xff\xfe\x00\x01,1\n")
-    assert "not text in UTF-8" in refusal(path)
+    assert "is no UTF-8 text" in refusal(path)
 
 
 def test_what_is_not_a_run(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ of a random salt and the plain text, stands in `set.toml` and is to be committed
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import tomlkit
 
 from openant_tools.blind.draw import Answer
 from openant_tools.errors import BadInput
-from openant_tools.files import write_text
+from openant_tools.files import parse_toml, read_toml, write_text
 from openant_tools.virtual.seal import commitment_of, open_sealed, seal
 
 __all__ = ["OPEN", "SEALED", "committed", "open_answers", "read_answers", "write_answers"]
@@ -31,9 +30,9 @@ def committed(out: Path, facts: Mapping[str, Any]) -> str | None:
     """
     path = out / "set.toml"
     if path.exists():
-        there = tomllib.loads(path.read_text(encoding="utf-8"))
-        if {name: there.get(name) for name in facts} != facts:
-            raise BadInput("another set is here already", where=out, remedy="name another folder")
+        there = read_toml(path)
+        if {name: there.get(name) for name in facts} != facts or "commitment" not in there:
+            raise BadInput("another set is here already", where=path, remedy="name another folder")
         return str(there["commitment"])
     if out.exists() and any(out.iterdir()):
         raise BadInput("the folder is not empty", where=out, remedy="name a new one")
@@ -63,8 +62,11 @@ def read_answers(folder: Path, key: bytes | None, commitment: str) -> Mapping[st
             raise BadInput(
                 "there are no answers here", where=folder, remedy="name a set that `openant gap blind make` made"
             )
-        return {file.parent.name: Answer.of(tomllib.loads(file.read_text(encoding="utf-8"))) for file in found}
-    return {name: Answer.of(one) for name, one in tomllib.loads(open_answers(path, key, commitment))["answer"].items()}
+        with reading(folder, "its answers are not as they were written", "make the set anew"):
+            return {file.parent.name: Answer.of(read_toml(file)) for file in found}
+    return {
+        name: Answer.of(one) for name, one in parse_toml(open_answers(path, key, commitment), path)["answer"].items()
+    }
 
 
 def open_answers(path: Path, key: bytes | None, commitment: str) -> str:
@@ -75,8 +77,9 @@ def open_answers(path: Path, key: bytes | None, commitment: str) -> str:
     """
     if key is None:
         raise BadInput("the answers are sealed", where=path, remedy="name the key by --key-file")
-    table = tomllib.loads(path.read_text(encoding="utf-8"))
-    if table["sealed"]["commitment"] != commitment:
+    table = read_toml(path)
+    sealed = table.get("sealed")
+    if not isinstance(sealed, dict) or sealed.get("commitment") != commitment:
         raise BadInput(
             "the answers are not those that the set committed to", where=path, remedy="take the set's own file"
         )

@@ -18,7 +18,7 @@ from typing import Any, Literal
 from joblib import Parallel, delayed, parallel_config
 
 from openant_tools.errors import BadInput, OpenAntError
-from openant_tools.files import write_text
+from openant_tools.files import read_json, write_text
 from openant_tools.recording.tables import read_run
 from openant_tools.workers import tied
 
@@ -101,8 +101,8 @@ def _whole(robots: Sequence[Path]) -> list[Path]:
 
 def _judged(path: Path) -> bool:
     try:
-        return "error" not in json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError):
+        return "error" not in read_json(path)
+    except (OSError, BadInput, TypeError):
         return False
 
 

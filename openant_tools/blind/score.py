@@ -5,9 +5,7 @@ Only `read` opens the answers, and unless asked for less only once every robot h
 
 from __future__ import annotations
 
-import json
 import math
-import tomllib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +17,7 @@ from openant_tools.blind.draw import OUTSIDE, Answer
 from openant_tools.blind.run import folders_of, verdict_path
 from openant_tools.blind.sizes import KINDS
 from openant_tools.errors import BadInput
+from openant_tools.files import read_json, read_toml
 from openant_tools.procedure.intervals import wilson
 
 __all__ = ["Case", "Row", "Score", "read", "score"]
@@ -173,7 +172,7 @@ def read(folder: Path, key: bytes | None, *, so_far: bool = False) -> tuple[dict
         BadInput: no set, a robot without a verdict (with `so_far`: all of them), or answers that do not open.
     """
     robots = [path.name for path in folders_of(folder)]
-    facts = tomllib.loads((folder / "set.toml").read_text(encoding="utf-8"))
+    facts = read_toml(folder / "set.toml")
     missing = [name for name in robots if not verdict_path(folder, name).exists()]
     judged = [name for name in robots if name not in missing]
     if missing and not (so_far and judged):
@@ -181,8 +180,8 @@ def read(folder: Path, key: bytes | None, *, so_far: bool = False) -> tuple[dict
             f"{len(missing)} of {len(robots)} robots have no verdict yet", where=folder,
             remedy="`openant gap blind run` first: answers are opened when all verdicts are written",
         )  # fmt: skip
-    answers = read_answers(folder, key, facts["commitment"])
-    said = {name: json.loads(verdict_path(folder, name).read_text(encoding="utf-8")) for name in judged}
+    answers = read_answers(folder, key, str(facts.get("commitment")))
+    said = {name: read_json(verdict_path(folder, name)) for name in judged}
     return facts, [Case(name, answers[name], said[name]) for name in judged]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -19,7 +18,7 @@ from openant_tools.blind.soak_virtual import soak_virtual
 from openant_tools.blind.soaks import SoakAnswer, SoakMix, draw_soaks
 from openant_tools.comms.dropouts.diagnose import diagnose_dropouts
 from openant_tools.errors import BadInput, OpenAntError
-from openant_tools.files import write_text
+from openant_tools.files import parse_toml, read_json, read_text, read_toml, reading, write_text
 from openant_tools.recording.tables import read_run, write_table
 from openant_tools.virtual.seal import commitment_of, seal
 from openant_tools.workers import tied
@@ -99,7 +98,7 @@ def soak_facts(folder: Path) -> Mapping[str, Any]:
         BadInput: this is no set of soaks.
     """
     path = folder / "set.toml"
-    facts = tomllib.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    facts = read_toml(path) if path.is_file() else {}
     if facts.get("schema") != SCHEMA:
         raise BadInput("this is no set of soaks", where=folder, remedy="name one that `openant comms blind make` made")
     return facts
@@ -111,15 +110,16 @@ def read_soak_answers(folder: Path, key: bytes | None) -> Mapping[str, SoakAnswe
     Raises:
         BadInput: there are none, or they do not open (`open_answers`).
     """
-    commitment = str(soak_facts(folder)["commitment"])
+    commitment = str(soak_facts(folder).get("commitment"))
     if (folder / SEALED).exists():
         plain = open_answers(folder / SEALED, key, commitment)
     else:
         path = folder / OPEN
         if not path.is_file():
             raise BadInput("there are no answers here", where=folder, remedy="make the set anew")
-        plain = path.read_text(encoding="utf-8")
-    return {name: SoakAnswer.of(one) for name, one in tomllib.loads(plain)["answer"].items()}
+        plain = read_text(path)
+    with reading(folder, "its answers are not as they were written", "make the set anew"):
+        return {name: SoakAnswer.of(one) for name, one in parse_toml(plain, folder)["answer"].items()}
 
 
 def run_soaks(folder: Path, *, jobs: int = 1, progress: Progress = _quiet) -> int:
@@ -166,4 +166,4 @@ def read_verdicts(folder: Path, names: Sequence[str], *, so_far: bool = False) -
             where=folder,
             remedy="run `openant comms blind run SET` first",
         )
-    return {name: json.loads(_verdict(folder, name).read_text(encoding="utf-8")) for name in names}
+    return {name: read_json(_verdict(folder, name)) for name in names}

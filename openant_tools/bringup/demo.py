@@ -7,7 +7,6 @@ have changed. So an interrupted demo goes on where it stopped, and one whose sce
 from __future__ import annotations
 
 import importlib.util
-import json
 import shlex
 import shutil
 import signal
@@ -18,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from openant_tools.errors import BadInput, OpenAntError
-from openant_tools.files import json_text, write_text
+from openant_tools.files import json_text, read_json, write_text
 from openant_tools.robot.config import CONFIG_NAME
 from openant_tools.workers import environment
 
@@ -299,8 +298,8 @@ class Demo:
 
     def _done(self) -> dict[str, list[list[str]]]:
         try:
-            done = json.loads((self.folder / STATE).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            done = read_json(self.folder / STATE)
+        except (OSError, BadInput):
             # Whatever is unreadable here only costs doing a stage again.
             return {}
         return done if isinstance(done, dict) else {}

@@ -14,6 +14,7 @@ import click
 
 from openant_tools.cli.leaving import heed_signals
 from openant_tools.errors import OpenAntError
+from openant_tools.trust import TRUST, trusted
 from openant_tools.workers import end_with_who_started_us
 
 __all__ = ["main"]
@@ -55,6 +56,27 @@ REMEDIES = {
 }
 
 
+def trust_option(command: click.Command) -> click.Command:
+    """Give a command, or each of a group's, `--trust-paths` where it reads files that may name others."""
+    names = {parameter.name for parameter in command.params}
+    if isinstance(command, click.Group):
+        for one in command.commands.values():
+            trust_option(one)
+    elif "trust_paths" not in names and names & {"model", "robot", "run", "runs"}:
+        words = "Follow absolute paths and links in files, wherever they lead."
+        option = ["--trust-paths"]
+        command.params.append(
+            click.Option(option, is_flag=True, is_eager=True, expose_value=False, callback=_trust, help=words)
+        )
+    return command
+
+
+def _trust(context: click.Context, option: click.Parameter, value: bool) -> None:
+    if value and not trusted():
+        os.environ[TRUST] = "1"
+        context.call_on_close(lambda: os.environ.pop(TRUST, None))
+
+
 class Manual(click.Group):
     """The top-level group: imports a command's module on use and lists commands by section."""
 
@@ -67,7 +89,7 @@ class Manual(click.Group):
         module = importlib.import_module(f"openant_tools.cli.{COMMANDS[cmd_name][0]}")
         command = getattr(module, "eval_" if cmd_name == "eval" else cmd_name)
         assert isinstance(command, click.Command)
-        return command
+        return trust_option(command)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         sections: dict[str, list[tuple[str, str]]] = {}

@@ -72,13 +72,16 @@ def eval_(
 
     from openant_agents.evaluate import evaluate
     from openant_agents.policies import load_policy
-    from openant_agents.runs import read_facts
+    from openant_agents.runs import making_sense, read_facts
     from openant_env.rendering import NoOpenGL, write_strip
     from openant_tools.files import json_text, write_text
 
     facts = read_facts(run)
-    options = dict(facts["env"]["options"])
-    name = {None: facts["env"]["id"], "sim": SIMULATED_ID, "hardware": HARDWARE_ID}[where]
+    with making_sense(run):
+        options = dict(facts["env"]["options"])
+        name = {None: str(facts["env"]["id"]), "sim": SIMULATED_ID, "hardware": HARDWARE_ID}[where]
+    if ":" in name:  # Gymnasium would import what stands before it
+        raise BadInput(f"its environment {name!r} names a module", where=run, remedy="train into another folder")
     if name == HARDWARE_ID:
         if where is not None or virtual_source is not None or robot is not None:
             for key in ("kit", "effects", "virtual", "clock", "robot"):

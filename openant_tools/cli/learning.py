@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +11,7 @@ import click
 
 from openant_tools.cli.options import robot_folder
 from openant_tools.errors import BadInput
+from openant_tools.files import read_json
 
 if TYPE_CHECKING:
     from openant_agents.drops import DropWatch
@@ -48,7 +48,7 @@ def read_settings(file: Path | None, agent: str) -> dict[str, Any]:
     if file is None:
         return {}
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
+        found = read_json(file, "name what `openant tune --json` wrote")
         settings, of = dict(found["settings"]), found["agent"]
     except OSError as error:
         raise BadInput(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from pathlib import Path
@@ -298,15 +297,17 @@ def _read(path: Path) -> Inputs:
 
 def _known(path: Path | None) -> Known | None:
     from openant_tools.errors import BadInput
+    from openant_tools.files import read_json
     from openant_tools.thermal.fit import Known
 
     if path is None:
         return None
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        what = error.strerror if isinstance(error, OSError) else "is no JSON"
-        raise BadInput(str(what), where=path, remedy="name the fit.json that `openant thermal fit` wrote") from None
+        content = read_json(path, "name the fit.json that `openant thermal fit` wrote")
+    except OSError as error:
+        raise BadInput(
+            str(error.strerror), where=path, remedy="name the fit.json that `openant thermal fit` wrote"
+        ) from None
     return Known.of_json(content, str(path))
 
 

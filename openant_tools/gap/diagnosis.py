@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from openant_tools.errors import BadInput
+from openant_tools.files import read_json
 
 __all__ = ["AMBIGUOUS", "NONE", "SCHEMA", "UNEXPLAINED", "Diagnosis", "Found", "Span", "read_diagnosis"]
 
@@ -125,13 +125,11 @@ class Diagnosis:
 def read_diagnosis(path: Path) -> Diagnosis:
     """A diagnosis from its JSON; raises BadInput where it is none."""
     try:
-        text = json.loads(path.read_text(encoding="utf-8"))
+        text = read_json(path, "name the JSON of `openant gap diagnose`")
     except OSError as error:
         raise BadInput(
             error.strerror or str(error), where=path, remedy="name the JSON of `openant gap diagnose`"
         ) from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise BadInput(f"is not JSON: {error}", where=path, remedy="name the JSON of `openant gap diagnose`") from None
     if not isinstance(text, dict) or text.get("schema") != SCHEMA:
         raise BadInput(
             f"is no diagnosis (schema {SCHEMA!r})", where=path, remedy="name the JSON of `openant gap diagnose`"
@@ -162,7 +160,7 @@ def read_diagnosis(path: Path) -> Diagnosis:
             calibration=text.get("calibration", {}), removal=text.get("removal", {}), notes=tuple(text.get("notes", ())),
             rest=text.get("rest", {}), refuted=text.get("refuted", {}),
         )  # fmt: skip
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise BadInput(
             f"lacks or misstates {error}", where=path, remedy="make it anew with `openant gap diagnose`"
         ) from None

@@ -33,6 +33,7 @@ from openant_tools.model.plant import (
     load_plant,
     samples_for,
 )
+from openant_tools.robot.model_file import parser
 
 __all__ = ["actuator_element", "document_text", "in_degrees", "joint_element", "number", "numbers", "write_model"]
 
@@ -180,7 +181,7 @@ def _read(path: Path, main: Path, taken_in: list[tuple[etree._Element, Path]]) -
         taken_in: gets every element that came by an include, with the folder of the file it stood in.
     """
     try:
-        tree = etree.parse(str(path), etree.XMLParser(remove_blank_text=False, remove_comments=False))
+        tree = etree.parse(str(path), parser())
     except etree.XMLSyntaxError as error:
         raise BadInput(f"not well-formed XML: {error.msg}", where=path) from error
     for include in list(tree.getroot().iter("include")):

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.model.attribute import Stated, set_stated
+from openant_tools.robot.model_file import check_model_file
 
 __all__ = ["Plant", "Setup", "is_filtered", "is_motor", "load_plant", "position_servos", "setup_of", "world_bodies"]
 
@@ -148,6 +149,7 @@ def load_plant(
     path = Path(path)
     if not path.is_file():
         raise BadInput("no such model file", where=path, remedy="name an MJCF with --model MODEL.xml")
+    check_model_file(path)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         set_stated(spec, stated or {})

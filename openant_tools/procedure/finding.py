@@ -8,14 +8,14 @@ says no without naming what is wrong cannot be built.
 from __future__ import annotations
 
 import datetime
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from openant_tools.files import json_text, known, write_text
+from openant_tools.errors import BadInput
+from openant_tools.files import json_text, known, read_json, write_text
 
 if TYPE_CHECKING:  # a manual that lists the steps opens without NumPy
     from openant_tools.robot.config import Provenance
@@ -192,8 +192,8 @@ def latest(folder: RobotFolder, step: str) -> Finding | None:
     """
     for path in sorted(folder.findings.glob(f"{step}-2*.json"), reverse=True):
         try:
-            finding = Finding.of_json(json.loads(path.read_text(encoding="utf-8")))
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            finding = Finding.of_json(read_json(path))
+        except (OSError, BadInput, ValueError, KeyError, TypeError, AttributeError):
             continue
         if finding.step == step:
             return finding

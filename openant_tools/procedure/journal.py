@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from openant_tools.errors import BadInput
+from openant_tools.files import parse_json
 
 __all__ = ["EepromWrite", "Entry", "Journal", "append_writes"]
 
@@ -97,8 +98,8 @@ class Journal:
         found = []
         for number, line in enumerate(lines, 1):
             try:
-                content = json.loads(line)
-            except ValueError:
+                content = parse_json(line, self.path)
+            except BadInput:
                 continue
             try:
                 undoes = content.pop("undoes", None)

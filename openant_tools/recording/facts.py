@@ -9,6 +9,7 @@ from dataclasses import fields
 from typing import Any
 
 from openant_tools.errors import BadInput
+from openant_tools.files import parse_json
 from openant_tools.recording.run import Facts
 
 __all__ = ["facts_from_json", "facts_to_json"]
@@ -28,11 +29,7 @@ def facts_from_json(text: str, where: str) -> Facts:
     Raises:
         BadInput: not JSON, no `joints`, or a value of the wrong kind.
     """
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        place = f"{where}, line {error.lineno}, column {error.colno}"
-        raise BadInput(f"this is not JSON: {error.msg}", where=place, remedy="correct it there") from error
+    data = parse_json(text, where)
     if not isinstance(data, dict):
         raise BadInput("the facts of a run are a JSON object", where=where, remedy='start with {"joints": [...]}')
     if "joints" not in data:

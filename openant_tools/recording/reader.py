@@ -13,15 +13,18 @@ from operator import attrgetter
 from pathlib import Path
 from typing import IO, Any
 
+import lz4.frame
 import numpy as np
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Metadata, Schema
-from mcap.stream_reader import MAGIC_SIZE, get_chunk_data_stream
+from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.files import parse_json, reading
 from openant_tools.recording.facts import facts_from_json
 from openant_tools.recording.run import Array, Facts, Run
 from openant_tools.recording.telemetry import IMU_FIELDS, POSE_FIELDS, ServoChannel, message_classes
@@ -31,6 +34,10 @@ __all__ = ["RecordScan", "Recording", "Samples", "read_recording", "recording_co
 
 _log = logging.getLogger(__name__)
 
+#: bytes of a chunk; those of ours have 64 KiB, of other software a few MiB
+LARGEST_CHUNK = 64 * 2**20
+#: bytes of all chunks of a file, unpacked: an hour of an Open Ant is 200 MB
+LARGEST_CONTENT = 4 * 2**30
 #: of the MCAP specification: opcode and length of a record; channel, sequence and the two times of a message
 _FRAME = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
@@ -103,6 +110,7 @@ class RecordScan:
             self.damage = f"{self.damage}; {lost}" if self.damage else lost
 
     def _records(self, stream: IO[bytes], size: int) -> Iterator[Schema | Channel | Message | Metadata]:
+        unpacked = 0
         while True:
             at = stream.tell()
             frame = stream.read(9)
@@ -122,15 +130,38 @@ class RecordScan:
             body = ReadDataStream(BytesIO(stream.read(length)))
             try:
                 if opcode == Opcode.METADATA:
-                    yield Metadata.read(body)
+                    records: list[Any] = [Metadata.read(body)]
                 else:
-                    chunk, _ = get_chunk_data_stream(Chunk.read(body), validate_crc=True)
-                    yield from _inside(chunk.read(-1))
-            except GeneratorExit:
-                raise
+                    chunk = _unpacked(Chunk.read(body))
+                    unpacked += len(chunk)
+                    records = list(_inside(chunk))
             except Exception:
                 # mcap, zstandard and struct each have their own errors for bytes that are not what they should be.
                 self.lost_chunks += 1
+                continue
+            yield from records
+            if unpacked > LARGEST_CONTENT:
+                self.damage = f"larger than a recording can be, after byte {at} of {size}"
+                return
+
+
+def _unpacked(chunk: Chunk) -> bytes:
+    """The records of a chunk as they were, and never more of them than a chunk may hold, however small it is packed."""
+    if chunk.uncompressed_size > LARGEST_CHUNK:
+        raise ValueError("a chunk that large is none of a recording's")
+    if chunk.compression == "zstd":
+        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(chunk.uncompressed_size + 1)
+    elif chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=chunk.uncompressed_size + 1)
+    elif chunk.compression:
+        raise ValueError(f"compressed by {chunk.compression}")
+    else:
+        data = chunk.data
+    if len(data) != chunk.uncompressed_size:
+        raise ValueError("a chunk of another size than it says")
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise ValueError("a wrong checksum")
+    return bytes(data)
 
 
 def _inside(chunk: bytes) -> Iterator[Schema | Channel | Message]:
@@ -156,6 +187,11 @@ def read_recording(path: str | Path) -> Recording:
         BadInput: not a recording of ours, or one torn before its first row.
     """
     path = Path(path)
+    with reading(path, "this recording is not as this program writes them", "record again, or name another"):
+        return _read(path)
+
+
+def _read(path: Path) -> Recording:
     scan = RecordScan(path)
     content: dict[str, Any] | None = None
     kinds: dict[int, str] = {}
@@ -169,16 +205,17 @@ def read_recording(path: str | Path) -> Recording:
             content = recording_content(record, path)
         elif isinstance(record, Schema):
             schemas[record.id] = record
-            if record.encoding == "protobuf" and not classes:
+            if record.encoding == "protobuf" and record.name.startswith("openant.") and not classes:
                 classes = message_classes(record.data)
         elif isinstance(record, Channel):
-            kinds[record.id] = schemas[record.schema_id].name
+            schema = schemas.get(record.schema_id)
+            kinds[record.id] = "" if schema is None else schema.name
         elif isinstance(record, Message):
             kind = kinds.get(record.channel_id)
             if kind == "openant.Cycle":
                 cycles.append(classes[kind].FromString(record.data))
             elif kind == "openant.Event":
-                events.append(json.loads(record.data))
+                events.append(parse_json(record.data, path))
             elif kind in body:
                 body[kind].append(classes[kind].FromString(record.data))
     if content is None:
@@ -254,7 +291,9 @@ def recording_content(record: Metadata, path: Path) -> dict[str, Any] | None:
     text = record.metadata.get("content", "")
     if f"{zlib.crc32(text.encode()):08x}" != record.metadata.get("crc32"):
         return None
-    content: dict[str, Any] = json.loads(text)
+    content: dict[str, Any] = parse_json(text, path)
+    if not isinstance(content, dict):
+        raise BadInput("this is not a recording of ours", where=path, remedy="record again")
     if content.get("schema") != SCHEMA:
         raise BadInput(
             f"this recording has the format {content.get('schema')}, this program reads {SCHEMA}",

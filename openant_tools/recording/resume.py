@@ -55,7 +55,7 @@ def continuation(path: str | Path, channels: Sequence[ServoChannel], now: float,
         elif isinstance(record, Channel):
             kinds[record.id] = record.topic
         elif isinstance(record, Message):
-            messages.append((kinds[record.channel_id], record.log_time, record.data))
+            messages.append((kinds.get(record.channel_id, ""), record.log_time, record.data))
     if content is None or metadata is None:
         raise BadInput("nothing of this recording can be kept", where=path, remedy="record under another name")
     ours = json.loads(json.dumps(Telemetry(channels).as_json()))

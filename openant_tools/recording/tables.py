@@ -16,13 +16,17 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
-from openant_tools.files import atomic_writer
+from openant_tools.files import atomic_writer, read_text, reading
 from openant_tools.recording.facts import facts_from_json, facts_to_json
 from openant_tools.recording.plausibility import check_columns, check_names, check_run, check_time, need_signals
 from openant_tools.recording.run import BODY_COLUMNS, JOINT_SIGNALS, Facts, Run
 
 __all__ = ["find_run", "read_run", "read_table", "write_table"]
 
+#: bytes of a CSV, and of its first line: an Open Ant's has 1,500
+LARGEST_CSV, LONGEST_HEADER = 2**30, 64 * 1024
+#: numbers of a table: an hour of an Open Ant at 300 Hz has 80 million
+LARGEST_TABLE = 400_000_000
 _MISSING = ("", "nan", "NaN", "NAN", "null", "NULL", "None", "NA", "N/A")
 
 
@@ -51,6 +55,11 @@ def read_run(path: str | Path, *, need: Sequence[str] = ("cmd", "pos")) -> Run:
 def read_table(path: str | Path) -> Run:
     """The table at `path` (.parquet or .csv), checked row by row; see `read_run`."""
     path = Path(path)
+    with reading(path, "this table cannot be read", "export it again"):
+        return _read(path)
+
+
+def _read(path: Path) -> Run:
     columns = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
     if "t" not in columns:
         raise BadInput(
@@ -60,7 +69,7 @@ def read_table(path: str | Path) -> Run:
         )
     facts_path = path.with_suffix(".json")
     if facts_path.exists():
-        facts = facts_from_json(_read_text(facts_path), str(facts_path))
+        facts = facts_from_json(read_text(facts_path), str(facts_path))
     else:
         facts = Facts(joints=_joints_of(list(columns), path))
     check_columns(list(columns), facts.joints, str(path))
@@ -129,13 +138,6 @@ def _few(names: Any, count: int = 8) -> str:
     return ", ".join(names[:count]) + (", …" if len(names) > count else "")
 
 
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise BadInput("this is not text in UTF-8", where=path, remedy="save it as UTF-8") from error
-
-
 def _joints_of(names: Sequence[str], path: Path) -> tuple[str, ...]:
     """The joints of a table without facts, in the order of their columns."""
     for signal in ("pos", "cmd", *JOINT_SIGNALS):
@@ -151,6 +153,13 @@ def _joints_of(names: Sequence[str], path: Path) -> tuple[str, ...]:
 
 def _read_parquet(path: Path) -> dict[str, NDArray[Any]]:
     try:
+        size = pq.read_metadata(path)
+        if size.num_rows * max(size.num_columns, 1) > LARGEST_TABLE:
+            raise BadInput(
+                f"it has {size.num_rows} rows of {size.num_columns} columns",
+                where=path,
+                remedy="cut it into shorter runs",
+            )
         table = pq.read_table(path, partitioning=None, page_checksum_verification=True)
         names = table.column_names
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
@@ -166,8 +175,20 @@ def _read_parquet(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _read_csv(path: Path) -> dict[str, NDArray[Any]]:
-    text = _read_text(path)
-    header = next(csv.reader(io.StringIO(text)), [])
+    text = read_text(path, LARGEST_CSV)
+    first = text[: text.find("\n") + 1 or len(text)]
+    if len(first) > LONGEST_HEADER or "\0" in first:
+        raise BadInput(
+            "the first line is no header of columns",
+            where=f"{path}, line 1",
+            remedy="name the columns there, as in t,pos.J",
+        )
+    try:
+        header = next(csv.reader(io.StringIO(text)), [])
+    except csv.Error as error:
+        raise BadInput(
+            f"the header cannot be read: {error}", where=f"{path}, line 1", remedy="export it again"
+        ) from None
     names = [name.strip() for name in header]
     if not any(names):
         raise BadInput("the run is empty: no header, no rows", where=path, remedy="record again, or export it again")
@@ -237,7 +258,11 @@ def _numbers(name: str, column: pa.Array, path: Path) -> NDArray[Any]:
         raise BadInput(
             f"the values are {column.type}, not numbers", where=f"{path}, column {name}", remedy="store float64"
         )
-    return np.array(column.to_pylist(), dtype=object)
+    if pa.types.is_temporal(column.type):
+        column = column.cast(pa.string())
+    out = np.empty(len(column), dtype=object)
+    out[:] = column.to_pylist()
+    return out
 
 
 def _parsed(name: str, column: pa.Array, path: Path, ours: bool) -> NDArray[Any]:

@@ -18,6 +18,7 @@ import tomlkit
 from tomlkit.exceptions import ParseError, TOMLKitError
 
 from openant_tools.errors import BadInput
+from openant_tools.files import decoded, parse_toml
 from openant_tools.robot.fields import Problem, choice, number, port, read, stranger, switch, text, vector, whole
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS, Kind
 from openant_tools.robot.kit import KITS, PLATFORM_PWM_LIMIT
@@ -29,6 +30,8 @@ __all__ = [
 ]  # fmt: skip
 
 CONFIG_NAME = "robot.toml"
+#: bytes; a whole robot has some 12,000, and one that edits it waits a second for each 100,000
+LARGEST_ROBOT = 512 * 1024
 TURN = 2 * math.pi
 #: Two turns: more than any mounting has, less than any angle in degrees.
 MAX_OFFSET_RAD = 2 * TURN
@@ -520,25 +523,29 @@ def _provenance(table: Any, problems: list[Problem]) -> dict[str, Provenance]:
 def read_document(data: bytes, where: str | Path) -> tomlkit.TOMLDocument:
     """The TOML document in a file's bytes; raises BadInput with line and column where it is none."""
     remedy = "mend it by hand"
+    if len(data) > LARGEST_ROBOT:
+        raise BadInput(f"is larger than {LARGEST_ROBOT // 1024} KiB", where=where, remedy="is it a robot's?")
+    text = decoded(data, where)
     try:
         # TOML forbids NUL; tomlkit would let it pass in comments, and a zeroed tail is what a power cut leaves.
-        if b"\0" in data:
+        if "\0" in text:
             raise BadInput(
                 "holds zero bytes, as a power cut leaves them",
                 where=f"{where}, line {data[: data.index(0)].count(10) + 1}",
                 remedy=remedy,
             )
-        return tomlkit.parse(data.decode("utf-8"))
-    except UnicodeDecodeError as error:
-        line = data[: error.start].count(b"\n") + 1
-        raise BadInput("is no UTF-8 text", where=f"{where}, line {line}", remedy=remedy) from None
+        document = tomlkit.parse(text)
     except ParseError as error:
         what = re.sub(r" at line \d+ col \d+$", "", str(error))
         raise BadInput(
             f"is no TOML: {what}", where=f"{where}, line {error.line}, column {error.col + 1}", remedy=remedy
         ) from None
-    except TOMLKitError as error:
+    except RecursionError:
+        raise BadInput("its lists and tables nest too deep", where=where, remedy=remedy) from None
+    except (TOMLKitError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise BadInput(f"is no TOML: {error}", where=where, remedy=remedy) from None
+    parse_toml(text, where, remedy)  # what tomlkit lets pass, and numbers that no computer counts with
+    return document
 
 
 def retired(problem: Problem) -> Problem:

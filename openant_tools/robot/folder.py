@@ -31,6 +31,7 @@ from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import ANGLE_LIMIT_RAD, NOMINAL_ZERO_RAD, Kit
 from openant_tools.robot.kit import kit as kit_by_name
 from openant_tools.robot.mjcf import nominal_mjcf
+from openant_tools.trust import follows
 
 __all__ = ["Located", "RobotFolder", "create_robot"]
 
@@ -154,7 +155,15 @@ class RobotFolder:
 
     def model_path(self, config: RobotConfig | None = None) -> Path:
         """The MJCF that simulates this robot."""
-        return self.path / (config or self.config()).model
+        named = (config or self.config()).model
+        path = follows(named, self.config_file)
+        if path is None:
+            raise BadInput(
+                f"its model {named} lies elsewhere and is not followed",
+                where=self.config_file,
+                remedy="put it into the robot's folder, or add --trust-paths",
+            )
+        return self.path / named
 
     def relative(self, path: str | Path) -> str:
         """A path as the folder's files name it: relative to the folder where it lies inside, with forward slashes."""
@@ -280,9 +289,14 @@ class RobotFolder:
             return []
         import mujoco
 
+        from openant_tools.robot.model_file import check_model_file
+
         try:
+            check_model_file(path)
             model = mujoco.MjModel.from_xml_path(str(path))
-        except ValueError as error:
+        except BadInput as error:
+            return [Problem("model", f"{error.where}: {error.what}", error.remedy)]
+        except (ValueError, mujoco.FatalError) as error:
             return [Problem("model", f"MuJoCo cannot load {path}: {' '.join(str(error).split())}")]
         driven = {int(model.actuator_trnid[k, 0]) for k in range(model.nu)}
         problems = []

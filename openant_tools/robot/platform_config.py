@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from openant_tools.errors import BadInput
-from openant_tools.files import write_bytes
+from openant_tools.files import read_json, write_bytes
 from openant_tools.robot.config import MAX_ANGLE_RAD, MAX_OFFSET_RAD, Provenance, RobotConfig, read_document
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
@@ -75,16 +75,9 @@ def _whole(value: Any, where: str) -> int:
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        raw = json.loads(path.read_bytes().decode("utf-8-sig"))
+        raw = read_json(path, "is the file cut short?")
     except FileNotFoundError:
         raise BadInput("there is no such file", where=path) from None
-    except UnicodeDecodeError:
-        raise BadInput("is no UTF-8 text", where=path) from None
-    except json.JSONDecodeError as error:
-        raise BadInput(
-            f"is no JSON: {error.msg}", where=f"{path}, line {error.lineno}, column {error.colno}",
-            remedy="is the file cut short?",
-        ) from None  # fmt: skip
     if not isinstance(raw, dict):
         raise BadInput("is no JSON object", where=path, remedy="the platform's configuration is one flat object")
     return raw

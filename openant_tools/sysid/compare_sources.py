@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import datetime
-import json
 import math
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from openant_tools.errors import BadInput
+from openant_tools.files import read_json, read_toml, reading
 from openant_tools.robot.config import CONFIG_NAME
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.sysid.compare import Estimate, Snapshot
@@ -65,14 +64,12 @@ def _date(text: str) -> datetime.datetime | None:
 
 
 def _read_json(path: Path) -> Snapshot:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, UnicodeDecodeError):
-        raise BadInput("is no JSON", where=path, remedy="name a fit.json") from None
+    content = read_json(path, "name a fit.json")
     parameters = _parameters(content, path)
     if not parameters:
         raise BadInput("holds no parameters", where=path, remedy="name the fit.json that `openant sysid fit` wrote")
-    return Snapshot(str(path), parameters, tuple(map(str, content.get("runs", ()))))
+    with reading(path, "it is no fit.json", "name the fit.json that `openant sysid fit` wrote"):
+        return Snapshot(str(path), parameters, tuple(map(str, content.get("runs", ()))))
 
 
 def _parameters(content: Any, path: Path) -> dict[str, Estimate]:
@@ -84,12 +81,12 @@ def _parameters(content: Any, path: Path) -> dict[str, Estimate]:
     out: dict[str, Estimate] = {}
     for name, entry in table.items():
         try:
+            joints = tuple(map(str, entry.get("joints", ())))
             value, low, high = float(entry["value"]), _number(entry["low"]), _number(entry["high"])
-        except (KeyError, TypeError, ValueError):
+        except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
             raise BadInput(f"{name} has no value, low and high", where=path, remedy="is it a fit.json?") from None
         if not math.isfinite(value):
             raise BadInput(f"{name} is {value}", where=path)
-        joints = tuple(map(str, entry.get("joints", ())))
         out[str(name)] = Estimate(
             value, low, high, str(entry.get("unit", "")), str(entry.get("verdict", "")), joints, date
         )
@@ -134,19 +131,19 @@ def _at(robot: RobotFolder, until: datetime.datetime | None, name: str) -> Snaps
 def _history(robot: RobotFolder) -> Iterator[tuple[str, Estimate]]:
     for path in sorted(robot.findings.rglob("*.json")):
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = read_json(path)
             parameters = _parameters(content, path)
-        except (ValueError, BadInput):
+        except (OSError, BadInput):
             continue  # a finding of another kind, or one that was cut
         written = datetime.datetime.fromtimestamp(path.stat().st_mtime, datetime.UTC)
         for name, estimate in parameters.items():
             yield name, estimate if estimate.date is not None else replace(estimate, date=written)
     for path in [*sorted(robot.backups.glob("robot-*.toml")), robot.config_file]:
         try:
-            table = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+            table = read_toml(path, "`openant config check` says more")
+        except (OSError, BadInput):
             if path == robot.config_file:
-                raise BadInput("is not TOML", where=path, remedy="`openant config check` says where") from None
+                raise
             continue
         yield from _of_table(table)
 

@@ -24,7 +24,6 @@ from __future__ import annotations
 import difflib
 import math
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +32,7 @@ from typing import Any
 import mujoco
 
 from openant_tools.errors import BadInput
+from openant_tools.files import read_toml
 from openant_tools.model.attribute import find
 from openant_tools.model.plant import Plant
 from openant_tools.sysid.kinds import KINDS, Kind
@@ -107,13 +107,11 @@ def read_declarations(path: Path) -> Declaration:
         BadInput: there is no such file, it is not TOML, or an entry is not as above; the message names the entry.
     """
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = read_toml(path)
     except OSError as error:
         raise BadInput(
             "no such file of parameters", where=path, remedy="name one with --parameters FILE.toml"
         ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise BadInput(f"not TOML: {error}", where=path, remedy="mend it at that place") from error
     unknown = [key for key in table if key not in ("kinds", "parameter")]
     if unknown:
         raise BadInput(f"unknown key {unknown[0]!r}", where=path, remedy="parameters stand in [[parameter]] tables")

@@ -6,6 +6,7 @@ its prior; whatever does not beat the given model on held-out runs, at the short
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -42,6 +43,7 @@ from openant_tools.sysid.parameter import (
 )  # fmt: skip
 from openant_tools.sysid.quality import Telemetry, check_model, check_runs, without_errors
 from openant_tools.sysid.verdict import IDENTIFIABLE, UNDETERMINED, Verdict, Word, experiment, verdicts
+from openant_tools.trust import follows
 
 __all__ = [
     "DEFAULT_KINDS",
@@ -55,6 +57,8 @@ __all__ = [
     "own_model",
     "restated",
 ]
+
+_log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -415,9 +419,17 @@ def _datasets(
 
 
 def own_model(run: Run) -> Path | None:
-    """The model that a run itself names, where that file is."""
+    """The model that a run itself names, where that file is; one elsewhere is not followed, and that is said."""
     own = run.model_path
-    return own if own is not None and own.is_file() else None
+    if own is None or not own.is_file():
+        return None
+    if follows(str(run.facts.model), run.path or Path()) is None:
+        _log.warning(
+            "%s: its model %s lies elsewhere and is not followed → add --trust-paths if it may be, or name one by --model",
+            run.path or run.name, run.facts.model,
+        )  # fmt: skip
+        return None
+    return own
 
 
 def _applicable(kinds: Sequence[str] | None, plant: Plant, runs: Sequence[Run]) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 import tomlkit
 
 from openant_tools.errors import BadInput
-from openant_tools.files import write_text
+from openant_tools.files import read_toml, write_text
 from openant_tools.sysid import excitation, floor_motion
 from openant_tools.sysid.excitation import Segment
 from openant_tools.sysid.protocols import LONGEST_S, Protocol
@@ -65,15 +64,9 @@ def write_plan(path: Path, protocols: tuple[Protocol, ...], comment: str) -> Non
 def read_plan(path: Path) -> tuple[Protocol, ...]:
     """The recordings that a plan asks for; raises BadInput, which names the place."""
     try:
-        text = path.read_text(encoding="utf-8")
+        table = read_toml(path, "mend it there; a plan is TOML")
     except OSError as error:
         raise BadInput(error.strerror or str(error), where=path, remedy="name a plan file") from None
-    except UnicodeDecodeError:
-        raise BadInput("is not a text file", where=path, remedy="a plan is TOML") from None
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise BadInput(f"is not TOML: {error}", where=path, remedy="mend it there; a plan is TOML") from None
     if table.get("schema") != SCHEMA:
         raise BadInput(
             f"is no plan: its schema is not {SCHEMA!r}", where=path, remedy="make one with `openant sysid plan --out`"

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from openant_tools.errors import BadInput
-from openant_tools.files import write_text
+from openant_tools.files import read_json, write_text
 from openant_tools.robot.registers import EEPROM_END
 from openant_tools.virtual.servo import Snapshot
 from openant_tools.virtual.world import World
@@ -40,10 +40,10 @@ class EepromFile:
 
     def _read(self, world: World) -> dict[str, Snapshot]:
         try:
-            content = json.loads(self.path.read_text(encoding="utf-8"))
+            content = read_json(self.path, "remove it")
         except FileNotFoundError:
             return {}
-        except (OSError, ValueError) as error:
+        except OSError as error:
             raise BadInput(f"not a file of EEPROMs ({error})", where=self.path, remedy="remove it") from None
         snapshots: dict[str, Snapshot] = {}
         for joint, servo in zip(world.joints, world.servos, strict=True):

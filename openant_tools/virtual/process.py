@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import subprocess
 import sys
 import tempfile
@@ -14,6 +13,8 @@ from pathlib import Path
 import tomlkit
 
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.files import read_json
+from openant_tools.robot.config import read_document
 
 __all__ = ["VIRTUAL_DEFAULT", "clock_of_its_own", "placeable", "placed", "virtual_robot"]
 
@@ -115,8 +116,8 @@ def placed(source: str, setup: str, heading_rad: float = 0.0, *, doze: bool = Fa
 def _scenario(source: str) -> tomlkit.TOMLDocument:
     """A scenario as it stands; empty where it cannot be read: the robot itself will say what is wrong with it."""
     try:
-        return tomlkit.parse(Path(source).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomlkit.exceptions.TOMLKitError):
+        return read_document(Path(source).read_bytes(), source)
+    except (OSError, BadInput):
         return tomlkit.document()
 
 
@@ -137,10 +138,10 @@ def _await(process: subprocess.Popen[bytes], ready: Path, log: str) -> None:
 
 def _read(path: Path) -> Mapping[str, str | None]:
     try:
-        content = json.loads(path.read_text())
+        content = read_json(path, "name what `openant virtual start --ready-file` wrote")
         return {"bus": str(content["bus"]), **{key: content.get(key) for key in ("imu", "camera", "control")}}
     except FileNotFoundError:
         raise BadInput("there is no such ready file", where=path, remedy="start a virtual robot first") from None
-    except (ValueError, KeyError, TypeError):
+    except (OSError, KeyError, TypeError, AttributeError):
         remedy = "name what `openant virtual start --ready-file` wrote, or a scenario that ends with .toml"
         raise BadInput("this is no ready file of a virtual robot", where=path, remedy=remedy) from None

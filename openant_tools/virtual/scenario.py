@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from openant_tools.errors import BadInput
+from openant_tools.files import LARGEST_TOML, parse_toml, read_text
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.kit import KITS, home_angles
 from openant_tools.robot.servo import baud_code, servo_model
@@ -93,7 +93,7 @@ def load_scenario(path: Path, key_file: Path | None = None) -> Scenario:
         key_file = key_file or (Path(os.environ[KEY_VARIABLE]) if os.environ.get(KEY_VARIABLE) else None)
         if key_file is None:
             raise BadInput("is sealed", where=path, remedy=f"name its key by --key-file or {KEY_VARIABLE}")
-        table = tomllib.loads(open_sealed(table, read_key(key_file), path))
+        table = parse_toml(open_sealed(table, read_key(key_file), path), path)
     scenario = parse_scenario(table, str(path))
     scenario.sealed = sealed
     if scenario.eeprom is not None and not scenario.eeprom.is_absolute():
@@ -104,15 +104,10 @@ def load_scenario(path: Path, key_file: Path | None = None) -> Scenario:
 def read_scenario_file(path: Path) -> tuple[str, dict[str, Any]]:
     """The text of a scenario and the table in it as they stand, sealed or not; raises BadInput."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, LARGEST_TOML)
     except OSError as error:
         raise BadInput(error.strerror or str(error), where=path, remedy="name a scenario file") from None
-    except UnicodeDecodeError:
-        raise BadInput("is not a text file", where=path, remedy="a scenario is TOML") from None
-    try:
-        return text, tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise BadInput(f"is not TOML: {error}", where=path, remedy="mend it there; a scenario is TOML") from None
+    return text, parse_toml(text, path, "mend it there; a scenario is TOML")
 
 
 def seal_scenario(path: Path, key: bytes, out: Path) -> str:

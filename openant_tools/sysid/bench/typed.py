@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from openant_tools.errors import BadInput
+from openant_tools.files import read_text
 
 __all__ = ["typed_rows"]
 
@@ -18,12 +19,14 @@ def typed_rows(path: Path, columns: str) -> Iterator[tuple[str, list[str]]]:
         BadInput: there is no such file, or it is not text.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path)
     except FileNotFoundError:
         raise BadInput("there is no such file", where=path) from None
-    except UnicodeDecodeError:
-        raise BadInput("is not a text file", where=path, remedy=f"a CSV of {columns}") from None
-    for number, row in enumerate(csv.reader(text.splitlines()), 1):
-        cells = [cell.strip() for cell in row]
-        if any(cells) and not cells[0].startswith("#"):
-            yield f"{path}, line {number}", cells
+    number = 0
+    try:
+        for number, row in enumerate(csv.reader(text.splitlines()), 1):
+            cells = [cell.strip() for cell in row]
+            if any(cells) and not cells[0].startswith("#"):
+                yield f"{path}, line {number}", cells
+    except csv.Error as error:
+        raise BadInput(f"{error}", where=f"{path}, line {number + 1}", remedy=f"a CSV of {columns}") from None

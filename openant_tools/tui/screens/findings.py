@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from rich.text import Text
@@ -12,6 +11,8 @@ from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
 
 from openant_tools.bringup.walk import WALK
+from openant_tools.errors import BadInput
+from openant_tools.files import parse_json, read_text
 from openant_tools.procedure.finding import Finding
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.found import finding_lines
@@ -71,12 +72,12 @@ kept in the robot's `findings/`, one a run of a step. The passport is the page t
         prose.display = path.suffix == ".md"
         finding.display = not prose.display
         try:
-            content = path.read_text(encoding="utf-8")
+            content = read_text(path)
             if prose.display:
                 prose.show(content)
             else:
-                finding.update(_page(Finding.of_json(json.loads(content))))
-        except (OSError, ValueError, KeyError, TypeError) as error:
+                finding.update(_page(Finding.of_json(parse_json(content, path))))
+        except (OSError, BadInput, ValueError, KeyError, TypeError, AttributeError) as error:
             prose.display, finding.display = False, True
             finding.update(marked("fail", f"{path} cannot be read: {error}"))
 
