@@ -154,7 +154,7 @@ def _open_sealed(path: Path) -> Any:
 
 
 def _plan(folder: Path) -> None:
-    segment = '[[recording.segment]]\nkind = "rest"\nseconds = 5.0\n'
+    segment = '[[recording.segment]]\nkind = "Rest"\nseconds = 5.0\n'
     (folder / "plan.toml").write_text(f'schema = "openant.plan/1"\n[[recording]]\nsetup = "stand"\n{segment}')
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import itertools
 import json
 import logging
@@ -64,12 +63,11 @@ def test_a_thousand_mutations_of_each_file_are_read_or_refused(
             reader.read(path)
 
 
-@functools.cache
-def written(kind: str, temporary: pytest.TempPathFactory) -> tuple[Reader, Path, str]:
+@pytest.fixture
+def written(kind: str, tmp_path: Path) -> tuple[Reader, Path, str]:
     """A reader, a folder with a good file of its kind, and what stands in that."""
-    reader, folder = READERS[kind], temporary.mktemp("json")
-    reader.make(folder)
-    return reader, folder, (folder / reader.name).read_text()
+    READERS[kind].make(tmp_path)
+    return READERS[kind], tmp_path, (tmp_path / READERS[kind].name).read_text()
 
 
 JSON = st.recursive(
@@ -83,9 +81,9 @@ JSON = st.recursive(
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_json_of_another_structure_is_read_or_refused(
-    kind: str, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+    kind: str, written: tuple[Reader, Path, str], data: st.DataObject
 ) -> None:
-    reader, folder, good = written(kind, tmp_path_factory)
+    reader, folder, good = written
     content = json.loads(good)
     place: Any = content
     while True:  # somewhere in it stands something else

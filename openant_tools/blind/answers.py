@@ -14,7 +14,7 @@ import tomlkit
 
 from openant_tools.blind.draw import Answer
 from openant_tools.errors import BadInput
-from openant_tools.files import parse_toml, read_toml, write_text
+from openant_tools.files import parse_toml, read_toml, reading, write_text
 from openant_tools.virtual.seal import commitment_of, open_sealed, seal
 
 __all__ = ["OPEN", "SEALED", "committed", "open_answers", "read_answers", "write_answers"]
@@ -64,9 +64,9 @@ def read_answers(folder: Path, key: bytes | None, commitment: str) -> Mapping[st
             )
         with reading(folder, "its answers are not as they were written", "make the set anew"):
             return {file.parent.name: Answer.of(read_toml(file)) for file in found}
-    return {
-        name: Answer.of(one) for name, one in parse_toml(open_answers(path, key, commitment), path)["answer"].items()
-    }
+    plain = open_answers(path, key, commitment)
+    with reading(path, "its answers are not as they were written", "make the set anew"):
+        return {name: Answer.of(one) for name, one in parse_toml(plain, path)["answer"].items()}
 
 
 def open_answers(path: Path, key: bytes | None, commitment: str) -> str:

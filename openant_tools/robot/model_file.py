@@ -52,7 +52,9 @@ def _check(path: Path, main: Path, above: tuple[Path, ...]) -> int:
     try:
         tree = etree.parse(str(path), parser())
     except etree.XMLSyntaxError as error:
-        raise BadInput(f"not well-formed XML: {error.msg}", where=path, remedy="mend the file at that place") from None
+        raise BadInput(
+            f"MuJoCo cannot load it: not well-formed XML: {error.msg}", where=path, remedy="mend the file at that place"
+        ) from None
     declared = tree.docinfo.internalDTD
     if declared is not None and any(True for _ in declared.iterentities()):  # type: ignore[union-attr]  # its stub lacks it
         raise BadInput(
