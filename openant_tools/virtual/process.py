@@ -14,7 +14,6 @@ import tomlkit
 
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.files import read_json
-from openant_tools.robot.config import read_document
 
 __all__ = ["VIRTUAL_DEFAULT", "clock_of_its_own", "placeable", "placed", "virtual_robot"]
 
@@ -115,6 +114,8 @@ def placed(source: str, setup: str, heading_rad: float = 0.0, *, doze: bool = Fa
 
 def _scenario(source: str) -> tomlkit.TOMLDocument:
     """A scenario as it stands; empty where it cannot be read: the robot itself will say what is wrong with it."""
+    from openant_tools.robot.config import read_document  # manuals, which need none of it, open at once
+
     try:
         return read_document(Path(source).read_bytes(), source)
     except (OSError, BadInput):
