@@ -1102,6 +1102,9 @@ class Engine:
     def _do_write(self, number: int, command: messages.WriteRegister) -> messages.Reply:
         if command.register in ("torque_enable", "bus_watchdog"):
             raise BadInput(f"{command.register} is the engine's own", remedy="use `messages.Torque`")
+        if command.register.startswith("goal_") and not self._torque:
+            why = "" if self._trip is None else f": {self._trip.what}"
+            raise BadInput(f"torque is off{why}", remedy="switch it on first")
         seen = len(self._servos.journal)
         self._servos.write_counts(command.register, command.joint, command.counts)
         return messages.Reply(number, value=self._servos.journal[seen:])

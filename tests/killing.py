@@ -1,0 +1,175 @@
+"""Every command that moves, begun on a virtual robot in real time, and a process of it killed while it holds torque."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import click
+
+from openant_tools.cli import openant
+from openant_tools.cli.hardware import Moving
+from openant_tools.comms.clock import VirtualControl
+from openant_tools.robot.folder import create_robot
+from openant_tools.robot.joints import JOINTS
+from openant_tools.virtual.process import virtual_robot
+
+__all__ = ["ELSEWHERE", "WAYS", "NotBegun", "Victim", "Way", "moving_commands", "torque_after_kill"]
+
+
+class NotBegun(Exception):
+    """The command ended before a process of it could be killed: a busy host lets watchdogs trip."""
+
+
+Victim = Literal["command", "engine", "guardian"]
+#: s that a command may take to its first torque, on a machine that has much else to do
+BEGIN_S = 120.0
+
+STAND = "[camera]\npresent = false\n"
+LOOSE = f'{STAND}[robot]\nsetup = "loose"\n'
+NAMED = LOOSE + "".join(
+    f'[[servo]]\njoint = "{joint.name}"\nid = {joint.id}\nbaud = 1000000\nreturn_delay_time = 0\n'
+    for joint in JOINTS.values()
+)
+
+
+@dataclass(frozen=True)
+class Way:
+    """How a command is begun: the robot's scenario, and what follows the command's name; OUT is a new file."""
+
+    scenario: str
+    words: tuple[str, ...] = ()
+
+
+_OUT = ("--out", "OUT")
+#: command → how it is begun
+WAYS: Mapping[str, Way] = {
+    "calib estop": Way(LOOSE),
+    "calib ids": Way(LOOSE, ("--joint", "hip_rr")),
+    "calib centre": Way(NAMED, ("--joint", "hip_rr")),
+    "calib legs": Way(LOOSE.replace("loose", "stand"), ("--joint", "hip_rr")),
+    "calib comms": Way(STAND),
+    "calib thermal": Way(STAND),
+    "calib identify": Way(STAND),
+    "comms soak": Way(STAND, _OUT),
+    "thermal soak": Way(STAND, (*_OUT, "--load", "hang")),
+    "sysid record": Way(STAND, (*_OUT, "--protocol", "stand")),
+    "sysid scale": Way(STAND),
+}
+#: command → why it is not begun here; its engine is the one that the others are killed with
+ELSEWHERE: Mapping[str, str] = {
+    "bringup": "it runs the steps, each of which is here",
+    "check": "needs a robot with its bounds; it sweeps and records as `calib identify` does",
+    "calib zeros": "a minute of hands before torque",
+    "calib bounds": "a minute of hands before torque",
+    "calib arena": "needs a camera, which a shared machine renders slowly",
+    "sysid tilt": "needs somebody who tilts a plate",
+    "train sac": "walking needs camera and IMU: tests/test_hardware_env.py",
+    "train sarsa": "walking needs camera and IMU: tests/test_hardware_env.py",
+    "eval": "walking needs camera and IMU: tests/test_hardware_env.py",
+    "policies play": "walking needs camera and IMU: tests/test_hardware_env.py",
+    "policies rank": "walking needs camera and IMU: tests/test_hardware_env.py",
+}
+
+
+def moving_commands() -> list[str]:
+    """Every command of `openant` that is declared as one that moves."""
+
+    def walk(command: click.Command, path: tuple[str, ...]) -> Iterator[str]:
+        if isinstance(command, click.Group):
+            context = click.Context(command)
+            for name in command.list_commands(context):
+                inner = command.get_command(context, name)
+                assert inner is not None
+                yield from walk(inner, (*path, name))
+        elif isinstance(command, Moving):
+            yield " ".join(path)
+
+    return list(walk(openant, ()))
+
+
+def torque_after_kill(name: str, victims: tuple[Victim, ...], folder: Path) -> dict[Victim, float]:
+    """Begin a command, and kill one process of it after the other while it holds torque.
+
+    Returns:
+        victim → s until torque was off everywhere, or until another guardian was there, less the time that this process
+        was itself late.
+    """
+    way = WAYS[name]
+    scenario = folder / "scenario.toml"
+    scenario.write_text(way.scenario)
+    robot = create_robot(folder / "ant")
+    with virtual_robot(str(scenario), clock="real", camera=False) as found, contextlib.ExitStack() as stack:
+        ready = folder / "ready.json"
+        ready.write_text(json.dumps(dict(found)))
+        control = VirtualControl(str(found["control"]))
+        stack.callback(control.close)
+        words = [str(folder / "out.mcap") if word == "OUT" else word for word in way.words]
+        log = stack.enter_context((folder / "log").open("wb"))
+        command = subprocess.Popen(
+            [sys.executable, "-m", "openant_tools.cli", *name.split(), "--robot", str(robot.path), "--virtual", str(ready),
+             "--yes", *words], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+        )  # fmt: skip
+        stack.callback(command.wait)
+        stack.callback(command.kill)
+
+        def torque() -> bool:
+            return any(control.ask("state")["torque_enable"].values())
+
+        def after(done: Callable[[], bool], limit_s: float) -> float:
+            begin, late = time.monotonic(), 0.0
+            while not done():
+                before = time.monotonic()
+                if before - begin > limit_s or (limit_s == BEGIN_S and command.poll() is not None):
+                    kind = NotBegun if limit_s == BEGIN_S else AssertionError
+                    raise kind(f"{name}: not within {limit_s:g} s; " + (folder / "log").read_text()[-800:])
+                time.sleep(0.005)
+                late += max(0.0, time.monotonic() - before - 0.006)
+            return time.monotonic() - begin - late
+
+        took: dict[Victim, float] = {}
+        for victim in victims:
+            after(torque, BEGIN_S)
+            family = _family(command.pid)
+            if victim == "guardian" and not family["guardian"]:
+                raise AssertionError(f"{name}: torque is on and nobody guards it")
+            pid = family[victim]
+            os.kill(pid, signal.SIGKILL)
+            if victim == "guardian":
+                took[victim] = after(
+                    lambda gone=pid: _family(command.pid)["guardian"] not in (0, gone) or not torque(), 5.0
+                )
+            else:
+                took[victim] = after(lambda: not torque(), 5.0)
+        return took
+
+
+def _family(pid: int) -> dict[Victim, int]:
+    """The processes of a command by what they are; 0 for what is not there."""
+    family: dict[Victim, int] = {"command": pid, "engine": 0, "guardian": 0}
+    for role, parent, module in (
+        ("engine", pid, "openant_tools.comms.engine"), ("guardian", 0, "guardian.py")
+    ):  # fmt: skip
+        for child in _children(parent or family["engine"]):
+            with contextlib.suppress(OSError):
+                if module in Path(f"/proc/{child}/cmdline").read_text():
+                    family[role] = child  # type: ignore[index]
+    return family
+
+
+def _children(pid: int) -> list[int]:
+    """Of all threads: a procedure may have started its engine in one of its own."""
+    children = list[int]()
+    for thread in Path(f"/proc/{pid}/task").glob("*/children"):
+        with contextlib.suppress(OSError):
+            children += [int(word) for word in thread.read_text().split()]
+    return children

@@ -1,0 +1,130 @@
+"""Whatever switches torque on is guarded: every command that moves, and each process of it killed while it holds."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import click
+import pytest
+from killing import ELSEWHERE, WAYS, NotBegun, Victim, moving_commands, torque_after_kill
+
+from openant_tools.cli.hardware import may_move
+from openant_tools.comms.clock import VirtualControl
+from openant_tools.comms.messages import EngineConfig
+from openant_tools.errors import BadInput
+from openant_tools.virtual.process import virtual_robot
+
+#: the issue's own bound
+OFF_S = 0.5
+
+
+def test_every_command_that_moves_says_how_it_is_begun_here() -> None:
+    assert sorted(moving_commands()) == sorted([*WAYS, *ELSEWHERE])
+
+
+def test_a_command_that_moves_without_being_declared_cannot() -> None:
+    @click.command()
+    def sneaky() -> None:
+        may_move(yes=True)
+
+    with pytest.raises(RuntimeError, match="`sneaky` moves: it must be a `Moving` command"):
+        sneaky.main([], prog_name="sneaky", standalone_mode=False)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are found by /proc")
+def test_a_killed_process_of_any_command_that_moves_leaves_torque_off(tmp_path: Path) -> None:
+    """Each loses its guardian, who is replaced, and then its engine or itself; benchmarks/reliability_door.py does all."""
+
+    def kill(k: int, name: str) -> dict[Victim, float]:
+        victims: tuple[Victim, ...] = ("guardian", "command" if k % 2 else "engine")
+        for tries in (1, 0):
+            folder = tmp_path / f"{name.replace(' ', '-')}-{tries}"
+            folder.mkdir()
+            try:
+                return torque_after_kill(name, victims, folder)
+            except NotBegun:
+                if not tries:
+                    raise
+        raise AssertionError
+
+    with ThreadPoolExecutor(4) as pool:
+        took = dict(zip(WAYS, pool.map(kill, range(len(WAYS)), WAYS), strict=True))
+    late = {name: times for name, times in took.items() if max(times.values()) > OFF_S}
+    assert not late, took
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf"), 0.01, 3.0])
+def test_a_watchdog_that_would_not_guard_is_refused_where_something_moves(seconds: float) -> None:
+    with pytest.raises(BadInput, match=r"Bus Watchdog \(watchdog_s\) .* give it 0.02 to 2.54 s"):
+        EngineConfig("/dev/null", (), watchdog_s=seconds)
+    assert EngineConfig("/dev/null", (), watchdog_s=0.0, still=True).still
+
+
+HOLDING = textwrap.dedent(
+    """
+    import sys
+    from openant_tools.cli import main, openant
+    from openant_tools.cli.hardware import Moving, engine_config, may_move
+    from openant_tools.comms import messages
+    from openant_tools.comms.engine_process import EngineProcess
+
+    @openant.command("hold", cls=Moving)
+    def hold():
+        may_move(True)
+        with engine_config(None, sys.argv[2], sys.argv[3]) as config, EngineProcess(config) as engine:
+            engine.ask(messages.Torque(True))
+            engine.ask(messages.Hold(300.0))
+
+    type(openant).get_command = lambda self, context, name: self.commands[name]
+    main(["hold"])
+    """
+)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="a suspended parent is seen by /proc")
+def test_suspension_and_a_lost_terminal_end_motion_first(tmp_path: Path) -> None:
+    (tmp_path / "stand.toml").write_text("[camera]\npresent = false\n")
+    with virtual_robot(str(tmp_path / "stand.toml"), clock="real", camera=False) as found:
+        control = VirtualControl(str(found["control"]))
+        ready = tmp_path / "ready.json"
+        ready.write_text(json.dumps(dict(found)))
+
+        def until(done: Callable[[], bool], patience_s: float = 60.0) -> None:
+            give_up = time.monotonic() + patience_s
+            while not done():
+                assert time.monotonic() < give_up
+                time.sleep(0.01)
+
+        def torque() -> bool:
+            return any(control.ask("state")["torque_enable"].values())
+
+        def holding() -> subprocess.Popen[bytes]:
+            words = [sys.executable, "-c", HOLDING, "hold", str(found["bus"]), str(ready)]
+            process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+            until(torque)
+            return process
+
+        for number in (signal.SIGTSTP, signal.SIGSTOP):
+            suspended = holding()
+            os.kill(suspended.pid, number)
+            until(lambda: not torque(), 2.0)
+            os.kill(suspended.pid, signal.SIGCONT)
+            assert suspended.wait(30.0) in (130, 1, 2), "it does not go on when it comes back"
+            assert not torque()
+        unread = holding()
+        assert unread.stdout is not None
+        unread.stdout.close()
+        until(lambda: not torque(), 2.0)
+        assert unread.wait(30.0) == 130
+        control.close()
