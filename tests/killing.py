@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -145,12 +146,15 @@ def torque_after_kill(name: str, victims: tuple[Victim, ...], folder: Path) -> d
             pid = family[victim]
             os.kill(pid, signal.SIGKILL)
             if victim == "guardian":
-                took[victim] = after(
-                    lambda gone=pid: _family(command.pid)["guardian"] not in (0, gone) or not torque(), 5.0
-                )
+                took[victim] = after(partial(_replaced, command.pid, pid, torque), 5.0)
             else:
                 took[victim] = after(lambda: not torque(), 5.0)
         return took
+
+
+def _replaced(command: int, gone: int, torque: Callable[[], bool]) -> bool:
+    """Whether another guardian is there instead of the one that is gone, or torque is off."""
+    return _family(command)["guardian"] not in (0, gone) or not torque()
 
 
 def _family(pid: int) -> dict[Victim, int]:
