@@ -71,7 +71,7 @@ RECORDED_REGISTERS = (
 WATCHDOG_FIRMWARE = 38
 #: Silence of this process, s, after which its guardian switches torque off, and how often it says that it lives.
 PATIENCE_S, BEAT_S = 1.0, 0.1
-#: s. A guardian that is ended so soon after it was started: another would fare no better.
+#: s. Guardians that are ended so soon after each other: another would fare no better.
 GUARDIAN_LIFE_S = 1.0
 #: Bits with which a servo switches torque on by itself (firmware ≥ 45): at a goal, and as it starts.
 UNASKED_FIRMWARE, UNASKED = 45, {"drive_mode": 8, "startup_configuration": 1}
@@ -136,8 +136,8 @@ class Engine:
         #: number of the goal that this cycle's command belongs to, 0 for none
         self._playing = 0
         self._guardian: subprocess.Popen[bytes] | None = None
-        #: when it was started, when we last looked after it, and when we last said to it how we are, s of this computer
-        self._guarded_since = self._alive_at = self._beat_at = -np.inf
+        #: when it was replaced last, when we last looked after it, and when we last said to it how we are, s of this computer
+        self._replaced_at = self._alive_at = self._beat_at = -np.inf
         #: whether servos without a Bus Watchdog were named
         self._unwatched_told = False
         self._lost = False
@@ -356,7 +356,7 @@ class Engine:
             ) from None
         assert self._guardian.stdin is not None
         os.set_blocking(self._guardian.stdin.fileno(), False)
-        self._guarded_since, self._beat_at = time.monotonic(), -np.inf
+        self._beat_at = -np.inf
 
     @property
     def _patience_s(self) -> float:
@@ -402,20 +402,21 @@ class Engine:
         if gone.stdin is not None:
             gone.stdin.close()
         self._guardian = None
-        lived = time.monotonic() - self._guarded_since
+        now, before = time.monotonic(), self._replaced_at
+        self._replaced_at = now
         why = ""
         try:
             self._start_guardian()
         except HardwareFault as error:
             why = error.what
-        if not why and lived < GUARDIAN_LIFE_S and self._torque:
+        if not why and now - before < GUARDIAN_LIFE_S and self._torque:
             why = "so was the one before it"
         if why and self._torque:
             words = f"the guardian was ended from outside, and {why}"
             self._stopped(Trip(words, "find out what ends processes here", cause=StopCause.GUARDIAN))
         else:
-            now = f"{why}: torque stays off" if why else "another one guards now"
-            self._notice(f"the guardian that switches torque off if this program dies was ended from outside: {now}")
+            then = f"{why}: torque stays off" if why else "another one guards now"
+            self._notice(f"the guardian that switches torque off if this program dies was ended from outside: {then}")
 
     def _beat(self) -> None:
         """Tell the guardian whether torque is on."""
