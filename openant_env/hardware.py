@@ -163,7 +163,7 @@ class AntHardware(AntBase):
                 imu=imu or found.get("imu"),
                 camera=found.get("camera") if camera is None else camera,
                 control=found.get("control"),
-                journal=None if folder is None else folder.journal,
+                folder=folder,
             )
             kept = recordings if recordings is not None else None if folder is None else folder.recordings
             facts = Facts(

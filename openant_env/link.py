@@ -21,9 +21,11 @@ from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.comms.restart import POSE_RAD, MotionStopped, Restart, StopCause
 from openant_tools.comms.setup import camera_of_robot, config_of_robot, config_of_unknown_robot, imu_of_robot, open_bus
+from openant_tools.comms.state import passport_registers
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.recording.run import Facts
 from openant_tools.robot.config import RobotConfig
+from openant_tools.robot.folder import RobotFolder
 
 __all__ = ["ENGINE_HZ", "RobotLink", "engine_config", "engine_rate"]
 
@@ -57,14 +59,14 @@ def engine_config(
     imu: str | None = None,
     camera: str | int | None = None,
     control: str | None = None,
-    journal: Path | None = None,
+    folder: RobotFolder | None = None,
 ) -> EngineConfig:
     """The engine for walking: bus, IMU and camera, which a learner needs all three.
 
     Args:
         robot: its robot.toml; None for a virtual robot that nobody has described.
         bus, imu, camera, control: in place of what robot.toml names.
-        journal: file of the robot's EEPROM writes.
+        folder: of the robot, whose journal takes EEPROM writes and whose passport says what is set in its servos.
 
     Raises:
         BadInput, HardwareFault: one of the three is not known or not there.
@@ -86,7 +88,9 @@ def engine_config(
                 where="robot.toml",
                 remedy=f"set {port} and run `openant calib {step}`",
             )
-    more = {**seen, "rate_hz": rate_hz, "journal": None if journal is None else str(journal)}
+    more: dict[str, Any] = {**seen, "rate_hz": rate_hz}
+    if folder is not None:
+        more |= {"journal": str(folder.journal), "passport": passport_registers(folder)}
     if robot is None:
         assert bus is not None  # of a virtual robot
         return config_of_unknown_robot(bus, control, **more)

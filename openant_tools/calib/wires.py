@@ -20,6 +20,7 @@ from openant_tools.comms.protocol2 import BROADCAST, write
 from openant_tools.comms.servos import Servo, Servos
 from openant_tools.comms.setup import config_of_robot, find_bus, imu_of_robot, open_bus
 from openant_tools.comms.silence import explaining
+from openant_tools.comms.state import passport_registers
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.procedure.step import Bench
@@ -121,7 +122,8 @@ def _servo(motor: Motor) -> Servo:
 def engine_config(bench: Bench, **more: object) -> EngineConfig:
     """The engine's config for this robot, its IMU beside the bus where it is known."""
     config = bench.folder.config()
-    more = {"imu": imu_of_robot(config, bench.imu), "journal": str(bench.folder.journal), **more}
+    passport = passport_registers(bench.folder)
+    more = {"imu": imu_of_robot(config, bench.imu), "journal": str(bench.folder.journal), "passport": passport, **more}
     return config_of_robot(config, bench.bus, control=bench.control, **more)
 
 

@@ -82,6 +82,7 @@ def engine_config(
         find_bus,
         imu_of_robot,
     )
+    from openant_tools.comms.state import passport_registers
 
     with contextlib.ExitStack() as stack:
         if folder is not None:
@@ -98,7 +99,7 @@ def engine_config(
         if camera:
             more["camera"] = camera_of_robot(described, found.get("camera"))
         if described is not None:
-            yield config_of_robot(described, port, control=control, **more)
+            yield config_of_robot(described, port, control=control, passport=passport_registers(folder), **more)
         else:
             yield config_of_unknown_robot(find_bus(port), control, **more)
 

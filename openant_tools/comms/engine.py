@@ -35,6 +35,7 @@ from openant_tools.comms.bus import Answer, Bus, Timing
 from openant_tools.comms.checked import checked
 from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
 from openant_tools.comms.faults import BrokenAnswer, Cause, NeverSilent, NoAnswer
+from openant_tools.comms.following import Behind, Following
 from openant_tools.comms.guards import Trip, Watch
 from openant_tools.comms.lateness import REMEDY
 from openant_tools.comms.line import PortGone, SerialLine
@@ -45,6 +46,16 @@ from openant_tools.comms.restart import StopCause
 from openant_tools.comms.ring import ERR_CODES, Ring
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Block, Servo, Servos
 from openant_tools.comms.silence import diagnose, explained, reader_words
+from openant_tools.comms.state import (
+    EXTENDED_POSITION,
+    POSITION,
+    Difference,
+    differences,
+    expected,
+    read_state,
+    refusal,
+    stopping,
+)
 from openant_tools.comms.thinning import Thinning
 from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
@@ -61,12 +72,6 @@ __all__ = ["Engine", "main"]
 
 Array = NDArray[np.float64]
 
-#: Registers kept with every recording: what decides how a servo moves and answers.
-RECORDED_REGISTERS = (
-    "firmware_version", "return_delay_time", "drive_mode", "operating_mode", "homing_offset", "temperature_limit",
-    "pwm_limit", "velocity_limit", "position_d_gain", "position_i_gain", "position_p_gain", "feedforward_2nd_gain",
-    "feedforward_1st_gain", "profile_acceleration", "profile_velocity",
-)  # fmt: skip
 #: From this firmware on servos have a Bus Watchdog.
 WATCHDOG_FIRMWARE = 38
 #: Silence of this process, s, after which its guardian switches torque off, and how often it says that it lives.
@@ -83,8 +88,6 @@ REOPEN_PERIOD_S = 0.5
 RAW_PERIOD_S = 0.05
 #: The IMU's port is left alone for so long before a cycle begins.
 IMU_SLACK_S = 0.3e-3
-#: Operating modes (register 11).
-POSITION, EXTENDED_POSITION = 3, 4
 _ERR_CODE = {word: code for code, word in enumerate(ERR_CODES)}
 _UNANSWERED = {cause: RecordedAnswer(None, False, cause.value) for cause in Cause}
 
@@ -143,6 +146,11 @@ class Engine:
         self._lost = False
         #: the line talks without a pause, and it has been told
         self._restless = False
+        #: joint → register → counts that a face has set, in place of what was expected
+        self._ours: dict[str, dict[str, int]] = {joint: dict(table) for joint, table in config.registers.items()}
+        self._differences: list[Difference] = []
+        #: joints that stand where they were not sent, rad from there, told and gone on with
+        self._behind: dict[str, float] = {}
         self._imu: BodyImu | None = None
         self._pose_lost = ""
         self._camera: BodyCamera | None = None
@@ -213,7 +221,12 @@ class Engine:
         for write in servos.journal:
             self._notice(f"{write.joint} (id {write.id}): {write.register} changed from {write.old} to {write.new}")
         self._servos = self._on_this_turn()
-        self._registers = self._read_registers()
+        self._read_registers()
+        for difference in self._differences:
+            self._notice(str(difference))
+        self._following: Following | None = None
+        if config.guards.behind_rad is not None:
+            self._following = Following(self._servos.servos, config.guards.behind_rad, self._registers)
         hottest = {joint: float(table["temperature_limit"]) for joint, table in self._registers.items()}
         self._watch = Watch(config.guards, self._servos.servos, config.limits_rad, hottest)
         self._period = 1.0 / config.rate_hz
@@ -320,18 +333,41 @@ class Engine:
         if self.config.journal is not None:
             Journal(Path(self.config.journal)).append(change, "engine")
 
-    def _read_registers(self) -> dict[str, dict[str, int]]:
-        table: dict[str, dict[str, int]] = {joint: {} for joint in self._servos.joints}
-        for register in RECORDED_REGISTERS:
-            for joint, counts in self._servos.read_all(register).items():
-                table[joint][register] = counts
-        return table
+    def _read_registers(self) -> None:
+        """What is set in the servos now, and how it differs from what should be."""
+        config, servos = self.config, self._servos.servos
+        self._registers = read_state(self._servos)
+        wanted = {
+            servo.joint: expected(
+                servo.model, ours=self._ours.get(servo.joint, {}), passport=config.passport.get(servo.joint, {})
+            )
+            for servo in servos
+        }
+        for joint in wanted:  # set when something is to move, whatever stands there now
+            if "pwm_limit" not in self._ours.get(joint, {}):
+                wanted[joint].pop("pwm_limit", None)
+        self._differences = differences(servos, self._registers, wanted, config.limits_rad)
+
+    def _look_at_registers(self, *, moves: bool) -> None:
+        """Read what is set in the servos anew; raises HardwareFault where that makes a motion wrong or unsafe."""
+        before = set(self._differences)
+        self._read_registers()
+        if self._following is not None:
+            self._following.take(self._registers)
+        for difference in self._differences:
+            if difference not in before:
+                self._notice(str(difference))
+        wrong = stopping(self._differences)
+        if wrong and moves and not self.config.anyway:
+            what, remedy = refusal(wrong)
+            raise HardwareFault(what, where=self.config.port, remedy=remedy)
 
     def _description(self) -> dict[str, Any]:
         return {
             "joints": self._servos.joints,
             "firmware": {servo.joint: servo.firmware for servo in self._servos.servos},
             "registers": self._registers,
+            "differences": self._differences,
             "position": self._measure(),
             "stepped": self.clock.stepped,
             "eeprom_writes": self._eeprom_writes,
@@ -614,11 +650,39 @@ class Engine:
                 self._notice(str(fault))
         self._restless = self._bus.restless
         if self._torque:
-            trip = self._watch.check(t, answers) or self._stood_still(t - before)
+            near, trip = self._follows(t, answers, ended)
+            trip = self._watch.check(t, answers) or self._stood_still(t - before) or trip
             if trip is not None:
                 self._stopped(self._explained(trip))
+            elif ended is not None and ended.arrives and not near:
+                # It holds its last row until all joints are there, or one has stood away from it for too long.
+                self._motions.appendleft(ended)
+                return
         if ended is not None:
             self._motion_ended(ended)
+
+    def _follows(
+        self, t: float, answers: list[tuple[Answer, Block | None]], ended: Motion | None
+    ) -> tuple[bool, Trip | None]:
+        """Whether all joints are near where they were sent; the reason to stop where one has stayed away from it."""
+        motion = ended or (self._motions[0] if self._motions else None)
+        if self._following is None or self._goal is None or motion is None or not motion.judged:
+            return True, None
+        near, behind = self._following.check(t, self._goal, self._limp, answers)
+        if behind is None or not self.config.anyway:
+            return near, None if behind is None else behind.trip
+        self._note_behind(behind)
+        return True, None
+
+    def _note_behind(self, behind: Behind) -> None:
+        """Go on, since the builder said so, and keep it with the recording; once for each joint."""
+        joint, away = behind.servo.joint, abs(behind.command_rad - behind.angle_rad)
+        if joint in self._behind:
+            return
+        self._behind[joint] = round(away, 4)
+        self._notice(f"{behind.trip.what}; going on anyway")
+        if self._recorder is not None:
+            self._recorder.event("behind", joint=joint, away_rad=away)
 
     def _make_sure(self, let_go: list[str]) -> None:
         """Joints that were let go must be without torque, or the recording lies."""
@@ -683,6 +747,8 @@ class Engine:
             self._servos.torque_off_now()
             if trip.examine == "silence":
                 return self._who_is_silent(trip)
+            if trip.examine == "behind":
+                return self._why_behind(trip)
             errors = self._servos.hardware_errors(trip.joint)
         except HardwareFault:
             return trip
@@ -700,6 +766,14 @@ class Engine:
         if hasattr(self, "_servos"):
             self._torque_off()
         return explained(self._bus, fault, self.config.chain)
+
+    def _why_behind(self, trip: Trip) -> Trip:
+        """The register that keeps a joint from where it was sent, where one differs."""
+        self._read_registers()
+        mine = [one for one in self._differences if one.joint == trip.joint]
+        if not mine:
+            return trip
+        return replace(trip, what=f"{trip.what}; {mine[0].what}", remedy=mine[0].mended)
 
     def _who_is_silent(self, trip: Trip) -> Trip:
         """Each servo asked alone: in a common read those behind a silent one wait for it and seem silent, too."""
@@ -947,6 +1021,7 @@ class Engine:
     def _switch_on(self) -> None:
         """Torque on where the robot stands, guarded before: goals are set to what is measured before and after."""
         servos = self._servos
+        self._look_at_registers(moves=True)
         try:
             self._guard()
             # A motion that was gentle, and was killed, has left its limit behind.
@@ -968,6 +1043,9 @@ class Engine:
         self._beat()
         self._asked_at = self.clock.now()
         self._watch.reset(self._asked_at)
+        if self._following is not None:
+            self._following.reset()
+        self._behind = {}
 
     def _guard(self) -> None:
         """What must be before torque is: a guardian, and the Bus Watchdog of every servo that has one, armed."""
@@ -996,8 +1074,10 @@ class Engine:
         if isinstance(command, messages.Hold):
             motions = [hold(self._goal, command.seconds, rate)]
         elif isinstance(command, messages.Ramp):
+            self._within_their_limits(command.target[None, :])
             motions = [ramp(self._goal, command.target, rate)]
         else:
+            self._within_their_limits(command.commands)
             motions = play(self._goal, command.commands, rate, command.name, command.limp)
         self._motions.extend(motions)
         self._waiting.append((number, motions[-1]))
@@ -1015,12 +1095,37 @@ class Engine:
     def _do_goal(self, number: int, command: messages.Goal) -> None:
         if self._refused_limp(number):
             return
+        self._within_their_limits(command.target[None, :])
         rows = held(command.target, command.seconds, self.config.rate_hz)
-        motion = Motion("goal", rows, number=number, measured=command.measured)
+        motion = Motion("goal", rows, number=number, measured=command.measured, judged=False)
         motion.agent = command.agent
         self._motions.clear()
         self._motions.append(motion)
         self._waiting.append((number, motion))
+
+    def _within_their_limits(self, commands: Array) -> None:
+        """In position mode a servo refuses goals beyond its own limits, and nobody would be told."""
+        if self.config.anyway:
+            return
+        for k, servo in enumerate(self._servos.servos):
+            table = self._registers[servo.joint]
+            if table["operating_mode"] != POSITION:
+                continue
+            ends = commands[:, k].min(), commands[:, k].max()
+            scale = servo.model.registers["goal_position"].scale
+            counts = [(round(servo.to_servo(angle) / scale), angle) for angle in ends]
+            for name, beyond in (
+                ("min_position_limit", [angle for count, angle in counts if count < table["min_position_limit"]]),
+                ("max_position_limit", [angle for count, angle in counts if count > table["max_position_limit"]]),
+            ):
+                if beyond:
+                    end = servo.to_joint(table[name] * scale)
+                    raise HardwareFault(
+                        f"{servo.joint} (id {servo.id}) would be sent to {beyond[0]:.3f} rad, but refuses goals beyond "
+                        f"{end:.3f} rad: its {name} is {table[name]}",
+                        where=self.config.port,
+                        remedy="widen it by `openant calib inventory`, or narrow this joint's limits in robot.toml",
+                    )
 
     def _do_record(self, number: int, command: messages.Record) -> messages.Reply:
         if self._recorder is not None:
@@ -1040,8 +1145,13 @@ class Engine:
         facts = replace(command.facts, joints=self._servos.joints, extra={**extra, **command.facts.extra})
         if command.thin_s is not None:
             facts = replace(facts, extra={**facts.extra, "rate_hz": self.config.rate_hz, "thinned_s": command.thin_s})
-        self._registers = self._read_registers()
         self._unrecorded = None
+        self._look_at_registers(moves=self._torque)
+        if self._differences:
+            told = [difference.as_fact() for difference in self._differences]
+            facts = replace(facts, extra={**facts.extra, "differences": told})
+        if self.config.anyway:
+            facts = replace(facts, extra={**facts.extra, "anyway": True, "behind_rad": dict(self._behind)})
         continued = None
         if command.resume:
             continued = continuation(command.path, channels, self.clock.now(), wall_counts=not self.clock.stepped)
@@ -1108,6 +1218,7 @@ class Engine:
             raise BadInput(f"torque is off{why}", remedy="switch it on first")
         seen = len(self._servos.journal)
         self._servos.write_counts(command.register, command.joint, command.counts)
+        self._ours.setdefault(command.joint, {})[command.register] = command.counts
         return messages.Reply(number, value=self._servos.journal[seen:])
 
     def _statistics(self) -> dict[str, object]:

@@ -27,6 +27,8 @@ class Guards:
         silent_s: a servo that does not answer for so long is lost, once it has been asked `silent_cycles` times in
             vain, too: a noisy line loses answers by chance, a busy host asks seldom.
         lost_s: a servo that does not answer for so long is lost, however often it was asked.
+        behind_rad: how far a joint may stand from a command that rests, beside what its gain explains; None where something may
+            rightly hold it back (a scale, a stop).
     """
 
     angle_margin_rad: float | None = 0.2
@@ -39,6 +41,7 @@ class Guards:
     silent_s: float | None = 0.25
     silent_cycles: int = 20
     lost_s: float = 0.4
+    behind_rad: float | None = 0.1
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ class Trip:
     what: str
     remedy: str
     joint: str | None = None
-    examine: Literal["", "alert", "silence"] = ""
+    examine: Literal["", "alert", "silence", "behind"] = ""
     cause: StopCause = StopCause.UNKNOWN
 
 

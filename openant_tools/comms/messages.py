@@ -79,6 +79,8 @@ class EngineConfig:
             off, only where nothing moves.
         journal: file that every EEPROM write stands in before it is sent.
         still: nothing will move: torque is refused, and no register is set for a motion.
+        passport: joint → register → counts as the robot's passport has them; see `state.passport_registers`.
+        anyway: move although registers differ from what is expected or joints do not follow; recordings say so.
 
     Raises:
         BadInput: servos could move, and their watchdog would not stop them, or at once.
@@ -99,6 +101,8 @@ class EngineConfig:
     chain: tuple[tuple[str, ...], ...] = ()
     journal: str | None = None
     still: bool = False
+    passport: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    anyway: bool = False
 
     def __post_init__(self) -> None:
         seconds = self.watchdog_s

@@ -30,6 +30,8 @@ class Motion:
         number: of the command that it came with, for those that telemetry is to tell apart.
         measured: whether where the joints are is to be read once more when it has ended.
         agent: s, when the observation was made and the action chosen that this carries out; None where nobody said.
+        arrives: whether it has ended only when the joints are there.
+        judged: whether joints that do not go where they are sent stop it; a learner may push where it likes.
     """
 
     name: str
@@ -39,6 +41,8 @@ class Motion:
     number: int = 0
     measured: bool = True
     agent: tuple[float, float] | None = None
+    arrives: bool = False
+    judged: bool = True
 
     @property
     def ended(self) -> bool:
@@ -64,7 +68,7 @@ def ramp(start: Array, end: Array, rate_hz: float, *, speed_rad_s: float = RAMP_
     distance = float(np.abs(end - start).max())
     seconds = max(_PEAK_OVER_MEAN * distance / speed_rad_s, SHORTEST_RAMP_S)
     share = _minimum_jerk(np.arange(1, round(seconds * rate_hz) + 1) / round(seconds * rate_hz))
-    return Motion("ramp", start + share[:, None] * (end - start))
+    return Motion("ramp", start + share[:, None] * (end - start), arrives=True)
 
 
 def hold(position: Array, seconds: float, rate_hz: float) -> Motion:

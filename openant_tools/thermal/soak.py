@@ -290,6 +290,8 @@ def soak(
     joints = tuple(servo.joint for servo in config.servos)
     before = _so_far(out) if resume else _SoFar()
     played = _commands(plan, joints, config)
+    if plan.load == "stall":  # pressed against what holds it
+        config = replace(config, guards=replace(config.guards, behind_rad=None))
     with EngineProcess(config) as engine:
         stepped = bool(engine.description["stepped"])
         limit = engine.ask(messages.ReadRegister("temperature_limit"))

@@ -12,6 +12,7 @@ from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig, Notice, Stopped
 from openant_tools.comms.release import release_all
 from openant_tools.comms.setup import config_of_robot, config_of_unknown_robot, find_bus, imu_of_robot
+from openant_tools.comms.state import passport_registers
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.procedure.step import Bench
 from openant_tools.robot.config import CONFIG_NAME
@@ -166,7 +167,7 @@ class Session:
         else:
             robot = folder.config()
             journal = str(folder.journal)
-            more = {"imu": imu_of_robot(robot, imu), "journal": journal, "still": True}
+            more = {"imu": imu_of_robot(robot, imu), "journal": journal, "still": True, "passport": passport_registers(folder)}
             config = config_of_robot(robot, port, control=control, **more)
         return config
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -123,7 +123,8 @@ def press(
     readings: list[DutyReading] = []
     weighings: list[Weighing] = []
     deflections = pressing.deflections_rad
-    with EngineProcess(config) as engine:
+    # The scale is to hold the joint back.
+    with EngineProcess(replace(config, guards=replace(config.guards, behind_rad=None))) as engine:
         heed(engine, notice)
         if journal is not None:
             append_writes(journal, engine.description["eeprom_writes"], "sysid scale")
