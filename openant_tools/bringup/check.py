@@ -1,6 +1,6 @@
 """The daily check, two minutes before a session: what is not as it was when the passport was written, and what to look at.
 
-Bus, supply, temperatures and IMU are read; then the slow sweep of the step Observation bounds is made again. Friction,
+Bus, registers, supply, temperatures and IMU are read; then the slow sweep of the step Observation bounds is made again. Friction,
 a leg's weight and both stops of every joint are compared with what stood then: a joint that grew stiff, a foot that was
 lost, a horn that slipped and a plug that works itself loose each change one of them and leave the others alone.
 """
@@ -8,14 +8,15 @@ lost, a horn that slipped and a plug that works itself loose each change one of 
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Collection, Generator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from openant_tools.bringup.gap_check import gap_by_joint
 from openant_tools.bringup.relay import relayed
 from openant_tools.calib.inventory import silence_words
-from openant_tools.calib.sweep import JointSweep, analyse, joint_sweep_of, play_watched, sweep
+from openant_tools.calib.sweep import FOLLOWED, JointSweep, analyse, joint_sweep_of, play_watched, sweep
 from openant_tools.calib.wires import engine_config, opened_bus, opened_imu, robot_servos
 from openant_tools.comms import messages
 from openant_tools.comms.body_imu import rotation
@@ -23,6 +24,7 @@ from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.imu import STANDARD_GRAVITY
 from openant_tools.comms.lateness import REMEDY, losses
 from openant_tools.comms.servos import Servos
+from openant_tools.comms.state import BY_FACTORY, differences_of_robot, passport_registers, read_state, stopping
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.gap.measure import measure
 from openant_tools.procedure.finding import Evidence, Finding, latest
@@ -34,7 +36,7 @@ from openant_tools.robot.joints import JOINTS
 from openant_tools.sysid.excitation import CommandSpace
 from openant_tools.sysid.protocols import protocol
 
-__all__ = ["changed", "check", "loose"]
+__all__ = ["changed", "check", "loose", "unjudged"]
 
 COMMAND = "openant check"
 #: Friction: grown by this factor and by more than the sweep repeats to. Doubled friction is far beyond both.
@@ -80,16 +82,31 @@ def check(bench: Bench) -> Procedure:
             remedy="`openant calib bounds` keeps what is healthy",
         )
     baseline = {joint: joint_sweep_of(one) for joint, one in bounds.data["sweep"].items()}
-    evidence, problems = list[Evidence](), list[str]()
+    evidence, problems, unsure = list[Evidence](), list[str](), list[str]()
     for line in START_LIST:
         if (yield Ask(f"Is it so: {line}?", ("yes", "no"), default="yes")) != "yes":
             problems.append(f"start list: it is not so that {line} → see to it first")
     if problems:
         return _finding(problems, evidence, {})
     yield Progress(0.0, "bus, supply, temperatures")
-    problems += _at_rest(bench, config, evidence)
+    state: dict[str, dict[str, int]] = {}
+    problems += _at_rest(bench, config, evidence, state)
     if problems:
         return _finding(problems, evidence, {})
+    # Before hardware is blamed: registers that other software left explain most of what a sweep can show.
+    odd = differences_of_robot(robot_servos(config), state, config, passport_registers(bench.folder))
+    problems += [f"{one.joint}: {one.reads} → {one.mended}" for one in odd if one.stops or one.by != BY_FACTORY]
+    if stopping(odd):
+        joints = ", ".join(dict.fromkeys(one.joint for one in stopping(odd)))
+        return _finding(
+            problems,
+            evidence,
+            {},
+            [f"friction, weight and stops, because the registers of {joints} differ: nothing moved"],
+        )
+    for difference in odd:
+        if difference.by == BY_FACTORY:
+            yield Say(str(difference), "warn")
     outside: dict[str, float] = {}
     yield Progress(0.05, "IMU")
     problems += _imu(bench, config, evidence)
@@ -105,13 +122,13 @@ def check(bench: Bench) -> Procedure:
     limits = {motor.joint: (motor.min_rad, motor.max_rad) for motor in config.motors.values()}
     now = analyse(run, limits)
     problems += changed(baseline, now)
+    unsure += unjudged(baseline, now)
     problems += loose(_lost(run), config.bus.chain)
     problems += yield from _of_this_computer(run)
     problems += _warm_or_weak(now, config)
     for joint, one in now.items():
-        evidence.append(
-            Evidence(f"friction of {joint}", one.friction_nm, "N·m", f"slow sweep; then {baseline[joint].friction_nm}")
-        )
+        then = baseline[joint].friction_nm if joint in baseline else None
+        evidence.append(Evidence(f"friction of {joint}", _measured(one.friction_nm), "N·m", f"slow sweep; then {then}"))
     try:
         twitch = yield from _twitch(bench)
     except HardwareFault as fault:
@@ -119,7 +136,8 @@ def check(bench: Bench) -> Procedure:
     else:
         problems += loose(_lost(twitch), config.bus.chain, problems)
         problems += yield from _of_this_computer(twitch)
-        problems += yield from _against_model(bench, twitch, evidence, problems)
+        named = {*(line.partition(":")[0] for line in problems), *(difference.joint for difference in odd)}
+        problems += yield from _against_model(bench, twitch, evidence, unsure, named)
         outside = _outside(twitch, config)
         for name, share in outside.items():
             low, high = config.observation[name]
@@ -129,8 +147,42 @@ def check(bench: Bench) -> Procedure:
     for line in BEFORE_A_SESSION:
         yield Say(line)
     return _finding(
-        problems, evidence, {"sweep": {joint: one.as_dict() for joint, one in now.items()}, "outside": outside}
+        problems,
+        evidence,
+        {"sweep": {joint: one.as_dict() for joint, one in now.items()}, "outside": outside},
+        unsure,
     )
+
+
+def _measured(value: float | None) -> float | None:
+    """A friction or weight, None where it cannot be one: neither is negative, nor nothing at all."""
+    return value if value is not None and math.isfinite(value) and value > 0 else None
+
+
+def unjudged(before: Mapping[str, JointSweep], now: Mapping[str, JointSweep]) -> list[str]:
+    """What cannot be compared, because one of the two sweeps has not measured it: joint, what, and why."""
+    words = []
+    for joint, new in now.items():
+        old = before.get(joint)
+        kinds = ("friction_nm", "weight_nm") if JOINTS[joint].kind == "knee" else ("friction_nm",)
+        for name in kinds:
+            what, value = name.removesuffix("_nm"), getattr(new, name)
+            if old is None or _measured(getattr(old, name)) is None:
+                words.append(
+                    f"{joint}: cannot judge its {what}, because it was not measured when the robot was healthy → `openant calib "
+                    "bounds`"
+                )
+            elif new.followed < FOLLOWED:
+                words.append(
+                    f"{joint}: cannot judge its {what}, because it went only {100 * new.followed:.0f} % of the way that it was told "
+                    "→ is it blocked? Turn it by hand, torque off, and check again"
+                )
+            elif _measured(value) is None:
+                found = "was not measured" if value is None else f"of {value:.3f} N·m cannot be"
+                words.append(f"{joint}: cannot judge its {what}, because a {what} {found} → check again")
+        if new.temperature_c is None or new.volts is None:
+            words.append(f"{joint}: cannot judge its supply and temperature, because it did not tell them → its cable")
+    return words
 
 
 def changed(before: Mapping[str, JointSweep], now: Mapping[str, JointSweep]) -> list[str]:
@@ -140,20 +192,19 @@ def changed(before: Mapping[str, JointSweep], now: Mapping[str, JointSweep]) -> 
         old = before.get(joint)
         if old is None:
             continue
-        if old.friction_nm is not None and new.friction_nm is not None:
-            grown = new.friction_nm - old.friction_nm
-            if new.friction_nm > FRICTION_FACTOR * old.friction_nm and grown > FRICTION_NM:
+        was, is_now = _measured(old.friction_nm), _measured(new.friction_nm)
+        if was is not None and is_now is not None:
+            if is_now > FRICTION_FACTOR * was and is_now - was > FRICTION_NM:
                 words.append(
-                    f"{joint}: friction {new.friction_nm:.3f} N·m, it was {old.friction_nm:.3f} → gear (thread-locker, a worn "
+                    f"{joint}: friction {is_now:.3f} N·m, it was {was:.3f} → gear (thread-locker, a worn "
                     "tooth), or the screws of its horn and idler too tight"
                 )
-            elif new.friction_nm < old.friction_nm / FRICTION_FACTOR - FRICTION_NM:
-                words.append(
-                    f"{joint}: friction {new.friction_nm:.3f} N·m, it was {old.friction_nm:.3f} → is its horn screw loose?"
-                )
-        if JOINTS[joint].kind == "knee" and old.weight_nm and new.weight_nm is not None:
-            share = new.weight_nm / old.weight_nm - 1
-            if abs(new.weight_nm - old.weight_nm) > WEIGHT_NM and abs(share) > WEIGHT_SHARE:
+            elif is_now < was / FRICTION_FACTOR - FRICTION_NM:
+                words.append(f"{joint}: friction {is_now:.3f} N·m, it was {was:.3f} → is its horn screw loose?")
+        was, is_now = _measured(old.weight_nm), _measured(new.weight_nm)
+        if JOINTS[joint].kind == "knee" and was is not None and is_now is not None:
+            share = is_now / was - 1
+            if abs(is_now - was) > WEIGHT_NM and abs(share) > WEIGHT_SHARE:
                 words.append(
                     f"{joint}: its leg weighs {100 * abs(share):.0f} % {'less' if share < 0 else 'more'} than it did → "
                     + (
@@ -240,12 +291,18 @@ def _of_this_computer(run: Run) -> Generator[Event, Answer, list[str]]:
     return [] if seen.judged else [f"cannot judge the connectors, because {seen.words} → {REMEDY}"]
 
 
-def _at_rest(bench: Bench, config: RobotConfig, evidence: list[Evidence]) -> list[str]:
-    """Who answers, with what voltage and temperature, and which hardware errors stand."""
+def _at_rest(
+    bench: Bench, config: RobotConfig, evidence: list[Evidence], state: dict[str, dict[str, int]]
+) -> list[str]:
+    """Who answers, with what voltage and temperature, and which hardware errors stand; fills in what is set in them."""
     problems = []
     with opened_bus(bench) as bus:
-        servos = Servos(bus, robot_servos(config))
         found = {motor.joint: bus.ping(motor.id, insist=True) for motor in config.motors.values()}
+        known = [
+            replace(servo, firmware=seen.firmware if (seen := found[servo.joint]) else None)
+            for servo in robot_servos(config)
+        ]
+        servos = Servos(bus, known)
         for joint, seen in found.items():
             if seen is not None and seen.model_number != config.motors[joint].servo.number:
                 problems.append(
@@ -260,6 +317,7 @@ def _at_rest(bench: Bench, config: RobotConfig, evidence: list[Evidence]) -> lis
             problems += [f"{servo.joint}: {e.name} → {e.advice}" for e in servos.hardware_errors(servo.joint)]
         volts = {servo.joint: servos.read("present_input_voltage", servo.joint) for servo in servos.servos}
         warm = {servo.joint: servos.read("present_temperature", servo.joint) for servo in servos.servos}
+        state |= read_state(servos)
     low = min(volts, key=lambda joint: volts[joint])
     evidence += [
         Evidence("lowest supply at rest", volts[low], "V", f"register 144 of {low}"),
@@ -306,6 +364,10 @@ def _imu(bench: Bench, config: RobotConfig, evidence: list[Evidence]) -> list[st
     body = rotation(config.imu.mounting_rad)
     acc, gyro = body @ seen[:3] - config.imu.acc_bias_m_s2, body @ seen[3:] - config.imu.gyro_bias_rad_s
     norm = float(np.linalg.norm(acc))
+    if not (math.isfinite(norm) and np.isfinite(gyro).all()):
+        return [
+            "IMU: it answers, but not with numbers → power it off and on; `openant comms scan` shows whether it is one"
+        ]
     lean = math.acos(max(-1.0, min(1.0, float(acc[2]) / norm))) if norm else math.pi
     evidence += [
         Evidence("norm of acc over gravity", norm / STANDARD_GRAVITY, "1", "IMU at rest"),
@@ -353,7 +415,7 @@ def _twitch(bench: Bench) -> Generator[Event, Answer, Run]:
 
 
 def _against_model(
-    bench: Bench, run: Run, evidence: list[Evidence], known: Sequence[str]
+    bench: Bench, run: Run, evidence: list[Evidence], unsure: list[str], known: Collection[str]
 ) -> Generator[Event, Answer, list[str]]:
     """Joints that the calibrated model simulates much worse than when it was made, besides those named already."""
     gap = latest(bench.folder, "gap")
@@ -365,19 +427,27 @@ def _against_model(
     evidence.append(
         Evidence("position gap of the twitch", found.gaps.get("pos"), "rad", f"{model.name}, 0.5 s horizon")
     )
-    before = {joint: off for joint, off in gap.data["by_joint_rad"].items() if off is not None}
-    named = {line.partition(":")[0] for line in known}
+    now = gap_by_joint(found)
+    before: dict[str, float] = {joint: off for joint, off in gap.data["by_joint_rad"].items() if off is not None}
     # A joint that was not measured is not as it was: its figure is missing, and that is said.
     evidence += [
         Evidence(f"position gap of {joint}", off, "rad", "the twitch against the model; its position was not read")
-        for joint, off in gap_by_joint(found).items()
+        for joint, off in now.items()
         if joint in before and not math.isfinite(off)
     ]
+    unsure += [
+        f"{joint}: cannot judge its motion, because the gap check has no figure of it → `openant calib gap`"
+        for joint in now
+        if joint not in before
+    ]
     return [
-        f"{joint}: moves differently from its model ({1e3 * off:.1f} mrad, it was {1e3 * before[joint]:.1f}) → screws, gear, or a "
+        f"{joint}: moves differently from its model ({1e3 * off:.1f} mrad, it was {1e3 * was:.1f}) → screws, gear, or a "
         "part that was exchanged; `openant gap diagnose` says more"
-        for joint, off in gap_by_joint(found).items()
-        if joint in before and off > GAP_FACTOR * before[joint] and off - before[joint] > GAP_RAD and joint not in named
+        for joint, off in now.items()
+        if (was := before.get(joint)) is not None
+        and off > GAP_FACTOR * was
+        and off - was > GAP_RAD
+        and joint not in known
     ]
 
 
@@ -392,18 +462,23 @@ def _outside(run: Run, config: RobotConfig) -> dict[str, float]:
     return shares
 
 
-def _finding(problems: Sequence[str], evidence: Sequence[Evidence], data: Mapping[str, object]) -> Finding:
+def _finding(
+    problems: Sequence[str], evidence: Sequence[Evidence], data: Mapping[str, object], unsure: Sequence[str] = ()
+) -> Finding:
     return Finding(
         "check",
-        not problems,
-        "as the passport has it"
-        if not problems
-        else f"{len(problems)} thing{'s' if len(problems) > 1 else ''} changed",
+        False if problems else None if unsure else True,
+        f"{len(problems)} thing{'s' if len(problems) > 1 else ''} changed"
+        if problems
+        else f"{len(unsure)} thing{'s' if len(unsure) > 1 else ''} could not be judged"
+        if unsure
+        else "as the passport has it",
         tuple(evidence),
         ""
-        if not problems
+        if not (problems or unsure)
         else "mend what is listed and check again; where it was meant, do the step that measures it again",
         COMMAND,
         data=dict(data),
         problems=tuple(problems),
+        unsure=tuple(unsure),
     )

@@ -1,4 +1,7 @@
-"""Inventory: every EEPROM item of every servo, found against expected; what differs is mended or accepted."""
+"""Inventory: what is set in every servo, EEPROM and RAM, found against expected; what differs is mended or accepted.
+
+How it stands afterwards is the robot's passport: what every later motion compares its servos with.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from openant_tools.comms.bus import Bus, Found
 from openant_tools.comms.faults import NoAnswer
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servo, Servos
 from openant_tools.comms.silence import diagnose
+from openant_tools.comms.state import Difference, differences_of_robot, passport_registers, read_state
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import (
@@ -28,10 +32,10 @@ from openant_tools.procedure.step import (
 )  # fmt: skip
 from openant_tools.robot.config import Motor, Provenance, RobotConfig
 from openant_tools.robot.joints import JOINTS
-from openant_tools.robot.registers import EEPROM_END, PWM_FULL
+from openant_tools.robot.registers import EEPROM_END
 from openant_tools.robot.servo import baud_code, servo_model
 
-__all__ = ["FIRMWARE_BRINGS", "expected_eeprom", "inventory", "silence_words"]
+__all__ = ["FIRMWARE_BRINGS", "inventory", "silence_words"]
 
 COMMAND = "openant calib inventory"
 #: firmware → what it brought (ROBOTIS e-manual); older ones lack it.
@@ -43,23 +47,7 @@ FIRMWARE_BRINGS: Mapping[int, str] = {
 #: Return delays to try, in counts of 2 µs; the factory's is the last.
 DELAYS = (0, 1, 5, 10, 25, 50, 125, 250)
 SWEEP_READS = 120
-#: Supply and temperature limits may be set tighter than the factory's by a builder who knows why.
-IDENTITY = frozenset({"model_number", "model_information", "firmware_version", "id", "baud_rate"})
 FIX_ALL, FIX_ONE, ACCEPT = "fix all", "fix one by one", "accept"
-
-
-def expected_eeprom(motor: Motor, config: RobotConfig) -> dict[str, int]:
-    """register → counts that a servo of this robot should hold: the factory's but for what the robot needs."""
-    wanted = {
-        name: register.default
-        for name, register in motor.servo.registers.items()
-        if register.address < EEPROM_END and register.writable and register.default is not None and name not in IDENTITY
-    }
-    wanted |= {
-        "return_delay_time": round(config.bus.return_delay_s / 2e-6),
-        "pwm_limit": round(config.bus.pwm_limit * PWM_FULL),
-    }
-    return wanted
 
 
 def inventory(bench: Bench) -> Procedure:
@@ -83,7 +71,9 @@ def inventory(bench: Bench) -> Procedure:
             found, missing = _ping_all(bus, config)
         problems += _wrong_models(found, config)
         present = [
-            servo for servo in robot_servos(config) if servo.joint in found and not _wrong(found, config, servo.joint)
+            replace(servo, firmware=found[servo.joint].firmware)
+            for servo in robot_servos(config)
+            if servo.joint in found and not _wrong(found, config, servo.joint)
         ]
         servos = journalled(bus, present, bench, COMMAND)
         for k, servo in enumerate(present):
@@ -95,33 +85,25 @@ def inventory(bench: Bench) -> Procedure:
             evidence.append(Evidence(f"firmware of {joint}", float(seen.firmware), "", "register 6"))
             if lacks:
                 yield Say(f"{joint} has firmware {seen.firmware}, without {'; '.join(lacks)}", "warn")
-        differences = [
-            RegisterChange(joint, name, items[name], wanted)
-            for joint, items in table.items()
-            for name, wanted in expected_eeprom(config.motors[joint], config).items()
-            if name in items and items[name] != wanted and not _harmless(name, items[name])
-        ]
+        state = read_state(servos)
+        passport = yield from _still_accepted(bench, state, present, config)
+        odd = differences_of_robot(present, state, config, passport)
         # What is to be told or written does not rest on one reading.
-        for change in differences:
-            table[change.joint][change.register] = servos.confirmed_counts(change.register, change.joint)
-        differences = [
-            replace(change, old=value)
-            for change in differences
-            if (value := table[change.joint][change.register]) != change.new and not _harmless(change.register, value)
-        ]
-        accepted: list[RegisterChange] = []
-        if differences:
-            yield Say(f"{len(differences)} items differ from what they should be", "warn")
-            left = yield from _mend(servos, differences)
-            accepted += left
+        for one in odd:
+            state[one.joint][one.register] = servos.confirmed_counts(one.register, one.joint)
+        odd = differences_of_robot(present, state, config, passport)
+        left: list[Difference] = []
+        if odd:
+            yield Say(f"{len(odd)} items differ from what they should be", "warn")
+            left = yield from _mend(servos, odd)
             problems += [
-                f"{change.joint}: {change.register} is {change.old}, expected {change.new} → accepted"
-                for change in left
+                f"{one.joint}: {one.register} is {one.found}, expected {one.expected} → accepted" for one in left
             ]
         delay_s = yield from _sweep(bus, servos, present)
         errors = {s.joint: servos.hardware_errors(s.joint) for s in present}
         problems += [f"{joint}: {e.name} → {e.advice}" for joint, found_errors in errors.items() for e in found_errors]
         volts = {s.joint: servos.read("present_input_voltage", s.joint) for s in present}
+        state = read_state(servos)
     if delay_s is None:
         problems.append(
             "return delay: no servo could be tried"
@@ -143,18 +125,37 @@ def inventory(bench: Bench) -> Procedure:
         "inventory",
         ok,
         f"{len(present)} of {len(config.motors)} servos as expected"
-        + (f", {len(differences) - len(accepted)} items mended" if differences else ""),
+        + (f", {len(odd) - len(left)} items mended" if odd else ""),
         tuple(evidence),
         "" if ok else "mend what is listed and run it again",
         COMMAND,
-        data={"eeprom": table, "accepted": [str(change) for change in accepted], "volts": volts},
+        data={"eeprom": table, "registers": state, "accepted": [one.what for one in left], "volts": volts},
         problems=tuple(problems),
     )
 
 
-def _harmless(name: str, value: int) -> bool:
-    """Extended position mode does all that position mode does, and a joint across the encoder's seam needs it."""
-    return name == "operating_mode" and value == 4
+def _still_accepted(
+    bench: Bench, state: Mapping[str, Mapping[str, int]], present: Sequence[Servo], config: RobotConfig
+) -> Generator[Event, Answer, Mapping[str, Mapping[str, int]]]:
+    """The passport's registers; without those that were accepted once and are no longer meant."""
+    passport = passport_registers(bench.folder)
+    plain, kept = (
+        differences_of_robot(present, state, config, {}),
+        differences_of_robot(present, state, config, passport),
+    )
+    left = {(one.joint, one.register) for one in kept}
+    accepted = [one for one in plain if (one.joint, one.register) not in left]
+    if not accepted:
+        return passport
+    for one in accepted:
+        yield Say(f"{one.what}; accepted before", "info")
+    if (yield Ask("Keep what was accepted before?", ("yes", "no"), default="yes")) == "yes":
+        return passport
+    gone = {(one.joint, one.register) for one in accepted}
+    return {
+        joint: {name: counts for name, counts in table.items() if (joint, name) not in gone}
+        for joint, table in passport.items()
+    }
 
 
 def _ping_all(bus: Bus, config: RobotConfig) -> tuple[dict[str, Found], list[Motor]]:
@@ -259,22 +260,26 @@ def _read_eeprom(servos: Servos, servo: Servo, firmware: int) -> dict[str, int]:
     return values
 
 
-def _mend(servos: Servos, differences: Sequence[RegisterChange]) -> Generator[Event, Answer, list[RegisterChange]]:
+def _mend(servos: Servos, odd: Sequence[Difference]) -> Generator[Event, Answer, list[Difference]]:
     """Ask what to do with them, do it; what was accepted as it is."""
-    for change in differences:
-        yield Say(str(change), "warn")
+    for one in odd:
+        yield Say(one.what, "warn")
     answer = yield Ask("What to do with them?", (FIX_ALL, FIX_ONE, ACCEPT), default=FIX_ALL)
-    chosen = list(differences) if answer == FIX_ALL else []
+    chosen = list(odd) if answer == FIX_ALL else []
     if answer == FIX_ONE:
-        for change in differences:
-            if (yield Ask(f"Set {change}?", ("yes", "no"), default="yes")) == "yes":
-                chosen.append(change)
+        for one in odd:
+            if (yield Ask(f"Set {_change(one)}?", ("yes", "no"), default="yes")) == "yes":
+                chosen.append(one)
     if chosen:
-        yield Intent(f"write {len(chosen)} EEPROM items, each read back", tuple(chosen))
+        yield Intent(f"write {len(chosen)} items, each read back", tuple(_change(one) for one in chosen))
         servos.set_torque(False)
-        for change in chosen:
-            servos.write_counts(change.register, change.joint, change.new)
-    return [change for change in differences if change not in chosen]
+        for one in chosen:
+            servos.write_counts(one.register, one.joint, one.expected)
+    return [one for one in odd if one not in chosen]
+
+
+def _change(one: Difference) -> RegisterChange:
+    return RegisterChange(one.joint, one.register, one.found, one.expected)
 
 
 def _sweep(bus: Bus, servos: Servos, present: Sequence[Servo]) -> Generator[Event, Answer, float | None]:

@@ -34,7 +34,7 @@ from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.registers import PWM_FULL
 from openant_tools.robot.servo import ServoModel, servo_model
 
-__all__ = ["JointSweep", "analyse", "joint_sweep_of", "play_watched", "sweep"]
+__all__ = ["FOLLOWED", "JointSweep", "analyse", "joint_sweep_of", "play_watched", "sweep"]
 
 Array = NDArray[np.float64]
 
@@ -49,6 +49,9 @@ MARGIN_RAD = 0.1
 #: rad that a joint stays behind its command where a stop holds it; friction and gain leave less
 HELD_RAD = 0.04
 FITTED_ROWS = 100
+#: A joint moves as it is told where it goes at least half as far within WINDOW_S; where it does for less than FOLLOWED of its
+#: way, its duty tells neither friction nor weight.
+WINDOW_S, FOLLOWED = 0.2, 0.8
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,7 @@ class JointSweep:
         friction_nm: f of the module's formula, with its standard error.
         weight_nm: g. low_stop_rad, high_stop_rad: where it was held.
         lost: share of reads that brought no valid answer while this computer was punctual. temperature_c: at the end. volts: lowest.
+        followed: share of the way between its limits in which it moved as it was told; without it nothing was measured.
     """
 
     joint: str
@@ -71,6 +75,7 @@ class JointSweep:
     lost: float
     temperature_c: float | None
     volts: float | None
+    followed: float = 1.0
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -182,9 +187,11 @@ def _joint(run: Run, joint: str, low: float, high: float, lost: float) -> JointS
     model = servo_model(run.facts.motors[joint])
     rate = np.gradient(cmd, run.t)
     inside = (np.abs(rate) > 0.8 * SPEED_RAD_S) & (pos > low + MARGIN_RAD) & (pos < high - MARGIN_RAD)
-    good = inside & np.isfinite(pos) & np.isfinite(duty)
+    moves = _moves(run.t, cmd, pos)
+    followed = float(np.mean(moves[inside])) if inside.any() else 0.0
+    good = inside & moves & np.isfinite(pos) & np.isfinite(duty)
     friction = weight = friction_error = weight_error = None
-    if good.sum() >= FITTED_ROWS:
+    if good.sum() >= FITTED_ROWS and followed >= FOLLOWED:
         supply = np.where(
             np.isfinite(volt), volt, np.nanmean(volt) if np.isfinite(volt).any() else model.nominal_voltage_v
         )
@@ -198,7 +205,23 @@ def _joint(run: Run, joint: str, low: float, high: float, lost: float) -> JointS
         lost,
         float(np.nanmax(temperature[-200:])) if np.isfinite(temperature[-200:]).any() else None,
         float(np.nanmin(volt)) if np.isfinite(volt).any() else None,
+        followed,
     )  # fmt: skip
+
+
+def _moves(t: Array, cmd: Array, pos: Array) -> NDArray[np.bool_]:
+    """(n,), where the joint goes at least half as far as its command within a window, the same way."""
+    seen = np.isfinite(pos)
+    if seen.sum() < 2:
+        return np.zeros(len(t), bool)
+
+    def way(values: Array) -> Array:
+        there: Array = np.interp(t + WINDOW_S / 2, t, values) - np.interp(t - WINDOW_S / 2, t, values)
+        return there
+
+    asked, went = way(cmd), way(np.interp(t, t[seen], pos[seen]))
+    out: NDArray[np.bool_] = went * np.sign(asked) >= 0.5 * np.abs(asked)
+    return out
 
 
 def _torque(model: ServoModel, duty: Array, supply: Array, rate: Array) -> Array:

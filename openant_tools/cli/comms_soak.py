@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from openant_tools.cli.hardware import Moving, engine_config, may_move, port_option, robot_of, yes_option
+from openant_tools.cli.hardware import Moving, anyway_option, engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import MINUTES, json_option, rate_option, robot_option
 from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option
@@ -39,6 +39,7 @@ TRANSACTIONS_HZ = 10.0
     is_flag=True,
     help="With --virtual: without bytes and ports, many times faster than real time, 10 cycles a second; RUN is a .parquet.",
 )
+@anyway_option
 @yes_option
 @port_option
 @virtual_option
@@ -54,6 +55,7 @@ def soak(
     resume: bool,
     every_cycle: bool,
     transactions: bool,
+    anyway: bool,
     yes: bool,
     port: str | None,
     virtual_source: str | None,
@@ -80,12 +82,14 @@ def soak(
         given = context.get_parameter_source("rate_hz") is not click.core.ParameterSource.DEFAULT
         _transactions(virtual_source, out, minutes * 60, rate_hz if given else TRANSACTIONS_HZ, still)
         return
-    _on_the_bus(out, minutes * 60, still, resume, every_cycle, yes, port, virtual_source, robot, rate_hz, json_file)
+    _on_the_bus(
+        out, minutes * 60, still, resume, every_cycle, anyway, yes, port, virtual_source, robot, rate_hz, json_file
+    )
 
 
 def _on_the_bus(
-    out: Path, seconds: float, still: bool, resume: bool, every_cycle: bool, yes: bool, port: str | None,
-    virtual_source: str | None, robot: Path | None, rate_hz: float, json_file: Path | None,
+    out: Path, seconds: float, still: bool, resume: bool, every_cycle: bool, anyway: bool, yes: bool,
+    port: str | None, virtual_source: str | None, robot: Path | None, rate_hz: float, json_file: Path | None,
 ) -> None:  # fmt: skip
 
     from rich.console import Console
@@ -104,7 +108,9 @@ def _on_the_bus(
     console = Console(stderr=True)
     folder = robot_of(robot, needed=False)
     with contextlib.ExitStack() as stack:
-        config = stack.enter_context(engine_config(folder, port, virtual_source, rate_hz=rate_hz, still=still))
+        config = stack.enter_context(
+            engine_config(folder, port, virtual_source, rate_hz=rate_hz, still=still, anyway=anyway)
+        )
         if not still:
             console.print(
                 f"all {len(config.servos)} joints swing by up to 0.25 rad; the robot must be on its stand, legs free"

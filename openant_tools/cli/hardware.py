@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
 
 __all__ = [
-    "Moving", "adapter_option", "camera_option", "engine_config", "imu_option", "may_move", "need_moving", "need_terminal",
+    "Moving", "adapter_option", "anyway_option", "camera_option", "engine_config", "imu_option", "may_move", "need_moving", "need_terminal",
     "port_option", "robot_of", "yes_option",
 ]  # fmt: skip
 
@@ -41,6 +41,12 @@ imu_option = click.option("--imu", metavar="PATH", help="The flight controller. 
 camera_option = click.option("--camera", metavar="SOURCE", help="The overhead camera. Default: robot.toml's.")
 yes_option = click.option(
     "--yes", is_flag=True, help="The robot may move: do not ask. Needed where no terminal is attached."
+)
+
+anyway_option = click.option(
+    "--anyway",
+    is_flag=True,
+    help="Move although servos' registers differ from what is expected, or joints do not follow; the recording says so.",
 )
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.hardware import Moving, engine_config, may_move, port_option, robot_of, yes_option
+from openant_tools.cli.hardware import Moving, anyway_option, engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import Number, rate_option, robot_option, seconds_option
 from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
 
@@ -70,6 +70,7 @@ setup_option = click.option(
 @setup_option
 @click.option("--imu/--no-imu", default=None, help="Record the IMU too. Default: on the floor.")
 @click.option("--camera/--no-camera", default=None, help="Record the pose too. Default: on the floor, if there is one.")
+@anyway_option
 @yes_option
 def record(
     name: str | None,
@@ -88,6 +89,7 @@ def record(
     setup: str | None,
     imu: bool | None,
     camera: bool | None,
+    anyway: bool,
     yes: bool,
 ) -> None:
     """Play an excitation on the robot and record it.
@@ -138,7 +140,7 @@ def record(
             source = virtual_source
             if source is not None and moves_itself:
                 source = stack.enter_context(placed(source, protocol.setup, protocol.heading_rad))
-            done = _record_here(stack, console, place, source, port, folder, rate_hz, imu, camera, yes or k > 0)
+            done = _record_here(stack, console, place, source, port, folder, rate_hz, imu, camera, yes or k > 0, anyway)
         for recorded in done:
             click.echo(f"{recorded.path}  {recorded.cycles} cycles")
             _print_tracking(recorded.path)
@@ -201,6 +203,7 @@ def _record_here(
     imu: bool | None,
     camera: bool | None,
     yes: bool,
+    anyway: bool,
 ) -> list[Recorded]:
     """Connect to the robot where it is, and record."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -217,6 +220,7 @@ def _record_here(
             imu=floor if imu is None else imu,
             camera=floor if camera is None else camera,
             rate_hz=rate_hz,
+            anyway=anyway,
         )
     )
     first = wanted[0].protocol

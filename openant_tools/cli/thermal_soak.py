@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.hardware import Moving, engine_config, may_move, port_option, robot_of, yes_option
+from openant_tools.cli.hardware import Moving, anyway_option, engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import Number, json_option, robot_option
 from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
 
@@ -83,6 +83,7 @@ DRAW_S, LINE_S = 0.25, 20.0
 @virtual_option
 @port_option
 @robot_option
+@anyway_option
 @yes_option
 @json_option
 def soak(
@@ -103,6 +104,7 @@ def soak(
     virtual_source: str | None,
     port: str | None,
     robot: Path | None,
+    anyway: bool,
     yes: bool,
     json_file: Path | None,
 ) -> int:
@@ -160,7 +162,7 @@ def soak(
         plan = replace(plan, commands=str(policy_commands(commands, out, folder)))
     with contextlib.ExitStack() as stack:
         config = _connected(
-            stack, plan, virtual_source, port, folder, rate_hz or (50.0 if plan.load == "play" else 5.0)
+            stack, plan, virtual_source, port, folder, rate_hz or (50.0 if plan.load == "play" else 5.0), anyway
         )
         console.print(
             f"{'going on with ' if resume else ''}{_words(plan)}, {plan.seconds / 60:g} min, then {plan.cool_down_s / 60:g} "
@@ -188,13 +190,14 @@ def _connected(
     port: str | None,
     folder: RobotFolder | None,
     rate_hz: float,
+    anyway: bool,
 ) -> EngineConfig:
     from openant_tools.thermal.soak import soak_config
 
     source = virtual_source
     if source is not None and placeable(source):
         source = stack.enter_context(placed(source, plan.setup, doze=True))
-    config = stack.enter_context(engine_config(folder, port, source))
+    config = stack.enter_context(engine_config(folder, port, source, anyway=anyway))
     return soak_config(config, rate_hz, plan.margin_k)
 
 

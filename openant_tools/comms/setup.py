@@ -13,11 +13,11 @@ from openant_tools.comms.messages import EngineConfig, ImuConfig
 from openant_tools.comms.ports import Host
 from openant_tools.comms.servos import Servo
 from openant_tools.comms.silence import explaining
+from openant_tools.comms.state import of_robot_toml
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.robot.config import RobotConfig
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import ANGLE_LIMIT_RAD, NOMINAL_ZERO_RAD, PLATFORM_PWM_LIMIT_COUNTS
-from openant_tools.robot.registers import PWM_FULL
 from openant_tools.robot.servo import servo_model
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def config_of_robot(robot: RobotConfig, port: str | None = None, **more: object)
         Servo(motor.joint, motor.id, motor.servo, motor.direction, motor.zero_offset_rad)
         for motor in robot.motors.values()
     )
-    pwm_limit = round(robot.bus.pwm_limit * PWM_FULL)
+    pwm_limit = of_robot_toml(robot)["pwm_limit"]
     return EngineConfig(
         port=find_bus(port, robot),
         servos=servos,

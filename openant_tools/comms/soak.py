@@ -21,6 +21,7 @@ from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.comms.restart import Interlock, MotionStopped, Restart, StopCause
+from openant_tools.comms.state import refusal, stopping
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
@@ -127,6 +128,10 @@ def soak(
     with EngineProcess(config) as engine:
         for event in engine.events():
             notice(str(event.text) if isinstance(event, messages.Notice) else str(event))
+        wrong = stopping(engine.description["differences"])
+        if move and wrong and not config.anyway:
+            what, remedy = refusal(wrong)
+            raise HardwareFault(what, where=config.port, remedy=f"{remedy}, and --still moves nothing")
         facts = Facts(joints=joints, setup="stand", protocol="comms soak", extra={"rate_hz": config.rate_hz})
         engine.ask(messages.Record(str(out), facts, robot_toml, resume=resume and out.exists(), thin_s=thin_s))
         statistics: Mapping[str, Any] = engine.ask(messages.Statistics())

@@ -18,11 +18,12 @@ from openant_tools.robot.registers import EEPROM_END, PULSES_PER_TURN, PWM_FULL
 from openant_tools.robot.servo import ServoModel, hardware_errors
 
 if TYPE_CHECKING:
+    from openant_tools.robot.config import RobotConfig
     from openant_tools.robot.folder import RobotFolder
 
 __all__ = [
     "BY_FACTORY", "BY_PASSPORT", "BY_ROBOT_TOML", "BY_US", "RECORDED", "SETTINGS", "Difference", "Expected", "Setting", "differences",
-    "expected", "factory", "passport_registers", "read_state", "refusal", "stopping",
+    "differences_of_robot", "expected", "factory", "of_robot_toml", "passport_registers", "read_state", "refusal", "stopping",
 ]  # fmt: skip
 
 BY_US, BY_PASSPORT, BY_ROBOT_TOML, BY_FACTORY = "we set", "its passport has", "robot.toml has", "the factory's is"
@@ -252,8 +253,13 @@ class Difference:
     mended: str
 
     @property
+    def reads(self) -> str:
+        """Without the joint."""
+        return f"{self.register} is {self.found}, {self.by} {self.expected}: {self.does}"
+
+    @property
     def what(self) -> str:
-        return f"{self.joint} (id {self.id}): {self.register} is {self.found}, {self.by} {self.expected}: {self.does}"
+        return f"{self.joint} (id {self.id}): {self.reads}"
 
     def __str__(self) -> str:
         return f"{self.what} → {self.mended}"
@@ -320,6 +326,14 @@ def expected(
     return wanted
 
 
+def of_robot_toml(config: RobotConfig) -> dict[str, int]:
+    """register → counts, of those that `robot.toml` itself names."""
+    return {
+        "pwm_limit": round(config.bus.pwm_limit * PWM_FULL),
+        "return_delay_time": round(config.bus.return_delay_s / 2e-6),
+    }
+
+
 def differences(
     servos: Sequence[Servo],
     found: Mapping[str, Mapping[str, int]],
@@ -354,6 +368,19 @@ def differences(
                 )
             )
     return sorted(out, key=lambda one: not one.stops)
+
+
+def differences_of_robot(
+    servos: Sequence[Servo],
+    found: Mapping[str, Mapping[str, int]],
+    config: RobotConfig,
+    passport: Mapping[str, Mapping[str, int]],
+) -> list[Difference]:
+    """The same for servos at rest, of a robot that has a `robot.toml`; `passport` as `passport_registers` gives it."""
+    named = of_robot_toml(config)
+    wanted = {s.joint: expected(s.model, passport=passport.get(s.joint, {}), robot_toml=named) for s in servos}
+    limits = {motor.joint: (motor.min_rad, motor.max_rad) for motor in config.motors.values()}
+    return differences(servos, found, wanted, limits)
 
 
 def _goal(register: str, table: Mapping[str, int], wanted: Mapping[str, Expected]) -> Expected | None:
