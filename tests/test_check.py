@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from builder import Robot, robot
 
-from openant_tools.bringup.check import changed, check, loose
+from openant_tools.bringup.check import changed, check, loose, unjudged
 from openant_tools.calib.sweep import JointSweep, analyse, joint_sweep_of, sweep
 from openant_tools.calib.wires import engine_config
 from openant_tools.errors import BadInput
@@ -163,3 +163,19 @@ def known_folder(tmp_path):
     swept = {joint: one.as_dict() for joint, one in HEALTHY.items()}
     keep(Finding("bounds", True, "", (), "", "", data={"sweep": swept}), folder)
     return folder.path
+
+
+@pytest.mark.parametrize("friction", [-0.239, 0.0, float("nan"), None])
+def test_a_friction_that_cannot_be_is_no_measurement(friction):
+    odd = {**HEALTHY, "knee_fl": replace(HEALTHY["knee_fl"], friction_nm=friction, weight_nm=-0.028)}
+    assert changed(HEALTHY, odd) == []
+    words = unjudged(HEALTHY, odd)
+    assert len(words) == 2
+    assert all(line.startswith("knee_fl: cannot judge its ") and "because" in line for line in words)
+    assert unjudged(HEALTHY, HEALTHY) == []
+
+
+def test_a_joint_that_did_not_move_as_told_is_not_judged():
+    odd = {**HEALTHY, "hip_fl": replace(HEALTHY["hip_fl"], followed=0.3)}
+    assert "hip_fl: cannot judge its friction, because it went only 30 % of the way" in unjudged(HEALTHY, odd)[0]
+    assert "not measured when the robot was healthy" in unjudged({}, HEALTHY)[0]

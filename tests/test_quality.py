@@ -241,3 +241,16 @@ def test_the_command_names_bad_data_and_gives_no_number(
     assert words in printed.err.strip().splitlines()[-1]
     assert "→" in printed.err
     assert not (tmp_path / "fit").exists()
+
+
+def test_servos_that_could_not_go_where_they_were_sent_are_named_by_their_registers(plant: Plant) -> None:
+    def with_registers(**registers: float) -> Run:
+        run = good_run()
+        return replace(run, facts=replace(run.facts, registers={"knee_rr": registers}))
+
+    words = refused(with_registers(min_position_limit=1900, max_position_limit=2200), plant)
+    assert "knee_rr is commanded over 0.60 rad" in words
+    assert "min_position_limit = 1900 and max_position_limit = 2200 leave 0.46 rad" in words
+    assert "profile_velocity = 1 lets it turn (0.024 rad/s)" in refused(with_registers(profile_velocity=1), plant)
+    check_runs([with_registers(min_position_limit=1900, max_position_limit=2200, operating_mode=4)], plant)
+    check_runs([with_registers(min_position_limit=0, max_position_limit=4095, profile_velocity=0)], plant)

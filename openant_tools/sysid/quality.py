@@ -16,7 +16,7 @@ from openant_tools.errors import BadInput
 from openant_tools.model.floor import resolution
 from openant_tools.model.plant import Plant
 from openant_tools.recording.run import Run
-from openant_tools.robot.registers import PWM_FULL
+from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE, RAD_S_PER_COUNT
 from openant_tools.sysid.kinds import KINDS, torque_limit
 
 __all__ = ["Telemetry", "check_model", "check_runs", "without_errors"]
@@ -44,6 +44,10 @@ BEYOND_STOP_RAD = 0.5
 #: a sample lies outside of both neighbours by more than so many steps of the encoder, or times of what such distances
 #: usually are, to be an error of telemetry
 GLITCH_QUANTA, GLITCH_TIMES = 8, 8.0
+#: operating mode in which position limits are in force, and the bit of the drive mode by which profiles count ms (e-manual)
+POSITION_MODE, TIME_BASED = 3, 0x04
+#: rad/s below which a command rests, and the share of a motion that may be faster than a profile
+STILL_RAD_S, TOO_FAST = 0.01, 0.2
 #: what a glitch leaves of itself in the line through its neighbours' own neighbours: a motion leaves far more
 GLITCH_ALONE = 0.25
 
@@ -132,7 +136,39 @@ def check_runs(runs: Sequence[Run], plant: Plant) -> None:
             raise BadInput(problem, where=where, remedy=remedy)
 
 
+def _by_registers(run: Run, plant: Plant, cmd: Array) -> Iterator[tuple[str, str]]:
+    """Joints whose servo could not go where it was sent, by the registers that the run names: they show these and nothing else."""
+    remedy = "set it to the factory's value (`openant calib inventory`) and record again"
+    for j, joint in enumerate(plant.joints):
+        table = run.facts.registers.get(joint, {})
+        on = run.signal("torque", [joint], default=1.0)[:, 0] != 0
+        low, high = table.get("min_position_limit"), table.get("max_position_limit")
+        wanted = _span(cmd[on, j]) if on.any() else 0.0
+        # Where the joint's zero is, a table does not say: the width alone tells.
+        if low is not None and high is not None and table.get("operating_mode", POSITION_MODE) == POSITION_MODE:
+            left = max(0.0, (high - low) * RAD_PER_PULSE)
+            if wanted > left:
+                yield (
+                    f"{joint} is commanded over {wanted:.2f} rad, and its registers min_position_limit = {low:.0f} and "
+                    f"max_position_limit = {high:.0f} leave {left:.2f} rad",
+                    remedy,
+                )
+        speed = table.get("profile_velocity", 0) * RAD_S_PER_COUNT
+        if speed > 0 and not int(table.get("drive_mode", 0)) & TIME_BASED and len(run.t) > 1:
+            with np.errstate(invalid="ignore"):
+                rate = np.abs(np.diff(cmd[:, j]) / np.diff(run.t))
+                moving = rate[rate > STILL_RAD_S]
+                faster = float(np.mean(moving > speed)) if len(moving) else 0.0
+            if faster > TOO_FAST:
+                yield (
+                    f"{joint} is commanded faster than its register profile_velocity = {table['profile_velocity']:.0f} lets it "
+                    f"turn ({speed:.2g} rad/s) in {100 * faster:.0f} % of its motion",
+                    remedy,
+                )
+
+
 def _problems(run: Run, plant: Plant, pos: Array, cmd: Array, moves: Sequence[bool]) -> Iterator[tuple[str, str]]:
+    yield from _by_registers(run, plant, cmd)
     for j, joint in enumerate(plant.joints):
         on = run.signal("torque", [joint], default=1.0)[:, 0] != 0
         commanded = _span(cmd[on, j]) if on.any() else 0.0
