@@ -49,7 +49,7 @@ def test_a_servo_from_the_factory_differs_in_nothing():
     "registers",
     [
         {"drive_mode": 1}, {"drive_mode": 4}, {"homing_offset": 500}, {"operating_mode": 16}, {"max_position_limit": 2200},
-        {"min_position_limit": 1900}, {"profile_velocity": 1}, {"secondary_id": 21}, {"goal_pwm": 100}, {"position_p_gain": 50},
+        {"min_position_limit": 1900}, {"profile_velocity": 1}, {"secondary_id": 21}, {"position_p_gain": 50},
     ],
 )  # fmt: skip
 def test_what_makes_a_motion_wrong_stops_it(registers):
@@ -66,6 +66,7 @@ def test_what_makes_a_motion_wrong_stops_it(registers):
     [
         {"position_p_gain": 400}, {"feedforward_1st_gain": 100}, {"velocity_limit": 5}, {"moving_threshold": 50},
         {"secondary_id": 77}, {"shutdown": 0}, {"temperature_limit": 60}, {"startup_configuration": 1},
+        {"goal_pwm": 100},  # raised whenever torque comes on
         {"profile_acceleration": 1},  # without a velocity there is no profile
         {"max_position_limit": 4000},  # beyond where this joint goes
         {"profile_velocity": 1000},  # faster than the servo can turn

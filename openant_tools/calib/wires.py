@@ -137,6 +137,8 @@ def bare_config(bench: Bench, servos: Sequence[Servo], baud: int) -> EngineConfi
         # A servo may lie anywhere, and hands may turn it while it is limp.
         guards=Guards(angle_margin_rad=None),
         limits_rad={servo.joint: (0.0, 2 * math.pi - RAD_PER_PULSE) for servo in servos},
+        # What is set in them is looked at when they have their ids.
+        anyway=True,
         journal=str(bench.folder.journal),
     )
 

@@ -199,7 +199,7 @@ SETTINGS: Mapping[str, Setting] = {
     "profile_acceleration": Setting(_acceleration, lambda seen: seen.found != 0 and _slow(seen)),
     "secondary_id": Setting(_second, _shadow),
     "pwm_limit": Setting(_push, _weak),
-    "goal_pwm": Setting(_push, _weak),
+    "goal_pwm": Setting(_push),  # raised to its limit whenever torque comes on
     "position_p_gain": Setting(_stiffness, _soft),
     "position_i_gain": Setting("it pushes on while an error stands"),
     "position_d_gain": Setting("it damps its motion otherwise"),

@@ -167,7 +167,12 @@ class Session:
         else:
             robot = folder.config()
             journal = str(folder.journal)
-            more = {"imu": imu_of_robot(robot, imu), "journal": journal, "still": True, "passport": passport_registers(folder)}
+            more = {
+                "imu": imu_of_robot(robot, imu),
+                "journal": journal,
+                "still": True,
+                "passport": passport_registers(folder),
+            }
             config = config_of_robot(robot, port, control=control, **more)
         return config
 
