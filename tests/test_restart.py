@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import resource
 import shutil
@@ -256,3 +257,34 @@ def test_a_soak_whose_port_vanished_listens_on_and_moves_no_more(robot: dict[str
     assert after.sum() > 50, "it listens on"
     assert (run.signal("torque")[after] == 0).all(), "and nothing moves again"
     assert not [event for event in read_recording(soaked.path).events if event["kind"] == "restart"]
+
+
+def test_a_walk_ends_where_motion_has_ended_for_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from openant_tools.bringup import walk as walking
+    from openant_tools.procedure.step import Bench
+    from openant_tools.robot.folder import create_robot
+
+    bench, done = Bench(create_robot(tmp_path / "ant")), list[str]()
+
+    def stop(cause: StopCause) -> None:
+        def drive(procedure: object, face: object) -> None:
+            done.append(cause.value)
+            raise MotionStopped("knee_fl is outside its limits", cause=cause)
+
+        monkeypatch.setattr(walking, "drive", drive)
+
+    class Silent:
+        def answer(self, event: object) -> None:
+            return None
+
+    two = {name: dataclasses.replace(walking.WALK[name], needs=()) for name in ("connect", "imu")}
+    monkeypatch.setattr(walking, "WALK", two)
+    stop(StopCause.SILENCE)
+    assert not walking.walk(bench, Silent())["imu"].ok
+    assert done == ["silence"] * 2
+    stop(StopCause.LIMITS)
+    walking.walk(bench, Silent(), again=True)
+    assert done == ["silence"] * 2 + ["limits"]
+    stop(StopCause.STORAGE)
+    with pytest.raises(MotionStopped):
+        walking.walk(bench, Silent(), again=True)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from openant_tools.errors import BadInput, OpenAntError
+from openant_tools.comms.restart import RULES, MotionStopped, StopCause
+from openant_tools.errors import BadInput, OpenAntError, StorageFault
 from openant_tools.procedure.finding import Finding, keep, latest
 from openant_tools.procedure.step import Bench, Declined, Face, Say, Step, drive
 
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 
 __all__ = ["WALK", "Standing", "State", "do", "standing", "step", "walk"]
 
+#: key of a finding's data: the `StopCause` of what ended its motion
+STOPPED = "stop_cause"
 #: name → step, in order.
 WALK: Mapping[str, Step] = {
     step.name: step
@@ -235,15 +238,21 @@ def do(step: Step, bench: Bench, face: Face) -> Finding:
 
     Raises:
         Declined: an intent was not granted. Nothing is kept then, nor after Ctrl-C: the step is still to be done.
+        MotionStopped, StorageFault: the disk takes no more, a finding neither.
     """
+    data: dict[str, Any] = {}
     try:
         finding = drive(step.start(bench), face)
-    except Declined:
+    except (Declined, StorageFault):
         raise
     except OpenAntError as error:
+        if isinstance(error, MotionStopped):
+            if error.cause is StopCause.STORAGE:
+                raise
+            data = {STOPPED: error.cause.value}
         what = f"{error.where}: {error.what}" if error.where else error.what
         command = f"openant calib {step.name}"
-        finding = Finding(step.name, False, what, (), error.remedy or "", command, problems=(what,))
+        finding = Finding(step.name, False, what, (), error.remedy or "", command, data=data, problems=(what,))
     keep(finding, bench.folder)
     return finding
 
@@ -256,6 +265,8 @@ def walk(
     notice: Callable[[Step, Finding | None], None] = lambda step, found: None,
 ) -> dict[str, Finding]:
     """All steps in order; those that stand are not done again, those whose needs say no are left out.
+
+    A stop that ends motion for good (`comms.restart`) ends the walk: what it would move next waits for a new command.
 
     Args:
         again: do every step, also those that stand.
@@ -276,5 +287,10 @@ def walk(
             face.answer(Say(f"{step.title} is left out: it needs {titles}", "warn"))
             continue
         notice(step, None)
-        notice(step, do(step, bench, face))
+        found = do(step, bench, face)
+        notice(step, found)
+        cause = found.data.get(STOPPED)
+        if cause is not None and not RULES[StopCause(cause)].faces:
+            face.answer(Say("motion has ended for good: look at the robot, then begin the walk again", "fail"))
+            break
     return {name: now.finding for name, now in standing(bench.folder).items() if now.finding is not None}

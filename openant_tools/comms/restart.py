@@ -225,7 +225,7 @@ event (`stopped`, `restart`). Everything else has ended for good. Single lost an
 {rows}
 
 - **Every other command** (`sysid record`, `thermal soak`, `calib`, `check`, `bringup` …) ends with the first stop: torque off,
-  the recording kept as far as it got, exit code 1.
+  the recording kept as far as it got, exit code 1. `bringup` ends that step, and the whole walk where motion has ended for good.
 - **`comms soak`** goes on listening, torque off, after a stop that ends motion for good, since it is the losses that are
   wanted; exit code 1. A full disk ends it.
 - **`openant_env`** truncates the step (`info["stop_cause"]` is the cause, `info["void"]` where its action was not carried
