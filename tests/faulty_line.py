@@ -21,7 +21,7 @@ ANSWER_S = 0.2e-3
 #: What refuses to be read.
 HOLE = 200
 #: Where what was written is kept; all else is fixed.
-WRITABLE = 64
+WRITABLE = 65
 
 
 def register_bytes(id: int, address: int, count: int) -> bytes:
@@ -37,7 +37,7 @@ class FaultyLine:
         faults: kind of fault → its probability for each answer; kinds are `late`, `doubled`, `lost`, `stolen`, `flipped`,
             `swapped` (with the next servo's), `noise`, and `echoed` (of each request).
         latest_s: how late an answer may be.
-        written_values: id → byte in register 64; refused: reads of the hole so far.
+        written_values: id → byte in register 65; refused: reads of the hole so far.
     """
 
     faults: dict[str, float]

@@ -95,7 +95,7 @@ def test_a_doubled_write_that_was_lost_is_not_taken_for_done() -> None:
     bus = bus_of(line)
     for value in range(100):
         try:
-            bus.write(10, 64, bytes((value,)))
+            bus.write(10, 65, bytes((value,)))
         except NoAnswer:
             continue
         assert line.written_values[10] == value
@@ -106,7 +106,7 @@ def test_an_adapter_that_echoes_changes_nothing_but_is_known() -> None:
     bus = bus_of(line)
     assert bus.ping(10) is not None
     assert bus.read(10, 11, 1) == register_bytes(10, 11, 1)
-    bus.write(10, 64, b"\1")
+    bus.write(10, 65, b"\1")
     before = line.now()
     assert all(answer.ok for answer in bus.sync_read(120, 27, IDS))
     bus.fast = set(IDS)
