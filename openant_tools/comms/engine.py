@@ -17,7 +17,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -49,6 +49,7 @@ from openant_tools.comms.silence import diagnose, explained, reader_words
 from openant_tools.comms.state import (
     EXTENDED_POSITION,
     POSITION,
+    RECORDED,
     Difference,
     differences,
     expected,
@@ -336,7 +337,7 @@ class Engine:
     def _read_registers(self) -> None:
         """What is set in the servos now, and how it differs from what should be."""
         config, servos = self.config, self._servos.servos
-        self._registers = read_state(self._servos)
+        self._registers = read_state(self._servos, self._alive_meanwhile(RECORDED))
         wanted = {
             servo.joint: expected(
                 servo.model, ours=self._ours.get(servo.joint, {}), passport=config.passport.get(servo.joint, {})
@@ -347,6 +348,12 @@ class Engine:
             if "pwm_limit" not in self._ours.get(joint, {}):
                 wanted[joint].pop("pwm_limit", None)
         self._differences = differences(servos, self._registers, wanted, config.limits_rad)
+
+    def _alive_meanwhile(self, registers: Iterable[str]) -> Iterator[str]:
+        """Reading them all takes a busy host a second: who reads has not stood still, and the guardian is told so."""
+        for register in registers:
+            self._beat()
+            yield register
 
     def _look_at_registers(self, *, moves: bool) -> None:
         """Read what is set in the servos anew; raises HardwareFault where that makes a motion wrong or unsafe."""
@@ -1168,6 +1175,7 @@ class Engine:
             )
         except (TypeError, ValueError, AttributeError) as error:
             raise BadInput(f"Record.facts cannot be recorded: {error}", where=command.path) from error
+        self._beat()
         self._thinning = None if command.thin_s is None else Thinning(command.thin_s, self._servos.joints)
         self._bus.failed = None
         if continued is not None:
