@@ -350,7 +350,7 @@ def test_commands_refuse_in_one_line(trained, tmp_path, capsys, monkeypatch):
         (("train", "sac", "--robot", robot.path, "--seed", 2, "--out", out), "this folder holds another run"),
         (("train", "sac", "--kit", "lite", "--device", "abacus", "--out", "x"), "torch cannot compute on abacus"),
         (("eval", tmp_path), "there is no training run here"),
-        (("eval", out, "--seconds", 0), "there is nothing to evaluate in 0 s"),
+        (("eval", out, "--seconds", 0), "Invalid value for '--seconds': 0.0 is not in the range"),
         (("eval", damaged), "there is no checkpoint yet"),
     ]
     for arguments, words in cases:

@@ -113,7 +113,7 @@ def scan(
         for baud in bauds:
             progress(baud)
             bus.line.set_baud(baud)
-            rate = _Rate(bus, baud == before or len(bauds) < 3, known)
+            rate = _Rate(bus, baud == before or len(bauds) < 3, known, stolen=reader)
             try:
                 found += rate.servos()
             except BrokenAnswer as error:
@@ -132,8 +132,8 @@ def scan(
 class _Rate:
     """One baud rate of a scan."""
 
-    def __init__(self, bus: Bus, patient: bool, known: Collection[int]) -> None:
-        self.bus, self.patient, self.known = bus, patient, known
+    def __init__(self, bus: Bus, patient: bool, known: Collection[int], *, stolen: bool) -> None:
+        self.bus, self.patient, self.known, self.stolen = bus, patient, known, stolen
         self.doubts: list[str] = []
         self.protocol_1: list[int] = []
 
@@ -154,7 +154,7 @@ class _Rate:
             for id in missing:
                 if id not in seen and id not in self.protocol_1 and protocol_1_ping(bus, id, SINGLE_S) == [id]:
                     self.protocol_1.append(id)
-        return [_examined(bus, seen[id]) for id in sorted(seen)]
+        return [_examined(bus, seen[id], stolen=self.stolen) for id in sorted(seen)]
 
     def _all(self, wait_s: float) -> dict[int, Found]:
         bus, noise, began = self.bus, self.bus.statistics.noise_bytes, self.bus.clock.now()
@@ -177,13 +177,13 @@ class _Rate:
         self.protocol_1 += [one.id for one in heard if one.id < BROADCAST and not one.params]
 
 
-def _examined(bus: Bus, seen: Found) -> Scanned:
-    """Whether the servo's answers are whole, and which questions it answers."""
+def _examined(bus: Bus, seen: Found, *, stolen: bool) -> Scanned:
+    """Whether the servo's answers are whole, and which questions it answers; what somebody else reads proves neither."""
     reads = [bus.sync_read(PROOF_ADDRESS, PROOF_SIZE, [seen.id])[0] for _ in range(PROOFS)]
     broken = sum(answer.cause in (Cause.CRC, Cause.SHORT) for answer in reads)
     level = bus.sync_read(RETURN_LEVEL, 1, [seen.id])[0]
     silent = sum(answer.data is None for answer in (*reads, level)) - broken
-    mute = silent == PROOFS + 1 and bus.ping(seen.id, insist=True) is not None
+    mute = not stolen and silent == PROOFS + 1 and bus.ping(seen.id, insist=True) is not None
     return Scanned(
         seen.id, bus.line.baud, seen.model_number, seen.firmware,
         clash=broken > PROOFS // 2,
