@@ -79,7 +79,7 @@ def test_a_robots_own_mass_pose_and_limits_enter_and_the_finding_is_kept(tmp_pat
         (["--mass", "-1"], "mass"),
         (["--servo", "XL430-W25"], "XL430-W250-T"),
         (["--supply", "24"], "does not run on 24 V"),
-        (["--pwm-limit", "50"], "share of full duty"),
+        (["--pwm-limit", "50"], "50.0 is not in the range 0.0<x<=1.0"),
         (["--angle", "steep"], "is no angle"),
     ],
 )

@@ -202,7 +202,7 @@ def test_a_full_disk_ends_motion_until_the_builder_says_otherwise(stepped: dict[
         engine.ask(messages.Torque(True))
         engine.ask(messages.Record(str(tmp_path / "full"), Facts(JOINT_NAMES)))
         unlimited = resource.prlimit(engine.pid, resource.RLIMIT_FSIZE)
-        resource.prlimit(engine.pid, resource.RLIMIT_FSIZE, (30_000, unlimited[1]))
+        resource.prlimit(engine.pid, resource.RLIMIT_FSIZE, (60_000, unlimited[1]))
         with pytest.raises(MotionStopped, match=r"the recording stopped; .* is kept, \d+ rows") as stopped:
             engine.ask(messages.Hold(60.0))
         assert stopped.value.cause is StopCause.STORAGE

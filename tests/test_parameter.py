@@ -394,7 +394,7 @@ def test_declared_and_known_kinds_change_the_same_file(tmp_path: Path) -> None:
         ('attribute = "mas"', "a geom has no number called 'mas' → did you mean 'mass'?"),
         ('attribute = "type"', "a geom has no number called 'type'"),
         ("index = 3", "mass has no number 3 → count from 0 to 0"),
-        (f"std = 1{400 * '0'}", "a number too large → give one below 1e308"),
+        (f"std = 1{400 * '0'}", "has a whole number of more than 64 bits"),
         ("std = -1", "std is -1 → give the prior's standard deviation, above 0"),
         ('std = "wide"', "std is 'wide' → give a number"),
         ('mode = "multiply"', "mode is 'multiply' → choose 'scale' or 'add'"),

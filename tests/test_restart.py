@@ -119,7 +119,7 @@ def test_a_soak_of_the_bus_ends_for_good_when_the_disk_is_full(
     robot: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, still: bool
 ) -> None:
     said: list[str] = []
-    with disk_of(monkeypatch, 40_000):
+    with disk_of(monkeypatch, 70_000):
         soaked = soak_bus(
             config(robot, 100.0), tmp_path / "soak.mcap", 60.0, move=not still, thin_s=None, notice=said.append
         )
@@ -138,7 +138,7 @@ def test_the_command_says_so_in_one_line_and_exits_with_1(
 ) -> None:
     ready = tmp_path / "ready.json"
     ready.write_text(json.dumps(robot))
-    with disk_of(monkeypatch, 40_000):
+    with disk_of(monkeypatch, 70_000):
         done = CliRunner().invoke(
             comms,
             ["soak", "--virtual", str(ready), "--minutes", "1", "--every-cycle", "--out", str(tmp_path / "s"), "--yes"],
@@ -155,7 +155,7 @@ def test_a_soak_of_the_servos_tells_a_full_disk_in_one_line(
 ) -> None:
     out = tmp_path / "warm.mcap"
     plan = Plan(load="hang", seconds=600.0, cool_down_s=10.0)
-    with disk_of(monkeypatch, 30_000), pytest.raises(MotionStopped, match=r"kept, \d+ rows") as stopped:
+    with disk_of(monkeypatch, 60_000), pytest.raises(MotionStopped, match=r"kept, \d+ rows") as stopped:
         for _ in soak_servos(soak_config(config(robot), 20.0), plan, out):
             pass
     assert stopped.value.cause is StopCause.STORAGE
@@ -169,7 +169,7 @@ def test_recording_an_excitation_ends_with_what_is_kept(
     robot: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "run.mcap"
-    with disk_of(monkeypatch, 30_000), pytest.raises(MotionStopped, match=r"kept, \d+ rows") as stopped:
+    with disk_of(monkeypatch, 60_000), pytest.raises(MotionStopped, match=r"kept, \d+ rows") as stopped:
         record_takes(config(robot, 100.0), [Take(out, protocol("stand", 30.0), 0)])
     assert stopped.value.exit_code == 1
     assert torque(robot) == 0

@@ -805,7 +805,7 @@ def test_eeprom_is_remembered_from_one_start_to_the_next(tmp_path):
     again = Wire(**table)
     assert [status.id for status in again.statuses(p2.ping(50))] == [50]
     (tmp_path / "eeprom.json").write_text("{broken")
-    with pytest.raises(BadInput, match="not a file of EEPROMs"):
+    with pytest.raises(BadInput, match=r"eeprom.json.*this is not JSON"):
         Wire(**table)
 
 

@@ -597,7 +597,8 @@ class Engine:
     def _take_poses(self, camera: BodyCamera) -> None:
         from openant_tools.comms.tags import BodyPose
 
-        lean = None if self._imu is None else self._imu.lean
+        known = self._imu is not None and self.config.imu is not None and self.config.imu.calibrated
+        lean = self._imu.lean if self._imu is not None and known else None
         if lean is not None:
             camera.lean(*lean)
         for seen in camera.poses():

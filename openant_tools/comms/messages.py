@@ -64,6 +64,11 @@ class ImuConfig:
     gyro_counts_per_dps: float = 0.0
     acc_counts_per_g: float = 0.0
 
+    @property
+    def calibrated(self) -> bool:
+        """Whether its place in the body has been measured: before that nobody knows what it calls a lean."""
+        return any((*self.mounting_rad, *self.gyro_bias_rad_s, *self.acc_bias_m_s2))
+
 
 @dataclass(frozen=True)
 class EngineConfig:

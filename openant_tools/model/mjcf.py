@@ -236,12 +236,18 @@ def _repoint_assets(root: etree._Element, source: Path, out: Path) -> None:
     here = Path(os.path.relpath(source.resolve(), out.resolve()))
     if here == Path("."):
         return
+
+    def moved(value: object) -> str:
+        # Relative, also where it was absolute: an absolute path that leads elsewhere is followed by nobody.
+        named = Path(str(value))
+        return os.path.relpath(named, out.resolve()) if named.is_absolute() else str(here / named)
+
     compilers = list(root.iter("compiler"))
     given = {name for e in compilers for name in ("assetdir", *ASSET_FOLDERS) if e.get(name) is not None}
     for element in compilers:
         for name in given:
             if element.get(name) is not None:
-                element.set(name, str(here / str(element.get(name))))
+                element.set(name, moved(element.get(name)))
     for name, tags in ASSET_FOLDERS.items():
         if not given & {name, "assetdir"} and any(_files(e) for e in root.iter(*tags)):
             if not compilers:
@@ -251,7 +257,7 @@ def _repoint_assets(root: etree._Element, source: Path, out: Path) -> None:
             compilers[0].set(name, str(here))
     for element in root.iter("model"):
         for name, value in _files(element):
-            element.set(name, str(here / value))
+            element.set(name, moved(value))
 
 
 def actuator_element(root: etree._Element, plant: Plant, j: int) -> etree._Element:

@@ -356,7 +356,20 @@ _SECTIONS: Mapping[str, type[Any]] = {
 }  # fmt: skip
 #: settings of files of before that are read no more → why
 RETIRED: Mapping[str, str] = {"bus.latency_timer_ms": "the adapter itself is asked, and set to 1 ms"}
-_KNOWN = {"schema", "name", "kit", "model", *_SECTIONS, "motors", "observation", "effect", "provenance", "platform"}
+_KNOWN = {
+    "schema",
+    "name",
+    "kit",
+    "model",
+    *_SECTIONS,
+    "motors",
+    "observation",
+    "effect",
+    "provenance",
+    "platform",
+    "identified",
+    "bench",
+}
 
 
 def _suggest(name: str, names: Sequence[str]) -> str:

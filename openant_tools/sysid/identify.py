@@ -423,7 +423,8 @@ def own_model(run: Run) -> Path | None:
     own = run.model_path
     if own is None or not own.is_file():
         return None
-    if follows(str(run.facts.model), run.path or Path()) is None:
+    # A run in memory was named by a program, not by a file from anybody.
+    if run.path is not None and follows(str(run.facts.model), run.path) is None:
         _log.warning(
             "%s: its model %s lies elsewhere and is not followed → add --trust-paths if it may be, or name one by --model",
             run.path or run.name, run.facts.model,
