@@ -48,7 +48,7 @@ FAST_READ_FIRMWARE = 45
 #: Whole plain reads in a row after which joined ones are tried again (a second at 100 Hz), and at most after failures.
 FAST_AGAIN, FAST_AGAIN_LONGEST = 100, 6400
 #: How much longer than it takes to listen for a second answer, where the first may have been an earlier question's, s.
-LISTEN_ON_S = 0.5e-3
+LISTEN_ON_S = 2e-3
 #: A line is quiet once nothing has come for so long, s; one that has not been for RESTLESS_S never falls silent.
 QUIET_S = 20e-3
 RESTLESS_S = 0.2
