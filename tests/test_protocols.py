@@ -397,12 +397,8 @@ def test_ctrl_c_leaves_torque_off_and_a_whole_recording(tmp_path: Path) -> None:
     )
     try:
         _wait(ready.is_file)
-        command = ["--virtual", str(ready), "--out", str(out), "--yes"]
-        call = (
-            "from openant_tools.cli import _interrupt; import signal; signal.signal(signal.SIGTERM, _interrupt); "
-            f"from openant_tools.cli.sysid_record import record; record({command!r}, standalone_mode=False)"
-        )
-        player = subprocess.Popen([sys.executable, "-c", call], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        command = [*cli, "sysid", "record", "--virtual", str(ready), "--out", str(out), "--yes"]
+        player = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         _wait(out.is_file)
         time.sleep(2.0)
         os.kill(player.pid, signal.SIGINT)
