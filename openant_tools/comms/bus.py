@@ -254,7 +254,7 @@ class Bus:
         """The same registers of several servos, in the order of `ids`. Never raises for a silent servo.
 
         An answer that is late is not taken for one to this question: where the servos' ticks are among the registers,
-        by them; else a question waits until none can come any more, at most `pending.LATEST_S`. `again` waves that:
+        by them; else a question waits until none can come any more, at most `pending.LATEST_S`. `again` waives that:
         the question is the same as the one before, and the answer to either will do.
         """
         ids = tuple(ids)
@@ -268,7 +268,7 @@ class Bus:
                 self.statistics.fast_read_fallbacks += 1
                 self._plain_wanted = min(2 * self._plain_wanted or FAST_AGAIN, FAST_AGAIN_LONGEST)
                 self._plain_left = self._plain_wanted
-                plain = self._transact(self._request(p2.Inst.SYNC_READ, address, count, tuple(rest)))
+                plain = self._transact(self._request(p2.Inst.SYNC_READ, address, count, tuple(rest)), again=again)
                 by_id = {answer.id: answer for answer in plain}
                 answers = [by_id.get(answer.id, answer) for answer in answers]
             return answers
