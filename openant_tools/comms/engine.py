@@ -974,7 +974,7 @@ class Engine:
                     answer = _refusal(number, command, error)
                 except Exception as error:  # ours: whoever waits is told, and nothing moves on with it
                     what = f"{type(command).__name__} failed in the engine: {type(error).__name__}: {error}"
-                    self._stopped(Trip(what, "report it: `openant support` packs what is needed"))
+                    self._stopped(Trip(what, "report it, with this line and the command that you gave"))
                     answer = messages.Reply(number, error=(what, None, None), cause=StopCause.UNKNOWN)
                 if answer is not None:
                     self._say(answer)
