@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -34,9 +33,6 @@ PARTS = {
 
 def run(part: str, scale: float, anew: bool, results: dict[str, Any]) -> None:
     """Try every row of a part, and keep each as it is done."""
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=HERE, capture_output=True, text=True, check=False
-    ).stdout.strip()
     rows = results.setdefault(part, {})
     for campaign in importlib.import_module(f"reliability_{part}").campaigns():
         row = {"tries": 0, "survived": 0} if anew else rows.get(campaign.attack, {"tries": 0, "survived": 0})
@@ -47,7 +43,6 @@ def run(part: str, scale: float, anew: bool, results: dict[str, Any]) -> None:
             row["tries"], row["survived"] = row["tries"] + 1, row["survived"] + survived
             if not survived:
                 failed.append(k)
-        row["commit"] = commit
         rows[campaign.attack] = row
         RESULTS.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         print(
