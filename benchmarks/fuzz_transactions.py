@@ -94,7 +94,7 @@ def main() -> None:
     began, seen, wrong, seed = time.monotonic(), Counter[str](), list[str](), options.seed
     while seen["transactions"] < options.transactions:
         chance = random.Random(seed)
-        line = FaultyLine(faults(chance), seed)
+        line = FaultyLine(faults=faults(chance), seed=seed)
         bus = Bus(line, line, Timing(return_delay_s=0.0, latency_timer_s=chance.choice((1e-3, 16e-3))))
         found = transact(bus, line, chance, LINES, seen)
         if found:

@@ -61,7 +61,7 @@ def campaigns() -> list[Campaign]:
 
 def _transactions(kinds: dict[str, float], seed: int) -> bool:
     chance = random.Random(seed)
-    line = FaultyLine(kinds, seed)
+    line = FaultyLine(faults=kinds, seed=seed)
     bus = Bus(line, line, Timing(return_delay_s=0.0, latency_timer_s=chance.choice((1e-3, 16e-3))))
     return not transact(bus, line, chance, TRANSACTIONS, Counter())
 

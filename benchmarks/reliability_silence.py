@@ -14,7 +14,7 @@ from pathlib import Path
 from campaign import Campaign
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from talker import Talker, talking
+from talker import READER, Talker, talking
 from wire import IDS, ant
 
 from openant_tools.comms.bus import Bus
@@ -27,15 +27,6 @@ __all__ = ["campaigns"]
 
 ANT = tuple(IDS)
 MEGABAUD = 1_000_000
-_THIEF = """
-import os, select, sys
-fd = os.open(sys.argv[1], os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
-print("reading", flush=True)
-while True:
-    select.select([fd], [], [], 1)
-    try: os.read(fd, 4096)
-    except BlockingIOError: pass
-"""
 
 
 @contextlib.contextmanager
@@ -64,7 +55,7 @@ def _shy(k: int) -> bool:
 
 def _thief(k: int) -> bool:
     with _bus(*ANT) as (bus, talker):
-        other = subprocess.Popen([sys.executable, "-c", _THIEF, talker.path], stdout=subprocess.PIPE)
+        other = subprocess.Popen([sys.executable, "-c", READER, talker.path], stdout=subprocess.PIPE)
         try:
             assert other.stdout is not None
             other.stdout.readline()

@@ -6,10 +6,11 @@ bytes behind it hold the microsecond in which the block was read.
 
 from __future__ import annotations
 
-import heapq
 import random
 import struct
 from dataclasses import dataclass, field
+
+from wire import MemoryLine
 
 from openant_tools.comms import protocol2 as p2
 
@@ -29,91 +30,40 @@ def register_bytes(id: int, address: int, count: int) -> bytes:
     return bytes((id * 37 + at * 101 + (id * at >> 3) * 7 + 13) & 0xFF for at in range(address, address + count))
 
 
-@dataclass
-class FaultyLine:
-    """`comms.line.Line` and `comms.clock.Clock` in one.
+@dataclass(kw_only=True)
+class FaultyLine(MemoryLine):
+    """Servos whose answers go wrong.
 
     Attributes:
         faults: kind of fault → its probability for each answer; kinds are `late`, `doubled`, `lost`, `stolen`, `flipped`,
             `swapped` (with the next servo's), `noise`, and `echoed` (of each request).
         latest_s: how late an answer may be.
-        written_values: id → byte in register 65; refused: reads of the hole so far.
+        written_values: id → byte in register 65.
     """
 
     faults: dict[str, float]
     seed: int = 0
     latest_s: float = 0.1
-    baud: int = 1_000_000
-    path: str = "memory"
-    written: int = 0
-    received: int = 0
-    stepped: bool = True
     written_values: dict[int, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self._t = 100.0
         self._chance = random.Random(self.seed)
-        self._coming: list[tuple[float, int, bytes]] = []
-        self._count = 0
-        self._arrivals: list[tuple[int, float]] = []
-
-    # ---- a line
-
-    def fileno(self) -> int:
-        return -1
 
     def write(self, data: bytes) -> None:
         self.written += len(data)
         if self._happens("echoed"):
-            self._put(data, self._t)
+            self.bring(data, self._t)
         self._t += len(data) * 10 / self.baud
         for item in p2.Parser().feed(data):
             assert isinstance(item, p2.Instruction)
             self._answer(item)
 
-    def read(self) -> bytes:
-        out, self._arrivals = b"", []
-        while self._coming and self._coming[0][0] <= self._t:
-            at, _, data = heapq.heappop(self._coming)
-            out += data
-            self.received += len(data)
-            self._arrivals.append((self.received, at))
-        return out
-
-    def set_baud(self, baud: int) -> None:
-        self.baud = baud
-
-    def close(self) -> None: ...
-
-    # ---- a clock
-
-    def now(self) -> float:
-        return self._t
-
-    def sleep_until(self, t: float) -> None:
-        self._t = max(self._t, t)
-
-    def wait_readable(self, line: object, deadline: float) -> bool:
-        if self._coming and self._coming[0][0] <= max(deadline, self._t):
-            self._t = max(self._t, self._coming[0][0])
-            return True
-        self.sleep_until(deadline)
-        return False
-
-    def arrivals(self, line: object) -> list[tuple[int, float]]:
-        return self._arrivals
-
-    def in_time(self, at: float, deadline: float) -> bool:
-        return at <= deadline
-
     # ---- servos
 
     def _happens(self, kind: str) -> bool:
         return self._chance.random() < self.faults.get(kind, 0.0)
-
-    def _put(self, data: bytes, t: float) -> None:
-        self._count += 1
-        heapq.heappush(self._coming, (t, self._count, data))
 
     def _answer(self, asked: p2.Instruction) -> None:
         replies: list[p2.Status] = []
@@ -155,7 +105,7 @@ class FaultyLine:
             at += ANSWER_S + len(data) * 10 / self.baud
             t = at + self._chance.uniform(0.0, self.latest_s) if self._happens("late") else at
             if self._happens("doubled"):
-                self._put(
+                self.bring(
                     data, t + self._chance.choice((0.0, 0.5e-3, 2e-3, 10e-3, self._chance.uniform(0, self.latest_s)))
                 )
             if self._happens("lost"):
@@ -169,4 +119,4 @@ class FaultyLine:
                 data = bytes(broken)
             if self._happens("noise"):
                 data = self._chance.randbytes(self._chance.randrange(1, 30)) + data
-            self._put(data, t)
+            self.bring(data, t)

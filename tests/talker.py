@@ -18,6 +18,16 @@ from openant_tools.comms import protocol1
 from openant_tools.comms import protocol2 as p2
 
 XM430 = 1020
+#: Another program that has the port open without a lock, and only reads: `python -c READER PATH`.
+READER = """
+import os, select, sys
+fd = os.open(sys.argv[1], os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
+print("reading", flush=True)
+while True:
+    select.select([fd], [], [], 1)
+    try: os.read(fd, 4096)
+    except BlockingIOError: pass
+"""
 
 
 @dataclass

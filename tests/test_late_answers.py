@@ -21,6 +21,7 @@ from openant_tools.comms.bus import Bus, Timing
 from openant_tools.comms.clock import RealClock, portions
 from openant_tools.comms.faults import BrokenAnswer, Cause, NeverSilent, NoAnswer
 from openant_tools.comms.line import PortGone, SerialLine
+from openant_tools.comms.protocol2 import Status
 from openant_tools.comms.ticks import PROOF_S, TickClock
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -34,7 +35,7 @@ def bus_of(line: FaultyLine, latency_timer_s: float = 1e-3) -> Bus:
 @pytest.mark.parametrize("seed", range(8))
 def test_no_value_is_wrong_on_a_line_that_does_all_of_it(seed: int) -> None:
     chance, seen = random.Random(seed), Counter[str]()
-    line = FaultyLine(faults(chance), seed)
+    line = FaultyLine(faults=faults(chance), seed=seed)
     assert transact(bus_of(line, chance.choice((1e-3, 16e-3))), line, chance, 200, seen) == []
     assert seen["kept"] > seen["rows"] / 2
 
@@ -42,7 +43,7 @@ def test_no_value_is_wrong_on_a_line_that_does_all_of_it(seed: int) -> None:
 @pytest.mark.parametrize("latency_timer_s", [1e-3, 16e-3])
 @pytest.mark.parametrize("late_s", [0.006, 0.012, 0.02, 0.03, 0.045, 0.07, 0.1])
 def test_one_late_answer_spoils_no_later_question(late_s: float, latency_timer_s: float) -> None:
-    line = FaultyLine({})
+    line = FaultyLine(faults={})
     bus = bus_of(line, latency_timer_s)
     bus.read(10, 44, 1)
     line.latest_s, line.faults = late_s, {"late": 1.0}
@@ -57,7 +58,7 @@ def test_one_late_answer_spoils_no_later_question(late_s: float, latency_timer_s
 
 
 def test_a_loop_of_100_hz_keeps_its_rows_where_one_answer_in_a_hundred_is_late() -> None:
-    line = FaultyLine({"late": 0.01}, seed=3)
+    line = FaultyLine(faults={"late": 0.01}, seed=3)
     bus, rows, kept = bus_of(line), 0, 0
     start = line.now()
     for k in range(1500):
@@ -74,16 +75,14 @@ def test_a_loop_of_100_hz_keeps_its_rows_where_one_answer_in_a_hundred_is_late()
 
 
 def test_an_answer_that_comes_again_in_the_next_cycle_is_dropped_and_the_next_one_kept() -> None:
-    line = FaultyLine({})
+    line = FaultyLine(faults={})
     bus = bus_of(line)
     for k in range(20):
         line.sleep_until(100.0 + k * 0.01)
         bus.sync_read(120, 27, [10])
     old = bus.sync_read(120, 27, [10])[0]
     line.sleep_until(line.now() + 0.01)
-    from openant_tools.comms.protocol2 import Status
-
-    line._put(Status(10, 0, old.data or b"").encode(), line.now())
+    line.bring(Status(10, 0, old.data or b"").encode(), line.now())
     [answer] = bus.sync_read(120, 27, [10])
     assert answer.ok
     assert answer.data != old.data
@@ -91,7 +90,7 @@ def test_an_answer_that_comes_again_in_the_next_cycle_is_dropped_and_the_next_on
 
 
 def test_a_doubled_write_that_was_lost_is_not_taken_for_done() -> None:
-    line = FaultyLine({"doubled": 0.3, "late": 0.1, "lost": 0.1}, seed=5)
+    line = FaultyLine(faults={"doubled": 0.3, "late": 0.1, "lost": 0.1}, seed=5)
     bus = bus_of(line)
     for value in range(100):
         try:
@@ -102,7 +101,7 @@ def test_a_doubled_write_that_was_lost_is_not_taken_for_done() -> None:
 
 
 def test_an_adapter_that_echoes_changes_nothing_but_is_known() -> None:
-    line = FaultyLine({"echoed": 1.0})
+    line = FaultyLine(faults={"echoed": 1.0})
     bus = bus_of(line)
     assert bus.ping(10) is not None
     assert bus.read(10, 11, 1) == register_bytes(10, 11, 1)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from talker import Talker, talking
+from talker import READER, Talker, talking
 from wire import IDS, ant
 
 from openant_tools.calib.mute import let_answer, silenced
@@ -95,17 +95,6 @@ def test_a_status_return_level_is_said_beside_the_servo(tmp_path: Path, level: i
         assert not talker.written
     assert ids(rows) == [10, 31]
     assert f"Status Return Level {level}, answers {answers}: `openant calib inventory`" in result.stdout
-
-
-READER = """
-import os, select, sys
-fd = os.open(sys.argv[1], os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
-print("reading", flush=True)
-while True:
-    select.select([fd], [], [], 1)
-    try: os.read(fd, 4096)
-    except BlockingIOError: pass
-"""
 
 
 def test_another_program_that_reads_the_port_is_named(tmp_path: Path) -> None:

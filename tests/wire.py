@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+import heapq
 from dataclasses import dataclass, field
 
 from openant_tools.comms.bus import Bus, Timing
@@ -39,39 +39,35 @@ class StillMotor:
 
 
 @dataclass
-class WireLine:
-    """`comms.line.Line` and `comms.clock.Clock` in one, over the virtual wire."""
+class MemoryLine:
+    """`comms.line.Line` and `comms.clock.Clock` in one: time jumps to whatever comes next. Subclasses say what `write` brings."""
 
-    wire: Wire
     baud: int = 1_000_000
-    path: str = "wire"
+    path: str = "memory"
     written: int = 0
     received: int = 0
     stepped: bool = True
-    unplugged: bool = False
-    lateness: Lateness = field(default_factory=lambda: Lateness(real=False))
 
     def __post_init__(self) -> None:
+        self.lateness = Lateness(real=False)
         self._t = 1.0
-        self._coming: deque[tuple[float, bytes]] = deque()
+        #: (when it is there, its number, bytes), the next one first
+        self._coming: list[tuple[float, int, bytes]] = []
+        self._count = 0
         self._arrivals: list[tuple[int, float]] = []
+
+    def bring(self, data: bytes, t: float) -> None:
+        """Let these bytes be there from `t` on."""
+        self._count += 1
+        heapq.heappush(self._coming, (t, self._count, data))
 
     def fileno(self) -> int:
         return -1
 
-    def write(self, data: bytes) -> None:
-        if self.unplugged:
-            raise PortGone(self.path)
-        self.written += len(data)
-        self._coming.extend((reply.t, reply.data) for reply in self.wire.receive(data, self._t, self.baud))
-
     def read(self) -> bytes:
-        if self.unplugged:
-            raise PortGone(self.path)
-        out = b""
-        self._arrivals = []
+        out, self._arrivals = b"", []
         while self._coming and self._coming[0][0] <= self._t:
-            at, data = self._coming.popleft()
+            at, _, data = heapq.heappop(self._coming)
             out += data
             self.received += len(data)
             self._arrivals.append((self.received, at))
@@ -88,8 +84,6 @@ class WireLine:
 
     def sleep_until(self, t: float) -> None:
         self._t = max(self._t, t)
-        for servo in self.wire.servos:
-            servo.watch_bus(self._t)
 
     def wait_readable(self, line: object, deadline: float) -> bool:
         if self._coming and self._coming[0][0] <= max(deadline, self._t):
@@ -105,6 +99,32 @@ class WireLine:
         return at <= deadline
 
 
+@dataclass(kw_only=True)
+class WireLine(MemoryLine):
+    """The virtual wire, with its servos."""
+
+    wire: Wire
+    path: str = "wire"
+    unplugged: bool = False
+
+    def write(self, data: bytes) -> None:
+        if self.unplugged:
+            raise PortGone(self.path)
+        self.written += len(data)
+        for reply in self.wire.receive(data, self._t, self.baud):
+            self.bring(reply.data, reply.t)
+
+    def read(self) -> bytes:
+        if self.unplugged:
+            raise PortGone(self.path)
+        return super().read()
+
+    def sleep_until(self, t: float) -> None:
+        super().sleep_until(t)
+        for servo in self.wire.servos:
+            servo.watch_bus(self._t)
+
+
 def ant(
     timing: Timing | None = None, *, firmware: int = 46, settings: BusSettings | None = None, seed: int = 0
 ) -> tuple[Bus, WireLine]:
@@ -118,7 +138,7 @@ def ant(
         servos.append(servo)
     settings = settings or BusSettings()
     settings.chains = [[0, 1], [2, 3], [4, 5], [6, 7]]
-    line = WireLine(Wire(servos, settings, lambda t: None, seed=seed))
+    line = WireLine(wire=Wire(servos, settings, lambda t: None, seed=seed))
     names = {joint.id: joint.name for joint in JOINTS.values()}
     bus = Bus(line, line, timing or Timing(return_delay_s=0.0, latency_timer_s=1e-3), names)
     bus.guarded = True  # these servos end with this process
