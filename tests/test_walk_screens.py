@@ -290,7 +290,8 @@ def test_the_whole_walk_by_its_screens_from_loose_motors_to_the_passport(tmp_pat
     with robot(tmp_path, f'[robot]\nsetup = "loose"\n{CAMERA}') as ant:
         ant.walk(walk, {"while the legs swing. For how long?": "0.2", "Soak for how long?": "1"})
         states = {name: now.state for name, now in standing(ant.folder).items()}
-        assert set(states.values()) == {"ok"}, (states, said)
+        failed = [name for name, state in states.items() if state != "ok"]
+        assert not failed, "\n".join(f"{name} {states[name]}: {said.get(name, '')[-3000:]}" for name in failed)
         assert ant.folder.passport.is_file()
         assert ant.folder.config().model == "calibrated.xml"
         assert ant.folder.config().arena.centre_m == pytest.approx((0.75, -0.30), abs=0.03)

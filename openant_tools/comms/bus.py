@@ -47,8 +47,6 @@ LONGEST_LATENCY_S = 16e-3
 FAST_READ_FIRMWARE = 45
 #: Whole plain reads in a row after which joined ones are tried again (a second at 100 Hz), and at most after failures.
 FAST_AGAIN, FAST_AGAIN_LONGEST = 100, 6400
-#: How much longer than it takes to listen for a second answer, where the first may have been an earlier question's, s.
-LISTEN_ON_S = 2e-3
 #: A line is quiet once nothing has come for so long, s; one that has not been for RESTLESS_S never falls silent.
 QUIET_S = 20e-3
 RESTLESS_S = 0.2
@@ -519,11 +517,8 @@ class Bus:
                 sorting = Sorting(request, started, self._clocks, plan)
             sorting.feed(data[sorted_to:], edges)
             sorted_to = len(data)
-            if sorting.complete:
-                if not plan.listen_on:
-                    break
-                # As long as an answer usually takes: one that is there already may have been an earlier question's.
-                deadline = min(deadline, started + request.whole - self.timing.margin_s + LISTEN_ON_S)
+            if sorting.complete and not plan.listen_on:
+                break  # else to the deadline: what is there already may have been an earlier question's
             if in_time:
                 deadline = min(deadline, max(edges[-1][1], sent) + quiet)
         if sorting is None:

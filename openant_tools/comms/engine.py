@@ -87,6 +87,8 @@ RELEASE_S = 0.5
 REOPEN_PERIOD_S = 0.5
 #: s between two losses whose raw bytes a thin recording keeps: a line that is dead says the same each time.
 RAW_PERIOD_S = 0.05
+#: rad. No body whose tag is seen from above leans farther.
+STEEP_RAD = np.pi / 4
 #: The IMU's port is left alone for so long before a cycle begins.
 IMU_SLACK_S = 0.3e-3
 _ERR_CODE = {word: code for code, word in enumerate(ERR_CODES)}
@@ -597,9 +599,8 @@ class Engine:
     def _take_poses(self, camera: BodyCamera) -> None:
         from openant_tools.comms.tags import BodyPose
 
-        known = self._imu is not None and self.config.imu is not None and self.config.imu.calibrated
-        lean = self._imu.lean if self._imu is not None and known else None
-        if lean is not None:
+        lean = None if self._imu is None else self._imu.lean
+        if lean is not None and self._may_lean(*lean[1:]):
             camera.lean(*lean)
         for seen in camera.poses():
             if self._recorder is None:
@@ -612,6 +613,11 @@ class Engine:
             if seen.kind != self._pose_lost:
                 self._pose_lost = seen.kind
                 self._recorder.event("pose lost" if reason else "pose found", taken=seen.t, reason=reason)
+
+    def _may_lean(self, roll: float, pitch: float) -> bool:
+        """Whether a lean (rad) can be the body's: an IMU whose place nobody has measured may sit in it any way round."""
+        imu = self.config.imu
+        return (imu is not None and imu.calibrated) or bool(np.cos(roll) * np.cos(pitch) > np.cos(STEEP_RAD))
 
     def _cycle(self, wake: float, cycles: int) -> None:
         if self._lost:
