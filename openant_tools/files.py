@@ -185,7 +185,8 @@ def parse_toml(text: str, where: str | Path, remedy: str = "mend it there") -> d
     except RecursionError:
         raise BadInput("its lists and tables nest too deep", where=where, remedy=remedy) from None
     except ValueError as error:
-        raise BadInput(f"is not TOML: {error}", where=where, remedy=remedy) from None
+        what, _, place = str(error).removesuffix(")").partition(" (at ")
+        raise BadInput(f"is not TOML: {what}", where=f"{where}, {place}" if place else where, remedy=remedy) from None
     _bounded(table, where, remedy)
     return table
 

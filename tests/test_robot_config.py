@@ -292,8 +292,8 @@ def test_a_file_cut_anywhere_is_refused_in_one_line(
     [
         (lambda data: data[:900] + b"\0" * 400, "holds zero bytes, as a power cut leaves them"),
         (lambda data: data[:900] + b"\xff\xfe", "is no UTF-8 text"),
-        (lambda data: data + b'\nname = "', "is no TOML"),
-        (lambda data: data.replace(b"[bus]", b"[ports]"), "is no TOML"),
+        (lambda data: data + b'\nname = "', "is not TOML"),
+        (lambda data: data.replace(b"[bus]", b"[ports]"), "is not TOML"),
     ],
 )
 def test_a_damaged_file_names_the_newest_backup(
@@ -463,7 +463,7 @@ def test_whatever_the_owner_wrote_survives(tmp_path_factory: pytest.TempPathFact
     assert folder.config_file.read_bytes() == text.encode("utf-8"), "nothing changed, so not a byte changes"
 
     path, value = data.draw(changes)
-    document = read_document(text.encode("utf-8"), "before").unwrap()
+    document = read_document(text.encode("utf-8"), "before")
     folder.update({path: value})
     after = folder.config_file.read_bytes()
     *keys, last = path.split(".")
@@ -471,7 +471,7 @@ def test_whatever_the_owner_wrote_survives(tmp_path_factory: pytest.TempPathFact
     for key in keys:
         table = table[key]
     table[last] = value
-    assert read_document(after, "after").unwrap() == document, "exactly this value has changed"
+    assert read_document(after, "after") == document, "exactly this value has changed"
     old_lines, new_lines = text.split("\n"), after.decode("utf-8").split("\n")
     assert len(old_lines) == len(new_lines)
     assert sum(a != b for a, b in zip(old_lines, new_lines, strict=True)) <= 1

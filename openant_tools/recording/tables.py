@@ -28,6 +28,7 @@ LARGEST_CSV, LONGEST_HEADER = 2**30, 64 * 1024
 #: numbers of a table: an hour of an Open Ant at 300 Hz has 80 million
 LARGEST_TABLE = 400_000_000
 _MISSING = ("", "nan", "NaN", "NAN", "null", "NULL", "None", "NA", "N/A")
+_TRUE, _FALSE = pa.array(["true", "True", "TRUE"]), pa.array(["false", "False", "FALSE"])
 
 
 def read_run(path: str | Path, *, need: Sequence[str] = ("cmd", "pos")) -> Run:
@@ -268,10 +269,9 @@ def _numbers(name: str, column: pa.Array, path: Path) -> NDArray[Any]:
 def _parsed(name: str, column: pa.Array, path: Path, ours: bool) -> NDArray[Any]:
     texts = pc.utf8_trim_whitespace(column.cast(pa.string()))
     missing = pc.or_kleene(pc.is_null(texts), pc.is_in(texts, value_set=pa.array(_MISSING)))
-    flags = {"true": "1", "True": "1", "TRUE": "1", "false": "0", "False": "0", "FALSE": "0"}
     numbers = pc.if_else(missing, pa.scalar(None, pa.string()), texts)
-    for word, digit in flags.items():
-        numbers = pc.if_else(pc.equal(numbers, word), digit, numbers)
+    for words, digit in ((_TRUE, "1"), (_FALSE, "0")):
+        numbers = pc.if_else(pc.is_in(texts, value_set=words), digit, numbers)
     try:
         values = pc.fill_null(numbers.cast(pa.float64()), np.nan)
     except pa.ArrowInvalid:

@@ -8,14 +8,13 @@ from __future__ import annotations
 import datetime
 import difflib
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import tomlkit
-from tomlkit.exceptions import ParseError, TOMLKitError
+from tomlkit.exceptions import TOMLKitError
 
 from openant_tools.errors import BadInput
 from openant_tools.files import decoded, parse_toml
@@ -26,7 +25,8 @@ from openant_tools.robot.servo import BAUD_CODES, SERVO_MODELS, ServoModel
 
 __all__ = [
     "ACTION_PRESETS", "CONFIG_NAME", "ActionRange", "Actions", "Arena", "Bus", "Camera", "Effect", "Imu", "Motor", "Ports",
-    "Problem", "Provenance", "RobotConfig", "Timing", "covers", "parse_config", "read_document",
+    "Problem", "Provenance", "RobotConfig", "Timing", "covers", "editable_document",
+    "parse_config", "read_document",
 ]  # fmt: skip
 
 CONFIG_NAME = "robot.toml"
@@ -533,32 +533,24 @@ def _provenance(table: Any, problems: list[Problem]) -> dict[str, Provenance]:
     return entries
 
 
-def read_document(data: bytes, where: str | Path) -> tomlkit.TOMLDocument:
-    """The TOML document in a file's bytes; raises BadInput with line and column where it is none."""
-    remedy = "mend it by hand"
+def read_document(data: bytes, where: str | Path) -> dict[str, Any]:
+    """What a robot's file, given by its bytes, says; raises BadInput with line and column where it is no TOML."""
     if len(data) > LARGEST_ROBOT:
         raise BadInput(f"is larger than {LARGEST_ROBOT // 1024} KiB", where=where, remedy="is it a robot's?")
-    text = decoded(data, where)
+    remedy, text = "mend it by hand", decoded(data, where)
+    if "\0" in text:
+        line = text[: text.index("\0")].count("\n") + 1
+        raise BadInput("holds zero bytes, as a power cut leaves them", where=f"{where}, line {line}", remedy=remedy)
+    return parse_toml(text, where, remedy)
+
+
+def editable_document(data: bytes, where: str | Path) -> tomlkit.TOMLDocument:
+    """The same with comments, order and all else that its owner wrote, to be changed and written."""
+    read_document(data, where)  # first: it takes a tenth of the time, and is strict
     try:
-        # TOML forbids NUL; tomlkit would let it pass in comments, and a zeroed tail is what a power cut leaves.
-        if "\0" in text:
-            raise BadInput(
-                "holds zero bytes, as a power cut leaves them",
-                where=f"{where}, line {data[: data.index(0)].count(10) + 1}",
-                remedy=remedy,
-            )
-        document = tomlkit.parse(text)
-    except ParseError as error:
-        what = re.sub(r" at line \d+ col \d+$", "", str(error))
-        raise BadInput(
-            f"is no TOML: {what}", where=f"{where}, line {error.line}, column {error.col + 1}", remedy=remedy
-        ) from None
-    except RecursionError:
-        raise BadInput("its lists and tables nest too deep", where=where, remedy=remedy) from None
-    except (TOMLKitError, ValueError, LookupError, TypeError, AttributeError) as error:
-        raise BadInput(f"is no TOML: {error}", where=where, remedy=remedy) from None
-    parse_toml(text, where, remedy)  # what tomlkit lets pass, and numbers that no computer counts with
-    return document
+        return tomlkit.parse(decoded(data, where))
+    except (TOMLKitError, RecursionError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise BadInput(f"cannot be edited: {error}", where=where, remedy="mend it by hand") from None
 
 
 def retired(problem: Problem) -> Problem:
@@ -571,7 +563,7 @@ def parse_config(document: Mapping[str, Any]) -> tuple[RobotConfig | None, list[
     """What a document says, and everything in it that cannot be or is probably not meant.
 
     Args:
-        document: plain values of a TOML document (`unwrap()` of a tomlkit one).
+        document: plain values, as `read_document` gives them.
 
     Returns:
         The configuration, None where an error stands among the problems; and the problems in the file's order of

@@ -6,16 +6,16 @@ import contextlib
 import datetime
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import tomlkit
 from tomlkit.items import AoT, InlineTable, Table
 
 from openant_tools.errors import BadInput
-from openant_tools.files import write_bytes, write_text
+from openant_tools.files import parse_toml, write_bytes, write_text
 from openant_tools.lock import Claim, Holder, held, holder
 from openant_tools.robot.config import (
     CONFIG_NAME,
@@ -24,6 +24,7 @@ from openant_tools.robot.config import (
     Provenance,
     RobotConfig,
     covers,
+    editable_document,
     parse_config,
     read_document,
 )
@@ -40,6 +41,8 @@ NOMINAL_MODEL = "nominal.xml"
 CHANGE_PATIENCE_S = 30.0
 HELD = "this robot is held by {}"
 WAIT = "wait for it, or stop it; what only reads goes on"
+
+Document = TypeVar("Document", bound=Mapping[str, Any])
 
 
 @dataclass(frozen=True)
@@ -184,7 +187,7 @@ class RobotFolder:
             BadInput: the file is missing, cut, or no TOML.
         """
         data = self._bytes()
-        document = self._document(data).unwrap()
+        document = self._read(read_document, data)
         config, problems = parse_config(document)
         model = document.get("model")
         if isinstance(model, str):
@@ -244,7 +247,9 @@ class RobotFolder:
         with self._changing():
             before = self._bytes()
             try:
-                after, config = _edited(self._document(before), self.config_file, values, provenance or {}, effects)
+                after, config = _edited(
+                    self._read(editable_document, before), self.config_file, values, provenance or {}, effects
+                )
             except BadInput as error:
                 raise BadInput(
                     f"{error.what}; the file was left as it is", where=error.where, remedy=error.remedy
@@ -274,9 +279,9 @@ class RobotFolder:
     def newest_backup(self) -> Path | None:
         return max(self.backups.glob("robot-*.toml"), default=None)
 
-    def _document(self, data: bytes) -> tomlkit.TOMLDocument:
+    def _read(self, reader: Callable[[bytes, Path], Document], data: bytes) -> Document:
         try:
-            return read_document(data, self.config_file)
+            return reader(data, self.config_file)
         except BadInput as error:
             backup = self.newest_backup
             remedy = f"mend it by hand, or bring back {backup}" if backup else "mend it by hand"
@@ -374,7 +379,7 @@ def _edited(
     if effects is not None:
         _set_effects(document, effects)
     after = tomlkit.dumps(document)
-    says = tomlkit.parse(after).unwrap()
+    says = parse_toml(after, where)
     config, problems = parse_config(says)
     errors = [problem for problem in problems if problem.severity == "error"]
     if errors or config is None:

@@ -207,7 +207,7 @@ def import_platform_config(platform: PlatformConfig, path: str | Path, kit: str 
 
 def imported_object(folder: RobotFolder) -> dict[str, Any] | None:
     """The object that was imported into a folder, None where none was, or where its copy is gone."""
-    document = read_document(folder.config_file.read_bytes(), folder.config_file).unwrap()
+    document = read_document(folder.config_file.read_bytes(), folder.config_file)
     table = document.get("platform")
     name = table.get("config") if isinstance(table, dict) else None
     path = folder.path / name if isinstance(name, str) else None

@@ -114,10 +114,10 @@ def placed(source: str, setup: str, heading_rad: float = 0.0, *, doze: bool = Fa
 
 def _scenario(source: str) -> tomlkit.TOMLDocument:
     """A scenario as it stands; empty where it cannot be read: the robot itself will say what is wrong with it."""
-    from openant_tools.robot.config import read_document  # manuals, which need none of it, open at once
+    from openant_tools.robot.config import editable_document  # manuals, which need none of it, open at once
 
     try:
-        return read_document(Path(source).read_bytes(), source)
+        return editable_document(Path(source).read_bytes(), source)
     except (OSError, BadInput):
         return tomlkit.document()
 
