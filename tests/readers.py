@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from lerobot_data import calibrate
+from lerobot_data import make as make_dataset
 from plants import pendulum
 
 from openant_tools.arrays import read_arrays, write_arrays
@@ -243,6 +245,28 @@ def _committed(path: Path) -> Any:
     return committed(path.parent, {"schema": "openant.blind/1"})
 
 
+def _dataset(folder: Path) -> None:
+    make_dataset(folder, lengths=(8, 12), files=((0,), (1,)))
+
+
+def _read_dataset(path: Path) -> Any:
+    from openant_tools.exchange.lerobot_import import convert, read_conversion
+
+    return list(convert(read_conversion(path.parents[2])))
+
+
+def _open_dataset(path: Path) -> Any:
+    from openant_tools.exchange.lerobot_dataset import open_dataset
+
+    return open_dataset(next(folder for folder in path.parents if (folder / "data").is_dir()))
+
+
+def _ranges(path: Path) -> Any:
+    from openant_tools.exchange.lerobot_units import read_calibration
+
+    return read_calibration(path)
+
+
 def _text(name: str, text: str) -> Callable[[Path], object]:
     return lambda folder: (folder / name).write_text(text)
 
@@ -268,6 +292,10 @@ READERS = {
     "typed readings": Reader("typed.csv", _text("typed.csv", "volts,grams\n1.0,2.0\n# no\n2.0,4.5\n"), _typed),
     "ready file": Reader("ready.json", _text("ready.json", '{"bus": "/dev/pts/1", "imu": null, "pid": 3}'), _ready),
     "blind set": Reader("set.toml", _set, _committed),
+    "LeRobot dataset": Reader("meta/info.json", _dataset, _open_dataset),
+    "LeRobot episodes": Reader("meta/episodes/chunk-000/file-000.parquet", _dataset, _open_dataset),
+    "LeRobot rows": Reader("data/chunk-000/file-001.parquet", _dataset, _read_dataset),
+    "LeRobot calibration": Reader("arm.json", calibrate, _ranges),
     "cache": Reader(
         "part.npz", lambda folder: write_arrays(folder / "part.npz", {"run0": np.ones((4, 3), np.float16)}), read_arrays
     ),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from openant_tools.cli.options import json_option
+from openant_tools.errors import BadInput
 
 if TYPE_CHECKING:
     from openant_tools.recording.run import Run
@@ -103,23 +104,66 @@ def export(runs: tuple[Path, ...], kind: str, out: Path) -> None:
         click.echo(f"{path}: {len(run.t)} rows, {len(run.columns)} columns; facts in {path.with_suffix('.json').name}")
 
 
-@rec.command(name="import", short_help="Make a recording of a table, for viewers.")
-@click.argument("table", type=RUN)
-@click.option("--out", type=RUN, required=True, metavar="RUN", help="The recording to make (NAME.mcap).")
-def import_(table: Path, out: Path) -> None:
-    """Make a native recording of TABLE, so that viewers (Foxglove, Rerun, PlotJuggler) open it."""
+@rec.command(name="import", short_help="Make a recording of a table, or tables of a LeRobot dataset.")
+@click.argument("source", type=RUN)
+@click.option("--from", "kind", type=click.Choice(["lerobot"]), help="What SOURCE is; default: a table of ours.")
+@click.option(
+    "--calibration", type=RUN, metavar="FILE", help="LeRobot's of the robot: for normalised units and grippers."
+)
+@click.option("--joints", "names", multiple=True, metavar="THEIRS=OURS", help="A joint's name here. Repeatable.")
+@click.option(
+    "--units",
+    type=click.Choice(["degrees", "normalised", "radians"]),
+    help="Of LeRobot's joints; default: what their numbers show.",
+)
+@click.option("--out", type=RUN, required=True, help="The recording (NAME.mcap), or the folder of tables, to make.")
+def import_(
+    source: Path, kind: str | None, calibration: Path | None, names: tuple[str, ...], units: str | None, out: Path
+) -> None:
+    """Make a native recording of the table SOURCE, so that viewers (Foxglove, Rerun, PlotJuggler) open it.
+
+    With --from lerobot, SOURCE is the folder of a LeRobot dataset: each episode becomes a table in the folder --out.
+    """
+    if kind == "lerobot":
+        _import_lerobot(source, calibration, names, units, out)
+        return
+    if calibration is not None or names or units is not None:
+        raise BadInput("--calibration, --joints and --units are of LeRobot's datasets", remedy="add --from lerobot")
     from rich.console import Console
     from rich.progress import Progress
 
     from openant_tools.recording.convert import import_run
     from openant_tools.recording.tables import read_run
 
-    run = read_run(table, need=())
+    run = read_run(source, need=())
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(f"importing {run.name}", total=1.0)
         path = import_run(run, out, progress=lambda share: bar.update(task, completed=share))
     click.echo(f"{path}: {len(run.t)} rows of {', '.join(run.joints)}")
+
+
+def _import_lerobot(root: Path, calibration: Path | None, names: tuple[str, ...], units: Any, out: Path) -> None:
+    from openant_tools.exchange.lerobot_import import convert, read_conversion
+    from openant_tools.recording.tables import write_table
+
+    rename = {}
+    for pair in names:
+        theirs, _, ours = pair.partition("=")
+        if not theirs or not ours or "=" in ours or not ours.isprintable():
+            raise BadInput(f"--joints {pair}", remedy="write THEIRS=OURS, and repeat the option for each joint")
+        rename[theirs] = ours
+    if out.exists() and not out.is_dir():
+        raise BadInput(
+            "this is a file", where=out, remedy="name a folder with --out: each episode becomes a table there"
+        )
+    conversion = read_conversion(root, calibration, rename, units)
+    for remark in conversion.remarks:
+        click.echo(remark, err=True)
+    for run in convert(conversion):
+        path = out / f"{run.name}.parquet"
+        write_table(run, path)
+        click.echo(f"{path}: {len(run.t)} rows over {run.duration_s:.1f} s of {', '.join(run.joints)}")
 
 
 def _lines(path: Path, run: Run, summary: RunSummary, more: dict[str, Any]) -> list[str]:

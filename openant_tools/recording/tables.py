@@ -21,7 +21,7 @@ from openant_tools.recording.facts import facts_from_json, facts_to_json
 from openant_tools.recording.plausibility import check_columns, check_names, check_run, check_time, need_signals
 from openant_tools.recording.run import BODY_COLUMNS, JOINT_SIGNALS, Facts, Run
 
-__all__ = ["find_run", "read_run", "read_table", "write_table"]
+__all__ = ["find_run", "parquet_table", "read_run", "read_table", "write_table"]
 
 #: bytes of a CSV, and of its first line: an Open Ant's has 1,500
 LARGEST_CSV, LONGEST_HEADER = 2**30, 64 * 1024
@@ -153,16 +153,32 @@ def _joints_of(names: Sequence[str], path: Path) -> tuple[str, ...]:
 
 
 def _read_parquet(path: Path) -> dict[str, NDArray[Any]]:
+    table = parquet_table(path)
+    check_names(table.column_names, str(path))
+    return {name: _numbers(name, table[name].combine_chunks(), path) for name in table.column_names}
+
+
+def parquet_table(path: Path, columns: Sequence[str] | None = None, width: int = 1) -> pa.Table:
+    """What a parquet file holds of `columns` (default: of all), by its checksums whole.
+
+    Args:
+        width: numbers in a cell, where cells are lists.
+
+    Raises:
+        BadInput: it is cut, damaged or no such file, or holds more numbers than a run can have.
+        OSError: it cannot be opened.
+    """
     try:
-        size = pq.read_metadata(path)
-        if size.num_rows * max(size.num_columns, 1) > LARGEST_TABLE:
-            raise BadInput(
-                f"it has {size.num_rows} rows of {size.num_columns} columns",
-                where=path,
-                remedy="cut it into shorter runs",
-            )
-        table = pq.read_table(path, partitioning=None, page_checksum_verification=True)
-        names = table.column_names
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            size = file.metadata
+            wanted = None if columns is None else [name for name in file.schema_arrow.names if name in columns]
+            if size.num_rows * max(size.num_columns if wanted is None else len(wanted), 1) * width > LARGEST_TABLE:
+                raise BadInput(
+                    f"it has {size.num_rows} rows of {size.num_columns} columns",
+                    where=path,
+                    remedy="cut it into shorter runs",
+                )
+            return file.read(wanted)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         if isinstance(error, OSError) and error.errno is not None:
             raise
@@ -171,8 +187,6 @@ def _read_parquet(path: Path) -> dict[str, NDArray[Any]]:
             where=path,
             remedy="copy or export it again; a parquet file cut short has lost its index and cannot be repaired",
         ) from error
-    check_names(names, str(path))
-    return {name: _numbers(name, table[name].combine_chunks(), path) for name in names}
 
 
 def _read_csv(path: Path) -> dict[str, NDArray[Any]]:

@@ -1,0 +1,1 @@
+"""Other people's formats: datasets of LeRobot become runs."""
