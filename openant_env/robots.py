@@ -73,7 +73,7 @@ class SimulatedRobot:
         Raises:
             BadInput: MuJoCo cannot load it, or it lacks one of the joints.
         """
-        plant = load_plant(self.model_path, self.joints, Setup.FLOOR)
+        plant = load_plant(self.model_path, self.joints, Setup.FLOOR, drawn=True)
         present = {plant.model.sensor(i).name for i in range(plant.model.nsensor)}
         missing = [
             name for kind in ("pos", "vel") for joint in self.joints if (name := f"{kind}.{joint}") not in present

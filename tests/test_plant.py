@@ -273,3 +273,94 @@ def test_a_joint_that_is_not_there_gets_the_nearest_name() -> None:
         load_plant(path, ["hip_rr", "kneefl"])
     with pytest.raises(BadInput, match="its position-controlled joints are hip_rr, knee_rr, "):
         load_plant(path, ["Rotation"])
+
+
+# --- what is only drawn --------------------------------------------------------------------------------------------------
+
+#: two links of an arm that hangs above a floor, each drawn by one mesh and collided by another
+DRAWN_ARM = """\
+<mujoco>
+  <compiler angle="radian" {compiler}/>
+  <asset>
+    <mesh name="shell" file="lump.obj" scale="1 1 1.2" refpos="0 0 0.01"/>
+    <mesh name="lump" file="lump.obj"/>
+    {texture}
+  </asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="2 2 0.1" {floor}/>
+    <body name="upper" pos="0 0 0.16">
+      <freejoint/>
+      <geom name="upper shell" type="mesh" mesh="shell" contype="0" conaffinity="0" density="500"/>
+      <geom name="upper" type="mesh" mesh="lump" euler="0.3 0.2 0.1" density="300"/>
+      <body name="lower" pos="0.1 0 0">
+        <inertial pos="0 0 -0.02" mass="0.2" diaginertia="1e-4 2e-4 1.5e-4"/>
+        <joint name="elbow" axis="0 1 0" damping="0.05"/>
+        <geom type="mesh" mesh="shell" contype="0" conaffinity="0"/>
+        <geom name="lower" type="mesh" mesh="lump"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><position name="elbow" joint="elbow" kp="2"/></actuator>
+</mujoco>
+"""
+TEXTURE = (
+    '<texture name="floor" type="2d" builtin="checker" rgb1=".1 .2 .3" rgb2=".2 .3 .4" width="1024" height="1024"/>'
+    '<material name="floor" texture="floor"/>'
+)
+
+
+def write_lump(path: Path, rings: int = 40) -> None:
+    """A ball with dents, whose hull has far fewer corners than it."""
+    around = np.linspace(0, 2 * np.pi, 2 * rings, endpoint=False)
+    lines, n = [], 2 * rings
+    for up in np.linspace(0, np.pi, rings):
+        radius = 0.03 * (1 + 0.1 * np.sin(5 * up) * np.cos(4 * around))
+        for r, a in zip(radius, around, strict=True):
+            lines.append(
+                f"v {r * np.sin(up) * np.cos(a) + 0.01} {1.5 * r * np.sin(up) * np.sin(a)} {2 * r * np.cos(up)}"
+            )
+    for ring in range(rings - 1):
+        for k in range(n):
+            a, b = ring * n + k + 1, ring * n + (k + 1) % n + 1
+            lines += [f"f {a} {a + n} {b}", f"f {b} {a + n} {b + n}"]
+    path.write_text("\n".join(lines), encoding="utf-8")
+
+
+def drawn_arm(folder: Path, compiler: str = "", texture: str = TEXTURE) -> Path:
+    write_lump(folder / "lump.obj")
+    floor = 'material="floor"' if texture else ""
+    return plants.write(folder / "arm.xml", DRAWN_ARM.format(compiler=compiler, texture=texture, floor=floor))
+
+
+@pytest.mark.parametrize("compiler", ["", 'inertiafromgeom="true" inertiagrouprange="0 2"'])
+@pytest.mark.parametrize("setup", list(Setup))
+def test_what_is_only_drawn_is_not_simulated(setup: Setup, compiler: str, tmp_path: Path) -> None:
+    """Every number of the physics is the file's, where a mesh gives a body its mass, too."""
+    path = drawn_arm(tmp_path, compiler)
+    small, whole = (load_plant(path, setup=setup, drawn=drawn).model for drawn in (False, True))
+    assert mujoco.mj_sizeModel(whole) > 3e6
+    assert mujoco.mj_sizeModel(small) < 0.2 * mujoco.mj_sizeModel(whole)
+    for field in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_invweight0", "geom_bodyid"):
+        assert np.allclose(getattr(small, field), getattr(whole, field), rtol=1e-9, atol=0), field
+    assert [small.geom(k).name for k in range(small.ngeom)] == [whole.geom(k).name for k in range(whole.ngeom)]
+
+
+def test_a_hull_lands_as_its_mesh_does(tmp_path: Path) -> None:
+    path = drawn_arm(tmp_path)
+    ends = []
+    for drawn in (False, True):
+        model = load_plant(path, setup=Setup.FLOOR, drawn=drawn).model
+        data = mujoco.MjData(model)
+        for _ in range(300):
+            mujoco.mj_step(model, data)
+        assert data.ncon
+        ends.append(data.qpos.copy())
+    assert np.allclose(*ends, atol=1e-4)
+
+
+def test_looks_that_are_missing_do_not_keep_a_model_from_moving(tmp_path: Path) -> None:
+    lost = '<texture name="floor" type="2d" file="lost.png"/><material name="floor" texture="floor"/>'
+    path = drawn_arm(tmp_path, texture=lost)
+    load_plant(path)
+    with pytest.raises(BadInput, match=r"lost\.png"):
+        load_plant(path, drawn=True)

@@ -40,7 +40,7 @@ def same_physics(written: Any, variant: Any) -> None:
     for field in dir(variant):
         if field.startswith(
             ("_", "sensor", "name", "nsensor", "nnames", "nbuffer", "paths", "signature", "npaths", "text_")
-        ):
+        ) or field.startswith(("mat_", "tex_", "ntex")):  # looks are not loaded for simulation
             continue
         value = getattr(variant, field)
         if field == "qpos_spring" and not variant.jnt_stiffness.any():

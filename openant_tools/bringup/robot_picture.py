@@ -32,7 +32,7 @@ def robot_picture(model_path: Path) -> tuple[bytes | None, str]:
     from openant_env.rendering import NoOpenGL
     from openant_tools.model.plant import Setup, load_plant
 
-    model = load_plant(model_path, None, Setup.FLOOR).model
+    model = load_plant(model_path, None, Setup.FLOOR, drawn=True).model
     data = mujoco.MjData(model)
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, data, 0)

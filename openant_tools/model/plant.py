@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.model.attribute import Stated, set_stated
+from openant_tools.model.stripped import strip_colliding, strip_visual
 from openant_tools.robot.model_file import check_model_file
 
 __all__ = ["Plant", "Setup", "is_filtered", "is_motor", "load_plant", "position_servos", "setup_of", "world_bodies"]
@@ -127,6 +129,7 @@ def load_plant(
     delayed: bool = False,
     lagging: bool = False,
     stated: Stated | None = None,
+    drawn: bool = False,
 ) -> Plant:
     """Read an MJCF and set it up.
 
@@ -141,20 +144,30 @@ def load_plant(
         lagging: filter the setpoint of every servo that can have it (`filter_form`), with no lag as yet. What is filtered
             does not become a DC motor: MuJoCo's has no filter.
         stated: attributes of the file that are to have other values.
+        drawn: keep what only a picture shows: textures, and meshes whole. Without them every copy is as small as its physics.
 
     Raises:
         BadInput: the file is missing or MuJoCo cannot load it, it has no position-controlled joint, or it lacks one of
             `joints`.
     """
     path = Path(path)
+    # What cannot be compiled without its looks may compile with them, or MuJoCo says what is wrong with the file itself.
+    whole = partial(
+        load_plant, path, joints, setup,
+        electrical=electrical, delayed=delayed, lagging=lagging, stated=stated, drawn=True,
+    )  # fmt: skip
     if not path.is_file():
         raise BadInput("no such model file", where=path, remedy="name an MJCF with --model MODEL.xml")
     check_model_file(path)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         set_stated(spec, stated or {})
+        if not drawn:
+            strip_visual(spec)
         original = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
+        if not drawn:
+            return whole()
         words = " ".join(str(error).split())
         remedy = "mend the file at the place it names"
         raise BadInput(f"MuJoCo cannot load it: {words}", where=path, remedy=remedy) from error
@@ -185,7 +198,15 @@ def load_plant(
             buffer_commands(spec.actuators[servos[joint]], LONGEST_DELAY_S, original.opt.timestep)
     if electrical or delayed or lagging:
         original = spec.compile()
-    model = _on_stand(spec, original) if setup is Setup.STAND else original
+    if setup is Setup.STAND:
+        _put_on_stand(spec, original)
+    try:
+        stripped = not drawn and strip_colliding(spec, original)
+        model = spec.compile() if stripped or setup is Setup.STAND else original
+    except ValueError:
+        if drawn:
+            raise
+        return whole()
     actuator = [servos[joint] for joint in joints]
     ids = [model.joint(joint).id for joint in joints]
     dof = model.jnt_dofadr[ids].astype(np.int64)
@@ -336,8 +357,8 @@ def is_motor(model: mujoco.MjModel, actuator: int) -> bool:
     return bool(model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_DCMOTOR)
 
 
-def _on_stand(spec: mujoco.MjSpec, original: mujoco.MjModel) -> mujoco.MjModel:
-    """Compile `spec` with its base fixed and no contact with the world; `original` is the same spec as it was given."""
+def _put_on_stand(spec: mujoco.MjSpec, original: mujoco.MjModel) -> None:
+    """Fix the base of `spec` and keep it from touching the world; `original` is the same spec, compiled as it was given."""
     weld, parent = original.body_weldid, original.body_parentid
     # Elements keep the ids of the first compilation until the next, so the original's tables describe the spec's.
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
@@ -367,7 +388,6 @@ def _on_stand(spec: mujoco.MjSpec, original: mujoco.MjModel) -> mujoco.MjModel:
         spec.delete(joint)
     for key in list(spec.keys):
         spec.delete(key)  # a keyframe's qpos counts the free joint's seven numbers
-    return spec.compile()
 
 
 def world_bodies(model: mujoco.MjModel) -> set[int]:
