@@ -143,7 +143,7 @@ def test_stiffness_follows_the_register_and_the_supply() -> None:
     # P 800 → 6.25 counts of PWM a pulse; the platform's authors measured 18.64 N·m/rad with a kitchen scale.
     assert knee.stiffness_nm_rad(800, 12.0) == pytest.approx(18.9, abs=0.05)
     assert knee.stiffness_nm_rad(400) == pytest.approx(knee.stiffness_nm_rad() / 2)
-    assert knee.stiffness_nm_rad(supply_v=6.0) == pytest.approx(knee.stiffness_nm_rad() / 2)
+    assert knee.stiffness_nm_rad(supply_v=14.8) == pytest.approx(knee.stiffness_nm_rad() * 4.8 / 4.1)
     assert servo_model("XL430-W250-T").stiffness_nm_rad() == pytest.approx(5.16, abs=0.01)
 
 

@@ -8,7 +8,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from openant_tools.errors import BadInput
+from openant_tools.robot import gains
 from openant_tools.robot.control_table import control_table
+from openant_tools.robot.gains import Rating
 from openant_tools.robot.registers import PULSES_PER_TURN, PWM_FULL, RAD_PER_PULSE, RAD_S_PER_COUNT, Register
 
 __all__ = [
@@ -22,16 +24,6 @@ _RPM = 2 * math.pi / 60
 BAUD_CODES: Mapping[int, int] = {
     0: 9_600, 1: 57_600, 2: 115_200, 3: 1_000_000, 4: 2_000_000, 5: 3_000_000, 6: 4_000_000, 7: 4_500_000,
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Rating:
-    """One line of a data sheet: stall and free run at one supply voltage."""
-
-    voltage_v: float
-    stall_torque_nm: float
-    stall_current_a: float
-    no_load_rad_s: float
 
 
 @dataclass(frozen=True)
@@ -160,22 +152,22 @@ class ServoModel:
     @property
     def kt_nm_a(self) -> float:
         """Torque at the output per ampere, τ_stall / I_stall; gear friction is in it, so it is not `ke_v_s_rad`."""
-        return self.stall_torque_nm / self.stall_current_a
+        return gains.torque_constant_nm_a(self.rating)
 
     @property
     def ke_v_s_rad(self) -> float:
         """Back-EMF at the output, V / ω_no-load."""
-        return self.nominal_voltage_v / self.no_load_rad_s
+        return gains.emf_constant_v_s_rad(self.rating)
 
     @property
     def resistance_ohm(self) -> float:
         """V / I_stall: winding, bridge and cable together."""
-        return self.nominal_voltage_v / self.stall_current_a
+        return gains.resistance_ohm(self.rating)
 
     @property
     def electrical_damping_nm_s_rad(self) -> float:
         """τ_stall / ω_no-load: the slope of the torque-speed line, the same at any supply."""
-        return self.stall_torque_nm / self.no_load_rad_s
+        return gains.back_emf_damping_nm_s_rad(self.rating)
 
     @property
     def armature_kg_m2(self) -> float:
@@ -183,14 +175,11 @@ class ServoModel:
         return self.gear_ratio**2 * self.rotor_inertia_kg_m2
 
     def stall_torque_at(self, supply_v: float | None = None, duty: float = 1.0) -> float:
-        """N·m at stall: τ_stall · duty · V / V_nominal, since stall current is V / R."""
-        supply = self.nominal_voltage_v if supply_v is None else supply_v
-        return self.stall_torque_nm * duty * supply / self.nominal_voltage_v
+        """N·m at stall, at a supply (default: the nominal one) and duty: `gains.stall_torque_nm`."""
+        return gains.stall_torque_nm(self.ratings, self.nominal_voltage_v if supply_v is None else supply_v, duty)
 
     def stiffness_nm_rad(self, p_gain: float | None = None, supply_v: float | None = None) -> float:
-        """N·m of torque per rad of position error.
-
-        duty = P / divisor · e / 885 with the error e in pulses (e-manual, position controller), and τ = duty · τ_stall.
+        """N·m of torque per rad of position error (`gains.stiffness_nm_rad`).
 
         Args:
             p_gain: the register `position_p_gain`; default the factory's.
@@ -198,17 +187,18 @@ class ServoModel:
         """
         gain = self.register("position_p_gain").default if p_gain is None else p_gain
         assert gain is not None
-        return gain / self.position_p_divisor / PWM_FULL / RAD_PER_PULSE * self.stall_torque_at(supply_v)
+        return gains.stiffness_nm_rad(gain, self.position_p_divisor, self.stall_torque_at(supply_v))
 
     def derivative_damping_nm_s_rad(self, d_gain: float | None = None, supply_v: float | None = None) -> float:
-        """N·m·s/rad that the D gain adds: duty = D / divisor · Δe / 885 once per control period.
+        """N·m·s/rad that the D gain adds (`gains.derivative_damping_nm_s_rad`).
 
         As uncertain as `control_period_s`; a prior at best.
         """
         gain = self.register("position_d_gain").default if d_gain is None else d_gain
         assert gain is not None
-        per_duty = self.control_period_s / RAD_PER_PULSE / PWM_FULL
-        return gain / self.position_d_divisor * per_duty * self.stall_torque_at(supply_v)
+        return gains.derivative_damping_nm_s_rad(
+            gain, self.position_d_divisor, self.control_period_s, self.stall_torque_at(supply_v)
+        )
 
     def register(self, name: str) -> Register:
         """A register by name; BadInput suggests the nearest name."""

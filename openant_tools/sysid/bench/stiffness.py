@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.robot.gains import stiffness_nm_rad
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE
 from openant_tools.robot.servo import ServoModel
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2
@@ -323,7 +324,7 @@ def stiffness_finding(
         measured_error: whether the scale's line is over the measured position error, not over the goal's deflection.
     """
     stall = servo.stall_torque_at(supply_v)
-    formula = {d: p_gain / d / PWM_FULL / RAD_PER_PULSE * stall for d in DIVISORS}
+    formula = {d: stiffness_nm_rad(p_gain, d, stall) for d in DIVISORS}
     servo_stiffness = None if duty is None else duty.scaled(stall)
     evidence = [
         Evidence(f"stiffness by P = {p_gain:.0f} and divisor {d:.0f}", value, "N·m/rad", "register and data sheet")
