@@ -29,6 +29,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "check": ("check", "Robot", "Two minutes before a session: is the robot as its passport has it?"),
     "passport": ("passport", "Robot", "One page with everything known about a robot."),
     "config": ("config", "Robot", "Check, show, import and export the robot's configuration."),
+    "servo": ("servo", "Robot", "Gains of a servo: registers as numbers of an MJCF, and back."),
     "comms": ("comms", "Robot", "The bus: scan, watch, measure."),
     "thermal": ("thermal", "Robot", "Heat: soak the robot, fit its heat, forecast shutdowns, compare."),
     "rec": ("rec", "Data", "Recordings: info, repair, export, import."),
