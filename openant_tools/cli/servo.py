@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from openant_tools.cli.options import POSITIVE, Number, json_option, robot_option
+from openant_tools.cli.options import POSITIVE, Number, json_option
 from openant_tools.errors import BadInput
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def servo() -> None:
 @click.option("--motor", required=True, metavar="MODEL", help="Such as XM430-W350 or MX-64, or its model number.")
 @click.option(
     "--supply", "supply_v", type=POSITIVE, metavar="V",
-    help="At the servo. Default: the robot's kit's, else the one that the maker recommends.",
+    help="At the servo. Default: the one that its maker recommends.",
 )  # fmt: skip
 @click.option("--kp", type=POSITIVE, metavar="N·m/rad", help="Wanted stiffness.")
 @click.option("--kv", type=Number(0.0), metavar="N·m·s/rad", help="Wanted velocity gain.")
@@ -64,13 +64,16 @@ def servo() -> None:
     "--pwm-limit",
     type=COUNTS,
     metavar="N",
-    help="Register pwm_limit (36). Default: the robot's, else as delivered (885).",
+    help="Register pwm_limit (36), of 885. Default: as delivered.",
 )
 @click.option(
     "--back-emf", type=click.Choice(["kv", "joint"]), default="kv", show_default=True,
     help="Where the model has the servo's back-EMF: in kv, or in the joint's damping.",
 )  # fmt: skip
-@robot_option
+@click.option(
+    "--robot", type=click.Path(path_type=Path), metavar="DIR",
+    help="Show what was identified of this robot beside; supply and PWM limit are its own where they are not given.",
+)  # fmt: skip
 @json_option
 def gains_(
     motor: str,
@@ -117,13 +120,14 @@ def gains_(
     model = gain_model(motor)
     folder = RobotFolder.at(robot) if robot is not None else None
     config = folder.config() if folder else None
+    own = config if config and any(one.model == model.name for one in config.motors.values()) else None
     supply, whose = supply_v, ""
-    if supply is None and config:
-        supply, whose = KITS[config.kit].supply_v, f", as the {config.kit} kit has"
+    if supply is None and own:
+        supply, whose = KITS[own.kit].supply_v, f", as the {own.kit} kit has"
     elif supply is None:
         supply, whose = model.nominal_voltage_v, ", as its maker recommends"
     factory = model.factory
-    limit = factory.pwm_limit if config is None else round(config.bus.pwm_limit * PWM_FULL)
+    limit = factory.pwm_limit if own is None else round(own.bus.pwm_limit * PWM_FULL)
     base = Registers(
         factory.position_p if position_p is None else position_p,
         factory.position_i if position_i is None else position_i,
@@ -133,7 +137,7 @@ def gains_(
     result = conversion(model, base, Wanted(kp, kv, force_nm), supply, back_emf)
     given = {"position_p": position_p, "position_i": position_i, "position_d": position_d, "pwm_limit": pwm_limit}
     origins = {name: "as delivered" if count is None else "given" for name, count in given.items()}
-    if config is not None and pwm_limit is None:
+    if own is not None and pwm_limit is None:
         origins["pwm_limit"] = "the robot's"
     rows = beside(result, folder) if folder else []
     click.echo(f"{model.name} at {supply:g} V{whose}")
@@ -190,7 +194,7 @@ def _show_constants(result: Conversion) -> None:
                 number = f"{figure.value:.4g}" if figure.value < 1e4 else f"{figure.value:.0f}"
                 name = "" if one.quantity == before else one.quantity
                 unit = "" if figure.unit == "1" else figure.unit
-                click.echo(f"  {name:18} {number:>7} {unit:9} {figure.source}")
+                click.echo(f"  {name:19} {number:>7} {unit:9} {figure.source}")
                 before = one.quantity
     for note in result.notes:
         click.echo(f"note: {note}")

@@ -15,24 +15,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from openant_tools.errors import BadInput
-from openant_tools.robot.gains import Rating
+from openant_tools.robot.gains import P_DIVISOR, Rating
 from openant_tools.robot.registers import PWM_FULL
 from openant_tools.robot.servo import SERVO_MODELS, ServoModel
 
-__all__ = [
-    "CONTROL_PERIOD_S",
-    "D_DIVISOR",
-    "GAIN_MODELS",
-    "I_DIVISOR",
-    "Figure",
-    "GainModel",
-    "Registers",
-    "gain_model",
-]
+__all__ = ["GAIN_MODELS", "Figure", "GainModel", "Registers", "gain_model"]
 
-#: Assumed: none is published. ROBOTIS says that its loop is "much faster" (DynamixelSDK issue 534).
-CONTROL_PERIOD_S = 1e-3
-I_DIVISOR, D_DIVISOR = 65536.0, 16.0
 _RPM = 2 * math.pi / 60
 _MANUAL = "https://emanual.robotis.com/docs/en/dxl/"
 
@@ -97,14 +85,9 @@ class GainModel:
         """The one that is used."""
         return self.p_divisors[0].value
 
-    @property
-    def drivable(self) -> bool:
-        """Whether the rest of this software knows it too, not its gains alone."""
-        return self.name in SERVO_MODELS
-
 
 def _divisors(page: str, *measured: tuple[float, str]) -> tuple[Figure, ...]:
-    manual = Figure(128.0, "1", f"manual: {_MANUAL}{page}/, Position PID Gain(80, 82, 84)")
+    manual = Figure(P_DIVISOR, "1", f"manual: {_MANUAL}{page}/, Position PID Gain(80, 82, 84)")
     return (*(Figure(value, "1", f"measured: {source}") for value, source in measured), manual)
 
 
@@ -180,7 +163,7 @@ _GAINS_ONLY = (
         "XL330-M288-T", 1200, "x/xl330-m288",
         ((3.7, 0.42, 1.11, 76), (5.0, 0.52, 1.47, 103), (6.0, 0.60, 1.74, 123)),
         5.0, _5V, Registers(400), (256.0, _XL330),
-        measured=_bam("xl330", (0.387, 0.366), (4.02, 2.81), "at some 7.4 V"), remarks=_SLOPE_5V,
+        measured=_bam("xl330", (0.387, 0.366), (4.02, 2.81), "at 7.5 V"), remarks=_SLOPE_5V,
     ),
     _model(
         "XC330-M181-T", 1230, "x/xc330-m181",
@@ -266,7 +249,7 @@ def _key(name: str) -> str:
 def _names(model: GainModel) -> Iterator[str]:
     """How a model may be called: as the maker does, with or without the ending that says how it is wired."""
     stem = _key(model.name.removesuffix("(2.0)").removesuffix("-T"))
-    yield from (stem, f"{stem}T", f"{stem}R")
+    yield from (stem, f"{stem}T", f"{stem}R", f"{stem}TR")
     if model.name.startswith("MX"):
         yield from (f"{stem}AT", f"{stem}AR", f"{stem}2", f"{stem}20")
 
@@ -277,7 +260,7 @@ def gain_model(name: str) -> GainModel:
     Raises:
         BadInput: no such model, or several; the line names those that it may be.
     """
-    wanted = _key(name)
+    wanted = _key(name).removeprefix("DYNAMIXEL")
     for model in GAIN_MODELS.values():
         if wanted in _names(model) or wanted == str(model.number):
             return model

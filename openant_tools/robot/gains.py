@@ -23,10 +23,15 @@ import numpy as np
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE
 
 __all__ = [
-    "Rating", "back_emf_damping_nm_s_rad", "d_gain_for", "derivative_damping_nm_s_rad", "emf_constant_v_s_rad",
+    "CONTROL_PERIOD_S", "D_DIVISOR", "I_DIVISOR", "P_DIVISOR", "Rating", "back_emf_damping_nm_s_rad", "d_gain_for", "derivative_damping_nm_s_rad", "emf_constant_v_s_rad",
     "integral_gain_nm_rad_s", "p_gain_for", "pwm_limit_for", "resistance_ohm", "stall_torque_nm", "stiffness_nm_rad",
     "torque_constant_nm_a", "torque_limit_nm",
 ]  # fmt: skip
+
+#: The manual's (Position PID Gain(80, 82, 84)), the same for every model that it has.
+P_DIVISOR, I_DIVISOR, D_DIVISOR = 128.0, 65536.0, 16.0
+#: Assumed: none is published. Asked of velocity control ROBOTIS says "much faster than 1kHz" (DynamixelSDK issue 534).
+CONTROL_PERIOD_S = 1e-3
 
 
 @dataclass(frozen=True)

@@ -122,10 +122,10 @@ class ServoModel:
     has_current_sensor: bool
     backlash_rad: float | None = None
     operating_minimum_c: float = -5.0
-    position_p_divisor: float = 128.0
-    position_i_divisor: float = 65536.0
-    position_d_divisor: float = 16.0
-    control_period_s: float = 1e-3
+    position_p_divisor: float = gains.P_DIVISOR
+    position_i_divisor: float = gains.I_DIVISOR
+    position_d_divisor: float = gains.D_DIVISOR
+    control_period_s: float = gains.CONTROL_PERIOD_S
     rotor_inertia_kg_m2: float = 1e-7
     registers: Mapping[str, Register] = field(init=False, repr=False, compare=False)
 

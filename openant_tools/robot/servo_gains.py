@@ -6,6 +6,7 @@ register's count, and every number that comes out is what the rounded registers 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
@@ -16,7 +17,8 @@ from openant_tools.robot import gains
 from openant_tools.robot.config import Provenance
 from openant_tools.robot.control_table import GAIN_MAX
 from openant_tools.robot.folder import RobotFolder
-from openant_tools.robot.gain_models import CONTROL_PERIOD_S, D_DIVISOR, I_DIVISOR, Figure, GainModel, Registers
+from openant_tools.robot.gain_models import Figure, GainModel, Registers
+from openant_tools.robot.gains import CONTROL_PERIOD_S, D_DIVISOR, I_DIVISOR
 from openant_tools.robot.registers import PULSES_PER_TURN, PWM_FULL
 
 __all__ = [
@@ -345,12 +347,22 @@ def constants(model: GainModel, supply_v: float) -> list[Constant]:
             Figure(
                 CONTROL_PERIOD_S,
                 "s",
-                "assumed: not published; ROBOTIS says that its loop is much faster (DynamixelSDK issue 534)",
+                "assumed: not published; of velocity control ROBOTIS says much faster than 1 kHz (DynamixelSDK issue 534)",
             ),
             True,
         ),
         Constant("PWM full range", Figure(PWM_FULL, "counts", f"manual: {model.url}, PWM Limit(36)"), True),
         Constant("pulses per turn", Figure(PULSES_PER_TURN, "pulses", sheet), True),
+        *(
+            Constant(
+                f"{letter} gain as delivered", Figure(count, "counts", f"manual: {model.url}, Control Table"), True
+            )
+            for letter, count in (
+                ("P", model.factory.position_p),
+                ("I", model.factory.position_i),
+                ("D", model.factory.position_d),
+            )
+        ),
         Constant("stall current", Figure(rating.stall_current_a, "A", f"{sheet}, {line}"), False),
     ]
     kt, ke, resistance = (
@@ -396,11 +408,10 @@ def identified(folder: RobotFolder) -> dict[str, dict[str, float]]:
         BadInput: a value that is no number.
     """
     found: dict[str, dict[str, float]] = {}
-    for kind, by_joint in read_toml(folder.config_file).get("identified", {}).items():
-        if not isinstance(by_joint, Mapping):
-            continue
-        for joint, value in by_joint.items():
-            if isinstance(value, bool) or not isinstance(value, int | float):
+    table = read_toml(folder.config_file).get("identified", {})
+    for kind, by_joint in table.items() if isinstance(table, Mapping) else ():
+        for joint, value in by_joint.items() if isinstance(by_joint, Mapping) else ():
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
                 raise BadInput(
                     f"identified.{kind}.{joint} is no number",
                     where=folder.config_file,
