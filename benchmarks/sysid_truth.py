@@ -6,7 +6,7 @@ sampling moment that its stamps do not tell. It is simulated by another integrat
 fit's. Each is fitted on one run and judged on another.
 
 Fits already in --out are not made again, so that a run can be stopped and gone on with. Prints Markdown: for each kind of
-parameter, of those called identifiable, how many intervals hold the truth (with the 95 % interval of that share after
+parameter, of those called identified, how many intervals hold the truth (with the 95 % interval of that share after
 Clopper and Pearson), and the mean error in standard deviations.
 """
 
@@ -211,12 +211,12 @@ def held(hits: int, of: int) -> str:
 
 
 def table(rows: Sequence[dict[str, Any]], fits: int) -> str:
-    lines = ["| parameter | called identifiable | of | hold the truth | 95 % interval of that | mean error (σ) |",
+    lines = ["| parameter | called identified | of | hold the truth | 95 % interval of that | mean error (σ) |",
              "|---|---|---|---|---|---|"]  # fmt: skip
     everything: list[tuple[bool, float]] = []
     for kind in [*dict.fromkeys(row["kind"] for row in rows), "all"]:
         mine = [row for row in rows if kind in (row["kind"], "all")]
-        told = [row for row in mine if row["verdict"] == "identifiable"]
+        told = [row for row in mine if row["verdict"] == "identified"]
         if not told:
             lines.append(f"| `{kind}` | 0 | {len(mine)} | – | – | – |")
             continue

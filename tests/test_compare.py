@@ -34,7 +34,7 @@ def fit(path: Path, values: Mapping[str, float] | None = None, relative: float =
             name = f"{kind}.{joint}"
             value = (values or {}).get(name, nominal)
             parameters[name] = {
-                "value": value, "low": value * (1 - relative), "high": value * (1 + relative), "verdict": "identifiable",
+                "value": value, "low": value * (1 - relative), "high": value * (1 + relative), "verdict": "identified",
                 "unit": unit, "given": nominal, "joints": [joint], "information": 0.99,
             }  # fmt: skip
     content = {"schema": "openant.fit/1", "runs": [path.parent.name], "parameters": parameters, **entries}

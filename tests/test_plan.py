@@ -39,14 +39,14 @@ def test_only_a_release_shows_what_of_the_damping_is_electrical() -> None:
     asked = replace(ASKED, kinds=("damping", "electrical_damping"), tie="all")
     released = make_plan(asked, [protocol("releases", 6.0)])
     held = make_plan(replace(asked, kinds=("damping",)), [protocol("chirp", 6.0)])
-    assert _of(released, "electrical_damping.all").verdict == "identifiable"
+    assert _of(released, "electrical_damping.all").verdict == "identified"
     assert [one.name for one in held.expectations] == ["damping.all"]
-    assert _of(held, "damping.all").verdict == "identifiable"
+    assert _of(held, "damping.all").verdict == "identified"
 
 
 def test_a_hips_zero_is_undetermined_since_its_axis_is_vertical_and_gains_are_found() -> None:
     made = make_plan(replace(ASKED, kinds=("stiffness", "zero_offset")), [protocol("holds", 8.0)])
-    assert _of(made, "zero_offset.hip_fl").verdict == "undetermined"
+    assert _of(made, "zero_offset.hip_fl").verdict == "not in the data"
     hip = _of(made, "stiffness.hip_fl")
     assert hip.prior_low < hip.low < hip.nominal < hip.high < hip.prior_high
     assert made.objections == []
@@ -179,7 +179,7 @@ def test_the_command_writes_plan_json_and_report(tmp_path: Path, monkeypatch: py
     assert result.exit_code == 0, result.output
     content = json.loads(figures.read_text())
     assert content["schema"] == "openant.plan-forecast/1"
-    assert content["parameters"]["damping.all"]["verdict"] == "identifiable"
+    assert content["parameters"]["damping.all"]["verdict"] == "identified"
     assert content["objections"] == []
     assert set(content["recordings"][0]["peaks"]) == set(SPACE.joints)
     assert read_plan(out)[0].setup == "stand"

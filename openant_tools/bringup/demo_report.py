@@ -63,8 +63,8 @@ class Recovered:
     given: float
     truth: float
     value: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
     verdict: str
 
     @property
@@ -78,12 +78,12 @@ class Recovered:
     @property
     def determined(self) -> bool:
         """Whether the fit claims to know it."""
-        return self.verdict in ("identifiable", "weak")
+        return self.verdict in ("identified", "weak", "conflict")
 
     @property
     def inside(self) -> bool:
         """Whether the truth lies in the interval."""
-        return self.low <= self.truth <= self.high
+        return self.low is not None and self.high is not None and self.low <= self.truth <= self.high
 
 
 def truth(scenario: Path) -> dict[str, float]:
@@ -299,8 +299,9 @@ def _settings_figure(rows: Sequence[Recovered]) -> MatplotlibFigure:
                 scale = 1 / row.given if factor is None else factor
                 y = joints.index(row.joint)
                 colour = plots.BLUE if row.determined else plots.SKY
-                axes.plot([scale * row.low, scale * row.high], [y, y], color=colour, linewidth=5, alpha=0.45,
-                          solid_capstyle="butt", label="found, 95 %" if y == 0 else None)  # fmt: skip
+                if row.low is not None and row.high is not None:
+                    axes.plot([scale * row.low, scale * row.high], [y, y], color=colour, linewidth=5, alpha=0.45,
+                              solid_capstyle="butt", label="found, 95 %" if y == 0 else None)  # fmt: skip
                 axes.plot(scale * row.value, y, "|", color=colour, markersize=9)
                 axes.plot(
                     scale * row.truth, y, "x", color=plots.VERMILLION, markersize=6, label="true" if y == 0 else None
@@ -361,7 +362,7 @@ def _row(row: Recovered) -> Sequence[object]:
     tone: Tone = "good" if row.inside else "bad"
     mark = Mark("yes" if row.inside else "no", tone) if row.determined else Mark(row.verdict)
     numbers = (row.given, row.truth, row.value, row.low, row.high)
-    return [row.name, *(f"{number:.4g}" for number in numbers), row.unit, mark]
+    return [row.name, *("" if number is None else f"{number:.4g}" for number in numbers), row.unit, mark]
 
 
 def _explained(rows: Sequence[Recovered]) -> str:

@@ -132,9 +132,7 @@ def fit(
 
     width = max(len(value.name) for value in result.values)
     for value in result.values:
-        click.echo(
-            f"{value.name:{width}}  {value.value:10.5g}  [{value.low:.4g}, {value.high:.4g}] {value.unit:10} {value.words}"
-        )
+        click.echo(f"{value.name:{width}}  {value.value:10.5g}  {value.interval:20} {value.unit:10} {value.words}")
     judged = "runs left out in turn" if result.in_turn else "held-out runs"
     click.echo(
         f"error on {judged}, full run: {1e3 * result.before.full:.2f} → {1e3 * result.after.full:.2f} mrad; "

@@ -222,9 +222,9 @@ def _print(result: Plan) -> None:
         )
     counts = {
         verdict: sum(one.verdict == verdict for one in result.expectations)
-        for verdict in ("identifiable", "tied", "weak")
+        for verdict in ("identified", "tied", "weak")
     }
     click.echo(
-        f"{counts['identifiable']} of {len(result.expectations)} identifiable, {counts['weak']} weak, {counts['tied']} tied, in "
+        f"{counts['identified']} of {len(result.expectations)} identified, {counts['weak']} weak, {counts['tied']} tied, in "
         f"{result.seconds:.0f} s; if a fit leaves {1e3 * result.asked.residual.rad:g} mrad"
     )

@@ -28,7 +28,7 @@ FAMILY_ERROR = 0.05
 TWO_SIDED_95 = 1.96
 #: verdicts of fit.json under which a value is no statement of the data
 _SILENT = {
-    "undetermined": "the data of {} do not determine it",
+    "not in the data": "the data of {} do not determine it",
     "fell back": "in {} it fell back to the given model",
 }
 

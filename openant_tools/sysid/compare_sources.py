@@ -20,6 +20,8 @@ __all__ = ["snapshot"]
 
 #: tables of robot.toml that hold what was identified and measured
 _TABLES = ("identified", "bench")
+#: what verdicts were called in files of before
+_FORMER = {"identifiable": "identified", "undetermined": "not in the data"}
 
 
 def snapshot(source: str, robot: RobotFolder | None = None) -> Snapshot:
@@ -88,13 +90,17 @@ def _parameters(content: Any, path: Path) -> dict[str, Estimate]:
         if not math.isfinite(value):
             raise BadInput(f"{name} is {value}", where=path)
         out[str(name)] = Estimate(
-            value, low, high, str(entry.get("unit", "")), str(entry.get("verdict", "")), joints, date
+            value, low, high, str(entry.get("unit", "")), _word(entry.get("verdict", "")), joints, date
         )
     return out
 
 
 def _number(value: Any) -> float | None:
     return None if value is None else float(value)
+
+
+def _word(value: Any) -> str:
+    return _FORMER.get(str(value), str(value))
 
 
 def _moment(value: Any) -> datetime.datetime | None:
@@ -162,7 +168,7 @@ def _of_table(table: Mapping[str, Any]) -> Iterator[tuple[str, Estimate]]:
                     _number(source.get("low")),
                     _number(source.get("high")),
                     "" if kind is None else kind.unit,
-                    str(source.get("how", "")),
+                    _word(source.get("how", "")),
                     date=_moment(source.get("date")),
                 ),
             )

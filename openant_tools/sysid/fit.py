@@ -73,6 +73,8 @@ CLEAN = 1.5
 TEMPER_S = 0.5
 #: priors weigh this much where the data lead alone: only against directions of which the data say nothing
 LOOSE = 0.1
+#: prior deviations beyond which the data contradict a prior that they are to be weighed against: one in 370
+CONFLICT = 3.0
 #: a residual is white where it forgets itself within this many samples, and more than model error where within so many
 WHITE, SHORT_LIVED = 1.5, 10
 #: nats by which a posterior must be better to count as another one: less is where the descent happened to stop
@@ -207,6 +209,8 @@ class Estimate:
         information: (parameters,) share of each parameter's posterior precision that the data gave: 0 prior only, 1 data.
         halves: (2, parameters) of u, what each half of the data alone would say (to first order); NaN where there is one.
         contradictory: (parameters,) whether the two halves differ by more than chance.
+        contradicts: (parameters,) whether the estimate lies where the prior says that it cannot.
+        prior_precision: (parameters,) of u: 1, or next to nothing where the prior would have held the estimate back.
         noise: (joints,) rad, standard deviation of the residual per joint, of all datasets.
         correlation_s: (joints,) s, integrated autocorrelation time of the residual.
         stamp_error_s: s, standard deviation by which the rows' time stamps miss the moments of sampling, row by row.
@@ -224,6 +228,8 @@ class Estimate:
     information: Array
     halves: Array
     contradictory: Bools
+    contradicts: Bools
+    prior_precision: Array
     noise: Array
     correlation_s: Array
     stamp_error_s: float
@@ -299,12 +305,14 @@ class Problem:
         tempered: all runs of a joint count alike, by their length, as one observation per TEMPER_S: to compare models all
             of which are wrong by the error that they leave. Trusting each stretch as far as the model can follow it, as is
             done otherwise, lets a wrong model choose what it is judged by.
+        freed: (parameters,) whose priors the data contradict, so that they count for next to nothing; found by `solve`.
     """
 
     datasets: Sequence[Dataset]
     parameters: Sequence[Parameter]
     floor: Array
     tempered: bool = False
+    freed: Bools = field(default_factory=lambda: np.zeros(0, bool))
     evaluations: int = field(default=0, init=False)
     _prior_weight: float = field(default=1.0, init=False)
 
@@ -345,6 +353,11 @@ class Problem:
             high.append(min(end[1] for end in ends))
         self.low, self.high = np.array(low), np.array(high)
         self.centre = np.array([parameter.centre for parameter in self.parameters])
+        self._free(self.freed if len(self.freed) else np.zeros(len(self.parameters), bool))
+
+    def _free(self, freed: Bools) -> None:
+        self.freed = freed
+        self._prior: Array = np.where(freed, LOOSE, 1.0) ** 2
 
     def gaps(self, u: Array, datasets: Sequence[Dataset] | None = None) -> Gap:
         """The gap of the model at u on these datasets (default: the problem's own), at both horizons."""
@@ -392,12 +405,16 @@ class Problem:
         if ((times >= WHITE * period) & (self.noise > CLEAN * self.floor)).any():
             led = self._by_data_alone(found, lambda: tell("following the data alone"))
             if led is not None:
+                before = self.freed
+                self._free(before | (np.abs(led - self.centre) > CONFLICT))
                 again = self._descend(led, lambda: tell("fitting once more"))
                 self._reweigh(again.point)
                 short_lived = bool((self.correlation_s < SHORT_LIVED * period).all())
                 better = short_lived and self.correlation_s.mean() < times.mean()
                 if better or self._score(again.point) < score - DECISIVE:
                     found = again
+                else:
+                    self._free(before)
         return self._estimate(found)
 
     def _with_delays(self, u: Array) -> Array:
@@ -440,19 +457,21 @@ class Problem:
     def _by_data_alone(self, found: _Descent, tell: Callable[[], None]) -> Array | None:
         """Where the data lead with the priors all but ignored, as if all that is left were the sensors' noise.
 
-        None where a second descent could not win: the derivatives already there promise no step worth the name.
+        None where a second descent could not win: derivatives taken there promise no step worth the name. (Those that a
+        descent has corrected on its way say little of parameters that it hardly moved.)
         """
+        tangent = self._tangent(found.point, True, self._coarse and not self._on_floor)
         self._weight = np.broadcast_to(1.0 / self.floor, self._weight.shape)
         self._prior_weight = LOOSE
         try:
-            precision, gradient = self._normal(found.tangent, found.point)
+            precision, gradient = self._normal(tangent, found.point)
             step = self._step(precision, gradient, found.point.u, math.inf, np.zeros(len(gradient), bool))
             if np.abs(step).max(initial=0.0) < STALE:
-                moved = found.point.residual + self._along(found.tangent, step)
+                moved = found.point.residual + self._along(tangent, step)
                 promised = self._score(replace(found.point, u=found.point.u + step, residual=moved))
                 if promised > self._score(found.point) - DECISIVE:
                     return None
-            return self._approach(found.point, tell, reweigh=False, tangent=found.tangent).point.u
+            return self._approach(found.point, tell, reweigh=False, tangent=tangent).point.u
         finally:
             self._prior_weight = 1.0
 
@@ -561,14 +580,14 @@ class Problem:
 
     def _cost(self, point: _Point) -> float:
         weighted = self._weight * point.residual
-        prior = self._prior_weight * (point.u - self.centre)
-        return 0.5 * float(np.nansum(weighted**2) + prior @ prior)
+        away = self._prior_weight * (point.u - self.centre)
+        return 0.5 * float(np.nansum(weighted**2) + away @ (self._prior * away))
 
     def _normal(self, tangent: _Tangent, point: _Point, rows: Bools | None = None) -> tuple[Array, Array]:
         """Hessian (parameters, parameters) and gradient of the cost, the prior included; of some rows where they are named."""
-        n = len(self.parameters)
-        hessian = self._prior_weight**2 * np.eye(n)
-        gradient = self._prior_weight**2 * (point.u - self.centre)
+        prior = self._prior_weight**2 * self._prior
+        hessian = np.diag(prior)
+        gradient = prior * (point.u - self.centre)
         for j, (p, _) in enumerate(self._movers):
             moves = self._moves(tangent, j)
             weight = self._weight[:, j] if rows is None else self._weight[:, j] * rows
@@ -615,14 +634,16 @@ class Problem:
             u=u,
             covariance=np.outer(wider, wider) * covariance + open_ @ open_.T,
             step_shift=step_shift,
-            precision=precision - np.eye(n),
+            precision=precision - np.diag(self._prior),
             centre=self.centre,
             low=self.low,
             high=self.high,
             # What the data, all other parameters free, say about each: 1 − posterior variance over prior variance.
-            information=1.0 - np.diag(covariance),
+            information=1.0 - np.diag(covariance) * self._prior,
             halves=halves,
             contradictory=contradictory,
+            contradicts=np.abs(u - self.centre) > CONFLICT,
+            prior_precision=self._prior,
             noise=self.noise,
             correlation_s=self.correlation_s,
             stamp_error_s=self.stamp_error_s,
@@ -786,7 +807,8 @@ class Problem:
     def _score(self, point: _Point) -> float:
         """−log posterior with unknown noise (each stretch's own, if not `tempered`), one effective sample per TEMPER_S:
         compares starts."""
-        score = 0.5 * float(np.sum((point.u - self.centre) ** 2))
+        away = (point.u - self.centre) ** 2
+        score = 0.5 * float(np.sum(np.where(self.freed, np.minimum(away, CONFLICT**2), away)))
         together = np.nanmean(point.residual**2, axis=0)
         for stretch in self._stretches:
             for j, rows in enumerate(stretch.rows):

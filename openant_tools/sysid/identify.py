@@ -42,13 +42,13 @@ from openant_tools.sysid.parameter import (
     restatements,
 )  # fmt: skip
 from openant_tools.sysid.quality import Telemetry, check_model, check_runs, without_errors
-from openant_tools.sysid.verdict import IDENTIFIABLE, UNDETERMINED, Verdict, Word, experiment, verdicts
+from openant_tools.sysid.verdict import IDENTIFIED, NOT_IN_THE_DATA, SILENT, Verdict, Word, experiment, verdicts
 from openant_tools.trust import follows
 
 __all__ = [
     "DEFAULT_KINDS",
-    "IDENTIFIABLE",
-    "UNDETERMINED",
+    "IDENTIFIED",
+    "NOT_IN_THE_DATA",
     "Identification",
     "Value",
     "calibrated",
@@ -99,12 +99,14 @@ class Value:
         joints: whose it is; none where it is the body's or the world's.
         given: the value in the given model (of the first joint where several are tied).
         value: the value in the written model.
-        low, high: 95 % interval of the estimate; where the value fell back, of what the data would have said.
-        verdict: `identifiable`, `weak` (between data and prior), `tied` (the data tell it only together with another),
-            `undetermined` (left at its prior) or `fell back` (it did not beat the given model on held-out runs).
+        low, high: 95 % interval of the estimate; none where the value is not the data's.
+        prior_low, prior_high: 95 % interval of the prior.
+        verdict: `identified`, `weak` (between data and prior), `tied` (the data tell it only together with another),
+            `conflict` (the data's, which contradict the prior), `not in the data` (left at its prior) or `fell back` (it
+            did not beat the given model on held-out runs).
         information: share of the precision that the data gave, 0…1.
         tied_to: the other parameter's name, where it is tied.
-        record_next: what to record so that it becomes identifiable; empty where it is, or where nothing is known.
+        record_next: what to record so that it becomes identified; empty where it is, or where nothing is known.
         halves: what each half of the data alone says, where they contradict each other; the interval holds both.
     """
 
@@ -113,8 +115,10 @@ class Value:
     joints: tuple[str, ...]
     given: float
     value: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
+    prior_low: float
+    prior_high: float
     verdict: Word
     information: float
     tied_to: str | None = None
@@ -123,11 +127,18 @@ class Value:
 
     @property
     def accepted(self) -> bool:
-        return self.verdict in ("identifiable", "weak", "tied")
+        return self.verdict not in SILENT
+
+    @property
+    def interval(self) -> str:
+        """For reading; empty where there is none."""
+        return "" if self.low is None or self.high is None else f"[{self.low:.4g}, {self.high:.4g}]"
 
     @property
     def words(self) -> str:
         """The verdict for reading."""
+        if self.verdict == "conflict":
+            return f"conflict: the prior says {self.prior_low:.4g} to {self.prior_high:.4g}"
         return f"tied to {self.tied_to}" if self.tied_to else self.verdict
 
 
@@ -202,6 +213,7 @@ class Identification:
                     "value": value.value,
                     "low": value.low,
                     "high": value.high,
+                    "prior": [value.prior_low, value.prior_high],
                     "verdict": value.verdict,
                     "unit": value.unit,
                     "given": value.given,
@@ -318,12 +330,12 @@ def identify(
     else:
         trials = []
         for k, (train, test) in enumerate(folds):
-            fold = Problem(datasets(train), chosen, floor)
+            fold = Problem(datasets(train), chosen, floor, freed=problem.freed)
             # Where all runs lead is near where most of them do; that it is only the start says nothing of the run left out.
             trials.append((fold.solve(estimate.u, progress=share(1 + k)), datasets(test)))
 
     untied = verdicts(estimate, np.ones(len(chosen), bool))
-    undetermined = np.array([verdict.word == "undetermined" for verdict in untied], bool)
+    undetermined = np.array([verdict.word == "not in the data" for verdict in untied], bool)
     kept, before, after = _judge(trials, chosen, undetermined, share(total - 1))
     u = np.where(kept, _conditional(estimate, ~kept), 0.0)
     u[undetermined & kept] = problem.centre[undetermined & kept]
@@ -578,24 +590,29 @@ def _value(parameter: Parameter, plant: Plant, estimate: Estimate, k: int, verdi
     kind = parameter.definition
     nominal = kind.read(plant.model, plant, parameter.joints[0])
     deviation = TWO_SIDED_95 * math.sqrt(estimate.covariance[k, k])
-    centre = float(estimate.u[k]) if verdict.word == "fell back" else u
+
+    def physical(end: float) -> float:
+        return float(np.clip(parameter.value(nominal, end), kind.low, kind.high))
+
     # The value is the best for this model with its time step; the interval reaches to where the robot's own lies.
-    ends = [centre + shift + side for shift in (0.0, float(estimate.step_shift[k])) for side in (-deviation, deviation)]
+    ends = [u + shift + side for shift in (0.0, float(estimate.step_shift[k])) for side in (-deviation, deviation)]
     halves = None
     if verdict.contradictory:
         ends += estimate.halves[:, k].tolist()
         first, second = (parameter.value(nominal, half) for half in estimate.halves[:, k].tolist())
         halves = (first, second)
     other = None if verdict.tied_to is None else estimate.parameters[verdict.tied_to]
-    wanting = verdict.word in ("weak", "tied", "undetermined")
+    wanting = verdict.word in ("weak", "tied", "not in the data")
     return Value(
         name=parameter.name,
         unit=kind.unit,
         joints=() if kind.body else tuple(plant.joints[j] for j in parameter.joints),
         given=nominal,
         value=parameter.value(nominal, u),
-        low=float(np.clip(parameter.value(nominal, min(ends)), kind.low, kind.high)),
-        high=float(np.clip(parameter.value(nominal, max(ends)), kind.low, kind.high)),
+        low=None if verdict.word in SILENT else physical(min(ends)),
+        high=None if verdict.word in SILENT else physical(max(ends)),
+        prior_low=physical(float(estimate.centre[k]) - TWO_SIDED_95),
+        prior_high=physical(float(estimate.centre[k]) + TWO_SIDED_95),
         verdict=verdict.word,
         information=float(estimate.information[k]),
         tied_to=None if other is None else other.name,

@@ -23,7 +23,7 @@ from openant_tools.recording.run import Run
 from openant_tools.sysid.excitation import CommandSpace
 from openant_tools.sysid.fit import TIMING_STD_S, Dataset
 from openant_tools.sysid.forecast import Forecast, forecast
-from openant_tools.sysid.identify import DEFAULT_KINDS, IDENTIFIABLE, TWO_SIDED_95, UNDETERMINED
+from openant_tools.sysid.identify import DEFAULT_KINDS, IDENTIFIED, NOT_IN_THE_DATA, TWO_SIDED_95
 from openant_tools.sysid.kinds import ELECTRICAL_DAMPING, KINDS
 from openant_tools.sysid.parameter import Parameter, apply, choose, colours
 from openant_tools.sysid.plan_file import as_table
@@ -71,7 +71,7 @@ class Expectation:
         nominal: the value that is assumed.
         low, high: expected 95 % interval about it; `prior_low`, `prior_high` the prior's.
         information: share of the precision that the data give, 0…1.
-        verdict: `identifiable`, `weak`, `undetermined`, or `tied`: what the data say of it they say of `tied_to`, too.
+        verdict: `identified`, `weak`, `not in the data`, or `tied`: what the data say of it they say of `tied_to`, too.
         tied_to: the parameter that is most correlated with it, where that matters.
         correlation: with that one.
     """
@@ -341,12 +341,12 @@ def _expectations(
         alone = 1.0 - 1.0 / float(precision[k, k])
         other = int(np.argmax(np.abs(correlation[k])))
         tied = abs(correlation[k, other]) >= TIED
-        if known >= IDENTIFIABLE:
-            verdict = "identifiable"
-        elif alone >= IDENTIFIABLE and tied:
+        if known >= IDENTIFIED:
+            verdict = "identified"
+        elif alone >= IDENTIFIED and tied:
             verdict = "tied"
         else:
-            verdict = "weak" if known >= UNDETERMINED else "undetermined"
+            verdict = "weak" if known >= NOT_IN_THE_DATA else "not in the data"
 
         def between(
             spread: float, k: int = k, parameter: Parameter = parameter, nominal: float = nominal

@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 __all__ = ["expected_shares", "plan_report", "timeline"]
 
-_TONE: dict[str, Tone] = {"identifiable": "good", "tied": "warn", "weak": "warn", "undetermined": ""}
-_COLOUR = {"identifiable": plots.GREEN, "tied": plots.PURPLE, "weak": plots.ORANGE, "undetermined": plots.SKY}
-_MARKER = {"identifiable": "o", "tied": "D", "weak": "s", "undetermined": "x"}
+_TONE: dict[str, Tone] = {"identified": "good", "tied": "warn", "weak": "warn", "not in the data": ""}
+_COLOUR = {"identified": plots.GREEN, "tied": plots.PURPLE, "weak": plots.ORANGE, "not in the data": plots.SKY}
+_MARKER = {"identified": "o", "tied": "D", "weak": "s", "not in the data": "x"}
 
 VERDICTS = """
-- **identifiable**: the data will give most of the value.
+- **identified**: the data will give most of the value.
 - **tied**: what the data say of it, they say of the parameter named beside it, too; an experiment that moves only one parts them.
 - **weak**: the interval stays between data and prior.
-- **undetermined**: these recordings say nothing about it.
+- **not in the data**: these recordings say nothing about it.
 """
 
 
@@ -35,16 +35,16 @@ def plan_report(plan: Plan) -> Report:
     first = plan.forecasts[0].protocol
     report = Report("Plan of recordings", f"{plan.asked.model.name} · {first.name}", made_by="openant sysid plan")
     objections = plan.objections
-    good = sum(one.verdict == "identifiable" for one in plan.expectations)
+    good = sum(one.verdict == "identified" for one in plan.expectations)
     report.text(
         f"**Do not play it: {'; '.join(objections)}.**"
         if objections
-        else f"**{good} of {len(plan.expectations)} parameters will be identifiable.** {first.words[:1].upper()}{first.words[1:]}."
+        else f"**{good} of {len(plan.expectations)} parameters will be identified.** {first.words[:1].upper()}{first.words[1:]}."
     )
     busiest = max((peak for one in plan.forecasts for peak in one.peaks), key=lambda peak: peak.saturated)
     nearest = min(plan.forecasts, key=lambda one: one.clearance_m)
     report.key_figures(
-        KeyFigure("identifiable", f"{good} of {len(plan.expectations)}", "parameters", "good" if good else "bad"),
+        KeyFigure("identified", f"{good} of {len(plan.expectations)}", "parameters", "good" if good else "bad"),
         KeyFigure("time", f"{plan.seconds:.0f} s", f"in {len(plan.forecasts)} recordings"),
         KeyFigure("at the torque limit", f"{100 * busiest.saturated:.0f} %", f"of the time, {busiest.joint}"),
         KeyFigure(

@@ -33,19 +33,21 @@ STRONG = 0.7
 WINDOW_S = 3.0
 
 _TONE: dict[str, Tone] = {
-    "identifiable": "good",
+    "identified": "good",
     "weak": "warn",
     "tied": "warn",
-    "undetermined": "",
+    "conflict": "warn",
+    "not in the data": "",
     "fell back": "bad",
 }
 
 VERDICTS = """
-- **identifiable**: the data gave most of the value; the interval is theirs.
+- **identified**: the data gave most of the value; the interval is theirs.
 - **weak**: between data and prior; more or other motion would settle it.
 - **tied**: the data tell it only together with the other that is named; knowing one would settle both.
-- **undetermined**: the data say nothing about it; it stays at its prior.
-- **fell back**: it did not beat the given model on held-out runs; the given value stays. The interval is of what the data would have said.
+- **conflict**: the data are certain, and contradict what the given model says; the data's value is written.
+- **not in the data**: the data say nothing about it; it stays at its prior.
+- **fell back**: it did not beat the given model on held-out runs; the given value stays.
 """
 
 
@@ -78,7 +80,7 @@ def fit_report(result: Identification) -> Report:
         "third line is the given model with what their data sheet and registers say of stiffness, damping and torque limit.",
     )
     report.section("What was found").table(
-        ["parameter", "given", "value", "from", "to", "unit", "verdict"], [_row(value) for value in result.values]
+        ["parameter", "given", "value", "95 % interval", "unit", "verdict"], [_row(value) for value in result.values]
     )
     report.text("*From* and *to* are the ends of the 95 % interval." + VERDICTS)
     for note in result.notes:
@@ -161,8 +163,7 @@ def _row(value: Value) -> list[object]:
         value.name,
         f"{value.given:.4g}",
         f"{value.value:.4g}",
-        f"{value.low:.4g}",
-        f"{value.high:.4g}",
+        value.interval,
         value.unit,
         Mark(value.words, _TONE[value.verdict]),
     ]

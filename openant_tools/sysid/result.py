@@ -109,9 +109,9 @@ def write_robot(result: Identification, folder: RobotFolder) -> None:
             path = f"identified.{kind}.{joint}"
             values[path] = _rounded(value.value)
             provenance[path] = (
-                source("fitted", _rounded(value.low), _rounded(value.high))
+                source("fitted", value.low and _rounded(value.low), value.high and _rounded(value.high))
                 if value.accepted
-                else source("undetermined" if value.verdict == "undetermined" else "as given")
+                else source("not in the data" if value.verdict == "not in the data" else "as given")
             )
     finding = {**result.as_json(), "date": now.isoformat()}
     write_text(

@@ -14,14 +14,16 @@ __all__ = ["Verdict", "Word", "experiment", "verdicts"]
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Word = Literal["identifiable", "weak", "tied", "undetermined", "fell back"]
+Word = Literal["identified", "weak", "tied", "conflict", "not in the data", "fell back"]
+#: of these a value has no interval: what is written is not what the data say
+SILENT: tuple[Word, ...] = ("not in the data", "fell back")
 
-#: share of the posterior precision that must come from the data for a value to be called identifiable: the interval is
+#: share of the posterior precision that must come from the data for a value to be called identified: the interval is
 #: then less than half as wide as the prior's
-IDENTIFIABLE = 0.75
+IDENTIFIED = 0.75
 #: below this share the data say nothing, and the value stays at its prior
-UNDETERMINED = 0.1
-#: two estimates are tied if they correlate beyond this, and knowing one would make the other identifiable
+NOT_IN_THE_DATA = 0.1
+#: two estimates are tied if they correlate beyond this, and knowing one would make the other identified
 TIED = 0.8
 
 #: what separates two kinds, by what moves one of them and not the other
@@ -85,8 +87,7 @@ class Verdict:
 
 def verdicts(estimate: Estimate, kept: Bools) -> list[Verdict]:
     """A verdict for each parameter; `kept` are those that stood up to held-out runs."""
-    precision = estimate.precision + np.eye(len(estimate.u))
-    covariance = np.linalg.inv(precision)
+    covariance = np.linalg.inv(estimate.precision + np.diag(estimate.prior_precision))
     deviation = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(deviation, deviation)
     out = []
@@ -95,23 +96,23 @@ def verdicts(estimate: Estimate, kept: Bools) -> list[Verdict]:
         word: Word
         if not kept[k]:
             word, other = "fell back", None
-        elif information >= IDENTIFIABLE:
-            word, other = "identifiable", None
+        elif information >= IDENTIFIED:
+            word, other = "conflict" if estimate.contradicts[k] else "identified", None
         elif other is not None:
             word = "tied"
         else:
-            word = "weak" if information >= UNDETERMINED else "undetermined"
+            word = "weak" if information >= NOT_IN_THE_DATA else "not in the data"
         out.append(Verdict(word, other, bool(estimate.contradictory[k])))
     return out
 
 
 def _partner(correlation: Array, k: int, deviation: float) -> int | None:
-    """The parameter whose value, if it was known, would make this one identifiable."""
+    """The parameter whose value, if it was known, would make this one identified."""
     strength = np.abs(np.delete(correlation, k))
     if not len(strength) or strength.max() < TIED:
         return None
     nearest = int(np.argmax(strength))
-    if 1 - deviation**2 * (1 - strength[nearest] ** 2) < IDENTIFIABLE:
+    if 1 - deviation**2 * (1 - strength[nearest] ** 2) < IDENTIFIED:
         return None
     return nearest + (nearest >= k)
 
