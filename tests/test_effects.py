@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -239,8 +240,13 @@ def test_load_friction_of_another_simulation_is_found_unasked_and_written_beside
         write_table(run, tables[-1])
     out = tmp_path / "fit"
     asked = [*tables[:2], "--hold-out", tables[2], "--model", path, "--out", out]
-    ran = CliRunner().invoke(fit, [str(word) for word in asked], standalone_mode=False)
+    shown = tmp_path / "shown"
+    ran = CliRunner().invoke(fit, [str(word) for word in (*asked, "--report", shown)], standalone_mode=False)
     assert ran.exception is None
+    for folder in (shown, shown / "with-effects"):
+        pictures = re.findall(r"\]\((figures/.*?)\)", (folder / "report.md").read_text())
+        assert len(pictures) == 3
+        assert all((folder / name).stat().st_size for name in pictures)
     assert "More is explained by what plain MuJoCo has no feature for: with load_friction.joint = 0.2" in ran.output
 
     plain, richer = (json.loads((folder / "fit.json").read_text()) for folder in (out, out / "with-effects"))

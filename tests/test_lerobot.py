@@ -22,6 +22,7 @@ from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
 
 Refused = Callable[..., str]
+REALDATA = Path(__file__).parents[1] / ".." / "shared" / "realdata" / "sage-so101"
 
 
 def code_of(*words: object) -> int:
@@ -183,6 +184,35 @@ def test_positions_that_lerobot_cut_off_are_told(
     _, said = imported(capsys, root, tmp_path / "runs", "--calibration", calibrate(tmp_path))
     assert "elbow_flex is at an end of its calibrated range in 13 % of rows" in said
     assert "exactly ±100: these are normalised units" in refused(root)
+
+
+@pytest.mark.skipif(not REALDATA.exists(), reason="no ../shared here")
+@pytest.mark.parametrize("mode", ["degrees", "normalised"])
+def test_a_real_arm_comes_back_as_its_own_logger_has_it(
+    mode: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An SO-101 that was recorded without LeRobot, its counts written as LeRobot would have: two episodes of two joints."""
+    names = ("Rotation", "Wrist_Roll")
+    recorded = [read_run(REALDATA / name) for name in ("multisine", "velocity_ramp")]
+    entries = {
+        name: CALIBRATION["shoulder_pan"] | {"range_min": 900, "range_max": 3195 + k} for k, name in enumerate(names)
+    }
+    column = {}
+    for key, signal in (("observation.state", "pos"), ("action", "cmd")):
+        angle = np.concatenate([run.signal(signal, names) for run in recorded])
+        middle = [(entry["range_min"] + entry["range_max"]) / 2 for entry in entries.values()]
+        counts = np.round(angle * TURN / (2 * math.pi) + middle)
+        values = [written(counts[:, k], entries[name], mode) for k, name in enumerate(names)]
+        column[key] = pa.array(np.stack(values, axis=1).astype(np.float32).tolist())
+    rows = [len(run.t) for run in recorded]
+    feature = {"shape": [2], "names": [f"{name}.pos" for name in names]}
+    features = {"action": feature, "observation.state": feature}
+    root = make(tmp_path / "arm", lengths=rows, files=((0, 1),), fps=50, column=column, info={"features": features})
+    (tmp_path / "arm.json").write_text(json.dumps(entries))
+    runs, said = imported(capsys, root, tmp_path / "runs", "--calibration", tmp_path / "arm.json")
+    assert f"joints are in {'normalised units' if mode == 'normalised' else mode}" in said
+    for run, own in zip(runs, recorded, strict=True):
+        assert np.abs(run.signal("pos") - own.signal("pos", names)).max() < 1.01 * math.pi / TURN, "half a count"
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.options import model_option, robot_folder, robot_option, tie_option
+from openant_tools.cli.options import model_option, report_option, robot_folder, robot_option, tie_option
 from openant_tools.cli.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ __all__ = ["fit"]
 )
 @tie_option
 @robot_option
+@report_option
 def fit(
     runs: tuple[Path, ...],
     model: Path | None,
@@ -51,6 +52,7 @@ def fit(
     declared: Path | None,
     tie: str,
     robot: Path | None,
+    report: Path | None,
 ) -> int:
     """Fit a model to recordings and write calibrated.xml, fit.json and report.html to DIR.
 
@@ -80,6 +82,7 @@ def fit(
     from openant_tools.sysid.beyond import with_effects
     from openant_tools.sysid.declared import read_declarations
     from openant_tools.sysid.identify import identify
+    from openant_tools.sysid.report import fit_report
     from openant_tools.sysid.result import WITH_EFFECTS, write_fit, write_robot
 
     folder = None if robot is None else RobotFolder.at(robot)
@@ -126,6 +129,10 @@ def fit(
             result = replace(result, notes=(*result.notes, _recommendation(result, richer, out / WITH_EFFECTS)))
         tell("writing the report", 1.0)
         written = write_fit(result, out, richer)
+        if report is not None:
+            written.append(fit_report(result).write_folder(report))
+        if report is not None and richer is not None:
+            written.append(fit_report(richer).write_folder(report / WITH_EFFECTS))
     if folder is not None and (result.accepted or richer is not None):
         write_robot(richer or result, folder)
         written.append(folder.config_file)
