@@ -89,6 +89,20 @@ def test_an_answer_that_comes_again_in_the_next_cycle_is_dropped_and_the_next_on
     assert bus.statistics.of(10).lost[Cause.LATE] == 1
 
 
+def test_an_answer_before_its_turn_is_an_earlier_ones_however_little_it_is_older() -> None:
+    """A loop that is behind asks a millisecond after the last answer: no clock tells so little apart."""
+    line = FaultyLine(faults={})
+    bus = bus_of(line)
+    for k in range(20):
+        line.sleep_until(100.0 + k * 0.01)
+        old = bus.sync_read(120, 27, IDS)[-1]
+    line.sleep_until(line.now() + 1e-3)
+    line.bring(Status(IDS[-1], 0, old.data or b"").encode(), line.now() + 1.1e-3)
+    *others, answer = bus.sync_read(120, 27, IDS)
+    assert all(other.ok for other in others)
+    assert answer.cause is Cause.LATE
+
+
 def test_a_doubled_write_that_was_lost_is_not_taken_for_done() -> None:
     line = FaultyLine(faults={"doubled": 0.3, "late": 0.1, "lost": 0.1}, seed=5)
     bus = bus_of(line)
@@ -129,11 +143,53 @@ def test_a_servo_that_starts_anew_is_believed_again_after_a_few_answers() -> Non
     assert clock.proven(1.3)
 
 
-def test_a_clock_that_stands_still_tells_nothing() -> None:
+def test_a_clock_that_stands_still_is_doubted_once_and_then_tells_nothing() -> None:
     clock = TickClock()
+    followed = []
     for k in range(50):
-        assert clock.follow(77, 1.0 + 0.01 * k, 1.002 + 0.01 * k)
+        followed.append(clock.follow(77, 1.0 + 0.01 * k, 1.002 + 0.01 * k))
         assert not clock.proven(1.0 + 0.01 * k)
+    assert followed == [True, False, *[True] * 48]
+    assert clock.decided_until(1.5) > 1.5, "nobody waits for it any more"
+
+
+def test_servos_whose_clocks_stand_still_lose_no_answer() -> None:
+    line = FaultyLine(faults={})
+    line._read = lambda id, address, count, t: Status(id, 0, register_bytes(id, address, count))  # type: ignore[method-assign]
+    bus, start = bus_of(line), line.now()
+    for k in range(100):
+        line.sleep_until(start + 0.01 * k)
+        assert all(answer.ok for answer in bus.sync_read(120, 27, IDS))
+    assert line.now() - start < 1.1, "one question was asked again, after what might have come"
+
+
+@pytest.mark.parametrize("joined", [False, True])
+@pytest.mark.parametrize("again_s", [0.002, 0.0075, 0.012, 0.04])
+@pytest.mark.parametrize("lost", [False, True])
+def test_an_answer_that_comes_twice_before_clocks_are_proven_is_not_the_next_cycles(
+    joined: bool, again_s: float, lost: bool
+) -> None:
+    """Whether it lies there before the question, or comes before the answer, or instead of it."""
+    line = FaultyLine(faults={})
+    bus = bus_of(line)
+    bus.fast = set(IDS) if joined else set()
+    bring, kept, delays = line.bring, 0, (0.0,)
+
+    def bring_after(data: bytes, t: float) -> None:
+        for delay in delays:
+            bring(data, t + delay)
+
+    line.bring = bring_after  # type: ignore[method-assign]
+    for k in range(20):
+        line.sleep_until(line.now() + 0.01)
+        asked = line.now()
+        delays = {1: (0.0, again_s), 2: () if lost else (0.0,)}.get(k, (0.0,))
+        for answer in bus.sync_read(120, 27, IDS):
+            kept += answer.ok
+            if answer.ok:
+                _, read_at = struct.unpack("<Hq", (answer.data or b"")[:10])
+                assert read_at * 1e-6 > asked - TICK_GRAIN_S
+    assert kept >= 16 * len(IDS)
 
 
 # ---- lines that never fall silent --------------------------------------------------------------------------------
@@ -178,6 +234,8 @@ def test_every_question_ends_on_a_line_that_never_falls_silent_and_says_so(babbl
     bus = Bus(babble, RealClock(), Timing(return_delay_s=0.0, latency_timer_s=1e-3))
     began = time.monotonic()
     with pytest.raises(NeverSilent, match=r"the line never falls silent: \d+ bytes that are no answer"):
+        bus.read(10, 31, 1)
+    with pytest.raises(NeverSilent, match=r"the line never falls silent: \d+ bytes that are no answer"):
         bus.broadcast_ping()
     for _ in range(100):
         assert not bus.sync_read(120, 27, IDS)[0].ok
@@ -185,6 +243,17 @@ def test_every_question_ends_on_a_line_that_never_falls_silent_and_says_so(babbl
     with pytest.raises(BrokenAnswer, match="the line never falls silent"):
         bus.read(10, 31, 1)
     assert time.monotonic() - began < 20.0, "none of them goes on for ever"
+
+
+def test_noise_before_and_after_a_program_was_suspended_is_no_line_that_never_falls_silent() -> None:
+    line = FaultyLine(faults={})
+    bus = bus_of(line)
+    for pause_s in (0.5, 0.5, 1e-3):
+        line.bring(bytes(700), line.now() + 1e-4)
+        bus.sync_read(120, 27, IDS)
+        assert not bus.restless
+        line.sleep_until(line.now() + pause_s)
+        assert not bus.restless
 
 
 def test_listening_until_a_deadline_ends_whatever_comes(babble: SerialLine) -> None:

@@ -393,33 +393,35 @@ class Bus:
 
     @property
     def restless(self) -> bool:
-        """Whether the line has been talking unasked for RESTLESS_S and more, without a pause."""
-        return self._restless_from is not None and self.clock.now() - self._restless_from >= RESTLESS_S
+        """Whether the line has been heard talking unasked for RESTLESS_S and more, without a pause."""
+        return self._restless_from is not None and self._unasked_at - self._restless_from >= RESTLESS_S
 
     def never_silent(self, count: int = 0, seconds: float = 0.0) -> NeverSilent:
         """The error that says so: of so many bytes in so many seconds, or of what was noticed last."""
         if not seconds and self._restless_from is not None:
-            count, seconds = self._restless_bytes, self.clock.now() - self._restless_from
+            count, seconds = self._restless_bytes, self._unasked_at - self._restless_from
         return NeverSilent(self.line.path, self.line.baud, count, seconds)
 
     def _settle(self, until: float) -> None:
         """Take what comes until then (s), answers to earlier questions or noise, and look whether the line falls silent."""
-        parser, noise, lain = Parser(), 0, 0
+        parser, noise, lain, heard = Parser(), 0, 0, self.clock.now()
         while self.clock.wait_readable(self.line, until):
-            data = self.line.read()
+            data, heard = self.line.read(), self.clock.now()
             noise += self._count_stale(parser.feed(data))
-            lain += len(data) if self.clock.now() > until else 0
+            lain += len(data) if heard > until else 0
             if lain > BUFFER or not data:
                 break  # no pause to wait for
-        self._note_unasked(noise + self._count_stale(parser.flush()))
+        self._note_unasked(noise + self._count_stale(parser.flush()), heard)
 
-    def _note_unasked(self, count: int) -> None:
-        """So many bytes have come that nobody asked for; without a pause between them they make a line restless."""
+    def _note_unasked(self, count: int, heard: float) -> None:
+        """So many bytes have come that nobody asked for, the last at `heard` (s); without a pause between them they make a
+        line restless."""
         now = self.clock.now()
         if count:
-            self._restless_from = now if self._restless_from is None else self._restless_from
+            if self._restless_from is None or heard - self._unasked_at > RESTLESS_S:  # nobody listened in between
+                self._restless_from, self._restless_bytes = heard, 0
             self._restless_bytes += count
-            self._unasked_at = now
+            self._unasked_at = heard
         elif now - self._unasked_at > QUIET_S:
             self._restless_from, self._restless_bytes = None, 0
 
@@ -453,7 +455,12 @@ class Bus:
         """Send a request and collect its answers; `again` where the one before was the same, and its answer will do."""
         if request.fitted_to != (self.timing, self.line.baud):
             self._fit(request)
-        plan = (None if again else self._pending.plan(request, self.clock.now(), self._told)) or NOTHING_PENDING
+        undecided = request.tick_at is not None and self._undecided(request)
+        if undecided and not again:
+            self._settle(self.clock.now())  # what lies there is none of its answers, and says that more may come
+        plan = (
+            None if again else self._pending.plan(request, self.clock.now(), self._told, undecided)
+        ) or NOTHING_PENDING
         if plan.wait_until > 0 or self._unsettled:
             self._settle(max(plan.wait_until, self.clock.now()))
         started = self._send(request.packet)
@@ -467,6 +474,13 @@ class Bus:
         """Whether a servo's own clock tells which question its answer belongs to."""
         clock = self._clocks.get(id)
         return clock is not None and clock.usable(self.clock.now())
+
+    def _undecided(self, request: Request) -> bool:
+        """Whether nobody knows yet of one of its servos if its clock runs."""
+        now = self.clock.now()
+        if now >= request.decided_until:
+            request.decided_until = min(self._clocks[id].decided_until(now) for id in request.ids)
+        return now >= request.decided_until
 
     def _fit(self, request: Request) -> None:
         """Compute the deadlines for this timing and rate."""
@@ -524,14 +538,25 @@ class Bus:
         if sorting is None:
             sorting = Sorting(request, started, self._clocks, plan)
             sorting.feed(data, edges)
+        if sorting.doubted:
+            return self._asked_again(request, started, extra_s, sorting)
         return self._sorted(request, sorting.answers(edges), sorting, data, edges, started)
+
+    def _asked_again(self, request: Request, started: float, extra_s: float, sorting: Sorting) -> list[Answer]:
+        """The same question once more, when no earlier answer can come any more: servos' clocks do not tell yet."""
+        for id, (tick, arrived) in sorting.doubted.items():
+            self._clocks[id].follow(tick, started, arrived)
+            self.statistics.of(id).retries += 1
+        self._pending.distrust(started)
+        self.settle()
+        return self._transact(request, extra_s, again=True)
 
     def _whole(self, request: Request, answers: list[Answer], edges: Sequence[Edge], started: float) -> list[Answer]:
         """Take in that all answered as they should."""
         at_once = len(edges) == 1
         rtt = edges[0][1] - started
         self.statistics.count_whole(request.ids, rtt if at_once else [answer[4] for answer in answers])  # type: ignore[misc]
-        self._pending.answered(request, started)
+        self._pending.answered(request, started, request.tick_at is not None and self._undecided(request))
         self._unsettled = False
         self._restless_from, self._restless_bytes = None, 0
         self._quiet_from = edges[-1][1] - self.timing.write_read_gap_s
@@ -545,7 +570,8 @@ class Bus:
         statistics.noise_bytes += sorting.noise_bytes
         statistics.echoes += sorting.echoed
         if sorting.noise_bytes > (0 if self._restless_from is not None else request.expected):
-            self._note_unasked(sorting.noise_bytes)  # more than broken answers can be, or more of the same
+            # more than broken answers can be, or more of the same
+            self._note_unasked(sorting.noise_bytes, self.clock.now())
         broken_off = False
         for answer in answers:
             # Of a joined reply that broke off, those behind the first silent one are asked again.
@@ -573,6 +599,8 @@ class Bus:
                 break
             again = answer.cause is not Cause.LATE
         else:
+            if self._restless_from is not None and not self.restless:
+                self._settle(self._restless_from + RESTLESS_S + QUIET_S)  # does it fall silent?
             if self.restless:
                 raise self.never_silent()
             self.require([answer])

@@ -34,13 +34,15 @@ class Pending:
         self._heard: dict[int, float] = {}
         self._distrust_until = 0.0
 
-    def plan(self, request: Request, now: float, told: Callable[[int], bool]) -> Plan | None:
+    def plan(self, request: Request, now: float, told: Callable[[int], bool], undecided: bool = False) -> Plan | None:
         """What asking this now needs; None where nothing does.
 
         Args:
             told: whether a servo's own clock tells which question its answer belongs to.
+            undecided: it asks for the clock of a servo of which nobody knows yet whether it runs.
         """
-        if request.tick_at is not None and now >= self._owed_until:
+        by_clock = request.tick_at is not None and not undecided
+        if by_clock and now >= self._owed_until:
             return None
         wait, listen, doubtful, refusing = now, False, set[int](), dict[int, float]()
         for id, shape in zip(request.ids, request.shapes, strict=True):
@@ -57,7 +59,7 @@ class Pending:
                     else:
                         doubtful.add(id)
             before = self._asked.get((id, shape))
-            if before is not None and before[1] > now and request.tick_at is None:
+            if before is not None and before[1] > now and not by_clock:
                 if now < self._distrust_until:
                     wait = max(wait, before[1])
                 elif before[0] != request.packet:
@@ -65,10 +67,10 @@ class Pending:
         may_refuse = frozenset(id for id, until in refusing.items() if until > wait)
         return Plan(wait, listen, frozenset(doubtful), may_refuse) if wait > now or listen or may_refuse else None
 
-    def answered(self, request: Request, started: float) -> None:
+    def answered(self, request: Request, started: float, undecided: bool = False) -> None:
         """All of them, each once."""
         self._heard.update(dict.fromkeys(request.ids, started))
-        if request.tick_at is None:
+        if request.tick_at is None or undecided:
             entry = request.packet, started + request.whole + LATEST_S
             self._asked |= dict.fromkeys(zip(request.ids, request.shapes, strict=True), entry)
 

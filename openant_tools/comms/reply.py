@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 from openant_tools.comms import protocol2 as p2
@@ -77,6 +78,7 @@ class Request:
             crcs: their CRC.
         wire: s that the request takes. whole: s from its first byte to the last answer's last.
         quiet: s without a byte that mean none will come.
+        decided_until: when to look again whether the clocks of all are known to run, or to stand still; s.
     """
 
     packet: bytes
@@ -93,6 +95,7 @@ class Request:
     wire: float = 0.0
     whole: float = 0.0
     quiet: float = 0.0
+    decided_until: float = 0.0
 
     @classmethod
     def of(
@@ -190,7 +193,8 @@ def whole_answers(
         where = request.tick_at
         for answer in answers:
             data, arrived = answer[1] or b"", started + (answer[4] or 0.0)
-            if not clocks[answer[0]].follow(data[where] | data[where + 1] << 8, started, arrived):
+            clock, tick = clocks[answer[0]], data[where] | data[where + 1] << 8
+            if clock.doubt(tick, started, arrived) or not clock.follow(tick, started, arrived):
                 return None
     return answers
 
@@ -207,6 +211,7 @@ class Sorting:
         complete: an answer of every servo has come.
         surplus: ids of answers that were not to this request, or too many.
         noise_bytes: bytes that were none. echoed: whether the host's own packet came back.
+        doubted: id → (tick, arrival in s) of an answer that is out of step with a clock of which nobody knows if it runs.
     """
 
     def __init__(self, request: Request, started: float, clocks: Mapping[int, TickClock], plan: Plan) -> None:
@@ -214,6 +219,7 @@ class Sorting:
         self.surplus: list[int] = []
         self.noise_bytes = 0
         self.echoed = False
+        self.doubted: dict[int, tuple[int, float]] = {}
         self._started, self._clocks, self._plan = started, clocks, plan
         self._parser = Parser()
         self._at = 0
@@ -226,7 +232,7 @@ class Sorting:
 
     @property
     def complete(self) -> bool:
-        return len(self._got) + len(self._unsure - self._got.keys()) == len(self.request.ids)
+        return len(self._got.keys() | self._unsure) == len(self.request.ids)
 
     def feed(self, portion: bytes, edges: Sequence[Edge]) -> None:
         """Take more bytes in; `edges` of all so far."""
@@ -237,6 +243,7 @@ class Sorting:
         """What has come of each servo by now, in the order asked."""
         for item in self._parser.flush():
             self._take(item, edges)
+        self._drop_early()
         answers = []
         for k, id in enumerate(self.request.ids):
             seen = self._got.get(id, [])
@@ -262,6 +269,19 @@ class Sorting:
                     self._broken.remove(mine)
                 answers.append(Answer(id, None, 0, Cause.TIMEOUT if mine is None else mine[1]))
         return answers
+
+    def _drop_early(self) -> None:
+        """Servos answer in turn: one before its turn answers an earlier question, which its clock is too coarse to tell."""
+        turns = [self.request.ids.index(id) for id in self._got]
+        if self.request.joined or all(a < b for a, b in pairwise(turns)):
+            return
+        in_turn = _longest_rise(turns)
+        for k, turn in enumerate(turns):
+            if turn not in in_turn and any(other < turn for other in turns[k:]):
+                id = self.request.ids[turn]
+                self.surplus.append(id)
+                self._unsure.add(id)
+                del self._got[id]
 
     def _take(self, item: Instruction | Status | JoinedStatus | Garbage, edges: Sequence[Edge]) -> None:
         if isinstance(item, Status):
@@ -321,10 +341,24 @@ class Sorting:
         elif doubtful:
             self._unsure.add(id)
             return
+        elif clock is not None and clock.doubt(request.tick(params), self._started, when):
+            self.surplus.append(id)
+            self._unsure.add(id)
+            self.doubted[id] = request.tick(params), when
+            return
         seen = self._got.setdefault(id, [])
         if seen:
             self.surplus.append(id)
         seen.append(Answer(id, params, error, None if in_time else Cause.LATE, when - self._started))
+
+
+def _longest_rise(values: Sequence[int]) -> set[int]:
+    """The longest rising subsequence of different values."""
+    best: list[list[int]] = []
+    for value in values:
+        before = max((one for one in best if one[-1] < value), key=len, default=list[int]())
+        best.append([*before, value])
+    return set(max(best, key=len, default=[]))
 
 
 def _when(count: int, edges: Sequence[Edge]) -> tuple[float, bool]:

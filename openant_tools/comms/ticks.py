@@ -26,24 +26,39 @@ class TickClock:
 
     The difference `servo − host` (s) lies between `low`, since no tick is read after its answer has arrived, and
     `high`, since none is read before it was asked for.
+
+    Until it is proven, an answer out of step may be an earlier question's, or the one before it was, or the clock stands
+    still: it is doubted, and answers that can only be their own questions' decide it.
     """
 
-    __slots__ = ("_at", "_high", "_low", "_runs", "_since", "_strikes", "_tau", "_tick")
+    __slots__ = ("_at", "_doubts", "_high", "_low", "_runs", "_since", "_strikes", "_tau", "_tick")
 
     def __init__(self) -> None:
         self._runs = True  # as far as is known
         self._at = self._since = float("-inf")  # host's time of the last answer and of the first in step, s
         self._tick, self._tau = 0, 0.0  # the last tick, and the servo's time unwrapped, s
         self._low = self._high = 0.0
-        self._strikes = 0
+        self._strikes = self._doubts = 0
 
     def usable(self, asked: float) -> bool:
         """Whether `stale` can be asked of an answer to a question asked at `asked` (s): it has been heard lately."""
-        return self._runs and asked - self._at < LONGEST_GAP_S
+        return self._runs and not self._doubts and asked - self._at < LONGEST_GAP_S
 
     def proven(self, asked: float) -> bool:
         """Whether it is usable, and is known to run."""
         return self.usable(asked) and self._at - self._since >= PROOF_S
+
+    def decided_until(self, asked: float) -> float:
+        """Until when (s) it is known whether it runs; the past where nobody knows."""
+        if not self._runs:
+            return asked + LONGEST_GAP_S
+        return self._at + LONGEST_GAP_S if self.proven(asked) else float("-inf")
+
+    def doubt(self, tick: int, asked: float, arrived: float) -> bool:
+        """Whether an answer with this tick is out of step with the one before, of which nobody knows whether it was right."""
+        if not self._runs or self._doubts or asked - self._at >= LONGEST_GAP_S or self.proven(asked):
+            return False
+        return self.stale(tick, asked, arrived)
 
     def stale(self, tick: int, asked: float, arrived: float) -> bool:
         """Whether an answer with this tick cannot have been read between `asked` and `arrived` (s); only where `usable`."""
@@ -66,11 +81,15 @@ class TickClock:
                 self._low, self._high = first if first > low else low, last if last < high else high
                 self._tick, self._tau, self._at = tick, tau, asked
                 self._strikes = 0
-                self._runs = self._runs or asked - self._since >= PROOF_S
+                if asked - self._since >= PROOF_S:
+                    self._runs, self._doubts = True, 0
                 return True
-            if self.proven(asked):
+            if self._runs and not self._doubts:
+                self._doubts += not self.proven(asked)
                 return False
-            self._runs = False
+            # The first answer after the doubt: the same tick as before, or all begins anew with it.
+            self._runs = self._runs and self._doubts < 2 and tick != self._tick
+            self._doubts = min(self._doubts + 1, 2)
         # The first answer, or one out of step with those before: a clock that stands still, or began anew.
         self._tick, self._tau, self._strikes = tick, 0.0, 0
         self._at = self._since = asked
@@ -82,4 +101,4 @@ class TickClock:
         self._strikes += 1
         if self._strikes >= STRIKES:
             self._at = self._since = float("-inf")
-            self._runs, self._strikes = False, 0
+            self._runs, self._strikes, self._doubts = False, 0, 0
