@@ -112,20 +112,19 @@ def main() -> None:
     parser.add_argument("--rings", type=int, default=220, help="of each mesh: 4 × rings² triangles")
     parser.add_argument("--seconds", type=float, default=6.0, help="of the recording")
     asked = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    with tempfile.TemporaryDirectory() as made_in:
+        folder = Path(made_in)
         # In a process of its own: what this one ever held counts as the peak of those that it starts.
         made = multiprocessing.get_context("spawn").Process(target=prepare, args=(folder, asked.rings, asked.seconds))
         made.start()
         made.join()
         run = str(folder / "run.csv")
         print("| command | bare | drawn | memory | CPU time |\n|---|---|---|---|---|")
-        for words in (("gap", "measure"), ("sysid", "fit")):
-            rest = ("--no-effects",) if words[0] == "sysid" else ()
-            costs = []
-            for model in ("bare", "drawn"):
-                out = ("--out", str(folder / model)) if words[0] == "sysid" else ()
-                costs.append(cost(*words, run, "--model", str(folder / f"{model}.xml"), *rest, *out))
+        for words, rest in (
+            (("gap", "measure"), ()),
+            (("sysid", "fit"), ("--no-effects", "--out", str(folder / "fit"))),
+        ):
+            costs = [cost(*words, run, "--model", str(folder / f"{name}.xml"), *rest) for name in ("bare", "drawn")]
             (mb, cpu), (more_mb, more_cpu) = costs
             good = more_mb <= min(WITHIN * mb, MOST_MB) and more_cpu <= WITHIN * cpu
             print(

@@ -38,9 +38,8 @@ def moved(source: Path, kinds: Sequence[str], u: float = 1.0, joints: Sequence[s
 def same_physics(written: Any, variant: Any) -> None:
     """Every number of the two compiled models is the same, but for the sensors that were added and their names."""
     for field in dir(variant):
-        if field.startswith(
-            ("_", "sensor", "name", "nsensor", "nnames", "nbuffer", "paths", "signature", "npaths", "text_")
-        ) or field.startswith(("mat_", "tex_", "ntex")):  # looks are not loaded for simulation
+        added = ("_", "sensor", "name", "nsensor", "nnames", "nbuffer", "paths", "signature", "npaths", "text_")
+        if field.startswith((*added, "mat_", "tex_", "ntex")):  # looks are not loaded for simulation
             continue
         value = getattr(variant, field)
         if field == "qpos_spring" and not variant.jnt_stiffness.any():

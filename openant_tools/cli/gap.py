@@ -9,6 +9,7 @@ import click
 from openant_tools.cli.gap_blind import blind
 from openant_tools.cli.gap_diagnose import apply, diagnose, next_experiment, prepare
 from openant_tools.cli.options import joint_option, json_option, model_option, report_option, robot_option
+from openant_tools.cli.runs import checked, model_of, read_runs
 
 __all__ = ["gap"]
 
@@ -49,24 +50,20 @@ def measure(
 
     Exit code 1: it cannot be judged, since repeats of one motion disagree.
     """
-    from openant_tools.cli.options import robot_folder
     from openant_tools.errors import BadInput
     from openant_tools.files import json_text, write_text
     from openant_tools.gap.measure import UNITS
     from openant_tools.gap.measure import measure as measured
     from openant_tools.gap.measure_report import gap_report, sentence
-    from openant_tools.recording.tables import read_run
-    from openant_tools.robot.folder import RobotFolder
 
-    if model is None:
-        model = RobotFolder.at(robot_folder(robot)).model_path()
     try:
         seconds = None if horizon == "full" else float(horizon)
     except ValueError:
         seconds = -1.0
     if seconds is not None and not 0.02 <= seconds < 1e6:
         raise BadInput(f"--horizon {horizon} is no time", remedy="give seconds, 0.02 or more, or `full`")
-    found = measured([read_run(path) for path in runs], model, joints or None, seconds)
+    recordings, path = model_of(read_runs(runs), model, robot)
+    found = measured(checked(recordings, path, joints), path, joints or None, seconds)
     click.echo(sentence(found))
     for signal, value in found.gaps.items():
         click.echo(f"{signal}: {value:.5g} {UNITS[signal]}, floor {found.floors[signal]:.3g}")

@@ -12,6 +12,7 @@ import click
 
 from openant_tools.cli.options import joint_option, json_option, report_option, robot_option
 from openant_tools.cli.progress import progress_bar
+from openant_tools.cli.runs import checked, model_of, read_runs
 
 if TYPE_CHECKING:
     from openant_tools.gap.diagnosis import Diagnosis
@@ -28,7 +29,7 @@ model_option = click.option(
     "--model",
     type=click.Path(path_type=Path),
     metavar="M.xml",
-    help="Default: the model that every run names, else that of the robot's folder.",
+    help="Default: each run's own model, else that of the robot's folder.",
 )
 robots_option = click.option(
     "--robots",
@@ -83,20 +84,21 @@ def diagnose(
     from openant_tools.files import json_text, write_text
     from openant_tools.gap.diagnose import diagnose as diagnosed
     from openant_tools.gap.report import diagnosis_report
-    from openant_tools.recording.tables import read_run
 
-    recordings, held_out = [read_run(path) for path in runs], [read_run(path) for path in hold_out]
-    model = _model(model, robot, (*runs, *hold_out))
+    fitted, held = read_runs(runs), read_runs(hold_out)
+    everything, given = model_of([*fitted, *held], model, robot)
+    everything = checked(everything, given, joints)
+    recordings, held_out = everything[: len(fitted)], everything[len(fitted) :]
     with progress() as tell:
         found = diagnosed(
-            recordings, model, hold_out=held_out, joints=joints or None, robots=robots, prior=prior, progress=tell
+            recordings, given, hold_out=held_out, joints=joints or None, robots=robots, prior=prior, progress=tell
         )
         if json_file:
             write_text(json_file, json_text(found.as_json()))
         written = None
         if report:
             tell(1.0, "writing the report")
-            written = diagnosis_report(found, recordings, held_out, model).write_folder(report)
+            written = diagnosis_report(found, recordings, held_out, given).write_folder(report)
     _print(found)
     if written:
         click.echo(f"wrote {written}", err=True)
@@ -118,13 +120,13 @@ def prepare(
     """
     from openant_tools.gap.prepare import prepare as prepared
     from openant_tools.gap.protocol import Protocol
-    from openant_tools.recording.tables import read_run
-    from openant_tools.sysid.identify import joints_in_common, own_model
+    from openant_tools.model.of_run import own_model
+    from openant_tools.sysid.identify import joints_in_common
 
-    recordings = [read_run(path) for path in runs]
-    model = _model(model, robot, runs)
-    wanted = joints_in_common(recordings, model, joints or None)
-    protocol = Protocol.of(recordings, model, wanted, [own_model(run) for run in recordings])
+    recordings, given = model_of(read_runs(runs), model, robot)
+    recordings = checked(recordings, given, joints)
+    wanted = joints_in_common(recordings, given, joints or None)
+    protocol = Protocol.of(recordings, given, wanted, [own_model(run) for run in recordings])
     with progress() as tell:
         made = prepared(protocol, robots, progress=tell)
     click.echo(f"ready: {len(made.cases)} simulated robots of {len(wanted)} joints in {made.folder}")
@@ -141,11 +143,13 @@ def apply(diagnosis: Path, model: Path | None, out: Path, robot: Path | None) ->
     What MuJoCo has features for stands in IMPROVED.xml, which plain MuJoCo loads; the rest beside it in
     IMPROVED.effects.toml, or with --robot in its robot.toml.
     """
+    from openant_tools.cli.options import robot_folder
     from openant_tools.gap.apply import apply as applied
     from openant_tools.gap.diagnosis import read_diagnosis
+    from openant_tools.robot.folder import RobotFolder
 
     found = read_diagnosis(diagnosis)
-    source = model or (_model(None, robot, ()) if robot is not None else Path(found.model))
+    source = model or (RobotFolder.at(robot_folder(robot)).model_path() if robot is not None else Path(found.model))
     done = applied(found, source, out, robot=robot)
     for line in done.carried:
         click.echo(line)
@@ -194,22 +198,6 @@ def progress() -> Iterator[Callable[[float, str], None]]:
         return
     with progress_bar("reading") as tell:
         yield lambda share, words: tell(words, share)
-
-
-def _model(model: Path | None, robot: Path | None, runs: tuple[Path, ...]) -> Path:
-    """The MJCF that was named, or that all runs name, or that the robot's folder has."""
-    from openant_tools.cli.options import robot_folder
-    from openant_tools.recording.tables import read_run
-    from openant_tools.robot.folder import RobotFolder
-    from openant_tools.sysid.identify import own_model
-
-    if model is not None:
-        return model
-    if robot is None and runs:
-        own = [own_model(read_run(path)) for path in runs]
-        if own[0] is not None and None not in own:
-            return own[0]
-    return RobotFolder.at(robot_folder(robot)).model_path()
 
 
 def _print(found: Diagnosis) -> None:

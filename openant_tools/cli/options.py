@@ -51,7 +51,10 @@ robot_option = click.option(
     help="The robot's folder (or its robot.toml). Default: $OPENANT_ROBOT, else the working directory.",
 )
 model_option = click.option(
-    "--model", type=click.Path(path_type=Path), metavar="M.xml", help="Default: the model of the robot's folder."
+    "--model",
+    type=click.Path(path_type=Path),
+    metavar="M.xml",
+    help="Default: each run's own model, else that of the robot's folder.",
 )
 joint_option = click.option("--joint", "joints", multiple=True, metavar="NAME", help="Only this joint. Repeatable.")
 json_option = click.option(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,9 +32,15 @@ def rec() -> None:
 
 @rec.command(short_help="Show what a run holds: signals, rate, gaps, loss, facts.")
 @click.argument("run", type=RUN)
+@click.option(
+    "--model", type=RUN, metavar="M.xml", help="Compare with this model. Default: the one that the run names."
+)
 @json_option
-def info(run: Path, json_file: Path | None) -> None:
-    """Show what RUN holds: joints, signals, rate and jitter, gaps, loss, facts."""
+def info(run: Path, model: Path | None, json_file: Path | None) -> None:
+    """Show what RUN holds: joints, signals, rate and jitter, gaps, loss, facts.
+
+    What is not plausible in it, by itself or beside its model, is noted; `sysid fit` and `gap` refuse some of it.
+    """
     from dataclasses import asdict
 
     from openant_tools.files import json_text, write_text
@@ -56,14 +63,17 @@ def info(run: Path, json_file: Path | None) -> None:
             "has_config": recording.config is not None,
         }
     else:
-        read = read_table(path)
+        read = read_table(path, plausible=False)
     summary = summarize(read)
+    notes = list(_notes(read, model))
     if json_file is not None:
         facts = {"facts": json.loads(facts_to_json(read.facts))}
-        result = {"path": str(path)} | asdict(summary) | facts | more
+        result = {"path": str(path)} | asdict(summary) | facts | more | {"notes": notes}
         write_text(json_file, json_text(result))
     for line in _lines(path, read, summary, more):
         click.echo(line)
+    for note in notes:
+        click.echo(f"  note: {note}")
 
 
 @rec.command(short_help="Make a torn recording whole.")
@@ -164,6 +174,30 @@ def _import_lerobot(root: Path, calibration: Path | None, names: tuple[str, ...]
         path = out / f"{run.name}.parquet"
         write_table(run, path)
         click.echo(f"{path}: {len(run.t)} rows over {run.duration_s:.1f} s of {', '.join(run.joints)}")
+
+
+def _notes(run: Run, model: Path | None) -> Iterator[str]:
+    """What is not plausible in a run, a line each."""
+    from openant_tools.errors import BadInput
+    from openant_tools.model.of_run import own_model
+    from openant_tools.model.plant import load_plant, setup_of
+    from openant_tools.recording.plausibility import problems
+    from openant_tools.sysid.rules import findings
+
+    impossible = list(problems(run, ""))
+    for problem in impossible:
+        yield str(problem)
+    joints = [joint for joint in run.joints if run.has("cmd", [joint]) and run.has("pos", [joint])]
+    source, plant = model or own_model(run), None
+    if source is not None:
+        try:
+            joints = [joint for joint in load_plant(source).joints if joint in joints]
+            plant = load_plant(source, joints, setup_of(run.facts.setup)) if joints else None
+        except BadInput as error:
+            yield str(error)
+    # What is impossible cannot be simulated either.
+    for found in findings(run, joints, None if impossible else plant):
+        yield found.words
 
 
 def _lines(path: Path, run: Run, summary: RunSummary, more: dict[str, Any]) -> list[str]:

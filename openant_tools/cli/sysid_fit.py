@@ -9,6 +9,7 @@ import click
 
 from openant_tools.cli.options import model_option, report_option, robot_folder, robot_option, tie_option
 from openant_tools.cli.progress import progress_bar
+from openant_tools.cli.runs import checked, model_of, read_runs
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
@@ -77,7 +78,7 @@ def fit(
     """
     from dataclasses import replace
 
-    from openant_tools.recording.tables import read_run
+    from openant_tools.model.of_run import own_model
     from openant_tools.robot.folder import RobotFolder
     from openant_tools.sysid.beyond import with_effects
     from openant_tools.sysid.declared import read_declarations
@@ -88,12 +89,14 @@ def fit(
     folder = None if robot is None else RobotFolder.at(robot)
     if folder is not None:
         folder.refuse_if_held()  # now, not after minutes
+    recordings, held_out = read_runs(runs), read_runs(hold_out)
+    everything = [*recordings, *held_out]
     described = folder
-    if model is None:
+    if model is None and any(own_model(run) is None for run in everything):
         described = folder or _robot_here()
-        model = described.model_path()
-    recordings = [read_run(path) for path in runs]
-    held_out = [read_run(path) for path in hold_out]
+    everything, model = model_of(everything, model, robot)
+    checked(everything, model, joints, fitting=True)
+    recordings, held_out = everything[: len(recordings)], everything[len(recordings) :]
     declarations = None if declared is None else read_declarations(declared)
     entries = () if described is None else described.config().effects
     richer = None
@@ -146,7 +149,7 @@ def fit(
         f"0.5 s: {1e3 * result.before.horizon:.2f} → {1e3 * result.after.horizon:.2f} mrad; "
         f"floor {1e3 * result.floor:.2f} mrad"
     )
-    for note in result.notes:
+    for note in result.notes:  # those that were said before the fit, too: what is read last is the result
         click.echo(note)
     if not result.accepted and richer is None:
         click.echo("nothing that was fitted beats the given model on held-out runs; calibrated.xml is the given model")

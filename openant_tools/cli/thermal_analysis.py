@@ -289,10 +289,14 @@ def compare(
 
 
 def _read(path: Path) -> Inputs:
+    from openant_tools.recording.plausibility import problems
     from openant_tools.recording.tables import read_run
     from openant_tools.thermal.inputs import inputs_of
 
-    return inputs_of(read_run(path, need=()))
+    run = read_run(path, need=(), plausible=False)
+    for problem in problems(run, str(run.path)):
+        click.echo(problem, err=True)
+    return inputs_of(run)
 
 
 def _known(path: Path | None) -> Known | None:

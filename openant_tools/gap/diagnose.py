@@ -43,9 +43,10 @@ from openant_tools.gap.thresholds import (
 )
 from openant_tools.gap.together import decide_together
 from openant_tools.gap.verdict import decide
+from openant_tools.model.of_run import own_model
 from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
-from openant_tools.sysid.identify import joints_in_common, own_model
+from openant_tools.sysid.identify import joints_in_common
 
 __all__ = ["diagnose"]
 

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from openant_tools.gap.regime import Regime, regimes
 from openant_tools.model.floor import disagreement, floors, stamp_error
 from openant_tools.model.gap import excess, gap
-from openant_tools.model.plant import Plant, load_plant, setup_of
+from openant_tools.model.of_run import plants_of
+from openant_tools.model.plant import Plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
-from openant_tools.sysid.identify import joints_in_common, own_model
+from openant_tools.sysid.identify import joints_in_common
 
 __all__ = ["Measurement", "Place", "Played", "measure"]
 
@@ -142,7 +143,7 @@ def measure(
     """
     wanted = joints_in_common(runs, model, joints)
     played = tuple(
-        _play(run, load_plant(own_model(run) or model, wanted, setup_of(run.facts.setup)), horizon_s) for run in runs
+        _play(run, plant, horizon_s) for run, plant in zip(runs, plants_of(runs, model, wanted), strict=True)
     )
     found = {signal: floors(runs, wanted, signal) for signal in UNITS}
     gaps = {

@@ -16,12 +16,12 @@ from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.words import closed, rest_words, sentence, standing, what_next, where_words
 from openant_tools.model.gap import HORIZON_S
-from openant_tools.model.plant import load_plant, setup_of
+from openant_tools.model.of_run import plants_of
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.report import KeyFigure, Report, Table, plots
 from openant_tools.robot.joints import JOINTS
-from openant_tools.sysid.identify import joints_in_common, own_model
+from openant_tools.sysid.identify import joints_in_common
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -211,8 +211,7 @@ def worst(found: Diagnosis, runs: Sequence[Run], model: Path) -> MatplotlibFigur
     joints = joints_in_common(runs, model, None)
     selected = [one for one in found.effects if one.effect in found.selected and (one.parameters or one.coordinates)]
     best: tuple[float, Run, int, int, Array] | None = None
-    for run in runs:
-        plant = load_plant(own_model(run) or model, joints, setup_of(run.facts.setup))
+    for run, plant in zip(runs, plants_of(runs, model, joints), strict=True):
         improved = robot_of(plant, selected, found.calibration)
         # Each is led by itself to where a window begins.
         leads = (Robot(len(joints)), None), (improved, improved.model(plant))

@@ -6,10 +6,9 @@ model in everything that `gap.robot` names, so that one batch holds thousands of
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -90,31 +89,19 @@ def simulate(
     if hidden.any():
         parts = math.ceil(plant.timestep / FINE_S - 1e-9) if floor else 1
         groups.append((np.flatnonzero(hidden), rollouts.finer(parts)))
-    with _unwarned():
-        for group, stepped in groups:
-            longest = max(len(segment.control) for segment in stepped.segments)
-            state = 8 * (plant.model.nq + 3 * plant.model.nv)
-            at_once = max(1, int(CHUNK_BYTES // (state * longest * len(stepped.segments))))
-            for first in range(0, len(group), at_once):
-                some = group[first : first + at_once]
-                # A run of its own of random numbers to each portion, whatever the others are.
-                rng = np.random.default_rng((seed, int(some[0])))
-                mine = {name: np.full((len(some), *whole.shape[1:]), np.nan, np.float32) for name, whole in out.items()}
-                _Batch(stepped, [robots[k] for k in some], rng, warm_c).play(mine)
-                for name, values in mine.items():
-                    out[name][some] = values
+    for group, stepped in groups:
+        longest = max(len(segment.control) for segment in stepped.segments)
+        state = 8 * (plant.model.nq + 3 * plant.model.nv)
+        at_once = max(1, int(CHUNK_BYTES // (state * longest * len(stepped.segments))))
+        for first in range(0, len(group), at_once):
+            some = group[first : first + at_once]
+            # A run of its own of random numbers to each portion, whatever the others are.
+            rng = np.random.default_rng((seed, int(some[0])))
+            mine = {name: np.full((len(some), *whole.shape[1:]), np.nan, np.float32) for name, whole in out.items()}
+            _Batch(stepped, [robots[k] for k in some], rng, warm_c).play(mine)
+            for name, values in mine.items():
+                out[name][some] = values
     return Log(out)
-
-
-@contextlib.contextmanager
-def _unwarned() -> Iterator[None]:
-    """That a hypothesis falls apart is no one's concern: MuJoCo would say so on the terminal, and in a file where it runs."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda text: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
 
 
 def _scatters(robot: Robot) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import difflib
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ from openant_tools.model.stripped import strip_colliding, strip_visual
 from openant_tools.robot.model_file import check_model_file
 
 __all__ = ["Plant", "Setup", "is_filtered", "is_motor", "load_plant", "position_servos", "setup_of", "world_bodies"]
+
+_log = logging.getLogger(__name__)
 
 Ints = NDArray[np.int64]
 
@@ -151,6 +154,9 @@ def load_plant(
             `joints`.
     """
     path = Path(path)
+    if mujoco.get_mju_user_warning() is None:
+        # That a simulation falls apart is said by who asked for it; MuJoCo says it on the terminal, and in a file where it runs.
+        mujoco.set_mju_user_warning(_log.debug)
     # What cannot be compiled without its looks may compile with them, or MuJoCo says what is wrong with the file itself.
     whole = partial(
         load_plant, path, joints, setup,

@@ -59,6 +59,8 @@ CLEARANCE_M = 0.01
 CHUNK_BYTES = 16 * 2**20
 #: where an actuator of this kind keeps the rate limit of its setpoint (`slewmax`) in dynprm, MuJoCo 4
 SLEW_RATE = {int(mujoco.mjtDyn.mjDYN_PID): 1, int(mujoco.mjtDyn.mjDYN_DCMOTOR): 7}
+#: MuJoCo's warnings of a simulation that falls apart
+FALLS_APART = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
 #: how long a robot without a measured base is left to settle on its feet before a floor run
 SETTLE_S = 1.0
 #: cosine of how far from its attitude at the start a base may lean that is led along
@@ -274,6 +276,11 @@ class Rollouts:
     def segments(self) -> Sequence[Segment]:
         """What is stepped, the longest first."""
         return self._segments
+
+    @property
+    def unstable(self) -> bool:
+        """Whether a simulation so far met numbers that are none, or none of this world: MuJoCo began that one anew."""
+        return any(batch.warning[:, FALLS_APART, 1].any() for batch in self._batches.values())
 
     def lean(self, model: mujoco.MjModel) -> mujoco.MjModel:
         """A variant that computes nothing that nobody reads: a copy, unless it is so already."""

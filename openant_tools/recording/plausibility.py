@@ -7,7 +7,7 @@ radians, milliamperes from amperes, percent from fractions and raw counts from S
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.recording.run import BODY_COLUMNS, JOINT_SIGNALS, Array, Run
 
-__all__ = ["LIMITS", "Limit", "check_columns", "check_names", "check_run", "need_signals"]
+__all__ = ["LIMITS", "Limit", "check_names", "check_run", "check_time", "need_signals", "problems"]
 
 
 @dataclass(frozen=True)
@@ -73,57 +73,33 @@ def check_names(names: Sequence[str], where: str) -> None:
             raise BadInput(f"column {name} is there twice", where=where, remedy="keep one of them")
 
 
-def check_columns(names: Sequence[str], joints: Sequence[str], where: str) -> None:
-    """Raise where a column speaks of a joint that is not among `joints`, or where a joint has none.
-
-    Columns of signals that the format does not know are welcome.
-    """
-    body = {name.partition(".")[0] for name in BODY_COLUMNS if "." in name}
-    for name in names:
-        signal, dot, joint = name.partition(".")
-        if dot and signal in JOINT_SIGNALS and joint not in joints:
-            raise BadInput(
-                f"no such joint: {joint}",
-                where=f"{where}, column {name}",
-                remedy=_nearest(joint, joints) or f"the run's `joints` are {', '.join(joints)}",
-            )
-        if dot and signal in body and name not in BODY_COLUMNS:
-            known = [column for column in BODY_COLUMNS if column.startswith(f"{signal}.")]
-            raise BadInput(
-                f"no such column: {name}",
-                where=where,
-                remedy=f"the columns of {signal} are {', '.join(known)}",
-            )
-    signals = {(name.partition(".")[0], name.partition(".")[2]) for name in names}
-    for joint in joints:
-        if not any((signal, joint) in signals for signal in JOINT_SIGNALS):
-            columns = [name for name in names if name != "t"]
-            raise BadInput(
-                f"joint {joint} has no column",
-                where=where,
-                remedy=_nearest(f"pos.{joint}", columns) or f"add pos.{joint} or take it out of `joints`",
-            )
-
-
 def check_run(run: Run, where: str) -> None:
-    """Raise BadInput at the first row where time does not run forward or a value cannot be in the unit it should be."""
-    check_time(run.t, where)
+    """Raise the first of `problems` that a run has."""
+    for problem in problems(run, where):
+        raise problem
+
+
+def problems(run: Run, where: str) -> Iterator[BadInput]:
+    """Everything that cannot be in a run: columns of joints that it has not, time that does not run forward, values that
+    cannot be in the unit that they should be in; of each, the first place."""
+    yield from _column_problems([*run.columns], run.joints, where)
+    yield from _time_problems(run.t, where)
     for name, values in run.columns.items():
         limit = LIMITS.get(name) or LIMITS.get(name.partition(".")[0])
         if limit is not None and values.dtype.kind in "fiub":
-            _check_values(name, np.asarray(values, float), limit, run.t, where)
+            yield from _value_problems(name, np.asarray(values, float), limit, run.t, where)
     quaternion = run.signal("base", ("qw", "qx", "qy", "qz"))
     with np.errstate(invalid="ignore"):
         wrong = np.flatnonzero(np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) > 0.05)
     if len(wrong):
         norm = float(np.linalg.norm(quaternion[wrong[0]]))
         place = _place(where, "base.qw|qx|qy|qz", int(wrong[0]), run.t)
-        raise BadInput(f"a quaternion of norm {norm:.3g} is no orientation", where=place, remedy="normalise it")
+        yield BadInput(f"a quaternion of norm {norm:.3g} is no orientation", where=place, remedy="normalise it")
     # At rest and on average when walking, an accelerometer shows 9.81 m/s²; a median of 1 is the same in g.
     with np.errstate(invalid="ignore"):
         norm_acc = np.linalg.norm(run.signal("acc", ("x", "y", "z")), axis=1)
     if np.isfinite(norm_acc).any() and 0.8 < float(np.nanmedian(norm_acc)) < 1.25:
-        raise BadInput(
+        yield BadInput(
             f"the body's specific force is {float(np.nanmedian(norm_acc)):.2f} in the median",
             where=f"{where}, columns acc.x|y|z",
             remedy="accelerations are in m/s² (g × 9.81)",
@@ -132,28 +108,66 @@ def check_run(run: Run, where: str) -> None:
     if command is not None:
         away = np.flatnonzero((command < run.t[0] - 3600.0) | (command > run.t[-1] + 3600.0))
         if len(away):
-            raise BadInput(
+            yield BadInput(
                 f"cmd_t = {float(command[away[0]]):.6g} s is not on the clock of t",
                 where=_place(where, "cmd_t", int(away[0]), run.t),
                 remedy="give both on the host's monotonic clock, in s",
             )
 
 
+def _column_problems(names: Sequence[str], joints: Sequence[str], where: str) -> Iterator[BadInput]:
+    """Columns that speak of a joint that is not among `joints`, and joints that have none.
+
+    Columns of signals that the format does not know are welcome.
+    """
+    body = {name.partition(".")[0] for name in BODY_COLUMNS if "." in name}
+    for name in names:
+        signal, dot, joint = name.partition(".")
+        if dot and signal in JOINT_SIGNALS and joint not in joints:
+            yield BadInput(
+                f"no such joint: {joint}",
+                where=f"{where}, column {name}",
+                remedy=_nearest(joint, joints) or f"the run's `joints` are {', '.join(joints)}",
+            )
+        if dot and signal in body and name not in BODY_COLUMNS:
+            known = [column for column in BODY_COLUMNS if column.startswith(f"{signal}.")]
+            yield BadInput(
+                f"no such column: {name}",
+                where=where,
+                remedy=f"the columns of {signal} are {', '.join(known)}",
+            )
+    signals = {(name.partition(".")[0], name.partition(".")[2]) for name in names}
+    for joint in joints:
+        if not any((signal, joint) in signals for signal in JOINT_SIGNALS):
+            columns = [name for name in names if name != "t"]
+            yield BadInput(
+                f"joint {joint} has no column",
+                where=where,
+                remedy=_nearest(f"pos.{joint}", columns) or f"add pos.{joint} or take it out of `joints`",
+            )
+
+
 def check_time(t: Array, where: str) -> None:
     """Raise unless `t` (n,) s has rows, is finite and strictly increasing."""
+    for problem in _time_problems(t, where):
+        raise problem
+
+
+def _time_problems(t: Array, where: str) -> Iterator[BadInput]:
     if not len(t):
-        raise BadInput("the run is empty: no rows", where=where, remedy="record again, or export the rows you mean")
+        yield BadInput("the run is empty: no rows", where=where, remedy="record again, or export the rows you mean")
+        return
     wrong = np.flatnonzero(~np.isfinite(t))
     if len(wrong):
         row = int(wrong[0])
-        raise BadInput(
+        yield BadInput(
             f"t is {t[row]}", where=f"{where}, column t, row {row + 1}", remedy="give every row its time, in s"
         )
     back = np.flatnonzero(np.diff(t) <= 0.0)
     if len(back):
         row = int(back[0]) + 1
         how = "repeats" if t[row] == t[row - 1] else "runs backwards"
-        raise BadInput(
+        yield BadInput(
             f"time {how}: t = {float(t[row])!r} s after {float(t[row - 1])!r} s",
             where=f"{where}, column t, row {row + 1}",
             remedy="sort the rows by time and keep one of each",
@@ -180,11 +194,11 @@ def need_signals(run: Run, signals: Sequence[str], where: str) -> None:
         )
 
 
-def _check_values(name: str, values: Array, limit: Limit, t: Array, where: str) -> None:
+def _value_problems(name: str, values: Array, limit: Limit, t: Array, where: str) -> Iterator[BadInput]:
     infinite = np.isinf(values)
     if infinite.any():
         row = int(np.flatnonzero(infinite)[0])
-        raise BadInput(
+        yield BadInput(
             f"{values[row]} is no measurement", where=_place(where, name, row, t), remedy="leave a missing sample empty"
         )
     flag = limit.low == 0.0 and limit.high == 1.0
@@ -196,7 +210,7 @@ def _check_values(name: str, values: Array, limit: Limit, t: Array, where: str) 
         row = int(np.flatnonzero(wrong)[0])
         unit = JOINT_SIGNALS.get(name.partition(".")[0]) or BODY_COLUMNS.get(name, "")
         shown = f"{values[row]:.6g}" + (f" {unit}" if unit not in ("", "1") else "")
-        raise BadInput(f"{shown} cannot be", where=_place(where, name, row, t), remedy=limit.remedy)
+        yield BadInput(f"{shown} cannot be", where=_place(where, name, row, t), remedy=limit.remedy)
 
 
 def _place(where: str, column: str, row: int, t: Array) -> str:

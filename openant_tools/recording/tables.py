@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.files import atomic_writer, read_text, reading
 from openant_tools.recording.facts import facts_from_json, facts_to_json
-from openant_tools.recording.plausibility import check_columns, check_names, check_run, check_time, need_signals
+from openant_tools.recording.plausibility import check_names, check_run, check_time, need_signals
 from openant_tools.recording.run import BODY_COLUMNS, JOINT_SIGNALS, Facts, Run
 
 __all__ = ["find_run", "parquet_table", "read_run", "read_table", "write_table"]
@@ -31,12 +31,13 @@ _MISSING = ("", "nan", "NaN", "NAN", "null", "NULL", "None", "NA", "N/A")
 _TRUE, _FALSE = pa.array(["true", "True", "TRUE"]), pa.array(["false", "False", "FALSE"])
 
 
-def read_run(path: str | Path, *, need: Sequence[str] = ("cmd", "pos")) -> Run:
+def read_run(path: str | Path, *, need: Sequence[str] = ("cmd", "pos"), plausible: bool = True) -> Run:
     """The run at `path`: a native recording (.mcap) or a table (.parquet, .csv), checked.
 
     Args:
         path: the file, or its name without the suffix.
         need: signals without which the run is of no use to the caller; `()` takes any run, such as a log of the bus.
+        plausible: refuse a table whose values cannot be in the units that they should be in.
 
     Raises:
         BadInput: the file, the column and the row of what cannot be, and what to do about it.
@@ -46,21 +47,21 @@ def read_run(path: str | Path, *, need: Sequence[str] = ("cmd", "pos")) -> Run:
         from openant_tools.recording.reader import read_recording
 
         run = read_recording(path).run
-        check_time(run.t, str(path))
     else:
-        run = read_table(path)
+        run = read_table(path, plausible=plausible)
+    check_time(run.t, str(path))
     need_signals(run, need, str(path))
     return run
 
 
-def read_table(path: str | Path) -> Run:
-    """The table at `path` (.parquet or .csv), checked row by row; see `read_run`."""
+def read_table(path: str | Path, *, plausible: bool = True) -> Run:
+    """The table at `path` (.parquet or .csv), checked row by row if it has to be plausible; see `read_run`."""
     path = Path(path)
     with reading(path, "this table cannot be read", "export it again"):
-        return _read(path)
+        return _read(path, plausible)
 
 
-def _read(path: Path) -> Run:
+def _read(path: Path, plausible: bool) -> Run:
     columns = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
     if "t" not in columns:
         raise BadInput(
@@ -73,12 +74,14 @@ def _read(path: Path) -> Run:
         facts = facts_from_json(read_text(facts_path), str(facts_path))
     else:
         facts = Facts(joints=_joints_of(list(columns), path))
-    check_columns(list(columns), facts.joints, str(path))
     t = columns.pop("t")
     if t.dtype.kind != "f":
         raise BadInput("t is not a number", where=f"{path}, column t", remedy="give the time in s, as a number")
     run = Run(name=path.stem, facts=facts, t=t, columns=columns, path=path)
-    check_run(run, str(path))
+    if plausible:
+        check_run(run, str(path))
+    elif not len(t):
+        check_time(t, str(path))
     return run
 
 

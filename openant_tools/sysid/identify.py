@@ -6,7 +6,6 @@ its prior; whatever does not beat the given model on held-out runs, at the short
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,6 +23,7 @@ from openant_tools.errors import BadInput
 from openant_tools.model.attribute import Attribute
 from openant_tools.model.floor import disagreement, floors
 from openant_tools.model.gap import HORIZON_S, Gap, share_closed
+from openant_tools.model.of_run import own_model, plants_of
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.recording.run import Run
 from openant_tools.robot.config import Effect as Entry
@@ -41,9 +41,9 @@ from openant_tools.sysid.parameter import (
     effect_values,
     restatements,
 )  # fmt: skip
-from openant_tools.sysid.quality import Telemetry, check_model, check_runs, without_errors
+from openant_tools.sysid.quality import Telemetry, check_model, without_errors
+from openant_tools.sysid.rules import check_runs, without_turns
 from openant_tools.sysid.verdict import IDENTIFIED, NOT_IN_THE_DATA, SILENT, Verdict, Word, experiment, verdicts
-from openant_tools.trust import follows
 
 __all__ = [
     "DEFAULT_KINDS",
@@ -57,8 +57,6 @@ __all__ = [
     "own_model",
     "restated",
 ]
-
-_log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -286,10 +284,10 @@ def identify(
     if same:
         raise BadInput("a held-out run is also fitted", remedy="hold out runs that are not among those to fit")
     joints = joints_in_common(everything, model, joints)
-    cleaned = [without_errors(run, joints) for run in everything]
+    said = check_runs(everything, plants_of(everything, model, joints))
+    cleaned = [without_errors(without_turns(run, joints), joints) for run in everything]
     everything, telemetry = [run for run, _ in cleaned], [found for _, found in cleaned]
     runs, hold_out = everything[: len(runs)], everything[len(runs) :]
-    check_runs(everything, load_plant(model, joints, Setup.FLOOR))
     floored = load_plant(model, joints, Setup.FLOOR)
     wanted = _applicable(declared.kinds if kinds is None and declared else kinds, floored, everything)
     if also:
@@ -362,6 +360,7 @@ def identify(
         held_out=tuple(judged or data),
         acting=acting,
         notes=(
+            *said,
             *([doubt] if doubt else []),
             *_telemetry_notes(everything, telemetry),
             *_acting_notes(acting),
@@ -428,21 +427,6 @@ def _datasets(
         )
         for (path, setup), members in groups.items()
     ]
-
-
-def own_model(run: Run) -> Path | None:
-    """The model that a run itself names, where that file is; one elsewhere is not followed, and that is said."""
-    own = run.model_path
-    if own is None or not own.is_file():
-        return None
-    # A run in memory was named by a program, not by a file from anybody.
-    if run.path is not None and follows(str(run.facts.model), run.path) is None:
-        _log.warning(
-            "%s: its model %s lies elsewhere and is not followed → add --trust-paths if it may be, or name one by --model",
-            run.path or run.name, run.facts.model,
-        )  # fmt: skip
-        return None
-    return own
 
 
 def _applicable(kinds: Sequence[str] | None, plant: Plant, runs: Sequence[Run]) -> list[str]:

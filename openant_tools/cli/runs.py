@@ -1,0 +1,76 @@
+"""The runs of a command and the model that they are played with: which one, and what about them has to be said first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from openant_tools.cli.options import robot_folder
+from openant_tools.errors import BadInput
+
+if TYPE_CHECKING:
+    from openant_tools.recording.run import Run
+
+__all__ = ["checked", "model_of", "read_runs", "say"]
+
+
+def read_runs(paths: Sequence[Path]) -> list[Run]:
+    """The runs at `paths`; those of a single row are left out, and that is said.
+
+    Raises:
+        BadInput: a run cannot be read, or none has a motion.
+    """
+    from openant_tools.recording.tables import read_run
+
+    runs = [read_run(path) for path in paths]
+    still = [run for run in runs if len(run.t) < 2]
+    if still and len(still) == len(runs):
+        raise BadInput(
+            "it has one row: nothing can be seen to move", where=still[0].path, remedy="export all rows of the run"
+        )
+    say(f"{run.path}: it has one row and is left out → export all rows of the run" for run in still)
+    return [run for run in runs if len(run.t) > 1]
+
+
+def model_of(runs: Sequence[Run], model: Path | None, robot: Path | None) -> tuple[list[Run], Path]:
+    """The MJCF that was named, else the first that a run names, else that of the robot's folder.
+
+    Returns:
+        the runs, and the model of those that name none. Where one was named, it is that of all.
+    """
+    from openant_tools.model.of_run import own_model, with_model
+    from openant_tools.robot.folder import RobotFolder
+
+    if model is not None:
+        named, said = with_model(runs, model)
+        say(said)
+        return named, model
+    own = [own_model(run) for run in runs]
+    first = next((path for path in own if path is not None), None)
+    if first is not None and None not in own:
+        return list(runs), first
+    return list(runs), RobotFolder.at(robot_folder(robot)).model_path()
+
+
+def checked(runs: Sequence[Run], model: Path, joints: Sequence[str], *, fitting: bool = False) -> list[Run]:
+    """Go through the rules before anything is computed, and say what they note; the runs without whole turns.
+
+    Raises:
+        BadInput: a rule refuses.
+    """
+    from openant_tools.model.of_run import plants_of
+    from openant_tools.sysid.identify import joints_in_common
+    from openant_tools.sysid.rules import check_runs, without_turns
+
+    common = joints_in_common(runs, model, joints or None)
+    check_runs(runs, plants_of(runs, model, common), fitting=fitting, tell=lambda line: click.echo(line, err=True))
+    return [without_turns(run, common) for run in runs]
+
+
+def say(lines: Iterable[str]) -> None:
+    """Notes, a line each, on stderr."""
+    for line in lines:
+        click.echo(line, err=True)

@@ -1,0 +1,54 @@
+"""Which model a run is simulated with, and set up how."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
+from openant_tools.recording.run import Run
+from openant_tools.trust import follows
+
+__all__ = ["own_model", "plants_of", "with_model"]
+
+_log = logging.getLogger(__name__)
+
+
+def own_model(run: Run) -> Path | None:
+    """The model that a run itself names, where that file is; one elsewhere is not followed, and that is said."""
+    own = run.model_path
+    if own is None or not own.is_file():
+        return None
+    # A run in memory was named by a program, not by a file from anybody.
+    if run.path is not None and follows(str(run.facts.model), run.path) is None:
+        _log.warning(
+            "%s: its model %s lies elsewhere and is not followed → add --trust-paths if it may be, or name one by --model",
+            run.path or run.name, run.facts.model,
+        )  # fmt: skip
+        return None
+    return own
+
+
+def with_model(runs: Sequence[Run], model: Path) -> tuple[list[Run], tuple[str, ...]]:
+    """The runs as runs of `model`, whatever they name themselves; and a line for each that names another."""
+    said = tuple(
+        f"{run.path or run.name}: its own model is {run.facts.model}, and {model} was named → leave --model out to play each "
+        "run on its own"
+        for run in runs
+        if run.model_path is not None and run.model_path.resolve() != model.resolve()
+    )
+    return [replace(run, facts=replace(run.facts, model=None)) for run in runs], said
+
+
+def plants_of(runs: Sequence[Run], model: Path, joints: Sequence[str]) -> list[Plant]:
+    """Of each run its own model, else `model`, set up as the run was made; the same plant for the same model and setup."""
+    plants: dict[tuple[Path, Setup], Plant] = {}
+    out = []
+    for run in runs:
+        key = own_model(run) or model, setup_of(run.facts.setup)
+        if key not in plants:
+            plants[key] = load_plant(key[0], joints, key[1])
+        out.append(plants[key])
+    return out
