@@ -23,6 +23,7 @@ from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE, RAD_S_PER_COUNT
 from openant_tools.sysid.kinds import KINDS, torque_limit
+from openant_tools.sysid.quality import without_errors
 
 __all__ = ["RULES", "Finding", "Rule", "Verdict", "check_runs", "findings", "without_turns"]
 
@@ -160,6 +161,7 @@ def findings(run: Run, joints: Sequence[str], plant: Plant | None = None) -> Ite
         joints: those to look at; where they are not both commanded and measured nothing is found.
         plant: the model, set up as the run was made, with the same joints.
     """
+    run = without_errors(run, joints)[0]
     recorded, straight = Case(run, tuple(joints), plant), Case(without_turns(run, joints), tuple(joints), plant)
     for rule in RULES:
         if plant is not None or not rule.needs_model:
