@@ -18,6 +18,7 @@ import pytest
 
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Setup, load_plant
+from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run, write_table
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
@@ -28,6 +29,7 @@ from openant_tools.sysid.data_sheet import data_sheet_model
 from openant_tools.sysid.fit import autocorrelation_time
 from openant_tools.sysid.identify import Identification, Value, calibrated, identify
 from openant_tools.sysid.protocols import CommandSpace, protocol
+from openant_tools.sysid.result import write_fit
 
 REAL = Path(__file__).parents[2] / "shared" / "realdata" / "bam-xl330"
 
@@ -182,6 +184,38 @@ def test_data_that_contradict_the_given_model_win_and_it_is_said(
         assert "the prior says" in found.words
     assert value(result, "zero_offset.joint").value == pytest.approx(robot.zero_offset, abs=0.005)
     assert result.after.full < 4 * FLOOR < result.before.full
+
+
+def test_runs_of_two_gains_are_one_servo(tmp_path: Path) -> None:
+    """Its registers set the stiffness, each file's own; friction, inertia and zero are the servo's, and told by both."""
+    files = {kp: plants.write(tmp_path / f"p{kp:g}.xml", MODEL.replace('kp="8"', f'kp="{kp:g}"')) for kp in (8.0, 4.0)}
+    robots = {8.0: Robot(7.3, coulomb_friction=0.05, zero_offset=0.01)}
+    robots[4.0] = replace(robots[8.0], stiffness=4.4)
+    runs = [
+        robots[kp].record(f"{name}-{kp:g}", 3.0, seed, model=str(path)) for kp, path in files.items()
+        for seed, name in enumerate(("a", "b"))
+    ]  # fmt: skip
+    result = identify(runs[::2], files[8.0], runs[1::2])
+    found = {one.name: one for one in result.values}
+    assert found["stiffness.joint.p8"].low <= 7.3 <= found["stiffness.joint.p8"].high
+    assert found["stiffness.joint.p4"].low <= 4.4 <= found["stiffness.joint.p4"].high
+    assert "coulomb_friction.joint" in found
+    assert "stiffness.joint" not in found
+    holds(result, {kind: value for kind, value in robots[8.0].values.items() if kind != "stiffness"})
+    out = tmp_path / "fit"
+    write_fit(result, out)
+    assert not (out / "calibrated.xml").exists()
+    figures = json.loads((out / "fit.json").read_text())
+    assert [entry["written"] for entry in figures["models"]] == ["calibrated-p8.xml", "calibrated-p4.xml"]
+    for kp, name, stiffness in ((8.0, "calibrated-p8.xml", 7.3), (4.0, "calibrated-p4.xml", 4.4)):
+        plant = load_plant(out / name)
+        assert -plant.model.actuator_biasprm[0, 1] == pytest.approx(stiffness, rel=0.03)
+        measured = next(run for run in runs[1::2] if run.name == f"b-{kp:g}")
+        left = Rollouts(plant, [measured])().pos[0] - measured.signal("pos", plant.joints)
+        assert math.sqrt(np.nanmean(left**2)) < 6 * FLOOR
+    # What an earlier fit wrote here would pass for a part of the next one.
+    write_fit(identify([runs[0]], files[8.0], [runs[1]]), out)
+    assert sorted(path.name for path in out.glob("*.xml")) == ["calibrated.xml"]
 
 
 @pytest.fixture(scope="module")

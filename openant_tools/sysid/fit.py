@@ -347,6 +347,7 @@ class Problem:
             ends = [
                 parameter.bounds(kind.read(data.plant.model, data.plant, j))
                 for data in self.datasets
+                if parameter.belongs(data.plant)
                 for j in parameter.joints
             ]
             low.append(max(end[0] for end in ends))

@@ -36,6 +36,7 @@ from openant_tools.sysid.parameter import (
     Parameter,
     apply,
     buffered,
+    by_register,
     choose,
     delays,
     effect_values,
@@ -77,6 +78,8 @@ ON_FLOOR = ("floor_friction", "contact_softness")
 
 #: going back must pay this much on held-out runs (relative, over both horizons): less is luck
 WORTH = 0.01
+#: times that runs are left out in turn, at most: each is another fit
+MOST_FOLDS = 4
 #: share of a run's samples that may be missing without a word
 MISSING = 0.01
 #: share by which a supply falls before it is worth a word: a servo measures it in steps of 0.1 V
@@ -180,6 +183,11 @@ class Identification:
     acting: EffectValues
     notes: tuple[str, ...]
     doubt: str = ""
+
+    @property
+    def models(self) -> tuple[Path, ...]:
+        """The files that the runs were made with: the given one, or each gain's own."""
+        return tuple(dict.fromkeys(data.plant.path for data in self.datasets))
 
     @property
     def accepted(self) -> tuple[str, ...]:
@@ -310,7 +318,7 @@ def identify(
             check_model(run, one.plant, given[rows])
     plant = data[0].plant
     motors = {k: v for run in everything for k, v in run.facts.motors.items()}
-    chosen = choose(plant, wanted, tie, motors)
+    chosen = by_register(choose(plant, wanted, tie, motors), [one.plant for one in data])
     chosen += declared_parameters(plant, declared) if declared else []
     floor = np.maximum(sensor_floor(runs, joints), 1e-6)
 
@@ -339,7 +347,10 @@ def identify(
     u[undetermined & kept] = problem.centre[undetermined & kept]
     tests = [run for _, test in folds for run in test]
     found = verdicts(estimate, kept)
-    values = tuple(_value(p, plant, estimate, k, found[k], float(u[k])) for k, p in enumerate(chosen))
+    values = tuple(
+        _value(p, next(one.plant for one in data if p.belongs(one.plant)), estimate, k, found[k], float(u[k]))
+        for k, p in enumerate(chosen)
+    )
     return Identification(
         model=model,
         joints=tuple(joints),
@@ -462,13 +473,15 @@ def _applicable(kinds: Sequence[str] | None, plant: Plant, runs: Sequence[Run]) 
 
 
 def _folds(runs: Sequence[Run]) -> list[tuple[list[Run], list[Run]]]:
-    """Leave out in turn: each run, together with its repeats; a single run is cut in three and loses a third at a time."""
+    """Leave out in turn: each motion with its repeats, or where there are many a share of them; a single run is cut in three
+    and loses a third at a time."""
     names = {run.name: run.facts.repeat_of or run.name for run in runs}
     motions = list(dict.fromkeys(names.values()))
     if len(motions) > 1:
+        fold = {motion: k % MOST_FOLDS for k, motion in enumerate(motions)}
         return [
-            ([run for run in runs if names[run.name] != motion], [run for run in runs if names[run.name] == motion])
-            for motion in motions
+            ([run for run in runs if fold[names[run.name]] != k], [run for run in runs if fold[names[run.name]] == k])
+            for k in range(min(MOST_FOLDS, len(motions)))
         ]
     folds = []
     for k in range(3):
@@ -678,11 +691,15 @@ def _notes(estimate: Estimate, joints: Sequence[str], runs: Sequence[Run], value
     return tuple(notes)
 
 
-def calibrated(identification: Identification, setup: Setup = Setup.FLOOR) -> mujoco.MjModel:
-    """The identified model. Its servos become DC motors only where a part of the damping was found to be electrical."""
+def calibrated(identification: Identification, setup: Setup = Setup.FLOOR, path: Path | None = None) -> mujoco.MjModel:
+    """The identified model. Its servos become DC motors only where a part of the damping was found to be electrical.
+
+    Args:
+        path: which of the identification's models; default the given one.
+    """
     moved = {p.kind for p, u in zip(identification.parameters, identification.u, strict=True) if u != 0}
     plant = load_plant(
-        identification.model,
+        path or identification.model,
         identification.joints,
         setup,
         electrical="electrical_damping" in moved,
@@ -695,6 +712,6 @@ def calibrated(identification: Identification, setup: Setup = Setup.FLOOR) -> mu
     return model
 
 
-def restated(identification: Identification) -> dict[Attribute, tuple[float, ...]]:
-    """What the attributes that were declared are in the identified model's file, where they moved."""
-    return restatements(identification.model, identification.parameters, identification.u)
+def restated(identification: Identification, path: Path | None = None) -> dict[Attribute, tuple[float, ...]]:
+    """What the attributes that were declared are in an identified model's file, where they moved."""
+    return restatements(path or identification.model, identification.parameters, identification.u)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -33,6 +33,7 @@ __all__ = [
     "Place",
     "apply",
     "buffered",
+    "by_register",
     "choose",
     "colours",
     "delays",
@@ -42,6 +43,8 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+#: kinds that a servo's registers set: its P gain, its D gain
+OF_REGISTERS = ("stiffness", "velocity_gain")
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,7 @@ class Parameter:
         std: the prior's standard deviation, of log(value) if relative, else in the kind's unit.
         declared: the kind, where a user declared it (`declared.py`).
         places: of what was declared, the attributes that change together, and which of an attribute's numbers.
+        model: the file whose servos alone it belongs to, where runs were made with several; None for all.
     """
 
     kind: str
@@ -65,6 +69,11 @@ class Parameter:
     std: float
     declared: Kind | None = None
     places: tuple[Place, ...] = ()
+    model: Path | None = None
+
+    def belongs(self, plant: Plant) -> bool:
+        """Whether it says anything of this plant."""
+        return self.model is None or self.model == plant.path
 
     @property
     def name(self) -> str:
@@ -100,6 +109,8 @@ def apply(plant: Plant, parameters: Sequence[Parameter], u: Array) -> mujoco.MjM
     constants = False
     for parameter, value in zip(parameters, u, strict=True):
         kind = parameter.definition
+        if not parameter.belongs(plant):
+            continue
         for j in parameter.joints[:1] if kind.body else parameter.joints:
             nominal = kind.read(plant.model, plant, j)
             kind.write(model, plant, j, parameter.value(nominal, float(value)))
@@ -252,6 +263,25 @@ def choose(
             std = kind.relative_std if relative and kind.relative_std is not None else kind.absolute_std(limit)
             chosen.append(Parameter(name, label, tuple(joints), relative, std))
     return chosen
+
+
+def by_register(parameters: Sequence[Parameter], plants: Sequence[Plant]) -> list[Parameter]:
+    """The parameters of runs that were made with several models of one robot: what its registers set is each model's own.
+
+    Friction, inertia and zeros are the servo's, whatever its gains.
+    """
+    paths = dict.fromkeys(plant.path for plant in plants)
+    if len(paths) < 2:
+        return list(parameters)
+    return [
+        one
+        for parameter in parameters
+        for one in (
+            [replace(parameter, model=path, label=f"{parameter.label}.{path.stem}") for path in paths]
+            if parameter.kind in OF_REGISTERS
+            else [parameter]
+        )
+    ]
 
 
 def _groups(plant: Plant, kind: Kind, tie: str, motors: Mapping[str, str]) -> dict[str, list[int]]:

@@ -13,7 +13,8 @@ from pathlib import Path
 
 from openant_tools.effects.catalogue import effect
 from openant_tools.effects.entries import as_toml, entries_of
-from openant_tools.files import json_text, write_text
+from openant_tools.errors import BadInput
+from openant_tools.files import json_text, read_json, write_text
 from openant_tools.model.mjcf import write_model
 from openant_tools.robot.config import Effect, Provenance
 from openant_tools.robot.folder import RobotFolder
@@ -43,20 +44,44 @@ def write_fit(result: Identification, out: Path, richer: Identification | None =
     runs = ", ".join(run.name for data in result.datasets for run in data.runs)
     note = f"Calibrated by `openant sysid fit` on {datetime.date.today()} from {result.model.name} and {runs}"
     entries = entries_of(result.effects, result.joints)
-    names = (CALIBRATED, "fit.json", "report.html", *([EFFECTS] if entries else []))
-    with _together(out, names) as (model, figures, report, *effects):
-        write_model(result.model, calibrated(result), model, joints=result.joints, note=note, stated=restated(result))
-        write_text(figures, json_text(result.as_json()))
+    models, earlier = result.models, _written_before(out)
+    written = [CALIBRATED] if len(models) == 1 else [f"calibrated-{path.stem}.xml" for path in models]
+    names = ("fit.json", "report.html", *written, *([EFFECTS] if entries else []))
+    with _together(out, names) as (figures, report, *rest):
+        for path, model in zip(models, rest, strict=False):
+            write_model(
+                path,
+                calibrated(result, path=path),
+                model,
+                joints=result.joints,
+                note=note.replace(result.model.name, path.name),
+                stated=restated(result, path),
+            )
+        listed = [{"given": str(path), "written": name} for path, name in zip(models, written, strict=True)]
+        write_text(figures, json_text({**result.as_json(), "models": listed}))
         fit_report(result).write(report)
+        effects = rest[len(models) :]
         for path in effects:
             write_text(path, as_toml(entries, note))
     # What an earlier fit left here would pass for a part of this one.
+    for name in earlier - set(names):
+        (out / name).unlink(missing_ok=True)
     if not entries:
         (out / EFFECTS).unlink(missing_ok=True)
     if richer is None:
         shutil.rmtree(out / WITH_EFFECTS, ignore_errors=True)
         return [out / name for name in names]
     return [*(out / name for name in names), *write_fit(richer, out / WITH_EFFECTS)]
+
+
+def _written_before(out: Path) -> set[str]:
+    """The models that a fit.json in `out` says were written beside it."""
+    try:
+        entries = read_json(out / "fit.json").get("models", ())
+        names = {Path(str(entry["written"])).name for entry in entries}
+    except (OSError, BadInput, AttributeError, KeyError, TypeError):
+        names = set[str]()
+    return {name for name in names | {CALIBRATED} if name.startswith("calibrated") and name.endswith(".xml")}
 
 
 @contextmanager
@@ -84,14 +109,18 @@ def _together(folder: Path, names: Sequence[str]) -> Iterator[list[Path]]:
 
 
 def write_robot(result: Identification, folder: RobotFolder) -> None:
-    """Put the calibrated model into a robot's folder, and every accepted value with where it came from into `robot.toml`."""
+    """Put the calibrated model into a robot's folder, and every accepted value with where it came from into `robot.toml`.
+
+    Of a fit to runs of several gains that is the given model, or the first run's.
+    """
+    source_file = result.model if result.model in result.models else result.models[0]
     write_model(
-        result.model,
-        calibrated(result),
+        source_file,
+        calibrated(result, path=source_file),
         folder.path / CALIBRATED,
         joints=result.joints,
         note="Written by `openant sysid fit`",
-        stated=restated(result),
+        stated=restated(result, source_file),
     )
     runs = [run for data in result.datasets for run in data.runs]
     recording = folder.relative(runs[0].path) if runs[0].path else runs[0].name
