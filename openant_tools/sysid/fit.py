@@ -350,8 +350,9 @@ class Problem:
                 if parameter.belongs(data.plant)
                 for j in parameter.joints
             ]
-            low.append(max(end[0] for end in ends))
-            high.append(min(end[1] for end in ends))
+            # Of a gain whose runs are all left out nothing is known but its prior.
+            low.append(max((end[0] for end in ends), default=-np.inf))
+            high.append(min((end[1] for end in ends), default=np.inf))
         self.low, self.high = np.array(low), np.array(high)
         self.centre = np.array([parameter.centre for parameter in self.parameters])
         self._free(self.freed if len(self.freed) else np.zeros(len(self.parameters), bool))
