@@ -26,6 +26,7 @@ import sqlalchemy
 from openant_agents import sac, sarsa
 from openant_agents.training import Progress
 from openant_tools.errors import BadInput
+from openant_tools.files import reading
 
 __all__ = ["SPACES", "Agent", "best_settings", "open_study", "search"]
 
@@ -129,9 +130,12 @@ def open_study(url: str, name: str, facts: Mapping[str, Any]) -> optuna.Study:
                 f"the storage cannot be opened: {reason}", where=url, remedy="give a URL such as sqlite:///tune.db"
             ) from error
     asked = json.loads(json.dumps(facts))
-    there = study.user_attrs.get("openant")
+    with reading(url, "the storage is not as Optuna wrote it", "name another, or mend it"):
+        there = study.user_attrs.get("openant")
     if there is None:
         study.set_user_attr("openant", asked)
+    elif not isinstance(there, dict):
+        raise BadInput(f"the study {name} is none of ours", where=url, remedy="name another --study")
     elif there != asked:
         differing = sorted(key for key in there.keys() | asked.keys() if there.get(key) != asked.get(key))
         raise BadInput(
@@ -220,8 +224,10 @@ def best_settings(study: optuna.Study) -> tuple[dict[str, Any], float]:
     Raises:
         BadInput: no trial is complete yet.
     """
-    try:
-        best = study.best_trial
-    except ValueError:
-        raise BadInput("no trial is complete yet", where=study.study_name, remedy="let it search longer") from None
-    return dict(best.user_attrs["settings"]), float(best.value or 0.0)
+    with reading(study.study_name, "the storage is not as Optuna wrote it", "name another, or mend it"):
+        try:
+            best = study.best_trial
+        except ValueError:
+            raise BadInput("no trial is complete yet", where=study.study_name, remedy="let it search longer") from None
+    with reading(study.study_name, "its best trial is not as `openant tune` wrote it", "name another --study"):
+        return dict(best.user_attrs["settings"]), float(best.value or 0.0)

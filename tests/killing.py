@@ -65,6 +65,7 @@ WAYS: Mapping[str, Way] = {
     "thermal soak": Way(STAND, (*_OUT, "--load", "hang")),
     "sysid record": Way(STAND, (*_OUT, "--protocol", "stand")),
     "sysid scale": Way(STAND),
+    "sysid tilt": Way(STAND, ("--imu",)),
 }
 #: command → why it is not begun here; its engine is the one that the others are killed with
 ELSEWHERE: Mapping[str, str] = {
@@ -73,7 +74,6 @@ ELSEWHERE: Mapping[str, str] = {
     "calib zeros": "a minute of hands before torque",
     "calib bounds": "a minute of hands before torque",
     "calib arena": "needs a camera, which a shared machine renders slowly",
-    "sysid tilt": "needs somebody who tilts a plate",
     "train sac": "walking needs camera and IMU: tests/test_hardware_env.py",
     "train sarsa": "walking needs camera and IMU: tests/test_hardware_env.py",
     "eval": "walking needs camera and IMU: tests/test_hardware_env.py",

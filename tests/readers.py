@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import json
 import random
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,11 +34,13 @@ class Reader:
         name: of the file to spoil, in its folder.
         make: puts a good one, with whatever belongs to it, into a folder.
         read: reads it there, as commands do.
+        tries: how often tests spoil it.
     """
 
     name: str
     make: Callable[[Path], object]
     read: Callable[[Path], Any]
+    tries: int = 1000
 
 
 def _run() -> Run:
@@ -267,6 +271,81 @@ def _ranges(path: Path) -> Any:
     return read_calibration(path)
 
 
+def _verdict(folder: Path) -> None:
+    (folder / "verdicts").mkdir()
+    effect = {"effect": "backlash", "joints": ["knee_fl"], "probability": 0.9}
+    said = {
+        "verdict": "backlash", "effects": [effect], "selected": ["backlash"], "ambiguous_with": [["backlash", "payload"]],
+        "gap": {"before": 0.1, "after": 0.05, "floor": 0.01}, "blind": {"robot": "robot-00", "seconds": 3.0, "first": False},
+    }  # fmt: skip
+    (folder / "verdicts" / "robot-00.json").write_text(json.dumps(said))
+
+
+def _scored(path: Path) -> Any:
+    from openant_tools.blind.answers import Answer
+    from openant_tools.blind.score import Case, score
+    from openant_tools.files import read_json
+
+    said = read_json(path)
+    drawn = {"effect": "backlash", "joints": ["knee_fl"], "parameters": {"width_rad": 0.1}, "size": "large"}
+    truth = Answer.of({"group": "single", "effect": [drawn], "seed": 1, "maker": "a", "tracker": True})
+    return score([{}], [Case("robot-00", truth, said)])
+
+
+def _eeprom(folder: Path) -> None:
+    from openant_tools.virtual.eeprom import EepromFile
+
+    EepromFile(folder / "eeprom.json").write(_world())
+
+
+def _read_eeprom(path: Path) -> Any:
+    from openant_tools.virtual.eeprom import EepromFile
+
+    return EepromFile(path)._read(_world())
+
+
+@functools.cache
+def _world() -> Any:
+    from openant_tools.virtual.scenario import parse_scenario
+    from openant_tools.virtual.start import assemble
+
+    server = assemble(parse_scenario({}), clock="stepped", camera=False)
+    world = server.world
+    server.close()
+    return world
+
+
+def _effects(folder: Path) -> None:
+    from openant_tools.robot.folder import create_robot
+
+    path = create_robot(folder).config_file
+    entry = '[[effect]]\neffect = "load_friction"\njoints = ["knee_fl"]\nparameters = { coefficient = 0.12 }\n'
+    path.write_text(f"{path.read_text()}\n{entry}")
+
+
+def _entries_of(path: Path) -> Any:
+    from openant_tools.effects.entries import commands_of, sensing_of, values_of
+    from openant_tools.robot.folder import RobotFolder
+    from openant_tools.robot.joints import JOINT_NAMES
+
+    effects = RobotFolder(path.parent).config().effects
+    return values_of(effects, JOINT_NAMES, path), commands_of(effects, JOINT_NAMES, path), sensing_of(effects, path)
+
+
+def _heat(folder: Path) -> None:
+    known = {
+        "joints": ["knee_fl"], "models": ["XM430-W350-T"], "names": [["loss", "knee_fl"], ["gain", ""]], "theta": [1.0, 2.0],
+        "covariance": [[1.0, 0.0], [0.0, 1.0]],
+    }  # fmt: skip
+    (folder / "fit.json").write_text(json.dumps({"known": known}))
+
+
+def _known(path: Path) -> Any:
+    from openant_tools.cli.thermal_analysis import _known as known
+
+    return known(path)
+
+
 def _text(name: str, text: str) -> Callable[[Path], object]:
     return lambda folder: (folder / name).write_text(text)
 
@@ -292,6 +371,10 @@ READERS = {
     "typed readings": Reader("typed.csv", _text("typed.csv", "volts,grams\n1.0,2.0\n# no\n2.0,4.5\n"), _typed),
     "ready file": Reader("ready.json", _text("ready.json", '{"bus": "/dev/pts/1", "imu": null, "pid": 3}'), _ready),
     "blind set": Reader("set.toml", _set, _committed),
+    "blind verdict": Reader("verdicts/robot-00.json", _verdict, _scored),
+    "EEPROM of a virtual robot": Reader("eeprom.json", _eeprom, _read_eeprom),
+    "effects of robot.toml": Reader("robot.toml", _effects, _entries_of),
+    "fit of heat": Reader("fit.json", _heat, _known),
     "LeRobot dataset": Reader("meta/info.json", _dataset, _open_dataset),
     "LeRobot episodes": Reader("meta/episodes/chunk-000/file-000.parquet", _dataset, _open_dataset),
     "LeRobot rows": Reader("data/chunk-000/file-001.parquet", _dataset, _read_dataset),
@@ -338,6 +421,29 @@ def _interventions(path: Path) -> Any:
     return read_interventions(path.parent)
 
 
+def _settings(path: Path) -> Any:
+    from openant_agents.sac import Settings
+    from openant_tools.cli.learning import settings_of
+
+    return settings_of(Settings, path, "sac", {})
+
+
+def _study(folder: Path) -> None:
+    import optuna
+
+    from openant_agents.tuning import open_study
+
+    study = open_study(f"sqlite:///{folder / 'tune.db'}", "ant", {"agent": "sac"})
+    trial = optuna.trial.create_trial(value=0.1, user_attrs={"settings": {"batch": 64}})
+    study.add_trial(trial)
+
+
+def _best(path: Path) -> Any:
+    from openant_agents.tuning import best_settings, open_study
+
+    return best_settings(open_study(f"sqlite:///{path}", "ant", {"agent": "sac"}))
+
+
 def _measured(path: Path) -> Any:
     from openant_agents.ranking import read_measured
 
@@ -350,6 +456,10 @@ if importlib.util.find_spec("torch") is not None:
         "run.json": Reader("run.json", _trained, _facts),
         "learning curve": Reader("learning_curve.csv", _trained, _curve),
         "interventions": Reader("interventions.csv", _trained, _interventions),
+        "Optuna's storage": Reader("tune.db", _study, _best, 30),
+        "tuned settings": Reader(
+            "best.json", _text("best.json", '{"agent": "sac", "settings": {"batch": 64, "tau": 0.01}}'), _settings
+        ),
         "measured policies": Reader(
             "measured.json",
             _text("measured.json", '{"policies": {"a": {"average_reward_m_s": 0.1, "plays": [0.1]}}}'),
@@ -364,6 +474,13 @@ _ODD = (
     "π".encode(), b"../../../etc/passwd", b"1979-05-27T07:32:00Z", b"\x1b[31m",
 )  # fmt: skip
 
+#: a value of TOML, JSON, CSV or XML, and what may stand there instead: what is well-formed, and of another kind
+_VALUE = re.compile(rb"""(?<=[=:,\[\n])\s*("[^"\n]*"|'[^'\n]*'|[^\s=:,\[\]{}"']+)""")
+_KINDS = (
+    b"3", b"-1", b"0", b"1.5", b"1e300", b"nan", b"true", b"null", b'""', b'"x"', b"[]", b"[3]", b'["x"]', b"[[1, 2], [3]]", b"{}",
+    b'{"x": 3}', b"1979-05-27T07:32:00Z",
+)  # fmt: skip
+
 
 def mutations(good: bytes, seed: int) -> Iterator[bytes]:
     """Endless bad files made of a good one."""
@@ -373,7 +490,7 @@ def mutations(good: bytes, seed: int) -> Iterator[bytes]:
         for _ in range(rng.choice((1, 1, 1, 2, 4))):
             at = rng.randrange(len(data) + 1)
             length = rng.choice((1, 2, 4, 8, 64, 512))
-            match rng.randrange(7):
+            match rng.randrange(8):
                 case 0:
                     data[at : at + 1] = bytes((rng.randrange(256),))
                 case 1 if data:
@@ -389,4 +506,9 @@ def mutations(good: bytes, seed: int) -> Iterator[bytes]:
                 case 6:
                     other = rng.randrange(len(data) + 1)
                     data[at:at] = data[other : other + length]
+                case 7:
+                    values = [found.span(1) for found in _VALUE.finditer(data)]
+                    if values:
+                        begin, end = rng.choice(values)
+                        data[begin:end] = rng.choice(_KINDS)
         yield bytes(data)

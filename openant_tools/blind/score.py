@@ -17,7 +17,7 @@ from openant_tools.blind.draw import OUTSIDE, Answer
 from openant_tools.blind.run import folders_of, verdict_path
 from openant_tools.blind.sizes import KINDS
 from openant_tools.errors import BadInput
-from openant_tools.files import read_json, read_toml
+from openant_tools.files import read_json, read_toml, reading
 from openant_tools.procedure.intervals import wilson
 
 __all__ = ["Case", "Row", "Score", "read", "score"]
@@ -191,7 +191,8 @@ def score(sets: Sequence[Mapping[str, Any]], cases: Sequence[Case]) -> Score:
     for case in cases:
         if case.answer.group != "two" and case.large:
             counted[(case.answer.outside or case.answer.verdict, case.verdict)] += 1
-    return Score(tuple(sets), tuple(cases), tuple(_rows(cases)), dict(counted), tuple(_reliability(cases)))
+    with reading("verdicts", "they are not as they were written", "`openant gap blind run` the set anew"):
+        return Score(tuple(sets), tuple(cases), tuple(_rows(cases)), dict(counted), tuple(_reliability(cases)))
 
 
 def _rows(cases: Sequence[Case]) -> list[Row]:

@@ -11,6 +11,7 @@ import tomlkit
 
 from openant_tools.bringup.virtual_hands import VirtualHands
 from openant_tools.errors import BadInput
+from openant_tools.robot.config import editable_document
 from openant_tools.virtual.process import VIRTUAL_DEFAULT, virtual_robot
 from openant_tools.virtual.scenario import read_scenario_file
 
@@ -61,11 +62,11 @@ def _scenario(source: str, folder: Path) -> tomlkit.TOMLDocument:
     """The scenario to start: the given one, or loose motors; with a file for the servos' memory where it names none."""
     if source == VIRTUAL_DEFAULT:
         kept = folder / SCENARIO
-        document = tomlkit.parse(kept.read_text(encoding="utf-8")) if kept.is_file() else tomlkit.document()
+        document = editable_document(kept.read_bytes(), kept) if kept.is_file() else tomlkit.document()
     else:
         if not Path(source).is_file():
             raise BadInput("there is no such scenario", where=source, remedy="name a scenario (NAME.toml)")
-        document = tomlkit.parse(read_scenario_file(Path(source))[0])
+        document = editable_document(read_scenario_file(Path(source))[0].encode(), source)
         if "sealed" in document:
             return document
     robot = document.setdefault("robot", tomlkit.table())

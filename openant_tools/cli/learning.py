@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -70,6 +72,15 @@ def settings_of(kind: type[Settings], file: Path | None, agent: str, given: Mapp
         BadInput: a setting that the agent does not have.
     """
     chosen = {**read_settings(file, agent), **{key: value for key, value in given.items() if value is not None}}
+    for key, parameter in inspect.signature(kind).parameters.items():
+        default: Any = parameter.default
+        value: Any = chosen.get(key, default)
+        kinds: tuple[type, ...] = (
+            (bool,) if isinstance(default, bool) else (int,) if isinstance(default, int) else (int, float)
+        )
+        fits = isinstance(value, kinds) and isinstance(value, bool) == isinstance(default, bool)
+        if not fits or (isinstance(value, float) and not math.isfinite(value)):
+            raise BadInput(f"{key} is {str(value)[:40]!r}", where=file, remedy=f"a value like {default!r}")
     try:
         return kind(**chosen)
     except TypeError as error:

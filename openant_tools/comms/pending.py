@@ -11,11 +11,10 @@ from collections.abc import Callable
 
 from openant_tools.comms.faults import Cause
 from openant_tools.comms.reply import Answer, Plan, Request, Shape
+from openant_tools.comms.ticks import LATEST_S
 
 __all__ = ["LATEST_S", "Pending"]
 
-#: How late an answer may be, beyond the time that it takes, and is still not taken for another's, s.
-LATEST_S = 0.1
 #: For so long after an answer too many, s, a question also waits where the one before was answered.
 DISTRUST_S = 60.0
 #: A servo that has not been heard for so long, s, is waited for by nobody.

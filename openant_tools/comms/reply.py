@@ -11,7 +11,7 @@ from typing import NamedTuple
 from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.faults import Cause
 from openant_tools.comms.protocol2 import Garbage, Instruction, JoinedStatus, Parser, Reason, Status
-from openant_tools.comms.ticks import TICK_ADDRESS, TICK_SIZE, TickClock
+from openant_tools.comms.ticks import LATEST_S, TICK_ADDRESS, TICK_SIZE, TickClock
 
 __all__ = ["Answer", "Edge", "Plan", "Request", "Shape", "Sorting", "whole_answers"]
 
@@ -338,6 +338,11 @@ class Sorting:
                 self.surplus.append(id)
                 self._stale.add(id)
                 return
+            if doubtful and clock.vague(self._started):
+                # Its own or an earlier one: dropped, and the clock goes on with what is sure, so that the next one is told.
+                clock.follow(request.tick(params), self._started - LATEST_S, when)
+                self._unsure.add(id)
+                return
         elif doubtful:
             self._unsure.add(id)
             return
@@ -356,9 +361,10 @@ def _longest_rise(values: Sequence[int]) -> set[int]:
     """The longest rising subsequence of different values."""
     best: list[list[int]] = []
     for value in values:
-        before = max((one for one in best if one[-1] < value), key=len, default=list[int]())
-        best.append([*before, value])
-    return set(max(best, key=len, default=[]))
+        before = [one for one in best if one[-1] < value]
+        best.append([*max(before, key=lambda one: len(one)), value] if before else [value])
+    longest = max(best, key=lambda one: len(one))
+    return set(longest)
 
 
 def _when(count: int, edges: Sequence[Edge]) -> tuple[float, bool]:

@@ -6,7 +6,10 @@ was read; held against the host's clock, that says whether it was read after the
 
 from __future__ import annotations
 
-__all__ = ["TICK_ADDRESS", "TICK_SIZE", "TickClock"]
+__all__ = ["LATEST_S", "TICK_ADDRESS", "TICK_SIZE", "TickClock"]
+
+#: How late an answer may be, beyond the time that it takes, and is still not taken for another's, s.
+LATEST_S = 0.1
 
 #: Register 120, ms, from 0 to 32767 (ROBOTIS e-manual).
 TICK_ADDRESS, TICK_SIZE = 120, 2
@@ -15,8 +18,8 @@ _TICK_S = 1e-3
 DRIFT = 0.02
 #: A clock has proven itself once its ticks have kept step with the host's for so long, s.
 PROOF_S = 0.05
-#: After so long without an answer, s, it has to do so again: the drift is too much by then.
-LONGEST_GAP_S = 1.0
+#: After so long without an answer, s, it tells cycles of 100 Hz no more apart; and after so long it is too much to go on with.
+VAGUE_S, LONGEST_GAP_S = 0.25, 1.0
 #: So many answers in a row that cannot be: the servo has started anew.
 STRIKES = 3
 
@@ -59,6 +62,10 @@ class TickClock:
         if not self._runs or self._doubts or asked - self._at >= LONGEST_GAP_S or self.proven(asked):
             return False
         return self.stale(tick, asked, arrived)
+
+    def vague(self, asked: float) -> bool:
+        """Whether an answer that is not `stale` may nevertheless be one to a question shortly before."""
+        return asked - self._at > VAGUE_S
 
     def stale(self, tick: int, asked: float, arrived: float) -> bool:
         """Whether an answer with this tick cannot have been read between `asked` and `arrived` (s); only where `usable`."""

@@ -181,6 +181,8 @@ class Known:
             theta, covariance = np.array(table["theta"], float), np.array(table["covariance"], float)
             if theta.shape != (len(names),) or covariance.shape != (len(names), len(names)):
                 raise ValueError
+            if not (np.isfinite(theta).all() and np.isfinite(covariance).all()):
+                raise ValueError
             return cls(tuple(table["joints"]), tuple(table["models"]), names, theta, covariance)
         except (KeyError, TypeError, ValueError):
             remedy = "name the fit.json that `openant thermal fit` wrote"

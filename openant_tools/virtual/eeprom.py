@@ -48,12 +48,14 @@ class EepromFile:
         snapshots: dict[str, Snapshot] = {}
         for joint, servo in zip(world.joints, world.servos, strict=True):
             entry = content.get(joint) if isinstance(content, dict) else None
-            if entry is None or entry.get("model") != servo.model.name:
+            if entry is None:
                 continue
             try:
+                if entry.get("model") != servo.model.name:
+                    continue
                 eeprom, backup = bytes.fromhex(entry["eeprom"]), entry.get("backup")
                 snapshots[joint] = Snapshot(eeprom, None if backup is None else bytes.fromhex(backup))
-            except (KeyError, ValueError, TypeError):
+            except (AttributeError, KeyError, ValueError, TypeError):
                 raise BadInput(f"the EEPROM of {joint} is broken", where=self.path, remedy="remove the file") from None
             if len(eeprom) != EEPROM_END:
                 raise BadInput(f"the EEPROM of {joint} is cut", where=self.path, remedy="remove the file")

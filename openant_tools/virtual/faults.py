@@ -70,9 +70,11 @@ class Fault:
         """A fault from a scenario's table or a control request; BadInput says what is wrong with it."""
         rest = dict(table)
         cause = rest.pop("cause", None)
-        if cause not in CAUSES:
+        if not isinstance(cause, str) or cause not in CAUSES:
             raise BadInput(f"no fault has the cause {cause!r}", where=place, remedy=nearest(str(cause), CAUSES))
         where = rest.pop("where", ())
+        if not isinstance(where, str | list | tuple | None):
+            raise BadInput(f"where = {where!r}", where=place, remedy='where = "knee_fl", or a list of joints')
         names = () if where in ("all", None) else (where,) if isinstance(where, str) else tuple(where)
         for name in names:
             if name not in joints:

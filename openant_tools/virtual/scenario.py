@@ -376,5 +376,5 @@ def _read_effect(entry: Mapping[str, Any], world: WorldSettings, where: str) -> 
     parameters = entry.get("parameters", {})
     if not isinstance(parameters, dict):
         raise BadInput("parameters is not a table", where=where, remedy="parameters = { delay_s = 0.02 }")
-    scope = tuple(joints) if isinstance(joints, list) else joints
+    scope = joints if isinstance(joints, str) else _joints(joints, [servo.joint for servo in world.servos], where)
     apply_entry(world, Entry(str(entry.get("effect")), scope, parameters), where)
