@@ -120,6 +120,16 @@ def test_a_command_sent_between_two_steps_counts_for_its_share(pendulum: Plant) 
     assert np.abs(half - (none + whole) / 2).max() < 0.1 * np.abs(whole - none).max()
 
 
+def test_a_delay_in_the_model_knows_what_was_commanded_before_a_segment(pendulum: Plant, tmp_path: Path) -> None:
+    """As one of the commands does: else each segment would begin with a command that the servo has not yet heard."""
+    t = 2.0 + np.arange(300) / 100
+    run = swinging(pendulum, t)
+    servo = f'<position {plants.SERVO} kp="8" forcerange="-1.5 1.5" delay="{20 * H}" nsample="22" interp="linear"/>'
+    own = load_plant(plants.write(tmp_path / "late.xml", plants.pendulum(servo)))
+    there = Rollouts(own, [run], 0.5)().pos
+    assert np.abs(there - Rollouts(pendulum, [run], 0.5)(delays=np.array([[20 * H]])).pos).max() < 1e-6
+
+
 def test_rows_faster_than_commands_repeat_the_command_in_force(pendulum: Plant) -> None:
     t = 2.0 + np.arange(600) / 200
     held = np.arange(600) // 10 * 10

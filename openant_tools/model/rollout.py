@@ -10,8 +10,9 @@ Contract
   the row's `t`), held until the next; each step sees its mean over the step, so that results vary smoothly with delays
   and time stamps instead of by whole steps. (A servo that limits its setpoint's rate takes the command of the middle of
   each step: to a limiter a part of a change is as good as the whole.) A missing command leaves the one before in force.
-* **Start of a segment.** Setpoint filters and slew limiters hold the first command, as do the delay buffers; all other
-  activations are zero (formats, section 5). Without a measured base, a robot on the floor starts a run settled on its
+* **Start of a segment.** Setpoint filters and slew limiters hold the first command; delay buffers hold the commands before it,
+  of which there are none at the start of a run, so that there they hold the first; all other activations are zero (formats,
+  section 5). Without a measured base, a robot on the floor starts a run settled on its
   feet; a later segment starts where the base has come to and as fast as it moves when the joints are led along their
   measured positions from there. (Started at rest amid a gait, it would first have to catch up with its own feet.)
 * **Torque off** (`torque.J` = 0) disables that joint's actuator from its row to the next; what stands in the joint
@@ -369,6 +370,7 @@ def _segments(plant: Plant, leads: Plant, run: Run, index: int, offset: int, hor
     flips = 1 + np.flatnonzero((torque_off[1:] != torque_off[:-1]).any(axis=1))
     commands = Staircase.of(run.command_times, cmd)
     rest = _at_rest(model)
+    buffered = int(model.actuator_history[plant.actuator, 0].max(initial=0))
     bases = _led(leads, run, starts, pos, commands)
     segments = []
     for n, (first, stop) in enumerate(zip(starts, [*starts[1:], len(t)], strict=True)):
@@ -389,7 +391,16 @@ def _segments(plant: Plant, leads: Plant, run: Run, index: int, offset: int, hor
             Segment(
                 run=index,
                 first=first,
-                state=_initial_state(leads, run, first, pos[first], velocity, setpoint[0], bases[n] if n else None),
+                state=_initial_state(
+                    leads,
+                    run,
+                    first,
+                    pos[first],
+                    velocity,
+                    setpoint[0],
+                    bases[n] if n else None,
+                    _setpoints(plant, commands, t[first] + h * np.arange(-buffered, 1.0)) if buffered else None,
+                ),
                 control=control,
                 step=step,
                 fraction=np.clip(at - step, 0.0, 1.0),
@@ -554,11 +565,13 @@ class Measured:
 
 
 def _initial_state(
-    plant: Plant, run: Run, row: int, pos: Array, vel: Array, command: Array, led: tuple[Array, Array] | None = None
-) -> Array:
+    plant: Plant, run: Run, row: int, pos: Array, vel: Array, command: Array, led: tuple[Array, Array] | None = None,
+    past: Array | None = None,
+) -> Array:  # fmt: skip
     """(nstate,) integration state at a row: measured joints, base, filled setpoints and buffers.
 
-    The base is where it was measured, else as it was `led` (pose and velocity), else settled.
+    The base is where it was measured, else as it was `led` (pose and velocity), else settled. `past`: (steps, joints)
+    setpoints of the steps before.
     """
     model = plant.model
     data = mujoco.MjData(model)
@@ -567,15 +580,19 @@ def _initial_state(
         _place_base(plant, data, run, row, command, led)
         data.qpos[plant.qpos] = pos
     data.qvel[plant.dof] = vel
-    fill_setpoints(plant, data, command)
+    fill_setpoints(plant, data, command, past)
     data.qacc_warmstart[:] = 0
     state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION))
     mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
     return state
 
 
-def fill_setpoints(plant: Plant, data: mujoco.MjData, command: Array) -> None:
-    """Set controls, setpoint activations and delay buffers as if `command` (joints,) had been in force for ever."""
+def fill_setpoints(plant: Plant, data: mujoco.MjData, command: Array, past: Array | None = None) -> None:
+    """Set controls, setpoint activations and delay buffers as if `command` (joints,) had been in force for ever.
+
+    Args:
+        past: (steps, joints) what was in force in the steps before, as far as buffers reach; default `command`.
+    """
     model = plant.model
     data.act[:] = 0
     for k, i in enumerate(plant.actuator):
@@ -589,7 +606,7 @@ def fill_setpoints(plant: Plant, data: mujoco.MjData, command: Array) -> None:
         if model.actuator_history[i, 0] > 0:
             nsample, width = int(model.actuator_history[i, 0]), int(model.actuator_ctrlnum[i])
             values = np.zeros((nsample, width))
-            values[:, 0] = command[k]
+            values[:, 0] = command[k] if past is None else past[len(past) - nsample :, k]
             mujoco.mj_initCtrlHistory(model, data, int(i), None, values)
 
 
