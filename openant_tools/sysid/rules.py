@@ -280,12 +280,14 @@ def _degrees(case: Case) -> Found:
                     f"pos.{joint} goes in steps of {case.steps[j]:.3g} to {_furthest(values):.3g}: it looks like degrees",
                     "give it in rad (degrees × π/180)",
                 )
-            elif _furthest(values) > MOST_RAD and not math.isfinite(_range(case, j)[1]):
+                break
+            if _furthest(values) > MOST_RAD and not math.isfinite(_range(case, j)[1]):
                 yield (
                     f"{name}.{joint} reaches {_furthest(values):.0f}, which is {_furthest(values) / (2 * math.pi):.0f} turns "
                     "in rad",
                     "check its unit (rad); if the joint does turn that far, give it a range in the model",
                 )
+                break
 
 
 def _degree_steps(case: Case, j: int) -> bool:
