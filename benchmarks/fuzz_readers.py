@@ -2,6 +2,7 @@
 
     python benchmarks/fuzz_readers.py --tries 50000 --state fuzz.json      # so many of each kind; goes on where it stopped
     python benchmarks/fuzz_readers.py --state fuzz.json --table            # the table of what was done so far
+    python benchmarks/fuzz_readers.py --state fuzz.json --table --write    # and into docs/reliability.md
 
 The kinds of files and their mutations are those of the tests (tests/readers.py). Survived is what was read, or refused in one
 line, within SLOW_S and LARGEST_MB; anything else keeps its file beside the state.
@@ -21,6 +22,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
+import reliability
 from readers import READERS, Reader, mutations
 
 from openant_tools.errors import OpenAntError
@@ -71,6 +73,7 @@ def main() -> None:
     parser.add_argument("--tries", type=int, default=50_000, help="of each kind")
     parser.add_argument("--state", type=Path, default=Path("fuzz_readers.json"))
     parser.add_argument("--table", action="store_true", help="only print what was done")
+    parser.add_argument("--write", action="store_true", help="put it into docs/reliability.md")
     options = parser.parse_args()
     logging.disable(logging.CRITICAL)
     state = json.loads(options.state.read_text()) if options.state.is_file() else {}
@@ -87,6 +90,13 @@ def main() -> None:
         print(f"| {kind} | {done} | {done - len(wrong)} |")
     total = sum(done for done, _ in state.values())
     print(f"| **all** | {total} | {total - sum(len(wrong) for _, wrong in state.values())} |")
+    if options.write:
+        results = json.loads(reliability.RESULTS.read_text(encoding="utf-8"))
+        results[reliability.SPOILT] = {
+            kind: {"tries": done, "survived": done - len(wrong)} for kind, (done, wrong) in sorted(state.items())
+        }
+        write_text(reliability.RESULTS, json.dumps(results, indent=1, ensure_ascii=False) + "\n")
+        write_text(reliability.PAGE, reliability.page(results))
     for _, wrong in state.values():
         for line in wrong[:5]:
             print(line, file=sys.stderr)

@@ -29,6 +29,9 @@ PARTS = {
     "sensors": "Camera, IMU and verdicts",
     "files": "Files, folders and processes",
 }
+#: what `fuzz_readers.py --write` keeps beside the parts
+SPOILT = "spoilt"
+TITLES = {**PARTS, SPOILT: "Files, spoilt a great many times: read, or refused in one line"}
 
 
 def run(part: str, scale: float, anew: bool, results: dict[str, Any]) -> None:
@@ -62,7 +65,7 @@ def page(results: dict[str, Any]) -> str:
         "Each attack is made again and again on the virtual robot, on fake servos or on files; `python benchmarks/reliability.py`",
         "makes more tries and adds them. What happens on a fault, one by one, stands in [the bus](comms.md#what-stops-a-motion).",
     ]
-    for part, title in PARTS.items():
+    for part, title in TITLES.items():
         rows = results.get(part, {})
         if not rows:
             continue

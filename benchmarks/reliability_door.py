@@ -35,6 +35,7 @@ def campaigns() -> list[Campaign]:
         "command": "`kill -9` of a command that moves: torque off within 0.5 s",
         "engine": "`kill -9` of its engine: torque off within 0.5 s",
         "guardian": "`kill -9` of its guardian: another one within 0.5 s, or torque off",
+        "guardian+engine": "`kill -9` of guardian and engine together: motion stops within 0.5 s",
     }
     return [
         Campaign(text, len(WAYS), lambda k, victim=victim: kill(victim, k))  # type: ignore[misc]

@@ -9,7 +9,6 @@ it ceased to.
 
 from __future__ import annotations
 
-import json
 import threading
 from collections import Counter
 from collections.abc import Sequence
@@ -24,7 +23,7 @@ from openant_agents.interventions import read_interventions
 from openant_agents.runs import CurvePoint, load_checkpoint, read_facts
 from openant_agents.training import Progress
 from openant_env.metrics import WINDOW_S
-from openant_tools.files import write_bytes, write_text
+from openant_tools.files import json_text, write_bytes, write_text
 
 __all__ = ["Drop", "DropFinder", "DropWatch", "find_drops", "preceding", "write_drops"]
 
@@ -201,7 +200,7 @@ def write_drops(folder: Path, points: Sequence[CurvePoint]) -> list[Path]:
     files = []
     for drop in find_drops(points):
         path = folder / "drops" / f"{drop.step}.json"
-        write_text(path, json.dumps(preceding(folder, drop), indent=2) + "\n")
+        write_text(path, json_text(preceding(folder, drop), indent=2))
         files.append(path)
     return files
 

@@ -11,7 +11,6 @@ With S_i the average reward of policy i in a simulation and R_i on the robot:
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -28,7 +27,7 @@ from openant_agents.exploits import Twitch
 from openant_agents.policies import load_policy
 from openant_agents.runs import read_facts
 from openant_tools.errors import BadInput
-from openant_tools.files import read_json, write_text
+from openant_tools.files import json_text, read_json, write_text
 
 __all__ = [
     "Agreement", "Interval", "Measured", "agreement", "find_policies", "kendall", "play", "rank_violation", "read_measured", "regret",
@@ -232,7 +231,7 @@ def play(
 def write_measured(file: Path, measured: Mapping[str, Measured], **facts: Any) -> None:
     """Write what policies achieved in one place, with whatever says where that was."""
     policies = {name: asdict(one) for name, one in measured.items()}
-    write_text(file, json.dumps({"schema": SCHEMA, **facts, "policies": policies}, indent=1) + "\n")
+    write_text(file, json_text({"schema": SCHEMA, **facts, "policies": policies}))
 
 
 def read_measured(file: Path) -> dict[str, Measured]:
@@ -246,6 +245,7 @@ def read_measured(file: Path) -> dict[str, Measured]:
         found = {}
         for name, one in policies.items():
             one = {"average_reward_m_s": one} if isinstance(one, int | float) else one
+            one = {key: said for key, said in one.items() if said is not None}  # a number that is not known
             value = float(one["average_reward_m_s"])
             found[name] = Measured(
                 value, float(one.get("standard_error_m_s", 0.0)), tuple(one.get("plays", (value,))),

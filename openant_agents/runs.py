@@ -34,7 +34,7 @@ import torch
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
-from openant_tools.files import read_json, read_text, reading, write_bytes, write_text
+from openant_tools.files import json_text, read_json, read_text, reading, write_bytes, write_text
 from openant_tools.lock import Claim
 
 __all__ = [
@@ -84,7 +84,7 @@ class Run:
     def __init__(self, folder: Path, facts: Mapping[str, Any]) -> None:
         self.folder = folder
         # As it will be read back: tuples as lists, keys as texts.
-        self.facts: dict[str, Any] = json.loads(json.dumps({"schema": SCHEMA, **facts}))
+        self.facts: dict[str, Any] = json.loads(json_text({"schema": SCHEMA, **facts}))
         self._claim = Claim(
             folder / LOCK,
             "another process trains in this folder: {}",
@@ -95,7 +95,7 @@ class Run:
             if path.is_file():
                 _check_same(path, read_facts(folder), self.facts)
             else:
-                write_text(path, json.dumps(self.facts, indent=2, ensure_ascii=False) + "\n")
+                write_text(path, json_text(self.facts, indent=2))
         except BaseException:
             self._claim.release()
             raise

@@ -13,7 +13,7 @@ import mmap
 import os
 import tempfile
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -92,13 +92,16 @@ def known(content: Any) -> Any:
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
-def json_text(content: Any, *, indent: int | None = 1) -> str:
+def json_text(content: Any, *, indent: int | None = 1, default: Callable[[Any], Any] | None = None) -> str:
     """JSON that every reader takes: one document, a line's end, null where a number is not known.
+
+    Args:
+        default: makes something that JSON can hold of what it cannot.
 
     Raises:
         TypeError: there is something in it that JSON cannot hold.
     """
-    return json.dumps(known(content), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
+    return json.dumps(known(content), indent=indent, ensure_ascii=False, allow_nan=False, default=default) + "\n"
 
 
 @contextmanager

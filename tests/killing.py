@@ -20,6 +20,7 @@ import click
 from openant_tools.cli import openant
 from openant_tools.cli.hardware import Moving
 from openant_tools.comms.clock import VirtualControl
+from openant_tools.robot.config import Provenance
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINTS
 from openant_tools.virtual.process import virtual_robot
@@ -31,7 +32,7 @@ class NotBegun(Exception):
     """The command ended before a process of it could be killed: a busy host lets watchdogs trip."""
 
 
-Victim = Literal["command", "engine", "guardian"]
+Victim = Literal["command", "engine", "guardian", "guardian+engine"]
 #: s that a command may take to its first torque, on a machine that has much else to do
 BEGIN_S = 120.0
 
@@ -41,14 +42,32 @@ NAMED = LOOSE + "".join(
     f'[[servo]]\njoint = "{joint.name}"\nid = {joint.id}\nbaud = 1000000\nreturn_delay_time = 0\n'
     for joint in JOINTS.values()
 )
+#: in view of a camera whose pictures are small: finding tags costs most
+FLOOR = """
+[robot]
+setup = "floor"
+[camera]
+width = 640
+height = 360
+fps = 12.0
+position = [-0.35, 0.2, 1.3]
+look_at = [-0.35, 0.2, 0.0]
+"""
 
 
 @dataclass(frozen=True)
 class Way:
-    """How a command is begun: the robot's scenario, and what follows the command's name; OUT is a new file."""
+    """How a command is begun.
+
+    Attributes:
+        scenario: of the robot; one that stands on the floor has a camera. words: what follows the command's name; OUT is a
+            new file or folder.
+        campaign: it takes too long for a test, so that benchmarks/reliability_door.py alone kills it.
+    """
 
     scenario: str
     words: tuple[str, ...] = ()
+    campaign: bool = False
 
 
 _OUT = ("--out", "OUT")
@@ -66,19 +85,19 @@ WAYS: Mapping[str, Way] = {
     "sysid record": Way(STAND, (*_OUT, "--protocol", "stand")),
     "sysid scale": Way(STAND),
     "sysid tilt": Way(STAND, ("--imu",)),
+    "bringup": Way(LOOSE),
+    "calib zeros": Way(STAND, campaign=True),
+    "calib bounds": Way(STAND, campaign=True),
+    "train sarsa": Way(FLOOR, ("--env", "hardware", "--steps", "1000", *_OUT), campaign=True),
 }
 #: command → why it is not begun here; its engine is the one that the others are killed with
 ELSEWHERE: Mapping[str, str] = {
-    "bringup": "it runs the steps, each of which is here",
     "check": "needs a robot with its bounds; it sweeps and records as `calib identify` does",
-    "calib zeros": "a minute of hands before torque",
-    "calib bounds": "a minute of hands before torque",
     "calib arena": "needs a camera, which a shared machine renders slowly",
-    "train sac": "walking needs camera and IMU: tests/test_hardware_env.py",
-    "train sarsa": "walking needs camera and IMU: tests/test_hardware_env.py",
-    "eval": "walking needs camera and IMU: tests/test_hardware_env.py",
-    "policies play": "walking needs camera and IMU: tests/test_hardware_env.py",
-    "policies rank": "walking needs camera and IMU: tests/test_hardware_env.py",
+    "train sac": "it walks in the environment that `train sarsa` walks in",
+    "eval": "it walks in the environment that `train sarsa` walks in",
+    "policies play": "it walks in the environment that `train sarsa` walks in",
+    "policies rank": "it walks in the environment that `train sarsa` walks in",
 }
 
 
@@ -101,6 +120,9 @@ def moving_commands() -> list[str]:
 def torque_after_kill(name: str, victims: tuple[Victim, ...], folder: Path) -> dict[Victim, float]:
     """Begin a command, and kill one process of it after the other while it holds torque.
 
+    Args:
+        victims: one after the other; "guardian+engine" at once, which the servos' own watchdogs alone notice: torque stays on, motion stops.
+
     Returns:
         victim → s until torque was off everywhere, or until another guardian was there, less the time that this process
         was itself late.
@@ -108,8 +130,14 @@ def torque_after_kill(name: str, victims: tuple[Victim, ...], folder: Path) -> d
     way = WAYS[name]
     scenario = folder / "scenario.toml"
     scenario.write_text(way.scenario)
-    robot = create_robot(folder / "ant")
-    with virtual_robot(str(scenario), clock="real", camera=False) as found, contextlib.ExitStack() as stack:
+    sees = way.scenario == FLOOR
+    calibrated = {"motors": Provenance("measured", "openant calib zeros")}
+    robot = (
+        create_robot(folder / "ant", values={"camera.body_tag_id": 12}, provenance=calibrated)
+        if sees
+        else create_robot(folder / "ant")
+    )
+    with virtual_robot(str(scenario), clock="real", camera=sees) as found, contextlib.ExitStack() as stack:
         ready = folder / "ready.json"
         ready.write_text(json.dumps(dict(found)))
         control = VirtualControl(str(found["control"]))
@@ -141,6 +169,12 @@ def torque_after_kill(name: str, victims: tuple[Victim, ...], folder: Path) -> d
         for victim in victims:
             after(torque, BEGIN_S)
             family = _family(command.pid)
+            if victim == "guardian+engine":
+                os.kill(family["engine"], signal.SIGSTOP)  # or it starts another guardian in between
+                os.kill(family["guardian"], signal.SIGKILL)
+                os.kill(family["engine"], signal.SIGKILL)
+                took[victim] = _last_motion(control)
+                continue
             if victim == "guardian" and not family["guardian"]:
                 raise AssertionError(f"{name}: torque is on and nobody guards it")
             pid = family[victim]
@@ -150,6 +184,20 @@ def torque_after_kill(name: str, victims: tuple[Victim, ...], folder: Path) -> d
             else:
                 took[victim] = after(lambda: not torque(), 5.0)
         return took
+
+
+def _last_motion(control: VirtualControl, seconds: float = 1.0) -> float:
+    """When within so many s from now a joint was last seen to move under torque, s."""
+    begin, moved, before = time.monotonic(), 0.0, control.ask("state")["angle"]
+    while (now := time.monotonic() - begin) < seconds:
+        time.sleep(0.02)
+        state = control.ask("state")
+        angles = state["angle"]
+        if not any(state["torque_enable"].values()):
+            break  # whoever is left has switched it off, and legs hang down
+        if max(abs(angles[joint] - before[joint]) for joint in angles) > 2e-3:
+            moved, before = now, angles
+    return moved
 
 
 def _replaced(command: int, gone: int, torque: Callable[[], bool]) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -75,13 +74,13 @@ def check(robot: Path | None, json_file: Path | None) -> int:
 @json_option
 def show(robot: Path | None, json_file: Path | None) -> None:
     """Print what is known of the robot, and where each value came from."""
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
     from openant_tools.robot.folder import RobotFolder
 
     folder = RobotFolder.at(robot_folder(robot))
     configuration = folder.config()
     if json_file:
-        write_text(json_file, json.dumps(dataclasses.asdict(configuration), indent=2, default=str) + "\n")
+        write_text(json_file, json_text(dataclasses.asdict(configuration), indent=2, default=str))
     _print(folder, configuration)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
@@ -35,7 +34,7 @@ def plot(runs: tuple[Path, ...], out: Path, singly: bool, json_file: Path | None
     need_agents()
     from openant_agents.curves import band, group_runs, plot_groups, read_run_curve
     from openant_agents.drops import write_drops
-    from openant_tools.files import write_text
+    from openant_tools.files import json_text, write_text
 
     curves = [read_run_curve(folder) for folder in runs]
     groups = group_runs(curves)
@@ -69,4 +68,4 @@ def plot(runs: tuple[Path, ...], out: Path, singly: bool, json_file: Path | None
             )
     click.echo(f"wrote {out}", err=True)
     if json_file is not None:
-        write_text(json_file, json.dumps(answer) + "\n")
+        write_text(json_file, json_text(answer, indent=None))
