@@ -37,7 +37,7 @@ def with_model(runs: Sequence[Run], model: Path) -> tuple[list[Run], tuple[str, 
         f"{run.path or run.name}: its own model is {run.facts.model}, and {model} was named → leave --model out to play each "
         "run on its own"
         for run in runs
-        if run.model_path is not None and run.model_path.resolve() != model.resolve()
+        if run.model_path is not None and run.model_path.is_file() and run.model_path.resolve() != model.resolve()
     )
     return [replace(run, facts=replace(run.facts, model=None)) for run in runs], said
 
