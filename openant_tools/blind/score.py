@@ -188,10 +188,10 @@ def read(folder: Path, key: bytes | None, *, so_far: bool = False) -> tuple[dict
 def score(sets: Sequence[Mapping[str, Any]], cases: Sequence[Case]) -> Score:
     """The table, confusions and reliability of these robots; sets: the facts of those that they are from."""
     counted: Counter[tuple[str, str]] = Counter()
-    for case in cases:
-        if case.answer.group != "two" and case.large:
-            counted[(case.answer.outside or case.answer.verdict, case.verdict)] += 1
     with reading("verdicts", "they are not as they were written", "`openant gap blind run` the set anew"):
+        for case in cases:
+            if case.answer.group != "two" and case.large:
+                counted[(case.answer.outside or case.answer.verdict, case.verdict)] += 1
         return Score(tuple(sets), tuple(cases), tuple(_rows(cases)), dict(counted), tuple(_reliability(cases)))
 
 
