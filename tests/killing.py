@@ -170,6 +170,12 @@ def torque_after_kill(name: str, victims: tuple[Victim, ...], folder: Path) -> d
             after(torque, BEGIN_S)
             family = _family(command.pid)
             if victim == "guardian+engine":
+                patience = time.monotonic() + 3.0
+                while _speed(control) < MOVES_RAD_S and time.monotonic() < patience:
+                    pass  # one that only holds has no motion to stop
+                family = _family(command.pid)
+                if not (family["engine"] and family["guardian"]):
+                    raise NotBegun(f"{name}: it has ended already")
                 os.kill(family["engine"], signal.SIGSTOP)  # or it starts another guardian in between
                 os.kill(family["guardian"], signal.SIGKILL)
                 os.kill(family["engine"], signal.SIGKILL)
@@ -186,17 +192,27 @@ def torque_after_kill(name: str, victims: tuple[Victim, ...], folder: Path) -> d
         return took
 
 
+#: rad/s of a joint that moves
+MOVES_RAD_S = 0.1
+
+
+def _speed(control: VirtualControl) -> float:
+    """rad/s of the fastest joint under torque; 0 where none has it."""
+    before = control.ask("state")
+    time.sleep(0.02)
+    now = control.ask("state")
+    if not any(now["torque_enable"].values()):
+        return 0.0
+    rates = [abs(now["angle"][joint] - before["angle"][joint]) for joint in now["angle"]]
+    return float(max(rates) / max(now["t"] - before["t"], 1e-3))
+
+
 def _last_motion(control: VirtualControl, seconds: float = 1.0) -> float:
     """When within so many s from now a joint was last seen to move under torque, s."""
-    begin, moved, before = time.monotonic(), 0.0, control.ask("state")["angle"]
+    begin, moved = time.monotonic(), 0.0
     while (now := time.monotonic() - begin) < seconds:
-        time.sleep(0.02)
-        state = control.ask("state")
-        angles = state["angle"]
-        if not any(state["torque_enable"].values()):
-            break  # whoever is left has switched it off, and legs hang down
-        if max(abs(angles[joint] - before[joint]) for joint in angles) > 2e-3:
-            moved, before = now, angles
+        if _speed(control) > MOVES_RAD_S:
+            moved = now
     return moved
 
 
