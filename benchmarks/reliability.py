@@ -69,7 +69,13 @@ def page(results: dict[str, Any]) -> str:
         rows = results.get(part, {})
         if not rows:
             continue
-        lines += ["", f"## {title}", "", "| attack, and what counts as withstood | tries | survived |", "|---|---|---|"]
+        lines += ["", f"## {title}", ""]
+        if part == SPOILT:
+            lines += [
+                "Two scenarios and two blind verdicts were not survived at first: mended, and those files tried again.",
+                "",
+            ]
+        lines += ["| attack, and what counts as withstood | tries | survived |", "|---|---|---|"]
         lines += [f"| {attack} | {row['tries']} | {row['survived']} |" for attack, row in rows.items()]
     return "\n".join(lines) + "\n"
 
