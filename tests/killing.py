@@ -170,7 +170,7 @@ def torque_after_kill(name: str, victims: tuple[Victim, ...], folder: Path) -> d
             after(torque, BEGIN_S)
             family = _family(command.pid)
             if victim == "guardian+engine":
-                patience = time.monotonic() + 3.0
+                patience = time.monotonic() + 0.1
                 while _speed(control) < MOVES_RAD_S and time.monotonic() < patience:
                     pass  # one that only holds has no motion to stop
                 family = _family(command.pid)
