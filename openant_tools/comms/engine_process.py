@@ -195,7 +195,8 @@ class EngineProcess:
         raise HardwareFault(
             f"the engine has ended (exit status {code})",
             where=self.config.port,
-            remedy="its guardian has switched torque off; connect again",
+            remedy="its guardian switches torque off (if that was killed too, the servos' watchdog has stopped motion: cut "
+            "their power); connect again",
         )
 
     def close(self) -> None:
