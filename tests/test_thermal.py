@@ -421,7 +421,7 @@ def test_a_soak_survives_kill_9_and_is_one_recording(tmp_path: Path) -> None:
 def test_a_soak_ends_below_the_limit_that_the_servo_has(tmp_path: Path) -> None:
     servo = {"joint": "hip_fl", "temperature_limit": 40}
     with robot(
-        tmp_path / "ant", servo=[servo], room={"ambient_c": 29.6}, **DOZING, **motor(case_j_k=4.0, standby_a=0.1)
+        tmp_path / "ant", servo=[servo], room={"ambient_c": 29.0}, **DOZING, **motor(case_j_k=4.0, standby_a=0.1)
     ) as there:
         made = finished(run_soak(Plan(load="hang", seconds=600.0, cool_down_s=5.0), tmp_path / "soak.mcap", there))
     assert made.why == "margin"

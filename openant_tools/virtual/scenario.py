@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from openant_tools.errors import BadInput
-from openant_tools.files import LARGEST_TOML, parse_toml, read_text
+from openant_tools.files import LARGEST_TOML, parse_toml, read_text, reading
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.kit import KITS, home_angles
 from openant_tools.robot.servo import baud_code, servo_model
@@ -29,6 +29,8 @@ __all__ = ["Scenario", "check_sealable", "load_scenario", "parse_scenario", "rea
 STEP_S, FINE_STEP_S = 1e-3, 5e-4
 
 _NUMBER = "a number"
+#: what no check below foresaw, and what to do
+NO_SCENARIO = ("something in it is of another kind than it should be", "docs/virtual-robot.md says what stands where")
 #: section → key → what it takes
 _SECTIONS: Mapping[str, Mapping[str, str]] = {
     "robot": {
@@ -94,7 +96,8 @@ def load_scenario(path: Path, key_file: Path | None = None) -> Scenario:
         if key_file is None:
             raise BadInput("is sealed", where=path, remedy=f"name its key by --key-file or {KEY_VARIABLE}")
         table = parse_toml(open_sealed(table, read_key(key_file), path), path)
-    scenario = parse_scenario(table, str(path))
+    with reading(path, *NO_SCENARIO):
+        scenario = parse_scenario(table, str(path))
     scenario.sealed = sealed
     if scenario.eeprom is not None and not scenario.eeprom.is_absolute():
         scenario.eeprom = path.parent / scenario.eeprom
@@ -120,7 +123,8 @@ def check_sealable(path: Path) -> str:
     text, table = read_scenario_file(path)
     if is_sealed(table):
         raise BadInput("is sealed already", where=path, remedy="seal the plain file")
-    parse_scenario(table, str(path))
+    with reading(path, *NO_SCENARIO):
+        parse_scenario(table, str(path))
     return text
 
 
@@ -261,7 +265,7 @@ def _read_servos(table: Mapping[str, Any], world: WorldSettings, name: str) -> N
     for n, entry in enumerate(entries):
         where = f"{name}, [[servo]] {n + 1}"
         joint = entry.get("joint")
-        if joint not in by_joint:
+        if not isinstance(joint, str) or joint not in by_joint:
             raise BadInput(f"joint = {joint!r}", where=where, remedy=nearest(str(joint), by_joint))
         if joint in named:
             raise BadInput(f"{joint} stands here twice", where=where)
