@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -222,19 +223,25 @@ def test_a_full_disk_ends_motion_until_the_builder_says_otherwise(stepped: dict[
 
 
 def test_a_motion_that_the_watchdog_stopped_is_not_taken_for_going_on(live: dict[str, str]) -> None:
-    with connected(live) as engine:
-        engine.ask(messages.Torque(True))
-        moving = engine.start(messages.Play(np.repeat(HOME[None, :], 3000, axis=0)))
-        time.sleep(0.3)
-        os.kill(engine.pid, signal.SIGSTOP)
-        time.sleep(0.5)
-        os.kill(engine.pid, signal.SIGCONT)
-        with pytest.raises(HardwareFault, match=r"stood still for 0\.\d+ s, and the servos' Bus Watchdog stopped"):
-            wait_until(lambda: engine.done(moving))
-        with pytest.raises(HardwareFault, match="does not begin again by itself"):
+    for _ in range(3):  # on a busy computer servos may be found silent first, by its own fault, which it says
+        with connected(live) as engine:
             engine.ask(messages.Torque(True))
-        engine.ask(messages.Torque(True, Interlock("comms soak").stopped(StopCause.STALL, "", 0.0)))
-        engine.ask(messages.Hold(0.1))
+            moving = engine.start(messages.Play(np.repeat(HOME[None, :], 3000, axis=0)))
+            time.sleep(0.3)
+            os.kill(engine.pid, signal.SIGSTOP)
+            time.sleep(0.5)
+            os.kill(engine.pid, signal.SIGCONT)
+            with pytest.raises(HardwareFault) as stopped:
+                wait_until(lambda engine=engine, moving=moving: engine.done(moving))
+            if "this computer was late" in str(stopped.value):
+                continue
+            assert re.search(r"stood still for 0\.\d+ s, and the servos' Bus Watchdog stopped", str(stopped.value))
+            with pytest.raises(HardwareFault, match="does not begin again by itself"):
+                engine.ask(messages.Torque(True))
+            engine.ask(messages.Torque(True, Interlock("comms soak").stopped(StopCause.STALL, "", 0.0)))
+            engine.ask(messages.Hold(0.1))
+            return
+    pytest.fail("this computer is too busy to tell")
 
 
 def test_what_cannot_be_is_refused_and_nothing_moves(stepped: dict[str, str]) -> None:
