@@ -18,6 +18,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from killing import FLOOR
 
 import openant_env  # noqa: F401
 from openant_env.link import engine_rate
@@ -30,19 +31,7 @@ from openant_tools.robot.config import Provenance
 from openant_tools.robot.derating import derating_of
 from openant_tools.robot.folder import RobotFolder, create_robot
 
-#: small pictures, few of them: finding tags is most of what a stepped robot waits for
-SCENARIO = """
-[robot]
-setup = "floor"
-[camera]
-width = 640
-height = 360
-fps = 12.0
-position = [-0.35, 0.2, 1.3]
-look_at = [-0.35, 0.2, 0.0]
-[clock]
-mode = "stepped"
-"""
+SCENARIO = FLOOR + '[clock]\nmode = "stepped"\n'
 STILL = np.zeros(8, np.float32)
 RULE = {"start_c": 62.0, "stop_c": 70.0, "least": 0.4}
 

@@ -82,7 +82,7 @@ def fit_report(result: Identification) -> Report:
     report.section("What was found").table(
         ["parameter", "given", "value", "95 % interval", "unit", "verdict"], [_row(value) for value in result.values]
     )
-    report.text("*From* and *to* are the ends of the 95 % interval." + VERDICTS)
+    report.text(VERDICTS)
     for note in result.notes:
         report.text(note)
     wanted: dict[str, list[str]] = {}

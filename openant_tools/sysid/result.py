@@ -42,7 +42,10 @@ def write_fit(result: Identification, out: Path, richer: Identification | None =
         richer: what is better than it with effects that plain MuJoCo cannot play, for a folder of its own within.
     """
     runs = ", ".join(run.name for data in result.datasets for run in data.runs)
-    note = f"Calibrated by `openant sysid fit` on {datetime.date.today()} from {result.model.name} and {runs}"
+
+    def note(given: Path) -> str:
+        return f"Calibrated by `openant sysid fit` on {datetime.date.today()} from {given.name} and {runs}"
+
     entries = entries_of(result.effects, result.joints)
     models, earlier = result.models, _written_before(out)
     written = [CALIBRATED] if len(models) == 1 else [f"calibrated-{path.stem}.xml" for path in models]
@@ -54,7 +57,7 @@ def write_fit(result: Identification, out: Path, richer: Identification | None =
                 calibrated(result, path=path),
                 model,
                 joints=result.joints,
-                note=note.replace(result.model.name, path.name),
+                note=note(path),
                 stated=restated(result, path),
             )
         listed = [{"given": str(path), "written": name} for path, name in zip(models, written, strict=True)]
@@ -62,7 +65,7 @@ def write_fit(result: Identification, out: Path, richer: Identification | None =
         fit_report(result).write(report)
         effects = rest[len(models) :]
         for path in effects:
-            write_text(path, as_toml(entries, note))
+            write_text(path, as_toml(entries, note(result.model)))
     # What an earlier fit left here would pass for a part of this one.
     for name in earlier - set(names):
         (out / name).unlink(missing_ok=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from openant_tools.sysid.fit import Estimate
 
-__all__ = ["Verdict", "Word", "experiment", "verdicts"]
+__all__ = ["SILENT", "Verdict", "Word", "experiment", "verdicts"]
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
