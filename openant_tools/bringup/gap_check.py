@@ -9,7 +9,7 @@ import numpy as np
 
 from openant_tools.bringup.relay import relayed
 from openant_tools.errors import BadInput
-from openant_tools.gap.measure import Measurement, measure
+from openant_tools.gap.measure import Measurement, difference, measure
 from openant_tools.procedure.finding import Evidence, Finding, latest
 from openant_tools.procedure.step import Bench, Procedure
 from openant_tools.recording.tables import read_run
@@ -18,6 +18,8 @@ from openant_tools.robot.folder import NOMINAL_MODEL
 __all__ = ["gap_by_joint", "gap_check"]
 
 COMMAND = "openant bringup"
+#: standard errors beyond which one model is called nearer than the other
+SURE = 2.0
 
 
 def gap_check(bench: Bench) -> Procedure:
@@ -39,17 +41,20 @@ def gap_check(bench: Bench) -> Procedure:
     if "pos" not in before.gaps or "pos" not in after.gaps:
         raise BadInput(after.doubt or before.doubt, remedy="do the step Identification again")
     closed = 1 - after.excess("pos") / before.excess("pos") if before.excess("pos") > 0 else math.nan
-    better = after.gaps["pos"] <= before.gaps["pos"]
+    change, spread = difference(before, after)
+    better, worse = change < -SURE * spread, change > SURE * spread
     unsure = (
         []
         if math.isfinite(closed)
         else ["gap closed: the nominal model is off by no more than the floor → nothing to judge by"]
     )
+    if not better and not worse:
+        unsure.append("which of both models is nearer cannot be told from this recording: they differ by chance alone")
     unsure += [after.doubt] if after.doubt else []
     worst = after.places[0] if after.places else None
     return Finding(
         "gap",
-        False if not better else None if unsure else True,
+        False if worse else None if unsure else True,
         f"simulated joints are {1e3 * after.gaps['pos']:.2f} mrad off (nominal {1e3 * before.gaps['pos']:.2f}, "
         f"floor {1e3 * after.floors['pos']:.2f})" + (f", most at {worst.joint} in {worst.regime}" if worst else ""),
         (
@@ -58,10 +63,10 @@ def gap_check(bench: Bench) -> Procedure:
             Evidence("floor", after.floors["pos"], "rad", "repeats of the recording"),
             Evidence("gap closed", closed, "1", "1 − excess after / before"),
         ),
-        "" if better else "the calibrated model is no better: record again, or `openant gap diagnose`",
+        "the calibrated model is worse: record again, or `openant gap diagnose`" if worse else "",
         COMMAND,
         data={"by_joint_rad": gap_by_joint(after), "measure": after.as_json()},
-        problems=() if better else ("the calibrated model is farther off than the nominal one",),
+        problems=("the calibrated model is farther off than the nominal one",) if worse else (),
         unsure=tuple(unsure),
     )
 

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.regime import Regime, regimes
 from openant_tools.model.floor import disagreement, floors, stamp_error
-from openant_tools.model.gap import excess, gap
+from openant_tools.model.gap import HORIZON_S, excess, gap
 from openant_tools.model.of_run import plants_of
 from openant_tools.model.plant import Plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.sysid.identify import joints_in_common
 
-__all__ = ["Measurement", "Place", "Played", "measure"]
+__all__ = ["Measurement", "Place", "Played", "difference", "measure"]
 
 Array = NDArray[np.float64]
 
@@ -160,6 +160,26 @@ def measure(
         stamp_error(runs, wanted),
         tuple(places), played, disagreement(runs, wanted) if "pos" in gaps else NOTHING_MEASURED,
     )  # fmt: skip
+
+
+def difference(before: Measurement, after: Measurement, signal: str = "pos") -> tuple[float, float]:
+    """By how much the mean squared error changes from one model to another on the same runs, and its standard error.
+
+    Both are compared window by window, HORIZON_S long: what one window is hard for, it is hard for with either model. Of
+    less than two windows the standard error is NaN.
+    """
+    each: list[float] = []
+    for one, other in zip(before.played, after.played, strict=True):
+        change = (other.measured[signal] - other.simulated[signal]) ** 2
+        change = change - (one.measured[signal] - one.simulated[signal]) ** 2
+        window = np.floor((one.run.t - one.run.t[0]) / HORIZON_S)
+        for k in np.unique(window):
+            here = change[window == k]
+            here = here[np.isfinite(here)]
+            if here.size:
+                each.append(float(here.mean()))
+    spread = np.std(each, ddof=1) / math.sqrt(len(each)) if len(each) > 1 else math.nan
+    return float(np.mean(each)) if each else math.nan, float(spread)
 
 
 def rms(values: Array) -> float:
