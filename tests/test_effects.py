@@ -29,6 +29,7 @@ from openant_tools.robot.config import Effect as Entry
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
+from openant_tools.sysid import rules
 from openant_tools.sysid.parameter import choose, colours
 
 #: a size of each parameter that shows
@@ -227,7 +228,12 @@ def rubbing_pendulum(t: np.ndarray, command: np.ndarray, coefficient: float) -> 
     return np.array(out)
 
 
-def test_load_friction_of_another_simulation_is_found_unasked_and_written_beside_the_plain_fit(tmp_path: Path) -> None:
+def test_load_friction_of_another_simulation_is_found_unasked_and_written_beside_the_plain_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged: list[str] = []
+    findings = rules.findings
+    monkeypatch.setattr(rules, "findings", lambda run, *rest: (judged.append(run.name), findings(run, *rest))[1])
     path = write(tmp_path / "pendulum.xml", pendulum())
     t = np.arange(0.0, 5.0, 0.01)
     tables = []
@@ -243,6 +249,7 @@ def test_load_friction_of_another_simulation_is_found_unasked_and_written_beside
     shown = tmp_path / "shown"
     ran = CliRunner().invoke(fit, [str(word) for word in (*asked, "--report", shown)], standalone_mode=False)
     assert ran.exception is None
+    assert judged == ["run0", "run1", "run2"]  # by the rules, once for both fits
     for folder in (shown, shown / "with-effects"):
         pictures = re.findall(r"\]\((figures/.*?)\)", (folder / "report.md").read_text())
         assert len(pictures) == 3

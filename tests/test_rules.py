@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plants
@@ -20,6 +21,7 @@ from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import write_table
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
+from openant_tools.sysid import rules
 from openant_tools.sysid.rules import check_runs, without_turns
 
 QUANTUM = 2 * np.pi / 4096
@@ -181,6 +183,31 @@ def test_what_the_model_cuts_is_said_before_the_fit(tmp_path: Path, capsys: pyte
     assert re.search(
         r"pos\.knee was measured at -?\d\.\d+ rad, beyond the model's range -0\.50 … 0\.50, in \d+ %", heard
     )
+
+
+def test_a_fit_goes_through_the_rules_once_and_says_each_note_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    def counted(run: Run, *rest: Any) -> Iterator[rules.Finding]:
+        asked.append(run.name)
+        return findings(run, *rest)
+
+    findings = rules.findings
+    monkeypatch.setattr(rules, "findings", counted)
+    run = played(tmp_path)
+    columns = {**run.columns, "pos.hip": 0.9 * run.columns["pos.hip"]}
+    write_table(replace(run, columns=columns), tmp_path / "log.csv")
+    model = chain(tmp_path, servo='kp="5" forcerange="-4 4" ctrlrange="-0.5 0.5"')
+    command("sysid", "fit", tmp_path / "log", "--model", model, "--kind", "stiffness", "--out", tmp_path / "fit")
+    assert asked == ["log"]
+    said, heard = capsys.readouterr()
+    notes = json.loads((tmp_path / "fit" / "fit.json").read_text())["notes"]
+    assert "cmd.hip goes to" in notes[0]
+    assert notes[0] in heard
+    for note in notes:
+        assert (said + heard).count(note) == 1, note
 
 
 def test_what_lies_within_is_not_spoken_of(tmp_path: Path) -> None:

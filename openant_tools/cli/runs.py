@@ -14,7 +14,7 @@ from openant_tools.errors import BadInput
 if TYPE_CHECKING:
     from openant_tools.recording.run import Run
 
-__all__ = ["checked", "model_of", "read_runs", "say"]
+__all__ = ["check", "checked", "model_of", "read_runs", "say"]
 
 
 def read_runs(paths: Sequence[Path]) -> list[Run]:
@@ -55,18 +55,27 @@ def model_of(runs: Sequence[Run], model: Path | None, robot: Path | None) -> tup
     return list(runs), RobotFolder.at(robot_folder(robot)).model_path()
 
 
-def checked(runs: Sequence[Run], model: Path, joints: Sequence[str], *, fitting: bool = False) -> list[Run]:
-    """Go through the rules before anything is computed, and say what they note; the runs without whole turns.
+def check(runs: Sequence[Run], model: Path, joints: Sequence[str], *, fitting: bool = False) -> tuple[str, ...]:
+    """Go through the rules before anything is computed; what they note, which is said at once.
 
     Raises:
         BadInput: a rule refuses.
     """
     from openant_tools.model.of_run import plants_of
     from openant_tools.sysid.identify import joints_in_common
-    from openant_tools.sysid.rules import check_runs, without_turns
+    from openant_tools.sysid.rules import check_runs
 
+    plants = plants_of(runs, model, joints_in_common(runs, model, joints or None))
+    return check_runs(runs, plants, fitting=fitting, tell=lambda line: click.echo(line, err=True))
+
+
+def checked(runs: Sequence[Run], model: Path, joints: Sequence[str]) -> list[Run]:
+    """The runs without whole turns, after `check`."""
+    from openant_tools.sysid.identify import joints_in_common
+    from openant_tools.sysid.rules import without_turns
+
+    check(runs, model, joints)
     common = joints_in_common(runs, model, joints or None)
-    check_runs(runs, plants_of(runs, model, common), fitting=fitting, tell=lambda line: click.echo(line, err=True))
     return [without_turns(run, common) for run in runs]
 
 

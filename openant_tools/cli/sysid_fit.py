@@ -9,7 +9,7 @@ import click
 
 from openant_tools.cli.options import model_option, report_option, robot_folder, robot_option, tie_option
 from openant_tools.cli.progress import progress_bar
-from openant_tools.cli.runs import checked, model_of, read_runs
+from openant_tools.cli.runs import check, model_of, read_runs
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
@@ -95,7 +95,7 @@ def fit(
     if model is None and any(own_model(run) is None for run in everything):
         described = folder or _robot_here()
     everything, model = model_of(everything, model, robot)
-    checked(everything, model, joints, fitting=True)
+    noted = check(everything, model, joints, fitting=True)
     recordings, held_out = everything[: len(recordings)], everything[len(recordings) :]
     declarations = None if declared is None else read_declarations(declared)
     entries = () if described is None else described.config().effects
@@ -112,6 +112,7 @@ def fit(
             tie=tie,
             declared=declarations,
             effects=entries,
+            checked=noted,
             progress=tell,
         )
         # A list of kinds that was given is the builder's word that nothing else is wanted.
@@ -149,8 +150,9 @@ def fit(
         f"0.5 s: {1e3 * result.before.horizon:.2f} → {1e3 * result.after.horizon:.2f} mrad; "
         f"floor {1e3 * result.floor:.2f} mrad"
     )
-    for note in result.notes:  # those that were said before the fit, too: what is read last is the result
-        click.echo(note)
+    for note in result.notes:
+        if note not in noted:  # said before the fit
+            click.echo(note)
     if not result.accepted and richer is None:
         click.echo("nothing that was fitted beats the given model on held-out runs; calibrated.xml is the given model")
     for path in written:

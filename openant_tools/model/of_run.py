@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,12 +24,18 @@ def own_model(run: Run) -> Path | None:
         return None
     # A run in memory was named by a program, not by a file from anybody.
     if run.path is not None and follows(str(run.facts.model), run.path) is None:
-        _log.warning(
-            "%s: its model %s lies elsewhere and is not followed → add --trust-paths if it may be, or name one by --model",
-            run.path or run.name, run.facts.model,
-        )  # fmt: skip
+        _say_elsewhere(str(run.path), str(run.facts.model))
         return None
     return own
+
+
+@functools.cache
+def _say_elsewhere(run: str, model: str) -> None:
+    """Once, however often a run is asked for its model."""
+    _log.warning(
+        "%s: its model %s lies elsewhere and is not followed → add --trust-paths if it may be, or name one by --model",
+        run, model,
+    )  # fmt: skip
 
 
 def with_model(runs: Sequence[Run], model: Path) -> tuple[list[Run], tuple[str, ...]]:

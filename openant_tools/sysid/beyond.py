@@ -70,6 +70,7 @@ def with_effects(
         declared=declared,
         measured_supply=measured_supply,
         effects=effects,
+        checked=plain.checked,
         progress=progress,
     )
     found = any(value.accepted and value.name.partition(".")[0] in tried for value in richer.values)

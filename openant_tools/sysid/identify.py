@@ -161,7 +161,7 @@ class Identification:
         stamp_error_s: s, standard deviation by which time stamps miss the moments of sampling, row by row.
         u: (parameters,) of the written model, for `models`.
         acting: effects between steps that were given and acted as they are, in the given model and in the written one.
-        notes: what a reader should know.
+        notes: what a reader should know; checked: those of them that are what the rules noted.
     """
 
     model: Path
@@ -183,6 +183,7 @@ class Identification:
     acting: EffectValues
     notes: tuple[str, ...]
     doubt: str = ""
+    checked: tuple[str, ...] = ()
 
     @property
     def models(self) -> tuple[Path, ...]:
@@ -264,6 +265,7 @@ def identify(
     declared: Declaration | None = None,
     measured_supply: bool = False,
     effects: Sequence[Entry] = (),
+    checked: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Identification:
     """Fit `model` to `runs` and judge the result on `hold_out`, or by leaving out runs in turn.
@@ -280,6 +282,7 @@ def identify(
         measured_supply: gains and torque limits follow the voltage that the runs logged, in the given model too.
         effects: `[[effect]]` entries that the robot has: those that act between steps act in every simulation as they are,
             unless they are fitted themselves.
+        checked: what `check_runs` noted of all these runs, where they have gone through it before; default they do now.
         progress: called with what is being done and the share that is done.
 
     Raises:
@@ -292,7 +295,7 @@ def identify(
     if same:
         raise BadInput("a held-out run is also fitted", remedy="hold out runs that are not among those to fit")
     joints = joints_in_common(everything, model, joints)
-    said = check_runs(everything, plants_of(everything, model, joints))
+    said = check_runs(everything, plants_of(everything, model, joints)) if checked is None else tuple(checked)
     cleaned = [without_errors(without_turns(run, joints), joints) for run in everything]
     everything, telemetry = [run for run, _ in cleaned], [found for _, found in cleaned]
     runs, hold_out = everything[: len(runs)], everything[len(runs) :]
@@ -370,6 +373,7 @@ def identify(
         datasets=tuple(data),
         held_out=tuple(judged or data),
         acting=acting,
+        checked=said,
         notes=(
             *said,
             *([doubt] if doubt else []),
