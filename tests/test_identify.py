@@ -379,6 +379,20 @@ def test_the_data_sheet_says_what_the_nominal_ant_is_and_what_registers_change(t
     assert of(motors=dict.fromkeys(motors, "SG90")) is None
 
 
+@pytest.mark.parametrize("name", ["XL330-M288-T", "xl330-m288"])
+def test_the_data_sheet_of_a_servo_that_no_open_ant_has_is_read_too(name: str, tmp_path: Path) -> None:
+    """As `openant servo gains` says it: by the measured divisor, at the run's supply."""
+    plant = load_plant(plants.write(tmp_path / "one.xml", MODEL))
+    t = np.arange(2.0)
+    facts = {"supply_v": 7.4, "registers": {"joint": {"position_p_gain": 400.0}}}
+    run = plants.run_of({"cmd.joint": t, "pos.joint": t}, t, ["joint"], motors={"joint": name}, **facts)
+    sheet = data_sheet_model(plant, [run])
+    assert sheet is not None
+    stall = 0.60 * 7.4 / 6.0
+    assert sheet.actuator_gainprm[0, 0] == pytest.approx(400 / 256 / 885 * 4096 / (2 * np.pi) * stall)
+    assert sheet.actuator_forcerange[0, 1] == pytest.approx(stall)
+
+
 def test_each_run_is_simulated_with_the_model_that_it_names(model: Path, tmp_path: Path) -> None:
     """Two gains, two files: what is fitted is what they have in common, and each keeps its own gain."""
     soft = plants.write(tmp_path / "soft.xml", MODEL.replace('kp="8"', 'kp="4"'))

@@ -1,7 +1,7 @@
 """Dynamixel servos as far as their gains go: what each needs for `gains`, and who says so.
 
-Those of the Open Ant are here as `servo` has them. The others are here for their gains only: nothing assigns them an ID, drives or
-simulates them, and no joint of a `robot.toml` can name them.
+This is the only table of ratings and divisors: `servo` has what else is known of those that the Open Ant uses. The others are here
+for their gains only: nothing assigns them an ID, drives or simulates them, and no joint of a `robot.toml` can name them.
 
 Figures and factory settings are the e-manual's (the page of each model: Specifications, Control Table). What others measured stands
 beside it. A measured P divisor is used before the manual's, since Present PWM over position error needs no data sheet.
@@ -15,9 +15,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from openant_tools.errors import BadInput
+from openant_tools.robot.control_table import control_table
 from openant_tools.robot.gains import P_DIVISOR, Rating
 from openant_tools.robot.registers import PWM_FULL
-from openant_tools.robot.servo import SERVO_MODELS, ServoModel
 
 __all__ = ["GAIN_MODELS", "Figure", "GainModel", "Registers", "gain_model"]
 
@@ -152,7 +152,39 @@ def _model(
     )
 
 
+def _delivered(name: str) -> Registers:
+    """The gains as delivered of a servo whose whole control table is known."""
+    table = control_table(name)
+    return Registers(*(table[f"position_{letter}_gain"].default or 0 for letter in "pid"))
+
+
+def _weighed(stiffness: float) -> dict[str, tuple[Figure, ...]]:
+    return {"stiffness": (Figure(stiffness, "N·m/rad", _WEIGHED),)}
+
+
 _5V, _11V, _12V = (3.7, 6.0), (6.5, 12.0), (10.0, 14.8)
+_OF_THE_ANT = (
+    _model(
+        "XL430-W250-T", 1060, "x/xl430-w250",
+        ((9.0, 1.0, 1.0, 47), (11.1, 1.4, 1.3, 57), (12.0, 1.5, 1.4, 61)),
+        11.1, _11V, _delivered("XL430-W250-T"), measured=_weighed(19.499),
+    ),
+    _model(
+        "XC430-W240-T", 1080, "x/xc430-w240",
+        ((9.0, 1.4, 1.1, 52), (11.1, 1.7, 1.3, 65), (12.0, 1.9, 1.4, 70)),
+        12.0, (6.5, 14.8), _delivered("XC430-W240-T"),
+    ),
+    _model(
+        "XM430-W210-T", 1030, "x/xm430-w210",
+        ((11.1, 2.7, 2.1, 70), (12.0, 3.0, 2.3, 77), (14.8, 3.7, 2.7, 95)),
+        12.0, _12V, _delivered("XM430-W210-T"),
+    ),
+    _model(
+        "XM430-W350-T", 1020, "x/xm430-w350",
+        ((11.1, 3.8, 2.1, 43), (12.0, 4.1, 2.3, 46), (14.8, 4.8, 2.7, 57)),
+        12.0, _12V, _delivered("XM430-W350-T"), measured=_weighed(18.638),
+    ),
+)  # fmt: skip
 _GAINS_ONLY = (
     _model(
         "XL330-M077-T", 1190, "x/xl330-m077",
@@ -214,32 +246,8 @@ _GAINS_ONLY = (
     ),
 )  # fmt: skip
 
-#: What was weighed of the Open Ant's own: servo → N·m/rad.
-_STIFFNESS = {"XL430-W250-T": 19.499, "XM430-W350-T": 18.638}
-
-
-def _of(model: ServoModel) -> GainModel:
-    """A servo of the Open Ant."""
-    page = f"x/{model.name.removesuffix('-T').lower()}"
-    weighed = _STIFFNESS.get(model.name)
-    defaults = {name: model.register(f"position_{name}_gain").default or 0 for name in "pid"}
-    return GainModel(
-        model.name,
-        model.number,
-        page,
-        model.ratings,
-        model.nominal_voltage_v,
-        model.supply_range_v,
-        Registers(defaults["p"], defaults["i"], defaults["d"]),
-        _divisors(page),
-        {} if weighed is None else {"stiffness": (Figure(weighed, "N·m/rad", _WEIGHED),)},
-    )
-
-
 #: name → model, those of the Open Ant first.
-GAIN_MODELS: Mapping[str, GainModel] = {
-    model.name: model for model in (*(_of(model) for model in SERVO_MODELS.values()), *_GAINS_ONLY)
-}
+GAIN_MODELS: Mapping[str, GainModel] = {model.name: model for model in (*_OF_THE_ANT, *_GAINS_ONLY)}
 
 
 def _key(name: str) -> str:

@@ -1,4 +1,4 @@
-"""The servos of the Open Ant as data: control table, ratings, and what follows from them in SI units."""
+"""The servos of the Open Ant as data: control table and build, and what follows from them and the ratings in SI units."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from openant_tools.errors import BadInput
 from openant_tools.robot import gains
 from openant_tools.robot.control_table import control_table
+from openant_tools.robot.gain_models import GAIN_MODELS, GainModel
 from openant_tools.robot.gains import Rating
 from openant_tools.robot.registers import PULSES_PER_TURN, PWM_FULL, RAD_PER_PULSE, RAD_S_PER_COUNT, Register
 
@@ -17,8 +18,6 @@ __all__ = [
     "BAUD_CODES", "HARDWARE_ERRORS", "PULSES_PER_TURN", "PWM_FULL", "RAD_PER_PULSE", "RAD_S_PER_COUNT", "SERVO_MODELS",
     "HardwareError", "Rating", "Register", "ServoModel", "baud_code", "hardware_errors", "servo_model",
 ]  # fmt: skip
-
-_RPM = 2 * math.pi / 60
 
 #: Code of the register `baud_rate` → bits per second.
 BAUD_CODES: Mapping[int, int] = {
@@ -91,28 +90,19 @@ class ServoModel:
     """One servo model.
 
     Attributes:
-        name, number: the vendor's name, and what the register `model_number` reads.
-        ratings: the data sheet's lines, by rising voltage.
-        nominal_voltage_v: the recommended supply, one of the ratings.
-        supply_range_v: lowest and highest supply.
+        name: the vendor's.
         nominal_torque_nm: what it bears for long; a fifth of stall (Open Ant paper).
         temperature_limit_c: factory limit and end of the operating range.
         standby_current_a: what it draws at rest.
         backlash_rad: full play of the gear where the vendor states it.
         modes: the operating modes it has.
-        position_p_divisor, position_i_divisor, position_d_divisor: counts of gain per count of PWM and pulse. The
-            manual's; measurements on a relative (XL330) found 256 for P, so these are data, not law.
-        control_period_s: period of the position loop, by which the D gain takes its difference. Not published; an
-            assumption.
         rotor_inertia_kg_m2: of the motor before the gear. Not published; the size that fits a rotor of this class
             (some 16 mm wide, some grams), good to a factor of two. Identification replaces it.
+        sheet: its ratings and what its gains count, as `gain_models` has them.
+        registers: name → register.
     """
 
     name: str
-    number: int
-    ratings: tuple[Rating, ...]
-    nominal_voltage_v: float
-    supply_range_v: tuple[float, float]
     gear_ratio: float
     mass_kg: float
     nominal_torque_nm: float
@@ -122,20 +112,43 @@ class ServoModel:
     has_current_sensor: bool
     backlash_rad: float | None = None
     operating_minimum_c: float = -5.0
-    position_p_divisor: float = gains.P_DIVISOR
-    position_i_divisor: float = gains.I_DIVISOR
-    position_d_divisor: float = gains.D_DIVISOR
-    control_period_s: float = gains.CONTROL_PERIOD_S
     rotor_inertia_kg_m2: float = 1e-7
+    sheet: GainModel = field(init=False, repr=False, compare=False)
     registers: Mapping[str, Register] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "sheet", GAIN_MODELS[self.name])
         object.__setattr__(self, "registers", control_table(self.name))
+
+    @property
+    def number(self) -> int:
+        """What the register `model_number` reads."""
+        return self.sheet.number
+
+    @property
+    def ratings(self) -> tuple[Rating, ...]:
+        """The data sheet's lines, by rising voltage."""
+        return self.sheet.ratings
 
     @property
     def rating(self) -> Rating:
         """The rating at the nominal voltage."""
-        return next(rating for rating in self.ratings if rating.voltage_v == self.nominal_voltage_v)
+        return self.sheet.rating
+
+    @property
+    def nominal_voltage_v(self) -> float:
+        """The recommended supply, one of the ratings."""
+        return self.sheet.nominal_voltage_v
+
+    @property
+    def supply_range_v(self) -> tuple[float, float]:
+        """Lowest and highest supply, V."""
+        return self.sheet.supply_range_v
+
+    @property
+    def position_p_divisor(self) -> float:
+        """Counts of P per count of PWM and pulse; of the other two gains that are `gains.I_DIVISOR` and `gains.D_DIVISOR`."""
+        return self.sheet.p_divisor
 
     @property
     def stall_torque_nm(self) -> float:
@@ -192,12 +205,12 @@ class ServoModel:
     def derivative_damping_nm_s_rad(self, d_gain: float | None = None, supply_v: float | None = None) -> float:
         """N·m·s/rad that the D gain adds (`gains.derivative_damping_nm_s_rad`).
 
-        As uncertain as `control_period_s`; a prior at best.
+        As uncertain as the control period; a prior at best.
         """
         gain = self.register("position_d_gain").default if d_gain is None else d_gain
         assert gain is not None
         return gains.derivative_damping_nm_s_rad(
-            gain, self.position_d_divisor, self.control_period_s, self.stall_torque_at(supply_v)
+            gain, gains.D_DIVISOR, gains.CONTROL_PERIOD_S, self.stall_torque_at(supply_v)
         )
 
     def register(self, name: str) -> Register:
@@ -220,11 +233,6 @@ def _nearest(name: str, names: Iterable[str], what: str) -> str:
     return f"did you mean {close[0]!r}?" if close else f"{what} start with {', '.join(sorted(names)[:5])} …"
 
 
-def _ratings(*lines: tuple[float, float, float, float]) -> tuple[Rating, ...]:
-    """Lines of (V, stall N·m, stall A, no-load rpm) as data sheets print them."""
-    return tuple(Rating(voltage, torque, current, rpm * _RPM) for voltage, torque, current, rpm in lines)
-
-
 _WITHOUT_CURRENT = (1, 3, 4, 16)
 _WITH_CURRENT = (0, 1, 3, 4, 5, 16)
 _XM_BACKLASH_RAD = math.radians(0.25)
@@ -233,10 +241,6 @@ _XM_BACKLASH_RAD = math.radians(0.25)
 _MODELS = (
     ServoModel(
         name="XL430-W250-T",
-        number=1060,
-        ratings=_ratings((9.0, 1.0, 1.0, 47), (11.1, 1.4, 1.3, 57), (12.0, 1.5, 1.4, 61)),
-        nominal_voltage_v=11.1,
-        supply_range_v=(6.5, 12.0),
         gear_ratio=258.5,
         mass_kg=0.0572,
         nominal_torque_nm=0.28,
@@ -247,10 +251,6 @@ _MODELS = (
     ),
     ServoModel(
         name="XC430-W240-T",
-        number=1080,
-        ratings=_ratings((9.0, 1.4, 1.1, 52), (11.1, 1.7, 1.3, 65), (12.0, 1.9, 1.4, 70)),
-        nominal_voltage_v=12.0,
-        supply_range_v=(6.5, 14.8),
         gear_ratio=245.22,
         mass_kg=0.065,
         nominal_torque_nm=0.38,
@@ -261,10 +261,6 @@ _MODELS = (
     ),
     ServoModel(
         name="XM430-W210-T",
-        number=1030,
-        ratings=_ratings((11.1, 2.7, 2.1, 70), (12.0, 3.0, 2.3, 77), (14.8, 3.7, 2.7, 95)),
-        nominal_voltage_v=12.0,
-        supply_range_v=(10.0, 14.8),
         gear_ratio=212.6,
         mass_kg=0.082,
         nominal_torque_nm=0.6,
@@ -276,10 +272,6 @@ _MODELS = (
     ),
     ServoModel(
         name="XM430-W350-T",
-        number=1020,
-        ratings=_ratings((11.1, 3.8, 2.1, 43), (12.0, 4.1, 2.3, 46), (14.8, 4.8, 2.7, 57)),
-        nominal_voltage_v=12.0,
-        supply_range_v=(10.0, 14.8),
         gear_ratio=353.5,
         mass_kg=0.082,
         nominal_torque_nm=0.82,

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 
 import mujoco
 
+from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant
 from openant_tools.recording.run import Run
-from openant_tools.robot.servo import PWM_FULL, SERVO_MODELS
+from openant_tools.robot.gain_models import GainModel, Registers, gain_model
+from openant_tools.robot.servo_gains import to_mjcf
 from openant_tools.sysid.kinds import KINDS
 
 __all__ = ["data_sheet_model"]
@@ -18,33 +21,44 @@ __all__ = ["data_sheet_model"]
 def data_sheet_model(plant: Plant, runs: Sequence[Run]) -> mujoco.MjModel | None:
     """A copy of the plant's model with the servos that the runs name as their maker describes them.
 
-    Stiffness is P gain over divisor times stall torque, damping the slope of the torque–speed line, velocity gain (where the
-    model has one) that of the D gain, and the torque limit stall torque times PWM limit, all at the runs' supply
-    (`ServoModel`). Registers that the runs do not tell are the factory's. Inertia, friction, delay and joints whose servo is
-    unknown stay as given: no data sheet states them.
+    Stiffness, damping, velocity gain (where the model has one) and torque limit are what the registers give at the runs' supply
+    (`servo_gains.to_mjcf`). Registers that the runs do not tell are the factory's, and so is the supply. Inertia, friction, delay and
+    joints whose servo is unknown stay as given: no data sheet states them.
 
     Returns:
         None where the runs name no servo that is known.
     """
     model, known = copy.copy(plant.model), False
     for j, joint in enumerate(plant.joints):
-        facts = next((run.facts for run in runs if run.facts.motors.get(joint) in SERVO_MODELS), None)
-        if facts is None:
+        servo, facts = next(((one, run.facts) for run in runs if (one := _servo(run, joint))), (None, None))
+        if servo is None or facts is None:
             continue
         known = True
-        servo, registers = SERVO_MODELS[facts.motors[joint]], facts.registers.get(joint, {})
-        duty = registers.get("pwm_limit", PWM_FULL) / PWM_FULL
-        KINDS["stiffness"].write(
-            model, plant, j, servo.stiffness_nm_rad(registers.get("position_p_gain"), facts.supply_v)
-        )
         # Where the given model has its damping, there it stays: in the servo, or in the joint.
-        in_joint = KINDS["damping"].read(plant.model, plant, j) > 0
         in_servo = KINDS["velocity_gain"].read(plant.model, plant, j) > 0
-        slope = servo.electrical_damping_nm_s_rad
+        in_joint = KINDS["damping"].read(plant.model, plant, j) > 0 or not in_servo
+        registers = _registers(servo, facts.registers.get(joint, {}))
+        supply = servo.nominal_voltage_v if facts.supply_v is None else facts.supply_v
+        mjcf = to_mjcf(servo, registers, supply, "joint" if in_joint else "kv")
+        KINDS["stiffness"].write(model, plant, j, mjcf.kp)
+        KINDS["torque_limit"].write(model, plant, j, mjcf.force_nm)
         if in_servo:
-            gain = servo.derivative_damping_nm_s_rad(registers.get("position_d_gain"), facts.supply_v)
-            KINDS["velocity_gain"].write(model, plant, j, gain if in_joint else gain + slope)
-        if in_joint or not in_servo:
-            KINDS["damping"].write(model, plant, j, slope)
-        KINDS["torque_limit"].write(model, plant, j, servo.stall_torque_at(facts.supply_v, duty))
+            KINDS["velocity_gain"].write(model, plant, j, mjcf.kv)
+        if in_joint:
+            KINDS["damping"].write(model, plant, j, mjcf.damping)
     return model if known else None
+
+
+def _servo(run: Run, joint: str) -> GainModel | None:
+    """The servo that drives a joint, where a data sheet of it is here."""
+    try:
+        return gain_model(run.facts.motors.get(joint, ""))
+    except BadInput:
+        return None
+
+
+def _registers(servo: GainModel, read: Mapping[str, float]) -> Registers:
+    """What was read of the servo's registers, else what it is delivered with."""
+    names = {"position_p": "position_p_gain", "position_i": "position_i_gain", "position_d": "position_d_gain"}
+    factory = asdict(servo.factory)
+    return Registers(**{name: round(read.get(names.get(name, name), count)) for name, count in factory.items()})

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from openant_tools.robot.gains import CONTROL_PERIOD_S, D_DIVISOR, I_DIVISOR, P_DIVISOR
 from openant_tools.robot.servo import ServoModel
 
 __all__ = ["GEAR_STIFFNESS_NM_RAD", "MotorSettings"]
@@ -63,10 +64,10 @@ class MotorSettings:
     ke: float
     resistance: float
     armature: float
-    p_divisor: float = 128.0
-    i_divisor: float = 65536.0
-    d_divisor: float = 16.0
-    control_period_s: float = 1e-3
+    p_divisor: float = P_DIVISOR
+    i_divisor: float = I_DIVISOR
+    d_divisor: float = D_DIVISOR
+    control_period_s: float = CONTROL_PERIOD_S
     standby_a: float = 0.046
     coulomb_nm: float = COULOMB_NM
     viscous: float = 0.0
@@ -121,9 +122,6 @@ class MotorSettings:
             resistance=model.resistance_ohm,
             armature=model.armature_kg_m2,
             p_divisor=model.position_p_divisor,
-            i_divisor=model.position_i_divisor,
-            d_divisor=model.position_d_divisor,
-            control_period_s=model.control_period_s,
             standby_a=model.standby_current_a,
             **_HEAT.get(model.name, {}),  # type: ignore[arg-type]
         )
