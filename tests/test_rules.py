@@ -17,6 +17,7 @@ from openant_tools.cli import main
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import load_plant
 from openant_tools.model.rollout import Rollouts
+from openant_tools.model.stability import growth
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import write_table
 from openant_tools.robot.joints import JOINT_NAMES
@@ -166,6 +167,54 @@ def test_an_unstable_model_is_refused_and_nothing_is_left_of_it(
         assert "the model is unstable" in line
         assert "timestep" in line.split("→")[1]
     assert not list(tmp_path.glob("MUJOCO*"))
+
+
+@pytest.mark.parametrize(
+    ("step", "integrator", "servo"),
+    [
+        ("0.02", "Euler", 'kp="20000" forcerange="-4 4"'),
+        ("0.02", "implicitfast", 'kp="3000" forcerange="-1 1"'),
+        ("0.005", "implicitfast", 'kp="20000" forcerange="-0.5 0.5"'),
+        ("0.005", "Euler", 'kp="5" kv="20" forcerange="-4 4"'),
+        ("0.005", "RK4", 'kp="20000" forcerange="-4 4"'),
+    ],
+)
+def test_a_model_that_only_its_limit_of_force_keeps_together_is_unstable_too(
+    step: str, integrator: str, servo: str, tmp_path: Path
+) -> None:
+    """It trembles where a command rests, and never goes far: no number in it is out of bounds."""
+    line = refused(played(tmp_path), chain(tmp_path, step=step, integrator=integrator, servo=servo))
+    assert "the model is unstable: its servos tremble without end in steps of" in line
+    finer = re.search(r'timestep="([\d.e-]+)" keeps it together', line)
+    if finer:
+        calm = chain(tmp_path, step=finer[1], integrator=integrator, servo=servo)
+        check_runs([played(tmp_path)], [load_plant(calm)], fitting=False)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"step": "0.01", "servo": 'kp="100" kv="3" forcerange="-4 4"'},
+        {"step": "0.005", "integrator": "Euler", "servo": 'kp="5" forcerange="-4 4"', "joint": 'frictionloss="0.3"'},
+        {"servo": 'kp="5" forcerange="-0.05 0.05"'},  # too weak to follow
+        {
+            "servo": 'kp="0.05" forcerange="-4 4"',
+            "more": '<option gravity="0 0 9.81"/>',
+        },  # upside down, it cannot stand
+        {"servo": 'kp="60" forcerange="-4 4" delay="0.02" nsample="11"'},
+        {"servo": 'kp="60" forcerange="-4 4" timeconst="0.05"'},
+    ],
+)
+def test_a_model_that_is_soft_weak_slow_or_rubs_is_not_unstable(said: dict[str, str], tmp_path: Path) -> None:
+    run = played(tmp_path)
+    check_runs([run], [load_plant(chain(tmp_path, **said))], fitting=False)
+
+
+def test_the_nominal_ant_holds_still() -> None:
+    for kit in ("standard", "lite"):
+        plant = load_plant(nominal_model_path(kit), JOINT_NAMES)
+        for pose in (np.zeros(8), np.tile([0.5, -1.0], 4)):
+            assert growth(plant, pose) < 0
 
 
 # --- said, and gone on -----------------------------------------------------------------------------------------------------

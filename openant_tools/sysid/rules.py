@@ -20,6 +20,7 @@ from openant_tools.errors import BadInput
 from openant_tools.model.floor import resolution
 from openant_tools.model.plant import Plant
 from openant_tools.model.rollout import Rollouts
+from openant_tools.model.stability import NUDGE, growth
 from openant_tools.recording.run import Run
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE, RAD_S_PER_COUNT
 from openant_tools.sysid.kinds import KINDS, torque_limit
@@ -64,6 +65,8 @@ POSITION_MODE, TIME_BASED = 3, 0x04
 STILL_RAD_S, TOO_FAST = 0.01, 0.2
 #: s of each run in which a model shows whether it falls apart, and into how many parts a step is cut to see what would help
 TRIED_S, FINER = 20.0, (2, 4, 8, 16)
+#: poses of a run in which servos must hold still, parts of a step that are as good as none at all, and s until a step is over
+POSES, FINEST, HELD_S = 5, 1024, 2.0
 
 
 class Verdict(Enum):
@@ -587,22 +590,70 @@ def _share_saturated(case: Case, j: int) -> float:
 
 
 def _unstable(case: Case) -> Found:
-    """Models that fall apart: MuJoCo meets numbers that are none and begins anew, or joints fly off."""
+    """Models that fall apart: MuJoCo meets numbers that are none and begins anew, or joints fly off. And those that would, were
+    their force not limited: they tremble."""
     assert case.plant is not None
     begin = case.run.between(float(case.run.t[0]), float(case.run.t[0]) + TRIED_S)
     try:
         played = Rollouts(case.plant, [begin])
+        apart = _falls_apart(case, played)
+        restless = [] if apart else _restless(case)
     except BadInput:
         return  # no motion that could be simulated: others say so
-    if not _falls_apart(case, played):
+    step = f"steps of {1e3 * case.plant.timestep:.3g} ms"
+    if apart:
+        what = f"simulated with this run's commands in {step} it falls apart"
+        calm = next(
+            (n for n in FINER if played.finer(n) is not played and not _falls_apart(case, played.finer(n))), None
+        )
+    elif restless:
+        what = f"its servos tremble without end in {step} where nothing is commanded to move, held only by their limit of force"
+        calm = next((n for n in FINER if not any(_grows(case, pose, n) for pose in restless)), None)
+    else:
         return
-    step = case.plant.timestep
-    calm = next((n for n in FINER if played.finer(n) is not played and not _falls_apart(case, played.finer(n))), None)
-    helps = f'timestep="{step / calm:.3g}" keeps it together' if calm else "shorten its `timestep`"
+    helps = f'timestep="{case.plant.timestep / calm:.3g}" keeps it together' if calm else "shorten its `timestep`"
     yield (
-        f"the model is unstable: simulated with this run's commands in steps of {1e3 * step:.3g} ms it falls apart",
+        f"the model is unstable: {what}",
         f'{helps}; or take integrator="implicitfast", or check stiffness, armature and damping',
     )
+
+
+def _restless(case: Case) -> list[Array]:
+    """Poses of a run, (joints,) rad each, that the model cannot hold in its time step and could in a fine one; none where it comes
+    to rest all the same, by dry friction."""
+    there = np.flatnonzero(np.isfinite(case.pos).all(axis=1) & np.isfinite(case.cmd).all(axis=1))
+    rows = np.unique(there[np.linspace(0, len(there) - 1, POSES).astype(int)]) if len(there) else there
+    found = [row for row in rows if _grows(case, case.pos[row], 1) and not _grows(case, case.pos[row], FINEST)]
+    return [case.pos[row] for row in found] if found and _never_rests(case, found) else []
+
+
+def _grows(case: Case, pose: Array, parts: int) -> bool:
+    """Whether what moves away from a pose is e times as large by the end of the run."""
+    assert case.plant is not None
+    return growth(case.plant, pose, parts) * case.run.duration_s > 1.0
+
+
+def _never_rests(case: Case, rows: Sequence[int]) -> bool:
+    """Whether joints still go to and fro long after a step from one of these rows' poses to the command of the next, which stays."""
+    assert case.plant is not None
+    step = case.plant.timestep
+    t = step * np.arange(round(HELD_S / step))
+    begun = (t < 2.5 * step)[:, None]
+    held = []
+    for row, other in zip(rows, [*rows[1:], rows[0]], strict=True):
+        signals = (
+            ("pos", np.where(begun, case.pos[row], np.nan)),
+            ("cmd", np.broadcast_to(case.cmd[other], (len(t), len(case.joints)))),
+        )
+        columns = {f"{name}.{joint}": v[:, j] for name, v in signals for j, joint in enumerate(case.joints)}
+        held.append(replace(case.run, t=t, columns=columns))
+    done = Rollouts(case.plant, held)()
+    for part in done.rows:
+        end = done.pos[0, part][-len(t) // 4 :]
+        went, span = np.abs(np.diff(end, axis=0)).sum(axis=0), np.ptp(end, axis=0)
+        if ((span > NUDGE) & (went > 2 * span)).any():
+            return True
+    return False
 
 
 def _falls_apart(case: Case, played: Rollouts) -> bool:
@@ -724,6 +775,6 @@ RULES: tuple[Rule, ...] = (
     Rule("beyond range", Verdict.NOTE, _beyond_range, needs_model=True),
     Rule("beyond ctrlrange", Verdict.NOTE, _beyond_ctrlrange, needs_model=True),
     Rule("coupled joint", Verdict.NOTE, _coupled, needs_model=True),
-    Rule("saturated", Verdict.REFUSE_FIT, _saturated, needs_model=True),
     Rule("unstable model", Verdict.REFUSE, _unstable, needs_model=True),
+    Rule("saturated", Verdict.REFUSE_FIT, _saturated, needs_model=True),
 )
