@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +15,7 @@ from numpy.typing import NDArray
 
 from openant_env.observations import Layout
 from openant_tools.effects.commands import CommandEffects
-from openant_tools.effects.entries import commands_of, sensing_of, values_of
+from openant_tools.effects.entries import check_pair, commands_of, sensing_of, values_of
 from openant_tools.effects.rollout import EffectValues
 from openant_tools.effects.sensing import SensingEffects
 from openant_tools.errors import BadInput
@@ -25,6 +27,8 @@ from openant_tools.robot.kit import ANGLE_LIMIT_RAD
 from openant_tools.robot.mjcf import nominal_model_path
 
 __all__ = ["DT_S", "SimulatedRobot", "simulated_robot"]
+
+_log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -51,6 +55,7 @@ class SimulatedRobot:
         folder: the robot's folder, None for the nominal one.
         identified: whether its model is one that was fitted to it; the nominal robot is what it is.
         effects: what acts beside the model, between its steps; commands: on the way to the servos; sensing: in sensors.
+        entries: where that stands in robot.toml; None where nothing is to act.
     """
 
     model_path: Path
@@ -66,14 +71,19 @@ class SimulatedRobot:
     sensing: SensingEffects | None = None
     joints: tuple[str, ...] = tuple(JOINTS)
     arena: Arena = field(default_factory=Arena)
+    entries: tuple[Effect, ...] | None = None
 
     def load(self) -> Plant:
         """Its model on the floor, with the sensors `pos.J` and `vel.J` added where the file has none.
 
         Raises:
-            BadInput: MuJoCo cannot load it, or it lacks one of the joints.
+            BadInput: MuJoCo cannot load it, it lacks one of the joints, or an effect was fitted with another model.
         """
         plant = load_plant(self.model_path, self.joints, Setup.FLOOR, drawn=True)
+        if self.entries is not None:
+            where = None if self.folder is None else RobotFolder(self.folder).config_file
+            for line in check_pair(self.entries, plant.model, self.model_path, where):
+                _say_once(line)
         present = {plant.model.sensor(i).name for i in range(plant.model.nsensor)}
         missing = [
             name for kind in ("pos", "vel") for joint in self.joints if (name := f"{kind}.{joint}") not in present
@@ -149,7 +159,14 @@ def simulated_robot(
         commands=commands_of(acting, tuple(JOINTS), folder.config_file),
         sensing=sensing_of(acting, folder.config_file),
         arena=config.arena,
+        entries=None if effects is False else tuple(acting),
     )
+
+
+@functools.cache
+def _say_once(line: str) -> None:
+    """A line of the log, however many environments are made."""
+    _log.warning("%s", line)
 
 
 def _chosen(present: Sequence[Effect], wanted: bool | Sequence[str], folder: RobotFolder) -> list[Effect]:

@@ -29,6 +29,7 @@ from openant_tools.robot.config import Effect as Entry
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
+from openant_tools.robot.pair import mark_of
 from openant_tools.sysid import rules
 from openant_tools.sysid.parameter import choose, colours
 
@@ -254,7 +255,7 @@ def test_load_friction_of_another_simulation_is_found_unasked_and_written_beside
         pictures = re.findall(r"\]\((figures/.*?)\)", (folder / "report.md").read_text())
         assert len(pictures) == 3
         assert all((folder / name).stat().st_size for name in pictures)
-    assert "More is explained by what plain MuJoCo has no feature for: with load_friction.joint = 0.2" in ran.output
+    assert "More is explained by what plain MuJoCo has no feature for, load_friction.joint = 0.2" in ran.output
 
     plain, richer = (json.loads((folder / "fit.json").read_text()) for folder in (out, out / "with-effects"))
     assert richer["held_out"]["after"]["gap_full_rad"] < 0.6 * plain["held_out"]["after"]["gap_full_rad"]
@@ -268,8 +269,13 @@ def test_load_friction_of_another_simulation_is_found_unasked_and_written_beside
     entries = tomllib.loads((out / "with-effects" / "calibrated.effects.toml").read_text())["effect"]
     assert entries == [
         {"effect": "load_friction", "joints": ["joint"], "enabled": True,
+         "pair": mark_of(load_plant(out / "with-effects" / "calibrated.xml").model),
          "parameters": {"coefficient": pytest.approx(value, rel=1e-5)}}
     ]  # fmt: skip
+    both = r"plain 0\.0\d+ rad, with effects 0\.0\d+ rad"
+    assert len(re.findall(both, ran.output)) == 2  # over full runs, and at 0.5 s
+    assert any(re.search(both, note) for note in plain["notes"])
+    assert re.search(both, (out / "report.html").read_text())
     # Said not to want them, nothing of theirs is left.
     ran = CliRunner().invoke(fit, [*(str(word) for word in asked), "--no-effects"], standalone_mode=False)
     assert ran.exception is None

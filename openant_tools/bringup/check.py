@@ -422,8 +422,9 @@ def _against_model(
     if gap is None or "by_joint_rad" not in gap.data:
         yield Say("there is no gap check to compare the twitch with", "warn")
         return []
-    model = bench.folder.model_path()
-    found = yield from relayed(lambda progress, notice: measure([run], model))
+    config = bench.folder.config()
+    model = bench.folder.model_path(config)
+    found = yield from relayed(lambda progress, notice: measure([run], model, effects=config.effects))
     evidence.append(
         Evidence("position gap of the twitch", found.gaps.get("pos"), "rad", f"{model.name}, 0.5 s horizon")
     )

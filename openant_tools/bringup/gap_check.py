@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 
@@ -32,10 +31,14 @@ def gap_check(bench: Bench) -> Procedure:
     if identified is None:
         raise BadInput("nothing was identified yet", remedy="do the step Identification first")
     runs = [read_run(bench.folder.path / name) for name in identified.data["held_out"]]
-    models: list[Path] = [bench.folder.path / NOMINAL_MODEL, bench.folder.model_path()]
+    config = bench.folder.config()
+    # The robot's own simulation is its model with what acts beside it, as in openant_env.
+    models = ((bench.folder.path / NOMINAL_MODEL, ()), (bench.folder.model_path(config), config.effects))
     found: list[Measurement] = []
-    for model in models:
-        one = yield from relayed(lambda progress, notice, model=model: measure(runs, model))  # type: ignore[misc]
+    for model, effects in models:
+        one = yield from relayed(
+            lambda progress, notice, model=model, effects=effects: measure(runs, model, effects=effects)  # type: ignore[misc]
+        )
         found.append(one)
     before, after = found
     if "pos" not in before.gaps or "pos" not in after.gaps:

@@ -14,7 +14,7 @@ from openant_tools.sysid.beyond import with_effects
 from openant_tools.sysid.identify import identify
 from openant_tools.sysid.protocols import protocols
 from openant_tools.sysid.record import record_takes, takes
-from openant_tools.sysid.result import write_fit, write_robot
+from openant_tools.sysid.result import stating_both, write_fit, write_robot
 
 __all__ = ["PROTOCOL", "identification"]
 
@@ -47,7 +47,8 @@ def identification(bench: Bench) -> Procedure:
     result = yield from relayed(lambda progress, notice: identify(fitted, nominal, held_out, progress=progress))
     # Geared servos rub the more the more they bear, which plain MuJoCo cannot do and the environment can.
     richer = yield from relayed(lambda progress, notice: with_effects(result, fitted, held_out, progress=progress))
-    written = write_fit(result, bench.folder.path / "fit", richer)
+    out = bench.folder.path / "fit"
+    written = write_fit(stating_both(result, richer, out) if richer else result, out, richer)
     best = richer or result
     better = bool(result.accepted) or richer is not None
     if better:

@@ -9,7 +9,7 @@ import click
 from openant_tools.cli.gap_blind import blind
 from openant_tools.cli.gap_diagnose import apply, diagnose, next_experiment, prepare
 from openant_tools.cli.options import joint_option, json_option, model_option, report_option, robot_option
-from openant_tools.cli.runs import checked, model_of, read_runs
+from openant_tools.cli.runs import checked, effects_of, model_of, read_runs
 
 __all__ = ["gap"]
 
@@ -30,6 +30,13 @@ for _command in (apply, blind, diagnose, next_experiment, prepare):
 @click.option(
     "--horizon", default="0.5", show_default=True, metavar="S", help="Seconds between re-initialisations, or `full`."
 )
+@click.option(
+    "--effects",
+    "effects_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE.toml",
+    help="What acts beside the model. Default: the robot's, where the model is its own.",
+)
 @robot_option
 @json_option
 @report_option
@@ -38,6 +45,7 @@ def measure(
     model: Path | None,
     joints: tuple[str, ...],
     horizon: str,
+    effects_file: Path | None,
     robot: Path | None,
     json_file: Path | None,
     report: Path | None,
@@ -47,6 +55,9 @@ def measure(
     \b
       openant gap measure run.mcap --robot my-ant --report gap
       openant gap measure swing.parquet --model pendulum.xml --horizon full
+      openant gap measure swing.parquet --model fit/with-effects/calibrated.xml --effects fit/with-effects/calibrated.effects.toml
+
+    Effects that were fitted act beside the model that was fitted with them, and are refused beside any other.
 
     Exit code 1: it cannot be judged, since repeats of one motion disagree.
     """
@@ -63,8 +74,11 @@ def measure(
     if seconds is not None and not 0.02 <= seconds < 1e6:
         raise BadInput(f"--horizon {horizon} is no time", remedy="give seconds, 0.02 or more, or `full`")
     recordings, path = model_of(read_runs(runs), model, robot)
-    found = measured(checked(recordings, path, joints), path, joints or None, seconds)
+    effects = effects_of(recordings, path, model, robot, effects_file)
+    found = measured(checked(recordings, path, joints, effects), path, joints or None, seconds, effects[0])
     click.echo(sentence(found))
+    if found.effects:
+        click.echo(f"beside the model act: {', '.join(dict.fromkeys(name for name, _ in found.effects))}")
     for signal, value in found.gaps.items():
         click.echo(f"{signal}: {value:.5g} {UNITS[signal]}, floor {found.floors[signal]:.3g}")
     click.echo("signal  joint          while        share    gap")

@@ -13,7 +13,6 @@ from openant_tools.cli.runs import check, model_of, read_runs
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
-    from openant_tools.sysid.identify import Identification
 
 __all__ = ["fit"]
 
@@ -29,7 +28,11 @@ __all__ = ["fit"]
 @click.option("--kind", "kinds", multiple=True, metavar="KIND", help="Fit this kind of parameter only. Repeatable.")
 @click.option("--also", multiple=True, metavar="KIND", help="Fit this kind besides the default ones. Repeatable.")
 @click.option("--measured-supply", is_flag=True, help="Gains and torque limits follow the logged voltage.")
-@click.option("--no-effects", is_flag=True, help="Do not try what plain MuJoCo has no feature for.")
+@click.option(
+    "--no-effects",
+    is_flag=True,
+    help="Do not try what plain MuJoCo has no feature for, nor play what robot.toml has of it for another model.",
+)
 @click.option(
     "--parameters",
     "declared",
@@ -76,15 +79,15 @@ def fit(
     goes to DIR/with-effects and into the robot's folder, and DIR keeps the best for plain MuJoCo. Exit code 1: nothing beats
     the given model.
     """
-    from dataclasses import replace
-
     from openant_tools.model.of_run import own_model
+    from openant_tools.model.plant import load_plant
     from openant_tools.robot.folder import RobotFolder
+    from openant_tools.robot.pair import strangers
     from openant_tools.sysid.beyond import with_effects
     from openant_tools.sysid.declared import read_declarations
     from openant_tools.sysid.identify import identify
     from openant_tools.sysid.report import fit_report
-    from openant_tools.sysid.result import WITH_EFFECTS, write_fit, write_robot
+    from openant_tools.sysid.result import WITH_EFFECTS, stating_both, write_fit, write_robot
 
     folder = None if robot is None else RobotFolder.at(robot)
     if folder is not None:
@@ -99,6 +102,9 @@ def fit(
     recordings, held_out = everything[: len(recordings)], everything[len(recordings) :]
     declarations = None if declared is None else read_declarations(declared)
     entries = () if described is None else described.config().effects
+    if no_effects:  # a plain model takes the place of the robot's pair, wherever it comes from
+        others = strangers(entries, load_plant(model).model)
+        entries = tuple(entry for entry in entries if entry not in others)
     richer = None
     with progress_bar("fitting", remaining=False) as tell:
         result = identify(
@@ -130,7 +136,7 @@ def fit(
                 progress=lambda what, done: tell(f"{words}: {what}", done),
             )
         if richer is not None:
-            result = replace(result, notes=(*result.notes, _recommendation(result, richer, out / WITH_EFFECTS)))
+            result = stating_both(result, richer, out)
         tell("writing the report", 1.0)
         written = write_fit(result, out, richer)
         if report is not None:
@@ -158,22 +164,6 @@ def fit(
     for path in written:
         click.echo(f"wrote {path}", err=True)
     return 0 if result.accepted or richer is not None else 1
-
-
-def _recommendation(plain: Identification, richer: Identification, folder: Path) -> str:
-    from openant_tools.sysid.beyond import TRIED
-
-    found = [
-        f"{value.name} = {value.value:.3g} {value.unit}"
-        for value in richer.values
-        if value.accepted and value.value and value.name.partition(".")[0] in TRIED
-    ]
-    return (
-        f"More is explained by what plain MuJoCo has no feature for: with {', '.join(found)} the error on held-out runs is "
-        f"{1e3 * richer.after.full:.2f} instead of {1e3 * plain.after.full:.2f} mrad over full runs, and "
-        f"{1e3 * richer.after.horizon:.2f} instead of {1e3 * plain.after.horizon:.2f} mrad at 0.5 s. That model and its "
-        f"effects, which act in openant_env, are in {folder}; with --robot they are the robot's."
-    )
 
 
 def _robot_here() -> RobotFolder:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import tomlkit
 from numpy.typing import NDArray
@@ -15,14 +16,64 @@ from openant_tools.effects.commands import SEND_S, CommandEffects
 from openant_tools.effects.rollout import EffectValues
 from openant_tools.effects.sensing import SensingEffects
 from openant_tools.errors import BadInput
+from openant_tools.files import read_toml
 from openant_tools.robot.config import Effect as Entry
+from openant_tools.robot.config import Problem, parse_effects
+from openant_tools.robot.pair import OTHER_REMEDY, PLAIN, mark_of, stranger_words, strangers
 
-__all__ = ["as_toml", "commands_of", "entries_of", "sensing_of", "values_of"]
+__all__ = ["as_toml", "check_pair", "commands_of", "entries_of", "read_effects", "sensing_of", "values_of"]
 
 #: effects that act between the steps of an environment, not between those of its physics, with their parameters
 ON_COMMANDS = {"clock_jitter": ("std_s",), "command_dropout": ("fraction", "longest_s")}
 _AXES = tuple(f"{sensor}_{axis}" for sensor in ("gyro", "acc") for axis in "xyz")
 ON_SENSORS = {"imu_bias": ("rad_s", "m_s2", *_AXES), "tracker_scale": ("scale", "yaw_rad", "latency_s")}
+
+
+def read_effects(path: Path, joints: Sequence[str]) -> tuple[Entry, ...]:
+    """The `[[effect]]` entries of a file.
+
+    Args:
+        joints: the robot's.
+
+    Raises:
+        BadInput: the file cannot be read, or an entry says something that cannot be.
+    """
+    problems: list[Problem] = []
+    entries = parse_effects(read_toml(path).get("effect", []), problems, joints)
+    errors = [problem for problem in problems if problem.severity == "error"]
+    if errors:
+        raise BadInput(errors[0].what, where=f"{path}, {errors[0].place}", remedy=errors[0].remedy)
+    return entries
+
+
+def check_pair(
+    entries: Sequence[Entry], model: mujoco.MjModel, path: Path, where: str | Path | None = None
+) -> list[str]:
+    """Refuse effects that were fitted with another model; what else is to be said of both together, a line each.
+
+    Args:
+        entries: all that shall act with the model.
+        path, where: the files of the model and of the entries, for messages.
+
+    Raises:
+        BadInput: an effect of another pair than the model.
+    """
+    others = strangers(entries, model)
+    if others:
+        raise BadInput(stranger_words(others, path), where=where, remedy=OTHER_REMEDY)
+    own, active = mark_of(model), [entry for entry in entries if entry.enabled]
+    by_hand = dict.fromkeys(entry.effect for entry in active if entry.pair is None and entry.effect in catalogue())
+    if own == PLAIN and by_hand:
+        return [
+            f"{path} was fitted without effects: what it lacked of {', '.join(by_hand)} it has as friction or gain already, which "
+            "counts twice now → fit it with these in robot.toml, or set enabled = false"
+        ]
+    if own not in (None, PLAIN) and not any(entry.effect in catalogue() for entry in active):
+        return [
+            f"{path} was fitted with effects that do not act here, and is not the best without → play it with its "
+            "`calibrated.effects.toml` or from its robot's folder, or take the plain `calibrated.xml`"
+        ]
+    return []
 
 
 def values_of(entries: Sequence[Entry], joints: Sequence[str], where: str | Path | None = None) -> EffectValues:
@@ -188,6 +239,8 @@ def as_toml(entries: Sequence[Entry], note: str = "") -> str:
         parameters.update(entry.parameters)
         table["parameters"] = parameters
         table["enabled"] = entry.enabled
+        if entry.pair is not None:
+            table["pair"] = entry.pair
         tables.append(table)
     document["effect"] = tables
     return tomlkit.dumps(document)

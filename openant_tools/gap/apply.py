@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
-from collections.abc import Mapping
-from dataclasses import dataclass
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 from openant_tools.effects.catalogue import catalogue as acting
 from openant_tools.effects.entries import as_toml, entries_of
 from openant_tools.errors import BadInput
-from openant_tools.files import write_text
+from openant_tools.files import json_text, write_text
 from openant_tools.gap.cause import catalogue
 from openant_tools.gap.closure import BODY, adjust
 from openant_tools.gap.diagnosis import Diagnosis, Found
@@ -26,6 +28,7 @@ from openant_tools.model.mjcf import document_text, write_model
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.robot.config import Effect, Provenance
 from openant_tools.robot.folder import RobotFolder
+from openant_tools.robot.pair import PLAIN, mark_of
 from openant_tools.sysid.kinds import KINDS
 
 __all__ = ["Applied", "apply", "robot_of", "write_robot"]
@@ -67,18 +70,26 @@ def apply(found: Diagnosis, model: Path, out: Path, *, robot: Path | None = None
     plant = load_plant(model, None, Setup.FLOOR)
     selected = [one for one in found.effects if one.effect in found.selected and (one.parameters or one.coordinates)]
     improved = robot_of(plant, selected, found.calibration)
-    edited = write_robot(model, improved, out, note=f"Written by `openant gap apply`: {found.verdict}")
     entries = _entries(plant, selected, improved)
-    written = [out]
     beside = out.with_name(f"{out.stem}.effects.toml")
-    if folder is not None:
-        _into_folder(folder, out, entries, found)
-        written.append(folder.config_file)
-    elif entries:
-        write_text(beside, as_toml(entries, f"What MuJoCo has no feature for; goes with {out.name}"))
-        written.append(beside)
-    else:
-        beside.unlink(missing_ok=True)  # of an earlier diagnosis, which would act beside this model
+    with (
+        folder.hold() if folder is not None else contextlib.nullcontext()
+    ):  # between reading its effects and writing them
+        kept = [] if folder is None else _kept(folder, found, mark_of(plant.model))
+        together = [entry for entry in (*entries, *kept) if entry.effect in acting() and entry.enabled]
+        word = _mark(found, model, together) if together else PLAIN
+        entries = [replace(entry, pair=word) if entry in together else entry for entry in entries]
+        kept = [replace(entry, pair=word) if entry.pair and entry in together else entry for entry in kept]
+        edited = write_robot(model, improved, out, note=f"Written by `openant gap apply`: {found.verdict}", pair=word)
+        written = [out]
+        if folder is not None:
+            _into_folder(folder, out, [*kept, *entries], found)
+            written.append(folder.config_file)
+        elif entries:
+            write_text(beside, as_toml(entries, f"What MuJoCo has no feature for; goes with {out.name}"))
+            written.append(beside)
+        else:
+            beside.unlink(missing_ok=True)  # of an earlier diagnosis, which would act beside this model
     where = "robot.toml" if folder is not None else beside.name
     carried = [
         f"{one.effect} ({_where(one)}): "
@@ -133,8 +144,11 @@ def robot_of(
     return robot
 
 
-def write_robot(source: Path, robot: Robot, out: Path, *, note: str) -> Edit:
+def write_robot(source: Path, robot: Robot, out: Path, *, note: str, pair: str | None = None) -> Edit:
     """Write an MJCF that moves as this robot does, by MuJoCo's own features as far as those go (formats, section 5).
+
+    Args:
+        pair: the mark of what acts beside it (`robot.pair`); default the source's.
 
     Raises:
         BadInput: the source cannot be edited so that it compiles to this.
@@ -146,7 +160,7 @@ def write_robot(source: Path, robot: Robot, out: Path, *, note: str) -> Edit:
     if hinged:
         note += ". It has hinges beside the servos' own: for openant_env and plain MuJoCo, not for code that counts coordinates"
     try:
-        write_model(source, variant, partial, note=note)
+        write_model(source, variant, partial, note=note, pair=pair)
         written = load_plant(partial, plant.joints, Setup.FLOOR)
         tree = etree.parse(str(partial), etree.XMLParser(remove_blank_text=False))
         done = edit(tree.getroot(), written, robot)
@@ -207,17 +221,34 @@ def _entries(plant: Plant, selected: list[Found], robot: Robot) -> list[Effect]:
     return entries
 
 
-def _into_folder(folder: RobotFolder, out: Path, entries: list[Effect], found: Diagnosis) -> None:
-    now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
-    recording = ", ".join(found.runs)
+def _kept(folder: RobotFolder, found: Diagnosis, given: str | None) -> list[Effect]:
+    """The robot's entries that a diagnosis says nothing of, but for those that were fitted with another model than was diagnosed.
+
+    Args:
+        given: that model's mark.
+    """
     considered = {one.effect for one in found.effects}
-    with folder.hold():  # between what is read of the effects and what is written
-        beside = [entry for entry in folder.config().effects if entry.effect not in considered]
-        folder.update(
-            {"model": folder.relative(out.resolve())},
-            provenance={"model": Provenance("fitted", "openant gap apply", recording, now)},
-            effects=[*beside, *entries],
-        )
+    return [
+        entry
+        for entry in folder.config().effects
+        if entry.effect not in considered and (entry.pair in (None, given) or not entry.enabled)
+    ]
+
+
+def _mark(found: Diagnosis, model: Path, together: Sequence[Effect]) -> str:
+    """The mark of an improved model and its effects (`robot.pair`)."""
+    told = [[entry.effect, entry.joints, dict(entry.parameters)] for entry in together]
+    text = json_text({"model": model.name, "calibration": found.calibration, "effects": told})
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def _into_folder(folder: RobotFolder, out: Path, effects: Sequence[Effect], found: Diagnosis) -> None:
+    now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+    folder.update(
+        {"model": folder.relative(out.resolve())},
+        provenance={"model": Provenance("fitted", "openant gap apply", ", ".join(found.runs), now)},
+        effects=effects,
+    )
 
 
 def _rows(plant: Plant, joints: tuple[str, ...], what: str) -> NDArray[np.int64]:

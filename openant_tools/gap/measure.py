@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.effects.entries import check_pair, entries_of, values_of
+from openant_tools.effects.rollout import EffectValues, rollout
 from openant_tools.gap.regime import Regime, regimes
 from openant_tools.model.floor import disagreement, floors, stamp_error
 from openant_tools.model.gap import HORIZON_S, excess, gap
@@ -18,6 +20,7 @@ from openant_tools.model.of_run import plants_of
 from openant_tools.model.plant import Plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
+from openant_tools.robot.config import Effect
 from openant_tools.sysid.identify import joints_in_common
 
 __all__ = ["Measurement", "Place", "Played", "difference", "measure"]
@@ -72,6 +75,7 @@ class Measurement:
         from_repeats: whether the floor comes from repeats of the same commands, else from the sensors.
         stamp_error_s: as `model.floor.stamp_error`; in a floor from the sensors.
         places: largest share first, signal by signal.
+        effects: what acted between the steps of the model, (effect, its parameter) → (joints,).
         doubt: why the floor is none, and nothing can be judged by it; "" where it holds.
     """
 
@@ -85,6 +89,7 @@ class Measurement:
     places: tuple[Place, ...]
     played: tuple[Played, ...]
     doubt: str = ""
+    effects: EffectValues = field(default_factory=dict)
 
     def excess(self, signal: str) -> float:
         return excess(self.gaps[signal], self.floors[signal])
@@ -110,6 +115,10 @@ class Measurement:
         return {
             "schema": "openant.gap-measure/1",
             "model": str(self.model),
+            "effects": [
+                {"effect": entry.effect, "joints": list(entry.joints), "parameters": dict(entry.parameters)}
+                for entry in entries_of(self.effects, self.joints)
+            ],
             "runs": [played.run.name for played in self.played],
             "horizon_s": self.horizon_s,
             "floor_from": "repeats" if self.from_repeats else "sensors",
@@ -129,7 +138,11 @@ class Measurement:
 
 
 def measure(
-    runs: Sequence[Run], model: Path, joints: Sequence[str] | None = None, horizon_s: float | None = 0.5
+    runs: Sequence[Run],
+    model: Path,
+    joints: Sequence[str] | None = None,
+    horizon_s: float | None = 0.5,
+    effects: Sequence[Effect] = (),
 ) -> Measurement:
     """Simulate runs with their own commands and say how far off they are, and where.
 
@@ -137,14 +150,18 @@ def measure(
         runs: recordings of robots of this model; each is simulated as it stood, on stand or floor.
         joints: default every position servo of the model that all runs command and measure.
         horizon_s: as `Measurement`.
+        effects: `[[effect]]` entries of the robot or of the model's pair: what acts between steps in an environment does here. What
+            chance decides (jitter, lost commands) does not, nor what acts on an IMU or tracker.
 
     Raises:
-        BadInput: no run, or none of the model's joints in it.
+        BadInput: no run, none of the model's joints in it, or effects that were fitted with another model.
     """
     wanted = joints_in_common(runs, model, joints)
-    played = tuple(
-        _play(run, plant, horizon_s) for run, plant in zip(runs, plants_of(runs, model, wanted), strict=True)
-    )
+    plants = plants_of(runs, model, wanted)
+    for plant in plants:
+        check_pair(effects, plant.model, plant.path)
+    acting = values_of(effects, wanted)
+    played = tuple(_play(run, plant, horizon_s, acting) for run, plant in zip(runs, plants, strict=True))
     found = {signal: floors(runs, wanted, signal) for signal in UNITS}
     gaps = {
         signal: gap(
@@ -158,7 +175,7 @@ def measure(
     return Measurement(
         model, tuple(wanted), horizon_s, gaps, {signal: rms(found[signal][0]) for signal in gaps}, found["pos"][1],
         stamp_error(runs, wanted),
-        tuple(places), played, disagreement(runs, wanted) if "pos" in gaps else NOTHING_MEASURED,
+        tuple(places), played, disagreement(runs, wanted) if "pos" in gaps else NOTHING_MEASURED, acting,
     )  # fmt: skip
 
 
@@ -186,8 +203,9 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _play(run: Run, plant: Plant, horizon_s: float | None) -> Played:
-    done = Rollouts(plant, [run], horizon_s)()
+def _play(run: Run, plant: Plant, horizon_s: float | None, effects: EffectValues) -> Played:
+    rollouts = Rollouts(plant, [run], horizon_s)
+    done = rollout(rollouts, [plant.model], [effects]) if effects else rollouts()
     measured = {signal: run.signal(signal, plant.joints) for signal in UNITS}
     return Played(run, measured, {"pos": done.pos[0], "vel": done.vel[0]}, regimes(run, plant))
 

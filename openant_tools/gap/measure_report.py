@@ -41,6 +41,8 @@ def gap_report(found: Measurement) -> Report:
         "The gap", f"{found.model.name} · {', '.join(p.run.name for p in found.played)}", made_by="openant gap measure"
     )
     report.text(f"**{sentence(found)}**")
+    if found.effects:
+        report.text(f"Beside the model act: {', '.join(dict.fromkeys(name for name, _ in found.effects))}.")
     report.key_figures(
         *(
             KeyFigure(_NAMES[signal], f"{value:.4g} {UNITS[signal]}", f"floor {found.floors[signal]:.2g}; {horizon}")

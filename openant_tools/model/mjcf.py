@@ -34,6 +34,7 @@ from openant_tools.model.plant import (
     samples_for,
 )
 from openant_tools.robot.model_file import parser
+from openant_tools.robot.pair import mark
 
 __all__ = ["actuator_element", "document_text", "in_degrees", "joint_element", "number", "numbers", "write_model"]
 
@@ -50,6 +51,7 @@ def write_model(
     joints: Sequence[str] | None = None,
     note: str | None = None,
     stated: Stated | None = None,
+    pair: str | None = None,
 ) -> Path:
     """Write `source` with the servo values of `variant` to `out`, with sensors `pos.J` and `vel.J` (formats, section 5).
 
@@ -62,6 +64,7 @@ def write_model(
         joints: the servo joints; default all.
         note: a line for the comment at the top.
         stated: attributes of the file that the variant was compiled with other values of.
+        pair: the mark of what it was fitted with (`robot.pair`); default that of the source.
 
     Raises:
         BadInput: the source cannot be read, or keeps a joint where it cannot be edited.
@@ -84,6 +87,8 @@ def write_model(
         _write_bodies(root, plant, variant, spec)
         _write_contacts(root, plant, variant)
         _append_sensors(root, plant.joints)
+        if pair is not None:
+            mark(root, pair)
         if note:
             root.insert(0, etree.Comment(f" {note.replace('--', '−−')} "))
             root[0].tail = root.text or "\n  "

@@ -45,7 +45,7 @@ def growth(plant: Plant, pose: Array, parts: int = 1) -> float:
     held = np.isin(model.jnt_type[model.dof_jntid], (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL))
     free = np.flatnonzero(np.concatenate([~held, ~held, np.ones(model.na, bool)]))
     fastest = float(np.abs(np.linalg.eigvals(step[np.ix_(free, free)])).max(initial=0.0))
-    return float(np.log(max(fastest, np.finfo(float).tiny))) / model.opt.timestep
+    return float(np.log(max(fastest, np.finfo(float).tiny)) / model.opt.timestep)
 
 
 def _linearised(plant: Plant, model: mujoco.MjModel, pose: Array) -> Array:

@@ -26,7 +26,7 @@ from openant_tools.robot.servo import BAUD_CODES, SERVO_MODELS, ServoModel
 __all__ = [
     "ACTION_PRESETS", "CONFIG_NAME", "ActionRange", "Actions", "Arena", "Bus", "Camera", "Effect", "Imu", "Motor", "Ports",
     "Problem", "Provenance", "RobotConfig", "Timing", "covers", "editable_document",
-    "parse_config", "read_document",
+    "parse_config", "parse_effects", "read_document",
 ]  # fmt: skip
 
 CONFIG_NAME = "robot.toml"
@@ -268,12 +268,14 @@ class Effect:
         joints: the joints it belongs to, or "all" or "body".
         parameters: by the catalogue's names, SI; a parameter may also be a list (a direction, a position).
         enabled: whether it acts.
+        pair: the mark of the model that it was fitted with (`robot.pair`); None goes with any.
     """
 
     effect: str = text()
     joints: str | tuple[str, ...] = "all"
     parameters: Mapping[str, Any] = field(default_factory=dict)
     enabled: bool = switch(True)
+    pair: str | None = text(None)
 
 
 @dataclass(frozen=True)
@@ -421,12 +423,14 @@ def _motors(table: Any, problems: list[Problem]) -> dict[str, Motor]:
     return motors
 
 
-def _joint_names(value: list[Any], path: str, problems: list[Problem]) -> tuple[str, ...]:
+def _joint_names(
+    value: list[Any], path: str, problems: list[Problem], known: Sequence[str] = JOINT_NAMES
+) -> tuple[str, ...]:
     """The joints in a list; what is none, or stands in it twice, is a problem."""
     joints: list[str] = []
     for joint in value:
-        if not isinstance(joint, str) or joint not in JOINTS:
-            problems.append(Problem(path, f"there is no joint {joint!r}", _suggest(str(joint), JOINT_NAMES)))
+        if not isinstance(joint, str) or joint not in known:
+            problems.append(Problem(path, f"there is no joint {joint!r}", _suggest(str(joint), known)))
         elif joint in joints:
             problems.append(Problem(path, f"{joint} stands in it twice"))
         else:
@@ -488,7 +492,12 @@ def _observation(table: Any, problems: list[Problem]) -> dict[str, tuple[float, 
     return bounds
 
 
-def _effects(entries: Any, problems: list[Problem]) -> tuple[Effect, ...]:
+def parse_effects(entries: Any, problems: list[Problem], known: Sequence[str] = JOINT_NAMES) -> tuple[Effect, ...]:
+    """What the `[[effect]]` tables of a document say; what cannot be goes to `problems`.
+
+    Args:
+        known: the robot's joints.
+    """
     if not isinstance(entries, list):
         problems.append(Problem("effect", "is no list of tables", "write each effect as a table [[effect]]"))
         return ()
@@ -498,9 +507,9 @@ def _effects(entries: Any, problems: list[Problem]) -> tuple[Effect, ...]:
         table = entry if isinstance(entry, Mapping) else {}
         joints = table.get("joints", "all")
         if isinstance(joints, list):
-            joints = _joint_names(joints, f"{path}.joints", problems)
+            joints = _joint_names(joints, f"{path}.joints", problems, known)
         elif joints not in ("all", "body"):
-            remedy = f'write ["{joints}"]' if isinstance(joints, str) and joints in JOINTS else None
+            remedy = f'write ["{joints}"]' if isinstance(joints, str) and joints in known else None
             problems.append(
                 Problem(f"{path}.joints", f'{joints!r} is neither "all" nor "body" nor a list of joints', remedy)
             )
@@ -593,7 +602,7 @@ def parse_config(document: Mapping[str, Any]) -> tuple[RobotConfig | None, list[
         **parts,
         motors=_motors(document.get("motors"), problems),
         observation=_observation(document.get("observation", {}), problems),
-        effects=_effects(document.get("effect", []), problems),
+        effects=parse_effects(document.get("effect", []), problems),
         provenance=_provenance(document.get("provenance", {}), problems),
         unknown=unknown,
     )

@@ -191,7 +191,7 @@ class RobotFolder:
         config, problems = parse_config(document)
         model = document.get("model")
         if isinstance(model, str):
-            problems += self._model_problems(self.path / model, simulate)
+            problems += self._model_problems(self.path / model, simulate, () if config is None else config.effects)
         text = data.decode("utf-8")
         if not text.endswith("\n"):
             what = "the last line has no end: is the file cut short?"
@@ -287,7 +287,7 @@ class RobotFolder:
             remedy = f"mend it by hand, or bring back {backup}" if backup else "mend it by hand"
             raise BadInput(error.what, where=error.where, remedy=remedy) from None
 
-    def _model_problems(self, path: Path, simulate: bool) -> list[Problem]:
+    def _model_problems(self, path: Path, simulate: bool, effects: Sequence[Effect]) -> list[Problem]:
         if not path.is_file():
             return [Problem("model", f"there is no file {path}", "name the MJCF relative to the robot's folder")]
         if not simulate:
@@ -295,6 +295,7 @@ class RobotFolder:
         import mujoco
 
         from openant_tools.robot.model_file import check_model_file
+        from openant_tools.robot.pair import OTHER_REMEDY, stranger_words, strangers
 
         try:
             check_model_file(path)
@@ -311,6 +312,12 @@ class RobotFolder:
                 problems.append(Problem("model", f"{path} has no joint {joint}"))
             elif index not in driven:
                 problems.append(Problem("model", f"no actuator of {path} drives {joint}"))
+        others = strangers(effects, model)
+        problems += [
+            Problem(f"effect[{n}]", stranger_words([one], path), OTHER_REMEDY)
+            for n, one in enumerate(effects, 1)
+            if one in others
+        ]
         return problems
 
 
@@ -443,6 +450,8 @@ def _effect_table(effect: Effect) -> Table:
     parameters.update(_plain(effect.parameters))
     table.append("parameters", parameters)
     table.append("enabled", effect.enabled)
+    if effect.pair is not None:
+        table.append("pair", effect.pair)
     return table
 
 
@@ -469,6 +478,10 @@ def _set_effects(document: tomlkit.TOMLDocument, effects: Sequence[Effect]) -> N
             del table["parameters"][name]
         if bool(table.get("enabled", True)) != effect.enabled:
             table["enabled"] = effect.enabled
+        if effect.pair is None:
+            table.pop("pair", None)
+        else:
+            _set(table, ["pair"], effect.pair)
         tables.append(table)
     if isinstance(present, AoT) and list(map(id, present)) == [id(kept.get((e.effect, e.joints))) for e in effects]:
         return  # the tables were changed in place, where they stand

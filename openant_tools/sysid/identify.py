@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.effects.catalogue import catalogue
-from openant_tools.effects.entries import entries_of, values_of
+from openant_tools.effects.entries import check_pair, entries_of, values_of
 from openant_tools.effects.rollout import EffectValues
 from openant_tools.errors import BadInput
 from openant_tools.model.attribute import Attribute
@@ -286,7 +286,8 @@ def identify(
         progress: called with what is being done and the share that is done.
 
     Raises:
-        BadInput: no runs, no joints in common, no motion, a held-out run that is also fitted, or a model that fails.
+        BadInput: no runs, no joints in common, no motion, a held-out run that is also fitted, a model that fails, or effects
+            that were fitted with another model.
     """
     everything = [*runs, *hold_out]
     same = {id(run) for run in runs} & {id(run) for run in hold_out} or (
@@ -309,12 +310,17 @@ def identify(
             remedy="leave --measured-supply out, or say supply_v in the run's facts",
         )
 
-    acting = _acting(effects, joints, wanted)
+    played = _played(effects, wanted)
+    acting = values_of(played, joints)
 
     def datasets(of: Sequence[Run]) -> list[Dataset]:
         return _datasets(of, model, joints, wanted, measured_supply, acting)
 
     data, judged = datasets(runs), datasets(hold_out)
+    for one in (*data, *judged):
+        beside = check_pair(played, one.plant.model, one.plant.path)
+        # An effect that is fitted makes a pair of its own.
+        said += tuple(beside) if played or not any(KINDS[kind].effect for kind in wanted) else ()
     for one in (*data, *judged):
         given = one.simulate((), [np.zeros(0)]).pos[0]
         for run, rows in zip(one.runs, one.fitted.rows, strict=True):
@@ -375,7 +381,7 @@ def identify(
         acting=acting,
         checked=said,
         notes=(
-            *said,
+            *dict.fromkeys(said),
             *([doubt] if doubt else []),
             *_telemetry_notes(everything, telemetry),
             *_acting_notes(acting),
@@ -412,13 +418,13 @@ def joints_in_common(runs: Sequence[Run], model: Path, wanted: Sequence[str] | N
     return common
 
 
-def _acting(entries: Sequence[Entry], joints: Sequence[str], kinds: Sequence[str]) -> EffectValues:
-    """What the robot's entries say acts between steps, without the effects that are fitted.
+def _played(entries: Sequence[Entry], kinds: Sequence[str]) -> list[Entry]:
+    """The robot's entries that act between steps, without the effects that are fitted.
 
     What the rest of a model carries (a written delay, a hinge with play) is in the model already.
     """
     fitted = {key[0] for kind in kinds if (key := KINDS[kind].effect) is not None}
-    return values_of([entry for entry in entries if entry.effect in catalogue() and entry.effect not in fitted], joints)
+    return [entry for entry in entries if entry.effect in catalogue() and entry.effect not in fitted]
 
 
 def _datasets(

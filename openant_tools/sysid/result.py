@@ -4,25 +4,32 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import hashlib
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from openant_tools.effects.catalogue import effect
 from openant_tools.effects.entries import as_toml, entries_of
 from openant_tools.errors import BadInput
 from openant_tools.files import json_text, read_json, write_text
+from openant_tools.model.gap import HORIZON_S
 from openant_tools.model.mjcf import write_model
 from openant_tools.robot.config import Effect, Provenance
 from openant_tools.robot.folder import RobotFolder
+from openant_tools.robot.pair import PLAIN, mark_of
+from openant_tools.sysid.beyond import TRIED
 from openant_tools.sysid.identify import Identification, calibrated, restated
 from openant_tools.sysid.kinds import KINDS
 from openant_tools.sysid.report import fit_report
 
-__all__ = ["WITH_EFFECTS", "effects_beside", "write_fit", "write_robot"]
+__all__ = ["WITH_EFFECTS", "effects_beside", "pair_of", "pairs", "stating_both", "write_fit", "write_robot"]
 
 CALIBRATED = "calibrated.xml"
 #: beside it: what MuJoCo has no feature for
@@ -41,14 +48,19 @@ def write_fit(result: Identification, out: Path, richer: Identification | None =
         out: the folder.
         richer: what is better than it with effects that plain MuJoCo cannot play, for a folder of its own within.
     """
+    return _write(result, out, richer, {"pairs": pairs(result, richer)} if richer else {})
+
+
+def _write(result: Identification, out: Path, richer: Identification | None, more: Mapping[str, Any]) -> list[Path]:
     runs = ", ".join(run.name for data in result.datasets for run in data.runs)
 
     def note(given: Path) -> str:
         return f"Calibrated by `openant sysid fit` on {datetime.date.today()} from {given.name} and {runs}"
 
-    entries = entries_of(result.effects, result.joints)
+    word = pair_of(result)
+    entries = [replace(entry, pair=word) for entry in entries_of(result.effects, result.joints)]
     models, earlier = result.models, _written_before(out)
-    written = [CALIBRATED] if len(models) == 1 else [f"calibrated-{path.stem}.xml" for path in models]
+    written = _models(result)
     names = ("fit.json", "report.html", *written, *([EFFECTS] if entries else []))
     with _together(out, names) as (figures, report, *rest):
         for path, model in zip(models, rest, strict=False):
@@ -59,9 +71,10 @@ def write_fit(result: Identification, out: Path, richer: Identification | None =
                 joints=result.joints,
                 note=note(path),
                 stated=restated(result, path),
+                pair=word,
             )
         listed = [{"given": str(path), "written": name} for path, name in zip(models, written, strict=True)]
-        write_text(figures, json_text({**result.as_json(), "models": listed}))
+        write_text(figures, json_text({**result.as_json(), "models": listed, **more}))
         fit_report(result).write(report)
         effects = rest[len(models) :]
         for path in effects:
@@ -74,7 +87,67 @@ def write_fit(result: Identification, out: Path, richer: Identification | None =
     if richer is None:
         shutil.rmtree(out / WITH_EFFECTS, ignore_errors=True)
         return [out / name for name in names]
-    return [*(out / name for name in names), *write_fit(richer, out / WITH_EFFECTS)]
+    return [*(out / name for name in names), *_write(richer, out / WITH_EFFECTS, None, {})]
+
+
+def stating_both(plain: Identification, richer: Identification, out: Path) -> Identification:
+    """The plain fit with a note of what both leave on held-out runs, and where the one with effects is.
+
+    Args:
+        out: where `write_fit` puts them.
+    """
+    found = [
+        f"{value.name} = {value.value:.3g} {value.unit}"
+        for value in richer.values
+        if value.accepted and value.value and value.name.partition(".")[0] in TRIED
+    ]
+    full, short = (
+        f"plain {_rad(one)} rad, with effects {_rad(other)} rad"
+        for one, other in ((plain.after.full, richer.after.full), (plain.after.horizon, richer.after.horizon))
+    )
+    note = (
+        f"More is explained by what plain MuJoCo has no feature for, {', '.join(found)}. Error on held-out runs: {full} over full runs; "
+        f"{short} at {HORIZON_S:g} s. These effects act in openant_env, beside their own model alone; both are in "
+        f"{out / WITH_EFFECTS}, and with --robot they are the robot's."
+    )
+    return replace(plain, notes=(*plain.notes, note))
+
+
+def _rad(error: float) -> str:
+    return f"{error:.3f}" if error >= 0.01 else f"{error:.5f}"
+
+
+def pair_of(result: Identification) -> str | None:
+    """The mark of the models of a fit and of the effects that were fitted with them; None where they are as they were given."""
+    if not np.any(result.u):
+        return mark_of(result.datasets[0].plant.model)
+    if not result.effects:
+        return PLAIN
+    told = {
+        "values": [[value.name, value.value] for value in result.values],
+        "models": [path.name for path in result.models],
+    }
+    return hashlib.sha256(json_text(told).encode()).hexdigest()[:12]
+
+
+def pairs(plain: Identification, richer: Identification) -> dict[str, Any]:
+    """Both pairs for `fit.json`: their files, what they leave on held-out runs, and which wins."""
+
+    def one(result: Identification, folder: str) -> dict[str, Any]:
+        figures = result.as_json()["held_out"]["after"]
+        effects = {"effects": f"{folder}{EFFECTS}"} if result.effects else {}
+        return {"model": f"{folder}{_models(result)[0]}", **effects, **figures}
+
+    return {
+        "wins": "with effects",
+        "plain": one(plain, ""),
+        "with effects": one(richer, f"{WITH_EFFECTS}/"),
+    }
+
+
+def _models(result: Identification) -> list[str]:
+    models = result.models
+    return [CALIBRATED] if len(models) == 1 else [f"calibrated-{path.stem}.xml" for path in models]
 
 
 def _written_before(out: Path) -> set[str]:
@@ -124,6 +197,7 @@ def write_robot(result: Identification, folder: RobotFolder) -> None:
         joints=result.joints,
         note="Written by `openant sysid fit`",
         stated=restated(result, source_file),
+        pair=pair_of(result),
     )
     runs = [run for data in result.datasets for run in data.runs]
     recording = folder.relative(runs[0].path) if runs[0].path else runs[0].name
@@ -150,23 +224,32 @@ def write_robot(result: Identification, folder: RobotFolder) -> None:
         folder.findings / f"sysid-fit-{now:%Y%m%dT%H%M%SZ}.json",
         json_text(finding),
     )
-    found = entries_of(result.effects_found, result.joints)
+    word = pair_of(result)
+    found = [replace(entry, pair=word) for entry in entries_of(result.effects_found, result.joints)]
     with folder.hold():  # between what is read of the effects and what is written
         folder.update(values, provenance=provenance, effects=[*effects_beside(result, folder), *found])
 
 
 def effects_beside(result: Identification, folder: RobotFolder) -> list[Effect]:
     """The robot's `[[effect]]` entries that were not fitted, which stay as they are; of one that was, the joints that were
-    not."""
+    not. What was fitted with an earlier model stays where this fit went on from that one, and is of the new pair then; else it
+    goes with its model."""
     fitted = {kind.effect[0] for kind in (KINDS[p.kind] for p in result.parameters if p.kind in KINDS) if kind.effect}
+    acted, given = {name for name, _ in result.acting}, mark_of(result.datasets[0].plant.model)
     config, beside = folder.config(), list[Effect]()
     for entry in config.effects:
-        if entry.effect not in fitted:
+        mine = tuple(config.motors) if isinstance(entry.joints, str) else entry.joints
+        rest = tuple(joint for joint in mine if joint not in result.joints)
+        if entry.effect in fitted:
+            if effect(entry.effect).shared or not rest:
+                continue
+            entry = replace(entry, joints=rest)
+        elif entry.pair is not None and entry.effect not in acted and rest != mine and entry.enabled:
+            continue
+        if entry.pair is None or not entry.enabled:
             beside.append(entry)
-        elif not effect(entry.effect).shared:
-            mine = tuple(config.motors) if isinstance(entry.joints, str) else entry.joints
-            rest = tuple(joint for joint in mine if joint not in result.joints)
-            beside += [replace(entry, joints=rest)] if rest else []
+        elif entry.pair == given:
+            beside.append(replace(entry, pair=pair_of(result)))
     return beside
 
 

@@ -623,7 +623,7 @@ def _restless(case: Case) -> list[Array]:
     to rest all the same, by dry friction."""
     there = np.flatnonzero(np.isfinite(case.pos).all(axis=1) & np.isfinite(case.cmd).all(axis=1))
     rows = np.unique(there[np.linspace(0, len(there) - 1, POSES).astype(int)]) if len(there) else there
-    found = [row for row in rows if _grows(case, case.pos[row], 1) and not _grows(case, case.pos[row], FINEST)]
+    found = [int(row) for row in rows if _grows(case, case.pos[row], 1) and not _grows(case, case.pos[row], FINEST)]
     return [case.pos[row] for row in found] if found and _never_rests(case, found) else []
 
 
@@ -637,7 +637,7 @@ def _never_rests(case: Case, rows: Sequence[int]) -> bool:
     """Whether joints still go to and fro long after a step from one of these rows' poses to the command of the next, which stays."""
     assert case.plant is not None
     step = case.plant.timestep
-    t = step * np.arange(round(HELD_S / step))
+    t: Array = step * np.arange(round(HELD_S / step), dtype=np.float64)
     begun = (t < 2.5 * step)[:, None]
     held = []
     for row, other in zip(rows, [*rows[1:], rows[0]], strict=True):
