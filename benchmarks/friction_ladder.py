@@ -31,7 +31,8 @@ from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
-from openant_tools.sysid.fit import Dataset, Problem, gaps, sensor_floor
+from openant_tools.sysid.dataset import Dataset, gaps, sensor_floor
+from openant_tools.sysid.fit import Problem
 from openant_tools.sysid.parameter import KINDS, choose
 
 #: what every rung fits: the servo's own numbers, and that its back-EMF ends with the torque

@@ -26,10 +26,10 @@ from openant_tools.robot.kit import PLATFORM_PWM_LIMIT_COUNTS
 from openant_tools.robot.kit import kit as kit_by_name
 from openant_tools.robot.mjcf import nominal_mjcf
 from openant_tools.sysid.data_sheet import data_sheet_model
-from openant_tools.sysid.fit import autocorrelation_time
 from openant_tools.sysid.identify import Identification, Value, calibrated, identify
 from openant_tools.sysid.protocols import CommandSpace, protocol
 from openant_tools.sysid.result import write_fit
+from openant_tools.sysid.weights import autocorrelation_time
 
 REAL = Path(__file__).parents[2] / "shared" / "realdata" / "bam-xl330"
 

@@ -17,9 +17,10 @@ from openant_tools.errors import BadInput
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.robot.mjcf import nominal_mjcf, nominal_model_path
 from openant_tools.sysid import design as design_module
+from openant_tools.sysid.dataset import Dataset
 from openant_tools.sysid.design import design
 from openant_tools.sysid.excitation import Rest, Steps
-from openant_tools.sysid.fit import Dataset, Problem
+from openant_tools.sysid.fit import Problem
 from openant_tools.sysid.forecast import ENCODER_RAD, forecast
 from openant_tools.sysid.parameter import choose
 from openant_tools.sysid.plan import Expectation, Plan, Planned, Residual, make_plan

@@ -12,10 +12,11 @@ import numpy as np
 
 from openant_tools.recording.run import Run
 from openant_tools.robot.config import Effect as Entry
+from openant_tools.sysid.dataset import sensor_floor
 from openant_tools.sysid.declared import Declaration
-from openant_tools.sysid.fit import WHITE, sensor_floor
 from openant_tools.sysid.identify import WORTH, Identification, identify
 from openant_tools.sysid.kinds import KINDS
+from openant_tools.sysid.weights import WHITE
 
 __all__ = ["TRIED", "with_effects"]
 

@@ -27,8 +27,10 @@ from openant_tools.model.of_run import own_model, plants_of
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.recording.run import Run
 from openant_tools.robot.config import Effect as Entry
+from openant_tools.sysid.dataset import Dataset, gaps, sensor_floor
 from openant_tools.sysid.declared import Declaration, declared_parameters
-from openant_tools.sysid.fit import Dataset, Estimate, Problem, gaps, sensor_floor
+from openant_tools.sysid.estimate import Estimate
+from openant_tools.sysid.fit import Problem
 from openant_tools.sysid.kinds import ACTUATOR_LAG, SPEED_LIMIT
 from openant_tools.sysid.parameter import (
     ACTION_DELAY,

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.recording.run import Run
+from openant_tools.sysid.dataset import Dataset
 from openant_tools.sysid.excitation import CommandSpace
-from openant_tools.sysid.fit import TIMING_STD_S, Dataset
 from openant_tools.sysid.forecast import Forecast, forecast
 from openant_tools.sysid.identify import DEFAULT_KINDS, IDENTIFIED, NOT_IN_THE_DATA, TWO_SIDED_95
+from openant_tools.sysid.intervals import TIMING_STD_S
 from openant_tools.sysid.kinds import ELECTRICAL_DAMPING, KINDS
 from openant_tools.sysid.parameter import Parameter, apply, choose, colours
 from openant_tools.sysid.plan_file import as_table

@@ -15,7 +15,7 @@ from openant_tools.recording.run import Run
 from openant_tools.report import Details, Figure, KeyFigure, Mark, Part, Report, plots
 from openant_tools.report.parts import Tone
 from openant_tools.sysid.data_sheet import data_sheet_model
-from openant_tools.sysid.fit import Dataset
+from openant_tools.sysid.dataset import Dataset
 from openant_tools.sysid.identify import Identification, Value
 
 if TYPE_CHECKING:

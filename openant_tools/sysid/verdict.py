@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.sysid.fit import Estimate
+from openant_tools.sysid.estimate import Estimate
 
 __all__ = ["SILENT", "Verdict", "Word", "experiment", "verdicts"]
 

@@ -1,0 +1,108 @@
+"""What a fit found, and how well it is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.sysid.forward import ForwardModel
+from openant_tools.sysid.intervals import halves, left_open, wider_by_blocks
+from openant_tools.sysid.parameter import Parameter
+from openant_tools.sysid.solve import Descent, Prior
+from openant_tools.sysid.weights import Weighing
+
+__all__ = ["CONFLICT", "Estimate", "estimate"]
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+#: prior deviations beyond which the data contradict a prior that they are to be weighed against: one in 370
+CONFLICT = 3.0
+#: share of the time step's effect that is taken as unknown: the rule is of first order
+RICHARDSON = 0.5
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Where a fit ended.
+
+    Attributes:
+        parameters: what was estimated.
+        u: (parameters,) in prior deviations.
+        covariance: (parameters, parameters) of u, the prior included.
+        step_shift: (parameters,) of u, by which a model with an infinitely small time step would be fitted otherwise.
+        precision: (parameters, parameters) of u, what the data alone say.
+        centre: (parameters,) the middle of the prior.
+        low, high: (parameters,) the physical bounds of u.
+        information: (parameters,) share of each parameter's posterior precision that the data gave: 0 prior only, 1 data.
+        halves: (2, parameters) of u, what each half of the data alone would say (to first order); NaN where there is one.
+        contradictory: (parameters,) whether the two halves differ by more than chance.
+        contradicts: (parameters,) whether the estimate lies where the prior says that it cannot.
+        prior_precision: (parameters,) of u: 1, or next to nothing where the prior would have held the estimate back.
+        noise: (joints,) rad, standard deviation of the residual per joint, of all datasets.
+        correlation_s: (joints,) s, integrated autocorrelation time of the residual.
+        stamp_error_s: s, standard deviation by which the rows' time stamps miss the moments of sampling, row by row.
+        converged: whether the optimiser met its tolerances.
+    """
+
+    parameters: tuple[Parameter, ...]
+    u: Array
+    covariance: Array
+    step_shift: Array
+    precision: Array
+    centre: Array
+    low: Array
+    high: Array
+    information: Array
+    halves: Array
+    contradictory: Bools
+    contradicts: Bools
+    prior_precision: Array
+    noise: Array
+    correlation_s: Array
+    stamp_error_s: float
+    converged: bool
+    evaluations: int
+
+
+def estimate(found: Descent, model: ForwardModel, weighing: Weighing, prior: Prior) -> Estimate:
+    """What is known where a descent ended."""
+    point, tangent, u = found.point, found.tangent, found.point.u
+    weights = weighing(point)
+    precision, _ = tangent.normal(point, weights.each, prior)
+    covariance = np.linalg.inv(precision)
+    # A parameter at its bound cannot give way to what is left open; the others must hold all of it.
+    free = (u > prior.low + 1e-6) & (u < prior.high - 1e-6)
+    inside = np.ix_(free, free)
+    give = np.zeros_like(precision)
+    give[inside] = np.linalg.inv(precision[inside])
+    open_ = give @ left_open(model, found, weights)
+    # What the step does has a direction: most of it is known, and the rest is as uncertain as the rule is rough.
+    by_step = point.residual.shape[1]
+    step_shift = open_[:, by_step].copy()
+    open_[:, by_step] *= RICHARDSON
+    wider = wider_by_blocks(model.datasets, found, weights, precision, free)
+    each, contradictory = halves(model.datasets, weighing, found, prior, free)
+    return Estimate(
+        parameters=tuple(model.parameters),
+        u=u,
+        covariance=np.outer(wider, wider) * covariance + open_ @ open_.T,
+        step_shift=step_shift,
+        precision=precision - np.diag(prior.precision),
+        centre=prior.centre,
+        low=prior.low,
+        high=prior.high,
+        # What the data, all other parameters free, say about each: 1 − posterior variance over prior variance.
+        information=1.0 - np.diag(covariance) * prior.precision,
+        halves=each,
+        contradictory=contradictory,
+        contradicts=np.abs(u - prior.centre) > CONFLICT,
+        prior_precision=prior.precision,
+        noise=weights.noise,
+        correlation_s=weights.correlation_s,
+        stamp_error_s=weights.stamp_error_s,
+        converged=found.converged,
+        evaluations=model.evaluations,
+    )
