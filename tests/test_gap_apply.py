@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -27,9 +28,13 @@ from openant_tools.gap.report import diagnosis_report
 from openant_tools.gap.robot import Form, Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.words import sentence
+from openant_tools.model.mjcf import write_model
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run
+from openant_tools.robot.config import Effect
+from openant_tools.robot.folder import create_robot
+from openant_tools.robot.pair import PLAIN, mark_of
 
 Array = NDArray[np.float64]
 
@@ -250,6 +255,30 @@ def test_what_mujoco_cannot_carry_stands_beside_the_model(model: Path, tmp_path:
         ("load_friction", True),
         ("clock_jitter", True),
     ]
+    # What was calibrated together goes together: a late command says nothing of the model.
+    assert [entry.get("pair") for entry in beside] == [mark_of(load_plant(out).model), None]
+
+
+def test_what_a_diagnosis_says_nothing_of_goes_along_with_the_robots_model(tmp_path: Path) -> None:
+    robot = create_robot(tmp_path / "ant")
+    nominal = robot.path / "nominal.xml"
+    write_model(
+        nominal, load_plant(nominal, None, Setup.FLOOR).model, robot.path / "calibrated.xml", pair="0123456789ab"
+    )
+    here, strange = (
+        Effect("load_friction", ("knee_fl",), {"coefficient": 0.2}, pair=pair)
+        for pair in ("0123456789ab", "fedcba987654")
+    )
+    robot.update({"model": "calibrated.xml"}, effects=[here, replace(strange, joints=("knee_fr",))])
+    late = diagnosis(robot.model_path(), found("action_delay", "all", delay_s=0.02))
+    apply(late, robot.model_path(), robot.path / "improved.xml", robot=robot.path)
+    (kept,) = robot.config().effects
+    assert kept.joints == ("knee_fl",)
+    assert kept.pair == mark_of(load_plant(robot.model_path()).model) != "0123456789ab"
+    # Another model, of which the entry says nothing: it goes with the model that it was fitted with.
+    apply(late, nominal, robot.path / "improved.xml", robot=robot.path)
+    assert robot.config().effects == ()
+    assert mark_of(load_plant(robot.model_path()).model) == PLAIN
 
 
 def test_the_environment_takes_what_stands_beside(model: Path, tmp_path: Path) -> None:

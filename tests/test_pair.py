@@ -33,7 +33,7 @@ from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.pair import PLAIN, mark_of
 from openant_tools.sysid.identify import Identification, identify
-from openant_tools.sysid.result import write_fit, write_robot
+from openant_tools.sysid.result import stating_both, write_fit, write_robot
 
 LOAD = ("load_friction", "coefficient")
 KNEES = tuple(joint for joint in JOINT_NAMES if "knee" in joint)
@@ -156,7 +156,7 @@ def test_effects_that_nobody_fitted_act_beside_any_model_and_a_doubt_is_said(
 
 
 def test_a_fit_goes_on_from_a_pair_and_its_entries_go_along(
-    fits: tuple[Identification, Identification], runs: list[Run], tmp_path: Path
+    fits: tuple[Identification, Identification], runs: list[Run], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     robot = create_robot(tmp_path / "ant")
     other, off = (
@@ -182,12 +182,30 @@ def test_a_fit_goes_on_from_a_pair_and_its_entries_go_along(
     assert robot.config().effects[-1].pair == second
     measure(runs, robot.model_path(), effects=robot.config().effects)
 
+    log = tmp_path / "log.csv"
+    write_table(runs[0], log)
+    refit = ("sysid", "fit", log, "--model", fits[0].model, "--robot", robot.path, "--out", tmp_path / "fit")
+    assert command(*refit) == 2
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert COUNTS_TWICE in line
+    assert "--no-effects" in line.split("→")[1]
+    assert not (tmp_path / "fit").exists()
+
     # A plain fit from another model takes the pair's place, with all that belonged to it.
     with pytest.raises(BadInput, match=COUNTS_TWICE):
         identify(few[:1], fits[0].model, few[1:], kinds=["stiffness"], effects=robot.config().effects)
     write_robot(fits[0], robot)
     assert mark_of(load_plant(robot.model_path()).model) == PLAIN
     assert list(robot.config().effects) == [other, off]
+
+
+def test_what_was_tried_is_stated_where_it_does_not_pay_too(fits: tuple[Identification, Identification]) -> None:
+    plain, richer = fits
+    won, lost = stating_both(plain, richer, Path("fit")), stating_both(richer, plain, Path("fit"))
+    figures = f"plain {plain.after.full:.3f} rad, with effects {richer.after.full:.5f} rad over full runs"
+    assert figures in won.notes[-1]
+    assert "both are in fit/with-effects" in won.notes[-1]
+    assert "the plain model is the best" in lost.notes[-1]
 
 
 # ---- in a robot's folder ----

@@ -10,7 +10,7 @@ from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Bench, Intent, Procedure
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.folder import NOMINAL_MODEL
-from openant_tools.sysid.beyond import with_effects
+from openant_tools.sysid.beyond import better, with_effects
 from openant_tools.sysid.identify import identify
 from openant_tools.sysid.protocols import protocols
 from openant_tools.sysid.record import record_takes, takes
@@ -46,17 +46,18 @@ def identification(bench: Bench) -> Procedure:
     nominal = bench.folder.path / NOMINAL_MODEL
     result = yield from relayed(lambda progress, notice: identify(fitted, nominal, held_out, progress=progress))
     # Geared servos rub the more the more they bear, which plain MuJoCo cannot do and the environment can.
-    richer = yield from relayed(lambda progress, notice: with_effects(result, fitted, held_out, progress=progress))
+    tried = yield from relayed(lambda progress, notice: with_effects(result, fitted, held_out, progress=progress))
+    richer = tried if tried is not None and better(tried, result) else None
     out = bench.folder.path / "fit"
-    written = write_fit(stating_both(result, richer, out) if richer else result, out, richer)
+    write_fit(stating_both(result, tried, out) if tried else result, out, richer)
     best = richer or result
-    better = bool(result.accepted) or richer is not None
-    if better:
+    closer = bool(result.accepted) or richer is not None
+    if closer:
         write_robot(best, bench.folder)
     beside = f" with {' and '.join(sorted({name for name, _ in richer.effects_found}))} beside it" if richer else ""
     return Finding(
         "identify",
-        False if not better else None if result.doubt else True,
+        False if not closer else None if result.doubt else True,
         f"error on a motion it has not seen: {1e3 * best.before.full:.1f} → {1e3 * best.after.full:.2f} mrad{beside} "
         f"(floor {1e3 * best.floor:.2f})",
         (
@@ -64,14 +65,14 @@ def identification(bench: Bench) -> Procedure:
             Evidence("error after", best.after.full, "rad", f"calibrated model{beside}, the same recording"),
             Evidence("floor", result.floor, "rad", "two repeats of that recording"),
         ),
-        "" if better else "look at fit/report.html; the nominal model stays in use",
+        "" if closer else "look at fit/report.html; the nominal model stays in use",
         COMMAND,
         data={
-            "report": bench.folder.relative(written[2]),
+            "report": bench.folder.relative(out / "report.html"),
             "fitted": [bench.folder.relative(take.path) for take in wanted],
             "held_out": [bench.folder.relative(take.path) for take in judge],
             "values": {v.name: [v.value, v.low, v.high, v.verdict] for v in best.values},
         },
         unsure=(result.doubt,) if result.doubt else (),
-        problems=() if better else ("no fitted value predicts better than the nominal model → it stays in use",),
+        problems=() if closer else ("no fitted value predicts better than the nominal model → it stays in use",),
     )

@@ -83,7 +83,7 @@ def fit(
     from openant_tools.model.plant import load_plant
     from openant_tools.robot.folder import RobotFolder
     from openant_tools.robot.pair import strangers
-    from openant_tools.sysid.beyond import with_effects
+    from openant_tools.sysid.beyond import better, with_effects
     from openant_tools.sysid.declared import read_declarations
     from openant_tools.sysid.identify import identify
     from openant_tools.sysid.report import fit_report
@@ -124,7 +124,7 @@ def fit(
         # A list of kinds that was given is the builder's word that nothing else is wanted.
         if not (no_effects or kinds or (declarations and declarations.kinds)):
             words = "with friction that follows the load"
-            richer = with_effects(
+            tried = with_effects(
                 result,
                 recordings,
                 held_out,
@@ -135,8 +135,9 @@ def fit(
                 effects=entries,
                 progress=lambda what, done: tell(f"{words}: {what}", done),
             )
-        if richer is not None:
-            result = stating_both(result, richer, out)
+            if tried is not None:
+                richer = tried if better(tried, result) else None
+                result = stating_both(result, tried, out)
         tell("writing the report", 1.0)
         written = write_fit(result, out, richer)
         if report is not None:

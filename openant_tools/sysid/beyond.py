@@ -18,7 +18,7 @@ from openant_tools.sysid.identify import WORTH, Identification, identify
 from openant_tools.sysid.kinds import KINDS
 from openant_tools.sysid.weights import WHITE
 
-__all__ = ["TRIED", "with_effects"]
+__all__ = ["TRIED", "better", "with_effects"]
 
 Progress = Callable[[str, float], None]
 
@@ -51,7 +51,7 @@ def with_effects(
     effects: Sequence[Entry] = (),
     progress: Progress | None = None,
 ) -> Identification | None:
-    """The fit with TRIED beside what `plain` fitted, if that follows held-out runs better at both horizons; else None.
+    """The fit with TRIED beside what `plain` fitted; None where nothing is left to try it for. Which of both wins, `better` says.
 
     Args:
         plain: what `identify` made of the same runs with the same arguments.
@@ -61,7 +61,7 @@ def with_effects(
     tried = [kind for kind in TRIED if kind not in also and (KINDS[kind].effect or ("",))[0] not in acting]
     if not tried or not _leaves_more_than_noise(plain):
         return None
-    richer = identify(
+    return identify(
         runs,
         plain.model,
         hold_out,
@@ -74,6 +74,10 @@ def with_effects(
         checked=plain.checked,
         progress=progress,
     )
-    found = any(value.accepted and value.name.partition(".")[0] in tried for value in richer.values)
+
+
+def better(richer: Identification, plain: Identification) -> bool:
+    """Whether a fit with effects found some, and follows held-out runs better than the plain one at both horizons."""
+    found = any(value.accepted and value.name.partition(".")[0] in TRIED for value in richer.values)
     short, long = richer.after.horizon / plain.after.horizon, richer.after.full / plain.after.full
-    return richer if found and max(short, long) < 1.0 and min(short, long) < 1.0 - WORTH else None
+    return found and max(short, long) < 1.0 and min(short, long) < 1.0 - WORTH

@@ -24,7 +24,7 @@ from openant_tools.model.mjcf import write_model
 from openant_tools.robot.config import Effect, Provenance
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.pair import PLAIN, mark_of
-from openant_tools.sysid.beyond import TRIED
+from openant_tools.sysid.beyond import TRIED, better
 from openant_tools.sysid.identify import Identification, calibrated, restated
 from openant_tools.sysid.kinds import KINDS
 from openant_tools.sysid.report import fit_report
@@ -91,25 +91,28 @@ def _write(result: Identification, out: Path, richer: Identification | None, mor
 
 
 def stating_both(plain: Identification, richer: Identification, out: Path) -> Identification:
-    """The plain fit with a note of what both leave on held-out runs, and where the one with effects is.
+    """The plain fit with a note of what both leave on held-out runs, and where the one with effects is, if it is better.
 
     Args:
         out: where `write_fit` puts them.
     """
+    full, short = (
+        f"plain {_rad(one)} rad, with effects {_rad(other)} rad"
+        for one, other in ((plain.after.full, richer.after.full), (plain.after.horizon, richer.after.horizon))
+    )
+    errors = f"Error on held-out runs: {full} over full runs; {short} at {HORIZON_S:g} s."
     found = [
         f"{value.name} = {value.value:.3g} {value.unit}"
         for value in richer.values
         if value.accepted and value.value and value.name.partition(".")[0] in TRIED
     ]
-    full, short = (
-        f"plain {_rad(one)} rad, with effects {_rad(other)} rad"
-        for one, other in ((plain.after.full, richer.after.full), (plain.after.horizon, richer.after.horizon))
-    )
-    note = (
-        f"More is explained by what plain MuJoCo has no feature for, {', '.join(found)}. Error on held-out runs: {full} over full runs; "
-        f"{short} at {HORIZON_S:g} s. These effects act in openant_env, beside their own model alone; both are in "
-        f"{out / WITH_EFFECTS}, and with --robot they are the robot's."
-    )
+    if better(richer, plain):
+        note = (
+            f"More is explained by what plain MuJoCo has no feature for, {', '.join(found)}. {errors} These effects act in "
+            f"openant_env, beside their own model alone; both are in {out / WITH_EFFECTS}, and with --robot they are the robot's."
+        )
+    else:
+        note = f"{errors} What plain MuJoCo has no feature for ({', '.join(TRIED)}) does not pay here: the plain model is the best."
     return replace(plain, notes=(*plain.notes, note))
 
 
