@@ -200,6 +200,12 @@ def test_a_file_that_is_not_toml_or_not_there_is_named(tmp_path):
         load_scenario(path)
 
 
+def test_effects_of_a_fit_are_those_of_a_robot_too():
+    table = effect("load_friction", ["knee_fl"], coefficient=0.1)
+    table["effect"][0]["pair"] = "0123456789ab"
+    assert sorted(motor.load_friction for motor in world_of(**table).drives.motors) == [0.0] * 7 + [0.1]
+
+
 def test_a_disabled_effect_is_left_out():
     table = effect("action_delay", delay_s=0.05)
     table["effect"][0]["enabled"] = False

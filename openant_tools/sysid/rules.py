@@ -621,10 +621,10 @@ def _unstable(case: Case) -> Found:
 def _restless(case: Case) -> list[Array]:
     """Poses of a run, (joints,) rad each, that the model cannot hold in its time step and could in a fine one; none where it comes
     to rest all the same, by dry friction."""
-    there = np.flatnonzero(np.isfinite(case.pos).all(axis=1) & np.isfinite(case.cmd).all(axis=1))
+    there = np.flatnonzero(np.isfinite(case.pos).all(axis=1))
     rows = np.unique(there[np.linspace(0, len(there) - 1, POSES).astype(int)]) if len(there) else there
     found = [int(row) for row in rows if _grows(case, case.pos[row], 1) and not _grows(case, case.pos[row], FINEST)]
-    return [case.pos[row] for row in found] if found and _never_rests(case, found) else []
+    return [case.pos[row] for row in found] if found and _never_rests(case, found, case.pos[rows]) else []
 
 
 def _grows(case: Case, pose: Array, parts: int) -> bool:
@@ -633,17 +633,19 @@ def _grows(case: Case, pose: Array, parts: int) -> bool:
     return growth(case.plant, pose, parts) * case.run.duration_s > 1.0
 
 
-def _never_rests(case: Case, rows: Sequence[int]) -> bool:
-    """Whether joints still go to and fro long after a step from one of these rows' poses to the command of the next, which stays."""
+def _never_rests(case: Case, rows: Sequence[int], poses: Array) -> bool:
+    """Whether joints still go to and fro long after a step to the command of one of these rows, from the farthest of `poses`."""
     assert case.plant is not None
     step = case.plant.timestep
     t: Array = step * np.arange(round(HELD_S / step), dtype=np.float64)
     begun = (t < 2.5 * step)[:, None]
     held = []
-    for row, other in zip(rows, [*rows[1:], rows[0]], strict=True):
+    for row in rows:
+        goal = np.where(np.isfinite(case.cmd[row]), case.cmd[row], case.pos[row])
+        start = poses[np.argmax(np.abs(poses - goal).sum(axis=1))]
         signals = (
-            ("pos", np.where(begun, case.pos[row], np.nan)),
-            ("cmd", np.broadcast_to(case.cmd[other], (len(t), len(case.joints)))),
+            ("pos", np.where(begun, start, np.nan)),
+            ("cmd", np.broadcast_to(goal, (len(t), len(case.joints)))),
         )
         columns = {f"{name}.{joint}": v[:, j] for name, v in signals for j, joint in enumerate(case.joints)}
         held.append(replace(case.run, t=t, columns=columns))

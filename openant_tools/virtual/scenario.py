@@ -370,7 +370,7 @@ def _read_camera(values: Any, world: WorldSettings, where: str) -> bool:
 
 
 def _read_effect(entry: Mapping[str, Any], world: WorldSettings, where: str) -> None:
-    known = ("effect", "joints", "parameters", "enabled")
+    known = ("effect", "joints", "parameters", "enabled", "pair")  # the last is a model's; this robot has none
     for key in entry:
         if key not in known:
             raise BadInput(f"unknown key {key!r}", where=where, remedy=nearest(key, known))
