@@ -32,8 +32,8 @@ from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
 from openant_tools.sysid.dataset import Dataset, gaps, sensor_floor
-from openant_tools.sysid.fit import Problem
 from openant_tools.sysid.parameter import KINDS, choose
+from openant_tools.sysid.problem import Problem
 
 #: what every rung fits: the servo's own numbers, and that its back-EMF ends with the torque
 SERVO = ("stiffness", "armature", "zero_offset", "electrical_damping")

@@ -42,10 +42,10 @@ from openant_tools.recording.tables import read_run
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
 from openant_tools.sysid.dataset import Dataset, sensor_floor
-from openant_tools.sysid.fit import Problem
 from openant_tools.sysid.identify import calibrated, identify
 from openant_tools.sysid.kinds import KINDS
 from openant_tools.sysid.parameter import choose
+from openant_tools.sysid.problem import Problem
 from openant_tools.sysid.protocols import CommandSpace, protocol
 
 Array = NDArray[np.float64]

@@ -1,14 +1,17 @@
 """The worked pages of the docs, run anew: their commands, what these print, and their pictures.
 
-    python benchmarks/worked_pages.py [so101|dynamixel] [--shared ../shared/realdata] [--work DIR]
+    python benchmarks/worked_pages.py [so101|dynamixel|python] [--shared ../shared/realdata] [--work DIR]
 
 Prints each command and its output as they stand in docs/so101.md and docs/dynamixel.md, and puts those pictures of
 each fit's report into docs/pictures that the page shows: the held-out error, the moment where the given model is worst.
+Of docs/python.md these are what examples/identify.ipynb prints and draws.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import json
 import re
 import shlex
 import shutil
@@ -16,7 +19,9 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
+import matplotlib
 import numpy as np
 from PIL import Image
 from real_recordings import SO101, TURNED_KG_M2
@@ -26,6 +31,7 @@ from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.tables import read_run
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
+NOTEBOOK = DOCS.parent / "examples" / "identify.ipynb"
 PAGES = {
     "so101": (
         "openant rec info runs/chirp_sweep",
@@ -66,9 +72,25 @@ def run_page(page: str, shared: Path, work: Path) -> None:
         for picture, what in ((pictures[0], "error"), (pictures[-1], "worst")):
             shown = f"pictures/{name}-{what}.png"
             if shown in text:
-                # Lines on white: 64 colours are enough, in a third of the bytes.
-                with Image.open(report / picture) as image:
-                    image.convert("RGB").quantize(64).save(DOCS / shown, optimize=True)
+                save(report / picture, DOCS / shown)
+
+
+def save(picture: Path, shown: Path) -> None:
+    """Lines on white: 64 colours are enough, in a third of the bytes."""
+    with Image.open(picture) as image:
+        image.convert("RGB").quantize(64).save(shown, optimize=True)
+
+
+def run_notebook(work: Path) -> None:
+    matplotlib.use("Agg")
+    work.mkdir(parents=True, exist_ok=True)
+    place: dict[str, Any] = {}
+    with contextlib.chdir(work):
+        for cell in json.loads(NOTEBOOK.read_text())["cells"]:
+            if cell["cell_type"] == "code":
+                exec("".join(cell["source"]), place)
+        place["figure"].savefig("judged.png", dpi=110)
+    save(work / "judged.png", DOCS / "pictures" / "python-judged.png")
 
 
 def print_by_frequency(work: Path, joint: str) -> None:
@@ -86,12 +108,15 @@ def print_by_frequency(work: Path, joint: str) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pages", nargs="*", metavar="so101|dynamixel")
+    parser.add_argument("pages", nargs="*", metavar="so101|dynamixel|python")
     parser.add_argument("--shared", type=Path, default=Path(__file__).resolve().parents[2] / "shared" / "realdata")
     parser.add_argument("--work", type=Path, default=Path("/tmp/worked_pages"))
     options = parser.parse_args()
-    for page in options.pages or PAGES:
-        run_page(page, options.shared, options.work / page)
+    for page in options.pages or [*PAGES, "python"]:
+        if page == "python":
+            run_notebook(options.work / page)
+        else:
+            run_page(page, options.shared, options.work / page)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import pytest
 from plants import ENCODER_RAD, pendulum, sweep, write
 
 import openant_env  # noqa: F401  (registers the environments)
+from openant_tools import sysid
 from openant_tools.bringup.gap_check import gap_check
 from openant_tools.cli import main
 from openant_tools.effects.entries import as_toml, read_effects
@@ -76,7 +77,7 @@ def fits(given: Path, runs: list[Run]) -> tuple[Identification, Identification]:
 @pytest.fixture(scope="module")
 def written(fits: tuple[Identification, Identification], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("fit")
-    write_fit(fits[0], out, fits[1])
+    write_fit(replace(fits[0], with_effects=fits[1]), out)
     return out
 
 
@@ -114,6 +115,21 @@ def test_each_pair_measures_as_its_fit_says_and_neither_file_goes_with_the_other
         assert COUNTS_TWICE in line
         assert str(effects) in line
         assert "calibrated.effects.toml" in line.split("→")[1]
+
+
+def test_from_python_a_pair_is_judged_as_its_fit_says_and_refused_apart(
+    written: Path, fits: tuple[Identification, Identification], runs: list[Run]
+) -> None:
+    beside = written / "with-effects"
+    rich = sysid.judge(runs[1], beside / "calibrated.xml", effects=beside / "calibrated.effects.toml")
+    assert rich.gap.full == pytest.approx(fits[1].after.full, rel=0.02)
+    assert sysid.judge(runs[1], fits[1]).gap.full == pytest.approx(fits[1].after.full, rel=1e-9)
+    assert rich.notes == ()
+    (alone,) = sysid.judge(runs[1], beside / "calibrated.xml").notes
+    assert "was fitted with effects that do not act here" in alone
+    with pytest.raises(BadInput, match=COUNTS_TWICE) as refused:
+        sysid.judge(runs[1], written / "calibrated.xml", effects=beside / "calibrated.effects.toml")
+    assert "calibrated.effects.toml: load_friction was" in str(refused.value)
 
 
 def test_a_pair_that_was_moved_renamed_and_edited_is_still_one(written: Path, runs: list[Run], tmp_path: Path) -> None:
@@ -201,11 +217,13 @@ def test_a_fit_goes_on_from_a_pair_and_its_entries_go_along(
 
 def test_what_was_tried_is_stated_where_it_does_not_pay_too(fits: tuple[Identification, Identification]) -> None:
     plain, richer = fits
-    won, lost = stating_both(plain, richer, Path("fit")), stating_both(richer, plain, Path("fit"))
+    won, lost = stating_both(plain, richer), stating_both(richer, plain)
     figures = f"plain {plain.after.full:.3f} rad, with effects {richer.after.full:.5f} rad over full runs"
     assert figures in won.notes[-1]
-    assert "both are in fit/with-effects" in won.notes[-1]
+    assert "both are in with-effects" in won.notes[-1]
     assert "the plain model is the best" in lost.notes[-1]
+    assert won.with_effects is richer
+    assert lost.with_effects is None
 
 
 # ---- in a robot's folder ----

@@ -20,11 +20,11 @@ from openant_tools.sysid import design as design_module
 from openant_tools.sysid.dataset import Dataset
 from openant_tools.sysid.design import design
 from openant_tools.sysid.excitation import Rest, Steps
-from openant_tools.sysid.fit import Problem
 from openant_tools.sysid.forecast import ENCODER_RAD, forecast
 from openant_tools.sysid.parameter import choose
 from openant_tools.sysid.plan import Expectation, Plan, Planned, Residual, make_plan
 from openant_tools.sysid.plan_file import read_plan
+from openant_tools.sysid.problem import Problem
 from openant_tools.sysid.protocols import CommandSpace, Protocol, protocol
 
 MODEL = nominal_model_path("standard")

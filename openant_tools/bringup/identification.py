@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import datetime
 
+from openant_tools import sysid
 from openant_tools.bringup.relay import relayed
 from openant_tools.calib.wires import engine_config
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Bench, Intent, Procedure
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.folder import NOMINAL_MODEL
-from openant_tools.sysid.beyond import better, with_effects
-from openant_tools.sysid.identify import identify
 from openant_tools.sysid.protocols import protocols
 from openant_tools.sysid.record import record_takes, takes
-from openant_tools.sysid.result import stating_both, write_fit, write_robot
 
 __all__ = ["PROTOCOL", "identification"]
 
@@ -44,16 +42,13 @@ def identification(bench: Bench) -> Procedure:
     )
     fitted, held_out = [read_run(take.path) for take in wanted], [read_run(take.path) for take in judge]
     nominal = bench.folder.path / NOMINAL_MODEL
-    result = yield from relayed(lambda progress, notice: identify(fitted, nominal, held_out, progress=progress))
+    result = yield from relayed(lambda progress, notice: sysid.fit(fitted, nominal, held_out, progress=progress))
     # Geared servos rub the more the more they bear, which plain MuJoCo cannot do and the environment can.
-    tried = yield from relayed(lambda progress, notice: with_effects(result, fitted, held_out, progress=progress))
-    richer = tried if tried is not None and better(tried, result) else None
-    out = bench.folder.path / "fit"
-    write_fit(stating_both(result, tried, out) if tried else result, out, richer)
+    richer = result.with_effects
     best = richer or result
-    closer = bool(result.accepted) or richer is not None
-    if closer:
-        write_robot(best, bench.folder)
+    closer = bool(best.accepted)
+    shown = bench.folder.path / "fit"
+    sysid.report(result, shown, robot=bench.folder.path)
     beside = f" with {' and '.join(sorted({name for name, _ in richer.effects_found}))} beside it" if richer else ""
     return Finding(
         "identify",
@@ -68,7 +63,7 @@ def identification(bench: Bench) -> Procedure:
         "" if closer else "look at fit/report.html; the nominal model stays in use",
         COMMAND,
         data={
-            "report": bench.folder.relative(out / "report.html"),
+            "report": bench.folder.relative(shown / "report.html"),
             "fitted": [bench.folder.relative(take.path) for take in wanted],
             "held_out": [bench.folder.relative(take.path) for take in judge],
             "values": {v.name: [v.value, v.low, v.high, v.verdict] for v in best.values},

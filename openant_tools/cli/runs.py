@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 import click
 
 from openant_tools.cli.options import robot_folder
-from openant_tools.errors import BadInput
 
 if TYPE_CHECKING:
     from openant_tools.recording.run import Run
     from openant_tools.robot.config import Effect
 
-__all__ = ["check", "checked", "effects_of", "model_of", "read_runs", "say"]
+__all__ = ["checked", "effects_of", "model_of", "read_runs", "say"]
 
 
 def read_runs(paths: Sequence[Path]) -> list[Run]:
@@ -25,15 +24,11 @@ def read_runs(paths: Sequence[Path]) -> list[Run]:
         BadInput: a run cannot be read, or none has a motion.
     """
     from openant_tools.recording.tables import read_run
+    from openant_tools.sysid.rules import with_rows
 
-    runs = [read_run(path) for path in paths]
-    still = [run for run in runs if len(run.t) < 2]
-    if still and len(still) == len(runs):
-        raise BadInput(
-            "it has one row: nothing can be seen to move", where=still[0].path, remedy="export all rows of the run"
-        )
-    say(f"{run.path}: it has one row and is left out → export all rows of the run" for run in still)
-    return [run for run in runs if len(run.t) > 1]
+    runs, said = with_rows([read_run(path) for path in paths])
+    say(said)
+    return runs
 
 
 def model_of(runs: Sequence[Run], model: Path | None, robot: Path | None) -> tuple[list[Run], Path]:
@@ -42,18 +37,12 @@ def model_of(runs: Sequence[Run], model: Path | None, robot: Path | None) -> tup
     Returns:
         the runs, and the model of those that name none. Where one was named, it is that of all.
     """
-    from openant_tools.model.of_run import own_model, with_model
+    from openant_tools.model.of_run import models_of
     from openant_tools.robot.folder import RobotFolder
 
-    if model is not None:
-        named, said = with_model(runs, model)
-        say(said)
-        return named, model
-    own = [own_model(run) for run in runs]
-    first = next((path for path in own if path is not None), None)
-    if first is not None and None not in own:
-        return list(runs), first
-    return list(runs), RobotFolder.at(robot_folder(robot)).model_path()
+    named, path, said = models_of(runs, model, lambda: RobotFolder.at(robot_folder(robot)))
+    say(said)
+    return named, path
 
 
 def effects_of(
@@ -85,18 +74,13 @@ def effects_of(
     return config.effects, at.config_file
 
 
-def check(
-    runs: Sequence[Run],
-    model: Path,
-    joints: Sequence[str],
-    *,
-    fitting: bool = False,
-    effects: tuple[Sequence[Effect], Path | None] | None = None,
-) -> tuple[str, ...]:
-    """Go through the rules before anything is computed; what they note, which is said at once.
+def checked(
+    runs: Sequence[Run], model: Path, joints: Sequence[str], effects: tuple[Sequence[Effect], Path | None] = ((), None)
+) -> list[Run]:
+    """Go through the rules before anything is computed, and say what they note; the runs without whole turns.
 
     Args:
-        effects: what acts with the model, and where that stands; None where the command itself looks at it.
+        effects: what acts with the model, and where that stands.
 
     Raises:
         BadInput: a rule refuses, or an effect was fitted with another model.
@@ -104,24 +88,13 @@ def check(
     from openant_tools.effects.entries import check_pair
     from openant_tools.model.of_run import plants_of
     from openant_tools.sysid.identify import joints_in_common
-    from openant_tools.sysid.rules import check_runs
+    from openant_tools.sysid.rules import check_runs, without_turns
 
-    plants = plants_of(runs, model, joints_in_common(runs, model, joints or None))
-    if effects is not None:
-        entries, where = effects
-        say(dict.fromkeys(line for p in plants for line in check_pair(entries, p.model, p.path, where)))
-    return check_runs(runs, plants, fitting=fitting, tell=lambda line: click.echo(line, err=True))
-
-
-def checked(
-    runs: Sequence[Run], model: Path, joints: Sequence[str], effects: tuple[Sequence[Effect], Path | None] = ((), None)
-) -> list[Run]:
-    """The runs without whole turns, after `check`."""
-    from openant_tools.sysid.identify import joints_in_common
-    from openant_tools.sysid.rules import without_turns
-
-    check(runs, model, joints, effects=effects)
     common = joints_in_common(runs, model, joints or None)
+    plants = plants_of(runs, model, common)
+    entries, where = effects
+    say(dict.fromkeys(line for p in plants for line in check_pair(entries, p.model, p.path, where)))
+    check_runs(runs, plants, fitting=False, tell=lambda line: say([line]))
     return [without_turns(run, common) for run in runs]
 
 

@@ -9,7 +9,7 @@ import click
 
 from openant_tools.cli.options import model_option, report_option, robot_folder, robot_option, tie_option
 from openant_tools.cli.progress import progress_bar
-from openant_tools.cli.runs import check, model_of, read_runs
+from openant_tools.cli.runs import read_runs, say
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
@@ -79,92 +79,59 @@ def fit(
     goes to DIR/with-effects and into the robot's folder, and DIR keeps the best for plain MuJoCo. Exit code 1: nothing beats
     the given model.
     """
+    from dataclasses import replace
+
+    from openant_tools import sysid
     from openant_tools.model.of_run import own_model
-    from openant_tools.model.plant import load_plant
     from openant_tools.robot.folder import RobotFolder
-    from openant_tools.robot.pair import strangers
-    from openant_tools.sysid.beyond import better, with_effects
     from openant_tools.sysid.declared import read_declarations
-    from openant_tools.sysid.identify import identify
-    from openant_tools.sysid.report import fit_report
-    from openant_tools.sysid.result import WITH_EFFECTS, stating_both, write_fit, write_robot
+    from openant_tools.sysid.fit_report import fit_report
+    from openant_tools.sysid.result import WITH_EFFECTS
 
     folder = None if robot is None else RobotFolder.at(robot)
     if folder is not None:
         folder.refuse_if_held()  # now, not after minutes
     recordings, held_out = read_runs(runs), read_runs(hold_out)
-    everything = [*recordings, *held_out]
     described = folder
-    if model is None and any(own_model(run) is None for run in everything):
+    if model is None and any(own_model(run) is None for run in [*recordings, *held_out]):
         described = folder or _robot_here()
-    everything, model = model_of(everything, model, robot)
-    noted = check(everything, model, joints, fitting=True)
-    recordings, held_out = everything[: len(recordings)], everything[len(recordings) :]
     declarations = None if declared is None else read_declarations(declared)
-    entries = () if described is None else described.config().effects
-    if no_effects:  # a plain model takes the place of the robot's pair, wherever it comes from
-        others = strangers(entries, load_plant(model).model)
-        entries = tuple(entry for entry in entries if entry not in others)
-    richer = None
-    with progress_bar("fitting", remaining=False) as tell:
-        result = identify(
+    told = list[str]()
+
+    def tell(line: str) -> None:
+        told.append(line)
+        say([line])
+
+    with progress_bar("fitting", remaining=False) as progress:
+        found = sysid.fit(
             recordings,
             model,
             held_out,
+            robot=None if described is None else described.path,
             joints=joints or None,
             kinds=kinds or None,
             also=also,
             measured_supply=measured_supply,
             tie=tie,
             declared=declarations,
-            effects=entries,
-            checked=noted,
-            progress=tell,
+            beyond_mujoco=not no_effects,
+            tell=tell,
+            progress=progress,
         )
-        # A list of kinds that was given is the builder's word that nothing else is wanted.
-        if not (no_effects or kinds or (declarations and declarations.kinds)):
-            words = "with friction that follows the load"
-            tried = with_effects(
-                result,
-                recordings,
-                held_out,
-                also=also,
-                tie=tie,
-                declared=declarations,
-                measured_supply=measured_supply,
-                effects=entries,
-                progress=lambda what, done: tell(f"{words}: {what}", done),
-            )
-            if tried is not None:
-                richer = tried if better(tried, result) else None
-                result = stating_both(result, tried, out)
-        tell("writing the report", 1.0)
-        written = write_fit(result, out, richer)
+        progress("writing the report", 1.0)
+        written = sysid.report(found, out, robot=None if folder is None else folder.path)
         if report is not None:
-            written.append(fit_report(result).write_folder(report))
-        if report is not None and richer is not None:
-            written.append(fit_report(richer).write_folder(report / WITH_EFFECTS))
-    if folder is not None and (result.accepted or richer is not None):
-        write_robot(richer or result, folder)
-        written.append(folder.config_file)
+            written.append(fit_report(found).write_folder(report))
+        if report is not None and found.with_effects:
+            written.append(fit_report(found.with_effects).write_folder(report / WITH_EFFECTS))
 
-    width = max(len(value.name) for value in result.values)
-    for value in result.values:
-        click.echo(f"{value.name:{width}}  {value.value:10.5g}  {value.interval:20} {value.unit:10} {value.words}")
-    judged = "runs left out in turn" if result.in_turn else "held-out runs"
-    click.echo(
-        f"error on {judged}, full run: {1e3 * result.before.full:.2f} → {1e3 * result.after.full:.2f} mrad; "
-        f"0.5 s: {1e3 * result.before.horizon:.2f} → {1e3 * result.after.horizon:.2f} mrad; "
-        f"floor {1e3 * result.floor:.2f} mrad"
-    )
-    for note in result.notes:
-        if note not in noted:  # said before the fit
-            click.echo(note)
-    if not result.accepted and richer is None:
+    click.echo(sysid.summary(replace(found, notes=tuple(note for note in found.notes if note not in told))))
+    accepted = found.accepted or found.with_effects
+    if not accepted:
         click.echo("nothing that was fitted beats the given model on held-out runs; calibrated.xml is the given model")
     for path in written:
         click.echo(f"wrote {path}", err=True)
-    return 0 if result.accepted or richer is not None else 1
+    return 0 if accepted else 1
 
 
 def _robot_here() -> RobotFolder:

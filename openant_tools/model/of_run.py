@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.recording.run import Run
+from openant_tools.robot.folder import RobotFolder
 from openant_tools.trust import follows
 
-__all__ = ["own_model", "plants_of", "with_model"]
+__all__ = ["models_of", "own_model", "plants_of", "with_model"]
 
 _log = logging.getLogger(__name__)
 
@@ -47,6 +49,33 @@ def with_model(runs: Sequence[Run], model: Path) -> tuple[list[Run], tuple[str, 
         if run.model_path is not None and run.model_path.is_file() and run.model_path.resolve() != model.resolve()
     )
     return [replace(run, facts=replace(run.facts, model=None)) for run in runs], said
+
+
+def models_of(
+    runs: Sequence[Run], model: Path | None, robot: Callable[[], RobotFolder] | None = None
+) -> tuple[list[Run], Path, tuple[str, ...]]:
+    """Which model each run is of: the one that was named, else its own, else that of the robot's folder.
+
+    Args:
+        model: of all runs, whatever they name themselves.
+        robot: asked for where no model was named and a run names none.
+
+    Returns:
+        the runs, the model of those that name none (else the first run's), and a line for each run whose own is not taken.
+
+    Raises:
+        BadInput: nobody names a model.
+    """
+    if model is not None:
+        named, said = with_model(runs, model)
+        return named, model, said
+    own = [own_model(run) for run in runs]
+    first = next((path for path in own if path is not None), None)
+    if first is not None and None not in own:
+        return list(runs), first, ()
+    if robot is None:
+        raise BadInput("no model is named", remedy="name an MJCF of this robot, or the robot's folder")
+    return list(runs), robot().model_path(), ()
 
 
 def plants_of(runs: Sequence[Run], model: Path, joints: Sequence[str]) -> list[Plant]:

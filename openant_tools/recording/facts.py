@@ -12,7 +12,7 @@ from openant_tools.errors import BadInput
 from openant_tools.files import parse_json
 from openant_tools.recording.run import Facts
 
-__all__ = ["facts_from_json", "facts_to_json"]
+__all__ = ["facts_from_json", "facts_to_json", "with_facts"]
 
 _TEXTS = ("setup", "protocol", "repeat_of", "model", "notes")
 _NUMBERS = ("heading_rad", "supply_v", "ambient_c")
@@ -69,6 +69,16 @@ def facts_to_json(facts: Facts) -> str:
     data = {name: _plain(getattr(facts, name)) for name in _KNOWN}
     known = {name: value for name, value in data.items() if name == "joints" or value not in (None, {})}
     return json.dumps(known | _plain(facts.extra), indent=1, ensure_ascii=False) + "\n"
+
+
+def with_facts(facts: Facts, more: Mapping[str, Any], where: str) -> Facts:
+    """The facts with `more` of them, by the keys of their JSON; each takes the place of what was there.
+
+    Raises:
+        BadInput: a value of the wrong kind.
+    """
+    known = json.loads(facts_to_json(facts)) | _plain(more)
+    return facts_from_json(json.dumps(known, default=str), where)  # a path is a text there
 
 
 def _plain(value: Any) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.files import atomic_writer, read_text, reading
@@ -21,7 +21,7 @@ from openant_tools.recording.facts import facts_from_json, facts_to_json
 from openant_tools.recording.plausibility import check_names, check_run, check_time, need_signals
 from openant_tools.recording.run import BODY_COLUMNS, JOINT_SIGNALS, Facts, Run
 
-__all__ = ["find_run", "parquet_table", "read_run", "read_table", "write_table"]
+__all__ = ["find_run", "parquet_table", "read_run", "read_table", "run_of_columns", "write_table"]
 
 #: bytes of a CSV, and of its first line: an Open Ant's has 1,500
 LARGEST_CSV, LONGEST_HEADER = 2**30, 64 * 1024
@@ -63,25 +63,66 @@ def read_table(path: str | Path, *, plausible: bool = True) -> Run:
 
 def _read(path: Path, plausible: bool) -> Run:
     columns = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
+    facts_path = path.with_suffix(".json")
+    facts = facts_from_json(read_text(facts_path), str(facts_path)) if facts_path.exists() else None
+    return _run(columns, path.stem, facts, path, str(path), plausible)
+
+
+def run_of_columns(columns: Mapping[str, ArrayLike], *, name: str = "run", need: Sequence[str] = ("cmd", "pos")) -> Run:
+    """A run of columns in memory, checked as a file's are.
+
+    Args:
+        columns: name → (n,) values, as in a table: `t` in s, `cmd.J`, `pos.J` … of joints; a data frame will do.
+        name: what the run is called in reports and messages.
+        need: as `read_run`.
+
+    Raises:
+        BadInput: the column and the row of what cannot be, and what to do about it.
+    """
+    named = {str(column): values for column, values in columns.items()}
+    check_names(list(named), name)
+    read: dict[str, NDArray[Any]] = {}
+    for column, values in named.items():
+        try:
+            read[column] = _numbers(column, pa.array(np.asarray(values), from_pandas=True), name)
+        except (pa.ArrowException, ValueError) as error:
+            raise BadInput(
+                f"the values are no column of numbers: {error}",
+                where=f"{name}, column {column}",
+                remedy="give (n,) values, one a row",
+            ) from error
+    rows = len(read["t"]) if "t" in read else 0
+    for column, there in read.items():
+        if len(there) != rows and "t" in read:
+            raise BadInput(
+                f"it has {len(there)} values, t has {rows}",
+                where=f"{name}, column {column}",
+                remedy="give one value a row; NaN where a sample is missing",
+            )
+    run = _run(read, name, None, None, name, True)
+    need_signals(run, need, name)
+    return run
+
+
+def _run(
+    columns: dict[str, NDArray[Any]], name: str, facts: Facts | None, path: Path | None, where: str, plausible: bool
+) -> Run:
+    """The run of columns that were read, its time apart from them."""
     if "t" not in columns:
         raise BadInput(
             "there is no column t",
-            where=path,
+            where=where,
             remedy="the first column of a run is t, the time in s" + (f"; here are {_few(columns)}" if columns else ""),
         )
-    facts_path = path.with_suffix(".json")
-    if facts_path.exists():
-        facts = facts_from_json(read_text(facts_path), str(facts_path))
-    else:
-        facts = Facts(joints=_joints_of(list(columns), path))
+    facts = facts or Facts(joints=_joints_of(list(columns), where))
     t = columns.pop("t")
     if t.dtype.kind != "f":
-        raise BadInput("t is not a number", where=f"{path}, column t", remedy="give the time in s, as a number")
-    run = Run(name=path.stem, facts=facts, t=t, columns=columns, path=path)
+        raise BadInput("t is not a number", where=f"{where}, column t", remedy="give the time in s, as a number")
+    run = Run(name=name, facts=facts, t=t, columns=columns, path=path)
     if plausible:
-        check_run(run, str(path))
+        check_run(run, where)
     elif not len(t):
-        check_time(t, str(path))
+        check_time(t, where)
     return run
 
 
@@ -142,7 +183,7 @@ def _few(names: Any, count: int = 8) -> str:
     return ", ".join(names[:count]) + (", …" if len(names) > count else "")
 
 
-def _joints_of(names: Sequence[str], path: Path) -> tuple[str, ...]:
+def _joints_of(names: Sequence[str], where: str) -> tuple[str, ...]:
     """The joints of a table without facts, in the order of their columns."""
     for signal in ("pos", "cmd", *JOINT_SIGNALS):
         joints = tuple(name.partition(".")[2] for name in names if name.startswith(f"{signal}."))
@@ -150,7 +191,7 @@ def _joints_of(names: Sequence[str], path: Path) -> tuple[str, ...]:
             return joints
     raise BadInput(
         "there is no column of a joint, such as pos.knee_fl",
-        where=path,
+        where=where,
         remedy=f"name the columns SIGNAL.JOINT ({_few(JOINT_SIGNALS, 5)}); here are {_few(names)}",
     )
 
@@ -248,7 +289,7 @@ def _read_csv(path: Path) -> dict[str, NDArray[Any]]:
     return {name: _numbers(name, table[name].combine_chunks(), path) for name in named}
 
 
-def _numbers(name: str, column: pa.Array, path: Path) -> NDArray[Any]:
+def _numbers(name: str, column: pa.Array, path: Path | str) -> NDArray[Any]:
     """One column as float64 with NaN where a sample is missing; words where the format holds words or knows nothing."""
     signal = name.partition(".")[0]
     ours = name == "t" or name in BODY_COLUMNS or (signal in JOINT_SIGNALS and "." in name)
@@ -283,7 +324,7 @@ def _numbers(name: str, column: pa.Array, path: Path) -> NDArray[Any]:
     return out
 
 
-def _parsed(name: str, column: pa.Array, path: Path, ours: bool) -> NDArray[Any]:
+def _parsed(name: str, column: pa.Array, path: Path | str, ours: bool) -> NDArray[Any]:
     texts = pc.utf8_trim_whitespace(column.cast(pa.string()))
     missing = pc.or_kleene(pc.is_null(texts), pc.is_in(texts, value_set=pa.array(_MISSING)))
     numbers = pc.if_else(missing, pa.scalar(None, pa.string()), texts)

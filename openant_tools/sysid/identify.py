@@ -30,7 +30,6 @@ from openant_tools.robot.config import Effect as Entry
 from openant_tools.sysid.dataset import Dataset, gaps, sensor_floor
 from openant_tools.sysid.declared import Declaration, declared_parameters
 from openant_tools.sysid.estimate import Estimate
-from openant_tools.sysid.fit import Problem
 from openant_tools.sysid.kinds import ACTUATOR_LAG, SPEED_LIMIT
 from openant_tools.sysid.parameter import (
     ACTION_DELAY,
@@ -44,6 +43,7 @@ from openant_tools.sysid.parameter import (
     effect_values,
     restatements,
 )  # fmt: skip
+from openant_tools.sysid.problem import Problem
 from openant_tools.sysid.quality import Telemetry, check_model, without_errors
 from openant_tools.sysid.rules import check_runs, without_turns
 from openant_tools.sysid.verdict import IDENTIFIED, NOT_IN_THE_DATA, SILENT, Verdict, Word, experiment, verdicts
@@ -55,6 +55,7 @@ __all__ = [
     "Identification",
     "Value",
     "calibrated",
+    "dataset_of",
     "identify",
     "joints_in_common",
     "own_model",
@@ -164,6 +165,7 @@ class Identification:
         u: (parameters,) of the written model, for `models`.
         acting: effects between steps that were given and acted as they are, in the given model and in the written one.
         notes: what a reader should know; checked: those of them that are what the rules noted.
+        with_effects: the fit to the same runs that is better by effects which plain MuJoCo cannot play; None where none is.
     """
 
     model: Path
@@ -186,6 +188,7 @@ class Identification:
     notes: tuple[str, ...]
     doubt: str = ""
     checked: tuple[str, ...] = ()
+    with_effects: Identification | None = None
 
     @property
     def models(self) -> tuple[Path, ...]:
@@ -450,6 +453,15 @@ def _datasets(
         )
         for (path, setup), members in groups.items()
     ]
+
+
+def dataset_of(identification: Identification, run: Run) -> Dataset:
+    """Another run, prepared to be simulated with what was identified: with `parameters` at `u`."""
+    kinds = [parameter.kind for parameter in identification.parameters]
+    fitted = identification.datasets[0]
+    return _datasets(
+        [run], identification.model, identification.joints, kinds, fitted.measured_supply, identification.acting
+    )[0]
 
 
 def _applicable(kinds: Sequence[str] | None, plant: Plant, runs: Sequence[Run]) -> list[str]:

@@ -7,7 +7,7 @@ import datetime
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -25,9 +25,9 @@ from openant_tools.robot.config import Effect, Provenance
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.pair import PLAIN, mark_of
 from openant_tools.sysid.beyond import TRIED, better
+from openant_tools.sysid.fit_report import fit_report
 from openant_tools.sysid.identify import Identification, calibrated, restated
 from openant_tools.sysid.kinds import KINDS
-from openant_tools.sysid.report import fit_report
 
 __all__ = ["WITH_EFFECTS", "effects_beside", "pair_of", "pairs", "stating_both", "write_fit", "write_robot"]
 
@@ -38,20 +38,14 @@ EFFECTS = "calibrated.effects.toml"
 WITH_EFFECTS = "with-effects"
 
 
-def write_fit(result: Identification, out: Path, richer: Identification | None = None) -> list[Path]:
+def write_fit(result: Identification, out: Path) -> list[Path]:
     """Write the model, the figures and the report into `out`, together or not at all; returns what was written.
 
-    Where nothing was accepted the model is the given one, so that a script can go on with `calibrated.xml` either way.
-
-    Args:
-        result: the fit.
-        out: the folder.
-        richer: what is better than it with effects that plain MuJoCo cannot play, for a folder of its own within.
+    Where nothing was accepted the model is the given one, so that a script can go on with `calibrated.xml` either way. What is
+    better with effects that plain MuJoCo cannot play goes into a folder of its own within.
     """
-    return _write(result, out, richer, {"pairs": pairs(result, richer)} if richer else {})
-
-
-def _write(result: Identification, out: Path, richer: Identification | None, more: Mapping[str, Any]) -> list[Path]:
+    richer = result.with_effects
+    more = {"pairs": pairs(result, richer)} if richer else {}
     runs = ", ".join(run.name for data in result.datasets for run in data.runs)
 
     def note(given: Path) -> str:
@@ -87,33 +81,30 @@ def _write(result: Identification, out: Path, richer: Identification | None, mor
     if richer is None:
         shutil.rmtree(out / WITH_EFFECTS, ignore_errors=True)
         return [out / name for name in names]
-    return [*(out / name for name in names), *_write(richer, out / WITH_EFFECTS, None, {})]
+    return [*(out / name for name in names), *write_fit(richer, out / WITH_EFFECTS)]
 
 
-def stating_both(plain: Identification, richer: Identification, out: Path) -> Identification:
-    """The plain fit with a note of what both leave on held-out runs, and where the one with effects is, if it is better.
-
-    Args:
-        out: where `write_fit` puts them.
-    """
+def stating_both(plain: Identification, tried: Identification) -> Identification:
+    """The plain fit with a note of what it and one with effects leave on held-out runs; and with that one, if it is better."""
     full, short = (
         f"plain {_rad(one)} rad, with effects {_rad(other)} rad"
-        for one, other in ((plain.after.full, richer.after.full), (plain.after.horizon, richer.after.horizon))
+        for one, other in ((plain.after.full, tried.after.full), (plain.after.horizon, tried.after.horizon))
     )
     errors = f"Error on held-out runs: {full} over full runs; {short} at {HORIZON_S:g} s."
     found = [
         f"{value.name} = {value.value:.3g} {value.unit}"
-        for value in richer.values
+        for value in tried.values
         if value.accepted and value.value and value.name.partition(".")[0] in TRIED
     ]
-    if better(richer, plain):
+    wins = better(tried, plain)
+    if wins:
         note = (
             f"More is explained by what plain MuJoCo has no feature for, {', '.join(found)}. {errors} These effects act in "
-            f"openant_env, beside their own model alone; both are in {out / WITH_EFFECTS}, and with --robot they are the robot's."
+            f"openant_env, beside their own model alone; both are in {WITH_EFFECTS}, and with --robot they are the robot's."
         )
     else:
         note = f"{errors} What plain MuJoCo has no feature for ({', '.join(TRIED)}) does not pay here: the plain model is the best."
-    return replace(plain, notes=(*plain.notes, note))
+    return replace(plain, notes=(*plain.notes, note), with_effects=tried if wins else None)
 
 
 def _rad(error: float) -> str:

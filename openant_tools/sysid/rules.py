@@ -26,7 +26,7 @@ from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE, RAD_S_PER_COU
 from openant_tools.sysid.kinds import KINDS, torque_limit
 from openant_tools.sysid.quality import without_errors
 
-__all__ = ["RULES", "Finding", "Rule", "Verdict", "check_runs", "findings", "without_turns"]
+__all__ = ["RULES", "Finding", "Rule", "Verdict", "check_runs", "findings", "with_rows", "without_turns"]
 
 Array = NDArray[np.float64]
 Found = Iterator[tuple[str, str]]
@@ -198,6 +198,20 @@ def check_runs(
             if tell:
                 tell(said[-1])
     return tuple(said)
+
+
+def with_rows(runs: Sequence[Run]) -> tuple[list[Run], tuple[str, ...]]:
+    """The runs of more than one row, and a line for each that is left out.
+
+    Raises:
+        BadInput: there are runs, and none has more.
+    """
+    remedy = "export all rows of the run"
+    single = [run.path or run.name for run in runs if len(run.t) < 2]
+    if single and len(single) == len(runs):
+        raise BadInput("it has one row: nothing can be seen to move", where=single[0], remedy=remedy)
+    said = tuple(str(BadInput("it has one row and is left out", where=where, remedy=remedy)) for where in single)
+    return [run for run in runs if len(run.t) > 1], said
 
 
 def without_turns(run: Run, joints: Sequence[str]) -> Run:

@@ -1,4 +1,4 @@
-"""What a residual is divided by: how far each stretch of each run is trusted (fit.py says why)."""
+"""What a residual is divided by: how far each stretch of each run is trusted (problem.py says why)."""
 
 from __future__ import annotations
 
