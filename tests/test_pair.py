@@ -89,8 +89,8 @@ def test_each_pair_measures_as_its_fit_says_and_neither_file_goes_with_the_other
     write_table(runs[1], log)
     beside = written / "with-effects"
     told = json.loads((written / "fit.json").read_text())["pairs"]
-    assert told["wins"] == "with effects"
-    assert told["with effects"]["model"] == "with-effects/calibrated.xml"
+    assert told["wins"] == "with_effects"
+    assert told["with_effects"]["model"] == "with-effects/calibrated.xml"
 
     def gap(*words: object) -> float:
         asked = ("gap", "measure", log, *words, "--horizon", "full", "--json", tmp_path / "gap.json")
@@ -101,7 +101,7 @@ def test_each_pair_measures_as_its_fit_says_and_neither_file_goes_with_the_other
     plain = gap("--model", written / "calibrated.xml")
     rich = gap("--model", beside / "calibrated.xml", "--effects", effects)
     assert plain == pytest.approx(told["plain"]["gap_full_rad"], rel=0.02)
-    assert rich == pytest.approx(told["with effects"]["gap_full_rad"], rel=0.02)
+    assert rich == pytest.approx(told["with_effects"]["gap_full_rad"], rel=0.02)
     assert rich < 0.5 * plain
     assert json.loads((tmp_path / "gap.json").read_text())["effects"][0]["effect"] == "load_friction"
     assert "was fitted with effects" not in capsys.readouterr().err

@@ -133,9 +133,9 @@ def pairs(plain: Identification, richer: Identification) -> dict[str, Any]:
         return {"model": f"{folder}{_models(result)[0]}", **effects, **figures}
 
     return {
-        "wins": "with effects",
+        "wins": "with_effects",
         "plain": one(plain, ""),
-        "with effects": one(richer, f"{WITH_EFFECTS}/"),
+        "with_effects": one(richer, f"{WITH_EFFECTS}/"),
     }
 
 
