@@ -293,3 +293,8 @@ def test_the_gap_check_judges_the_robots_model_with_what_acts_beside_it(ant: Rob
     # The model itself is the nominal one: what closes the gap is the friction beside it.
     assert figures["position gap, calibrated"] < 0.3 * figures["position gap, nominal"]
     assert found.data["measure"]["effects"][0]["effect"] == "load_friction"
+    # From Python, too, where the robot's folder is named; beside another model they do not act.
+    recorded = sysid.load(ant.recordings / "held-out")
+    assert sysid.judge(recorded, robot=ant.path).gap.horizon == pytest.approx(figures["position gap, calibrated"])
+    other = sysid.judge(recorded, ant.path / "nominal.xml", robot=ant.path)
+    assert other.gap.horizon == pytest.approx(figures["position gap, nominal"])
