@@ -104,7 +104,8 @@ def stating_both(plain: Identification, tried: Identification) -> Identification
         )
     else:
         note = f"{errors} What plain MuJoCo has no feature for ({', '.join(TRIED)}) does not pay here: the plain model is the best."
-    return replace(plain, notes=(*plain.notes, note), with_effects=tried if wins else None)
+    winner = replace(tried, notes=(*tried.notes, errors)) if wins else None
+    return replace(plain, notes=(*plain.notes, note), with_effects=winner)
 
 
 def _rad(error: float) -> str:
