@@ -60,7 +60,7 @@ def check_pair(
     """
     others = strangers(entries, model)
     if others:
-        raise BadInput(stranger_words(others, path), where=where, remedy=OTHER_REMEDY)
+        raise BadInput(stranger_words(others, path), where=where or "robot.toml, [[effect]]", remedy=OTHER_REMEDY)
     own, active = mark_of(model), [entry for entry in entries if entry.enabled]
     by_hand = dict.fromkeys(entry.effect for entry in active if entry.pair is None and entry.effect in catalogue())
     if own == PLAIN and by_hand:
