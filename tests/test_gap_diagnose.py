@@ -48,6 +48,12 @@ def recorded(text: str, late_s: float = 0.0) -> list[Run]:
     return runs
 
 
+@pytest.fixture(scope="module")
+def late(model: Path) -> Diagnosis:
+    """The diagnosis of the robot whose commands come late."""
+    return diagnose(recorded(pendulum(), late_s=0.04), model, robots=ROBOTS)
+
+
 def test_a_robot_within_tolerance_is_healthy(model: Path) -> None:
     found = diagnose(
         recorded(pendulum(joint='damping="0.128" armature="0.0063" frictionloss="0.035"')), model, robots=ROBOTS
@@ -68,8 +74,8 @@ def test_a_healthy_robot_that_warmed_up_is_answered_without_fits(model: Path) ->
     assert all(one.gap_closed is None for one in found.effects)
 
 
-def test_late_commands_are_named_and_close_the_gap(model: Path) -> None:
-    found = diagnose(recorded(pendulum(), late_s=0.04), model, robots=ROBOTS)
+def test_late_commands_are_named_and_close_the_gap(late: Diagnosis) -> None:
+    found = late
     # On positions alone a late command is a late sensor (effects.md).
     names = {found.effects[0].effect, found.effects[1].effect}
     assert names & {"action_delay", "sensor_delay"}
@@ -79,9 +85,9 @@ def test_late_commands_are_named_and_close_the_gap(model: Path) -> None:
     assert sum(place["share"] for place in found.where if place["signal"] == "pos") == pytest.approx(1, abs=0.01)
 
 
-def test_the_order_in_which_runs_are_named_does_not_matter(model: Path) -> None:
+def test_the_order_in_which_runs_are_named_does_not_matter(model: Path, late: Diagnosis) -> None:
     runs = recorded(pendulum(), late_s=0.04)
-    first, other = (diagnose(some, model, robots=ROBOTS) for some in (runs, [runs[2], runs[0], runs[1]]))
+    first, other = late, diagnose([runs[2], runs[0], runs[1]], model, robots=ROBOTS)
     for one, same in zip(first.effects, other.effects, strict=True):
         assert same.effect == one.effect
         assert same.probability == pytest.approx(one.probability, abs=1e-6)
