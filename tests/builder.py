@@ -29,6 +29,11 @@ from openant_tools.virtual.scenario import parse_scenario
 from openant_tools.virtual.server import Server
 from openant_tools.virtual.start import assemble
 
+#: of a scenario: pictures small enough that a test need not wait for them
+SMALL_PICTURES = "[camera]\nwidth = 640\nheight = 480\nfps = 15\n"
+#: of a scenario: servos that rub enough for a calibration to be worth it, whatever noise there is
+RUBS = "[motor]\ncoulomb_nm = 0.09\n"
+
 
 class Builder:
     """Grants, takes defaults unless told otherwise, and remembers every word.

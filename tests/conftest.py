@@ -8,12 +8,28 @@ import pytest
 
 # Each worker has its share of the cores, and so have the processes that it starts: threads of matrix products that wait for
 # one another by spinning cost a fit five times its time where another worker has the other core. Read when numpy is
-# imported, which no plugin does before this.
+# imported, which no plugin does before this. Where its share is one core, joblib works in the worker itself.
 _WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if _WORKERS > 1:
-    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // _WORKERS)))
+    for _limit in ("OMP_NUM_THREADS", "LOKY_MAX_CPU_COUNT"):
+        os.environ.setdefault(_limit, str(max(1, (os.cpu_count() or 1) // _WORKERS)))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with what takes minutes, so that at the end no worker waits for another."""
     items.sort(key=lambda item: item.get_closest_marker("minutes") is None)
+
+
+@pytest.fixture
+def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody waits for hands here: readings while a virtual hand moves something end with its motion, motions are short."""
+    from openant_tools.bringup import comms_step, identification
+    from openant_tools.calib import arena, legs, motions
+    from openant_tools.thermal import step as thermal_step
+
+    monkeypatch.setattr(legs, "READ_S", 2.5)
+    monkeypatch.setattr(motions, "SECONDS", dict.fromkeys(motions.LIBRARY, 1.5))
+    monkeypatch.setattr(identification, "RECORD_S", 5.0)
+    monkeypatch.setattr(arena, "WIGGLE_S", 3.0)
+    monkeypatch.setattr(comms_step, "DEFAULT_MIN", 0.2)
+    monkeypatch.setattr(thermal_step, "DEFAULT_MIN", 1.0)

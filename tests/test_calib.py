@@ -642,9 +642,13 @@ def test_a_board_before_the_camera_gives_the_lens_in_the_arena_step(tmp_path, mo
     assert lens.source != "ChArUco board"
 
 
+#: pictures that a test need not wait for
+SMALL = {"width": 640, "height": 480, "fps": 15.0}
+
+
 @pytest.mark.slow
 def test_the_arena_is_measured_by_the_robot_itself(tmp_path):
-    with robot(tmp_path / "ant", sees=True, camera={"body": {"yaw": 0.3}}, imu=ST) as ant:
+    with robot(tmp_path / "ant", sees=True, camera={**SMALL, "body": {"yaw": 0.3}}, imu=ST) as ant:
         finding, _ = ant.do(arena(ant.bench))
         assert finding.ok, finding
         assert finding.data["centre_m"] == pytest.approx([0.75, -0.30], abs=0.02)
@@ -665,7 +669,7 @@ def test_the_arena_is_measured_by_the_robot_itself(tmp_path):
 
 @pytest.mark.slow
 def test_a_wrong_tag_size_is_named_with_what_it_really_is(tmp_path):
-    with robot(tmp_path / "ant", sees=True, camera={"body": {"size": 0.03}}) as ant:
+    with robot(tmp_path / "ant", sees=True, camera={**SMALL, "body": {"size": 0.03}}) as ant:
         finding, _ = ant.do(arena(ant.bench))
         assert not finding.ok
         assert (

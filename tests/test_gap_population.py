@@ -250,8 +250,8 @@ def test_the_cache_of_another_user_is_refused(tmp_path: Path, monkeypatch: pytes
 def test_a_judge_says_how_strange_robots_are(
     protocol: Protocol, prepare_few: Callable[[Protocol, int, list[Case]], Prepared]
 ) -> None:
-    bank = templates(protocol)[:160]
-    whole = prepare_few(protocol, 160, bank)
+    bank = templates(protocol)[:64]
+    whole = prepare_few(protocol, 128, bank)
     judge = train(whole, [0, 1], [np.ones(x.shape[1], bool) for x in whole.features])
     x = np.concatenate(whole.features, axis=1)
     energy = judge.energy(x)

@@ -21,6 +21,7 @@ from gymnasium.utils.env_checker import check_env
 from killing import FLOOR
 
 import openant_env  # noqa: F401
+from openant_env import hardware
 from openant_env.link import engine_rate
 from openant_tools.cli import main
 from openant_tools.comms.clock import VirtualControl
@@ -121,8 +122,9 @@ def on_the_floor(ready: Path, folder: RobotFolder) -> Iterator[Walker]:
 
 
 @pytest.fixture
-def walker(on_the_floor: Walker) -> Walker:
-    """Standing; one for all tests, since getting up takes the robot its time."""
+def walker(on_the_floor: Walker, monkeypatch: pytest.MonkeyPatch) -> Walker:
+    """Standing; one for all tests, since getting up takes the robot its time. The virtual hands come soon."""
+    monkeypatch.setattr(hardware, "HELP_S", 1.0)
     on_the_floor.env._patience_s = 20.0
     on_the_floor.env.resume()
     on_the_floor.env.reset(seed=0)

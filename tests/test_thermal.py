@@ -34,7 +34,7 @@ from openant_tools.robot.kit import KITS
 from openant_tools.robot.servo import servo_model
 from openant_tools.thermal.compare import against_paper, compare
 from openant_tools.thermal.finding import thermal_finding, torque_warning
-from openant_tools.thermal.fit import Known, fit, held_out
+from openant_tools.thermal.fit import Fit, Known, fit, held_out
 from openant_tools.thermal.forecast import (
     HORIZON_S,
     cool_down,
@@ -92,6 +92,12 @@ def motor(**more: float) -> dict[str, object]:
 def lite() -> Inputs:
     """The Lite under the paper's stress test, until a knee shuts down."""
     return inputs_of(stalled(**motor(case_air_k_w=18.0)))
+
+
+@pytest.fixture(scope="module")
+def whole(lite: Inputs) -> Fit:
+    """What all of that run tells."""
+    return fit([lite])
 
 
 # ---- thermometers ----
@@ -174,8 +180,8 @@ def test_a_goal_that_is_in_force_wakes_nobody() -> None:
 # ---- the fit ----
 
 
-def test_the_fit_knows_what_it_can_know(lite: Inputs) -> None:
-    found = fit([lite])
+def test_the_fit_knows_what_it_can_know(lite: Inputs, whole: Fit) -> None:
+    found = whole
     for joint in ("knee_fl", "knee_rr"):
         seen = found.estimate("case_j_k", joint)
         assert seen.low < 48.0 < seen.high
@@ -191,9 +197,9 @@ def test_the_fit_knows_what_it_can_know(lite: Inputs) -> None:
     assert held.within > 0.9
 
 
-def test_what_a_run_taught_is_believed_in_the_next(lite: Inputs) -> None:
+def test_what_a_run_taught_is_believed_in_the_next(lite: Inputs, whole: Fit) -> None:
     short = lite.until(300.0)
-    alone, taught = fit([short]), fit([short], after=fit([lite]).known)
+    alone, taught = fit([short]), fit([short], after=whole.known)
     name = ("air_w_k", "knee_fl")
     width = [fitted.estimate(*name).high / fitted.estimate(*name).low for fitted in (alone, taught)]
     assert width[1] < 0.7 * width[0]
@@ -311,32 +317,32 @@ def test_rules_that_cannot_be_name_their_place(table: object, words: str) -> Non
     assert derating_of({}) is None
 
 
-def test_after_a_shutdown_nobody_hurries(lite: Inputs) -> None:
-    found = fit([lite])
-    knee = cool_down(found, "knee_fl")
+def test_after_a_shutdown_nobody_hurries(whole: Fit) -> None:
+    knee = cool_down(whole, "knee_fl")
     assert knee.low >= 1200.0, "the maker's twenty minutes"
-    assert cool_down(found, "hip_fl").value == 0.0
+    assert cool_down(whole, "hip_fl").value == 0.0
 
 
-def test_sinks_and_the_paper_are_compared(lite: Inputs) -> None:
+def test_sinks_and_the_paper_are_compared(whole: Fit) -> None:
     finned = inputs_of(stalled(seconds=1800, **motor(case_air_k_w=8.0, case_j_k=60.0)))
-    differences = {one.joint: one for one in compare(fit([lite]), fit([finned]))}
+    with_sinks = fit([finned])
+    differences = {one.joint: one for one in compare(whole, with_sinks)}
     knee = differences["knee_fl"]
     assert knee.certain
     assert knee.difference_k.high < 0
-    same = compare(fit([lite]), fit([lite]), joints={"knee_fl": "knee_fr"})[0]
+    same = compare(whole, whole, joints={"knee_fl": "knee_fr"})[0]
     assert not same.certain
     assert same.joint == "knee_fl / knee_fr"
-    beside = against_paper(fit([lite]))
+    beside = against_paper(whole)
     assert "as the paper's, within the interval" in beside.words
     assert beside.later_s is not None
     assert beside.later_s.low < 0 < beside.later_s.high
     with pytest.raises(BadInput, match="has no joint 'knee'"):
-        compare(fit([lite]), fit([finned]), joints={"knee": "knee"})
+        compare(whole, with_sinks, joints={"knee": "knee"})
 
 
-def test_a_finding_says_it_all_and_the_table_warns_while_cold(lite: Inputs) -> None:
-    found = fit([lite])
+def test_a_finding_says_it_all_and_the_table_warns_while_cold(lite: Inputs, whole: Fit) -> None:
+    found = whole
     warning = torque_warning([("knee_fl", servo_model("XL430-W250-T"))], KITS["lite"], supply_v=11.1, pwm_limit=0.5)
     assert warning is not None
     assert "0.54 N·m on two legs and hold 0.28 N·m" in warning
