@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,12 +25,31 @@ from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINTS
 from openant_tools.virtual.process import virtual_robot
 
-__all__ = ["ELSEWHERE", "WAYS", "NotBegun", "Victim", "Way", "moving_commands", "torque_after_kill"]
+__all__ = [
+    "ELSEWHERE",
+    "OFF_S",
+    "WAYS",
+    "InLine",
+    "Late",
+    "NotBegun",
+    "Victim",
+    "Way",
+    "children",
+    "moving_commands",
+    "torque_after_kill",
+]
 
 
 class NotBegun(Exception):
     """The command ended before a process of it could be killed: a busy host lets watchdogs trip."""
 
+
+class Late(NotBegun):
+    """It took too long, and those who were to act stood in line for a processor for all that was too long: this tells nothing."""
+
+
+#: s, the issue's own bound
+OFF_S = 0.5
 
 Victim = Literal["command", "engine", "guardian", "guardian+engine"]
 #: s that a command may take to its first torque, on a machine that has much else to do
@@ -126,6 +145,9 @@ def torque_after_kill(name: str, victims: tuple[Victim, ...], folder: Path) -> d
     Returns:
         victim → s until torque was off everywhere, or until another guardian was there, less the time that this process
         was itself late.
+
+    Raises:
+        Late: it was not within `OFF_S`, but would have been if nobody had waited for a processor.
     """
     way = WAYS[name]
     scenario = folder / "scenario.toml"
@@ -165,6 +187,13 @@ def torque_after_kill(name: str, victims: tuple[Victim, ...], folder: Path) -> d
                 late += max(0.0, time.monotonic() - before - 0.006)
             return time.monotonic() - begin - late
 
+        def in_time(done: Callable[[], bool], actors: Sequence[int]) -> float:
+            waited = InLine([*actors, _serving(scenario)])
+            took = after(lambda: waited.look() or done(), 5.0)
+            if took > OFF_S >= took - waited.seconds:
+                raise Late(f"{name}: {took:.2f} s, of which processes waited {waited.seconds:.2f} s for a processor")
+            return took
+
         took: dict[Victim, float] = {}
         for victim in victims:
             after(torque, BEGIN_S)
@@ -186,10 +215,46 @@ def torque_after_kill(name: str, victims: tuple[Victim, ...], folder: Path) -> d
             pid = family[victim]
             os.kill(pid, signal.SIGKILL)
             if victim == "guardian":
-                took[victim] = after(partial(_replaced, command.pid, pid, torque), 5.0)
+                took[victim] = in_time(partial(_replaced, command.pid, pid, torque), [family["engine"]])
             else:
-                took[victim] = after(lambda: not torque(), 5.0)
+                took[victim] = in_time(lambda: not torque(), [family["engine"], family["guardian"]])
         return took
+
+
+class InLine:
+    """How long processes were ready to run and had no processor, since this was made; 0 where the system does not tell.
+
+    Attributes:
+        seconds: of all of them together, as of the last look.
+    """
+
+    def __init__(self, pids: Sequence[int]) -> None:
+        self._first = {pid: _in_line(pid) for pid in pids if pid}
+        self._last = dict(self._first)
+        self.seconds = 0.0
+
+    def look(self) -> None:
+        """Read it anew; of a process that has ended, what was read last stands."""
+        for pid, last in self._last.items():
+            self._last[pid] = max(last, _in_line(pid))
+        self.seconds = sum(last - self._first[pid] for pid, last in self._last.items())
+
+
+def _in_line(pid: int) -> float:
+    """s that the main thread of a process was ready to run and did not."""
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) * 1e-9
+    except (OSError, IndexError):
+        return 0.0
+
+
+def _serving(scenario: Path) -> int:
+    """The process of the virtual robot of this scenario, 0 if it is not found."""
+    for pid in children(os.getpid()):
+        with contextlib.suppress(OSError):
+            if str(scenario).encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
+                return pid
+    return 0
 
 
 #: rad/s of a joint that moves
@@ -227,14 +292,14 @@ def _family(pid: int) -> dict[Victim, int]:
     for role, parent, module in (
         ("engine", pid, "openant_tools.comms.engine"), ("guardian", 0, "guardian.py")
     ):  # fmt: skip
-        for child in _children(parent or family["engine"]):
+        for child in children(parent or family["engine"]):
             with contextlib.suppress(OSError):
                 if module in Path(f"/proc/{child}/cmdline").read_text():
                     family[role] = child  # type: ignore[index]
     return family
 
 
-def _children(pid: int) -> list[int]:
+def children(pid: int) -> list[int]:
     """Of all threads: a procedure may have started its engine in one of its own."""
     children = list[int]()
     for thread in Path(f"/proc/{pid}/task").glob("*/children"):

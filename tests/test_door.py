@@ -15,16 +15,13 @@ from pathlib import Path
 
 import click
 import pytest
-from killing import ELSEWHERE, WAYS, NotBegun, Victim, moving_commands, torque_after_kill
+from killing import ELSEWHERE, OFF_S, WAYS, InLine, NotBegun, Victim, children, moving_commands, torque_after_kill
 
 from openant_tools.cli.hardware import may_move
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.errors import BadInput
 from openant_tools.virtual.process import virtual_robot
-
-#: the issue's own bound
-OFF_S = 0.5
 
 
 def test_every_command_that_moves_says_how_it_is_begun_here() -> None:
@@ -48,7 +45,8 @@ def test_a_killed_process_of_any_command_that_moves_leaves_torque_off(tmp_path: 
 
     def kill(k: int, name: str) -> dict[Victim, float]:
         victims: tuple[Victim, ...] = ("guardian", "command" if k % 2 else "engine")
-        for tries in (1, 0):
+        # On a busy computer a watchdog may trip first, or those who are to act may stand in line: that tells nothing.
+        for tries in (2, 1, 0):
             folder = tmp_path / f"{name.replace(' ', '-')}-{tries}"
             folder.mkdir()
             try:
@@ -103,31 +101,63 @@ def test_suspension_and_a_lost_terminal_end_motion_first(tmp_path: Path) -> None
         ready = tmp_path / "ready.json"
         ready.write_text(json.dumps(dict(found)))
 
-        def until(done: Callable[[], bool], patience_s: float = 60.0) -> None:
-            give_up = time.monotonic() + patience_s
-            while not done():
-                assert time.monotonic() < give_up
-                time.sleep(0.01)
-
         def torque() -> bool:
             return any(control.ask("state")["torque_enable"].values())
 
-        def holding() -> subprocess.Popen[bytes]:
-            words = [sys.executable, "-c", HOLDING, "hold", str(found["bus"]), str(ready)]
-            process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-            until(torque)
-            return process
+        class Busy(Exception):
+            """This computer was too busy to tell."""
 
-        for number in (signal.SIGTSTP, signal.SIGSTOP):
-            suspended = holding()
-            os.kill(suspended.pid, number)
-            until(lambda: not torque(), 2.0)
-            os.kill(suspended.pid, signal.SIGCONT)
-            assert suspended.wait(30.0) in (130, 1, 2), "it does not go on when it comes back"
-            assert not torque()
-        unread = holding()
-        assert unread.stdout is not None
-        unread.stdout.close()
-        until(lambda: not torque(), 2.0)
-        assert unread.wait(30.0) == 130
+        def tried(end: Callable[[subprocess.Popen[bytes]], None], codes: tuple[int, ...]) -> None:
+            """Begin to hold, end it so, and see that torque goes off within two seconds."""
+            log = tmp_path / "log"
+            words = [sys.executable, "-c", HOLDING, "hold", str(found["bus"]), str(ready)]
+            with log.open("wb") as err, subprocess.Popen(words, stdout=subprocess.PIPE, stderr=err) as process:
+                try:
+                    give_up = time.monotonic() + 60.0
+                    while not torque():
+                        if process.poll() is not None and b"this computer was late" in log.read_bytes():
+                            raise Busy
+                        assert process.poll() is None, log.read_text()
+                        assert time.monotonic() < give_up
+                        time.sleep(0.01)
+                    waited = InLine([*children(process.pid), *children(os.getpid())])
+                    begin = time.monotonic()
+                    end(process)
+                    while torque():
+                        took = time.monotonic() - begin
+                        waited.look()
+                        if took > 2.0 + waited.seconds:
+                            raise AssertionError(f"torque is on after {took:.2f} s")
+                        time.sleep(0.01)
+                    if time.monotonic() - begin > 2.0:
+                        raise Busy
+                    os.kill(process.pid, signal.SIGCONT)
+                    code = process.wait(30.0)
+                    if code not in codes and b"this computer was late" in log.read_bytes():
+                        raise Busy
+                    assert code in codes, log.read_text()
+                    assert not torque()
+                finally:
+                    process.kill()
+
+        def unread(process: subprocess.Popen[bytes]) -> None:
+            assert process.stdout is not None
+            process.stdout.close()
+
+        def suspended(number: int) -> Callable[[subprocess.Popen[bytes]], None]:
+            return lambda process: os.kill(process.pid, number)
+
+        for end, codes in (
+            (suspended(signal.SIGTSTP), (130, 1, 2)),  # it does not go on when it comes back
+            (suspended(signal.SIGSTOP), (130, 1, 2)),
+            (unread, (130,)),
+        ):
+            for _ in range(3):
+                try:
+                    tried(end, codes)
+                    break
+                except Busy:
+                    continue
+            else:
+                pytest.fail("this computer is too busy to tell")
         control.close()
