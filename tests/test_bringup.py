@@ -9,12 +9,13 @@ import time
 from pathlib import Path
 
 import pytest
-from builder import robot
+from builder import RUBS, SMALL_PICTURES, robot
 
 from openant_tools.bringup.passport import write_passport
 from openant_tools.bringup.relay import relayed
 from openant_tools.bringup.virtual_box import virtual_box
 from openant_tools.bringup.walk import WALK, do, standing, step, walk
+from openant_tools.cli import main
 from openant_tools.cli.calib import calib
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.errors import BadInput, HardwareFault
@@ -287,10 +288,13 @@ def test_a_virtual_robot_does_not_outlive_who_started_it(tmp_path):
 
 @pytest.mark.minutes
 @pytest.mark.timeout(1800)
-def test_from_loose_motors_to_a_passport_and_on_to_learning(tmp_path):
-    ant, report = tmp_path / "ant", tmp_path / "walk.json"
-    result = openant("bringup", "--virtual", "--robot", ant, "--yes", "--json", report)
-    assert result.returncode == 0, result.stdout + result.stderr[-2000:]
+def test_from_loose_motors_to_a_passport_and_on_to_learning(tmp_path, brisk, capfd):
+    ant, report, box = tmp_path / "ant", tmp_path / "walk.json", tmp_path / "box.toml"
+    box.write_text(f'[robot]\nsetup = "loose"\n{SMALL_PICTURES}{RUBS}')
+    # In this process, where motions can be short.
+    with pytest.raises(SystemExit) as end:
+        main(["bringup", "--virtual", str(box), "--robot", str(ant), "--yes", "--json", str(report)])
+    assert end.value.code == 0, "".join(capfd.readouterr())[-4000:]
     walked = json.loads(report.read_text())
     assert walked["ok"]
     assert {now["state"] for now in walked["steps"].values()} == {"ok"}
@@ -305,7 +309,7 @@ def test_from_loose_motors_to_a_passport_and_on_to_learning(tmp_path):
     assert "1/15" not in again.stdout  # what stands is not done again
     pytest.importorskip("torch")
     # On the bus a step takes the bus's time: enough of them to see that it walks, records and learns from this folder.
-    runs = {"sim": ("--steps", "2000"), "virtual": ("--steps", "40", "--env", "hardware", "--virtual", "--yes")}
+    runs = {"sim": ("--steps", "1000"), "virtual": ("--steps", "20", "--env", "hardware", "--virtual", "--yes")}
     for run, how in runs.items():
         trained = openant("train", "sac", "--robot", ant, *how, "--out", ant / "runs" / run)
         assert trained.returncode == 0, trained.stderr[-2000:]

@@ -37,7 +37,7 @@ def recorded(text: str, late_s: float = 0.0) -> list[Run]:
     robot.opt.timestep = 0.0005
     runs = []
     for k, (reach, fast) in enumerate([(0.6, 2.5), (0.9, 1.5), (0.35, 3.5)]):
-        t = 3.0 + np.arange(4 * RATE_HZ) / RATE_HZ
+        t = 3.0 + np.arange(3 * RATE_HZ) / RATE_HZ
         command = sweep(t, 1, reach=reach, high_hz=fast)
         # Late by whole rows: what acts is an older command than what is logged.
         rows = round(late_s * RATE_HZ)

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from builder import RUBS, SMALL_PICTURES
 from walker import AGAIN, BY_ITSELF, Reply, Walker
 
-from openant_tools.bringup import identification
 from openant_tools.bringup.walk import WALK, standing
-from openant_tools.calib import arena, legs, motions
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.procedure.journal import Journal
 from openant_tools.robot.folder import RobotFolder, create_robot
@@ -25,8 +24,6 @@ from openant_tools.tui.screens.walk import WalkScreen
 from openant_tools.virtual.process import virtual_robot
 
 WIDE = (120, 40)
-#: pictures small enough that a test need not wait for them
-CAMERA = "[camera]\nwidth = 640\nheight = 480\nfps = 15\n"
 BLIND = "[camera]\npresent = false\n"
 
 
@@ -102,15 +99,6 @@ def steps(*names: str) -> Callable[[Walker], Awaitable[None]]:
             await walker.choose("Back to the walk")
 
     return walk
-
-
-@pytest.fixture
-def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody waits for hands here: readings while a virtual hand moves something end with its motion, motions are short."""
-    monkeypatch.setattr(legs, "READ_S", 2.5)
-    monkeypatch.setattr(motions, "SECONDS", dict.fromkeys(motions.LIBRARY, 1.5))
-    monkeypatch.setattr(identification, "RECORD_S", 5.0)
-    monkeypatch.setattr(arena, "WIGGLE_S", 3.0)
 
 
 # ---- mistakes at the bench ---------------------------------------------------------------------------------------------
@@ -259,7 +247,7 @@ setup = "stand"
 [imu]
 mount_rpy = [0.0, 0.0, {math.pi / 2}]
 acc_scale = [1.15, 1.15, 1.15]
-{CAMERA}
+{SMALL_PICTURES}
 [camera.body]
 size = 0.03
 """
@@ -278,8 +266,6 @@ size = 0.03
 @pytest.mark.timeout(1800)
 def test_the_whole_walk_by_its_screens_from_loose_motors_to_the_passport(tmp_path: Path, brisk: None) -> None:
     said = dict[str, str]()
-    #: servos that rub enough for a calibration to be worth it, whatever noise there is
-    rubs = "[motor]\ncoulomb_nm = 0.09\n"
 
     async def walk(walker: Walker) -> None:
         said["connect"] = await walker.do("connect")
@@ -287,7 +273,7 @@ def test_the_whole_walk_by_its_screens_from_loose_motors_to_the_passport(tmp_pat
             await walker.choose(f"Next: {WALK[name].title}")
             said[name] = await walker.begin()
 
-    with robot(tmp_path, f'[robot]\nsetup = "loose"\n{CAMERA}{rubs}') as ant:
+    with robot(tmp_path, f'[robot]\nsetup = "loose"\n{SMALL_PICTURES}{RUBS}') as ant:
         ant.walk(walk, {"while the legs swing. For how long?": "0.2", "Soak for how long?": "1"})
         states = {name: now.state for name, now in standing(ant.folder).items()}
         failed = [name for name, state in states.items() if state != "ok"]

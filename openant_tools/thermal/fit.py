@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -208,6 +208,8 @@ class Fit:
     residual_k: Array
     _points: _Points
     _residual: Array
+    #: drawn once, since each draw is a simulation of the whole run; nobody changes what was drawn
+    _drawn: dict[tuple[int, int], Variants] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     @property
     def known(self) -> Known:
@@ -244,6 +246,11 @@ class Fit:
 
     def variants(self, count: int, seed: int = 0) -> Variants:
         """Draws from what is believed after the run; the first is the best estimate itself."""
+        if (count, seed) not in self._drawn:
+            self._drawn[count, seed] = self._draw(count, seed)
+        return self._drawn[count, seed]
+
+    def _draw(self, count: int, seed: int) -> Variants:
         random = np.random.default_rng(seed)
         root = _root(self.covariance)
         theta = self.theta + random.standard_normal((count, len(self.theta))) @ root.T
