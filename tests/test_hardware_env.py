@@ -427,17 +427,17 @@ def test_sac_learns_on_the_robot_beside_acting_with_a_cable_that_comes_off_in_th
             return super().reset(**options)
 
     small = Settings(learning_start=5, batch=8, hidden=8)
-    done = train_beside(Tripping(walker.env), folder=tmp_path, steps=24, seed=0, settings=small)
-    assert done.step == 24
+    done = train_beside(Tripping(walker.env), folder=tmp_path, steps=18, seed=0, settings=small)
+    assert done.step == 18
     assert done.updates is not None
     # What it then learns in a dozen steps may well throw it on its back, where the camera loses it.
     tripped, *later = read_interventions(tmp_path)
     assert "hip_rl" in tripped.reason
     assert all("hip_rl" not in one.reason for one in later)
     assert 8 <= tripped.step <= 14
-    rows = np.fromfile(tmp_path / "transitions.f32", np.float32).reshape(24, -1)
+    rows = np.fromfile(tmp_path / "transitions.f32", np.float32).reshape(18, -1)
     assert np.isfinite(rows).all()
-    assert rows[:, 33] == pytest.approx(np.full(24, 0.12), abs=0.03)
+    assert rows[:, 33] == pytest.approx(np.full(18, 0.12), abs=0.03)
 
 
 def test_what_walks_is_recorded_and_the_gap_reads_it(scenario: Path, folder: RobotFolder, tmp_path: Path) -> None:
