@@ -667,17 +667,6 @@ def test_the_arena_is_measured_by_the_robot_itself(tmp_path):
         assert recorded.run.facts.extra["imu"]["gyro_counts_per_dps"] == pytest.approx(16.384)
 
 
-@pytest.mark.slow
-def test_a_wrong_tag_size_is_named_with_what_it_really_is(tmp_path):
-    with robot(tmp_path / "ant", sees=True, camera={**SMALL, "body": {"size": 0.03}}) as ant:
-        finding, _ = ant.do(arena(ant.bench))
-        assert not finding.ok
-        assert (
-            "the body's tag is declared 45 mm, but everything fits only if its edge is about 30 mm"
-            in finding.problems[0]
-        )
-
-
 # ---- bus health -------------------------------------------------------------------------------------------------------
 
 

@@ -256,7 +256,8 @@ size = 0.03
         assert "the board is mounted rotated by 90° about z (up)" in said
         assert "IMU scale: |acc| at rest is 11.28 m/s² instead of 9.81" in said
         assert ant.folder.config().imu.acc_counts_per_g == 0.0, "nothing was written"
-        assert "tag is declared 45 mm, but everything fits only if its edge is about 30 mm" in said
+        assert "the body's tag is declared 45 mm, but everything fits only if its edge is about 30 mm" in said
+        assert standing(ant.folder)["arena"].state == "failed"
 
 
 # ---- the whole walk ------------------------------------------------------------------------------------------------------
