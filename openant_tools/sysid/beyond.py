@@ -55,7 +55,9 @@ def with_effects(
 
     Args:
         plain: what `identify` made of the same runs with the same arguments.
-        runs, hold_out, also, tie, declared, measured_supply, effects, progress: as `identify` took them.
+        runs, hold_out, also, tie, declared, effects, progress: as `identify` took them.
+        measured_supply: as well; where it was not asked for, gains and torque limits follow what was logged if that explains
+            the fitted runs better. (A plain model has to do without: a simulation knows no voltage.)
     """
     acting = {name for name, _ in plain.effects}
     tried = [kind for kind in TRIED if kind not in also and (KINDS[kind].effect or ("",))[0] not in acting]
@@ -69,7 +71,7 @@ def with_effects(
         also=[*also, *tried],
         tie=tie,
         declared=declared,
-        measured_supply=measured_supply,
+        measured_supply=measured_supply or None,
         effects=effects,
         checked=plain.checked,
         progress=progress,

@@ -13,7 +13,7 @@ from openant_tools.sysid.parameter import Parameter
 from openant_tools.sysid.solve import Descent, Prior
 from openant_tools.sysid.weights import Weighing
 
-__all__ = ["CONFLICT", "Estimate", "estimate"]
+__all__ = ["CONFLICT", "Estimate", "Posterior", "estimate", "posterior"]
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -25,17 +25,51 @@ RICHARDSON = 0.5
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """Where a fit ended.
+class Posterior:
+    """Where a fit ended, and what may lie about it.
+
+    Attributes:
+        u: (parameters,) in prior deviations.
+        covariance: (parameters, parameters) of u, the prior included.
+        centre: (parameters,) the middle of the prior.
+        low, high: (parameters,) the physical bounds of u.
+    """
+
+    u: Array
+    covariance: Array
+    centre: Array
+    low: Array
+    high: Array
+
+    def with_given(self, back: Bools) -> Array:
+        """u given that the parameters in `back` are at the given model's values (0), to first order.
+
+        The mean of a normal posterior, conditioned: u_k − Σ_kb Σ_bb⁻¹ u_b.
+        """
+        u = self.u.copy()
+        if back.any():
+            cross = self.covariance[np.ix_(~back, back)]
+            within = self.covariance[np.ix_(back, back)]
+            u[~back] -= cross @ np.linalg.solve(within, u[back])
+            u[back] = 0.0
+            u[~back] = np.clip(u, self.low, self.high)[~back]
+        return u
+
+
+def posterior(found: Descent, weighing: Weighing, prior: Prior) -> Posterior:
+    """To first order, where a descent ended."""
+    precision, _ = found.tangent.normal(found.point, weighing(found.point).each, prior)
+    return Posterior(found.point.u, np.linalg.inv(precision), prior.centre, prior.low, prior.high)
+
+
+@dataclass(frozen=True)
+class Estimate(Posterior):
+    """What is known where a fit ended, with all that no residual can show in its covariance.
 
     Attributes:
         parameters: what was estimated.
-        u: (parameters,) in prior deviations.
-        covariance: (parameters, parameters) of u, the prior included.
         step_shift: (parameters,) of u, by which a model with an infinitely small time step would be fitted otherwise.
         precision: (parameters, parameters) of u, what the data alone say.
-        centre: (parameters,) the middle of the prior.
-        low, high: (parameters,) the physical bounds of u.
         information: (parameters,) share of each parameter's posterior precision that the data gave: 0 prior only, 1 data.
         halves: (2, parameters) of u, what each half of the data alone would say (to first order); NaN where there is one.
         contradictory: (parameters,) whether the two halves differ by more than chance.
@@ -45,16 +79,12 @@ class Estimate:
         correlation_s: (joints,) s, integrated autocorrelation time of the residual.
         stamp_error_s: s, standard deviation by which the rows' time stamps miss the moments of sampling, row by row.
         converged: whether the optimiser met its tolerances.
+        score: nats, −log posterior: compares fits of the same parameters to the same runs; less is better.
     """
 
     parameters: tuple[Parameter, ...]
-    u: Array
-    covariance: Array
     step_shift: Array
     precision: Array
-    centre: Array
-    low: Array
-    high: Array
     information: Array
     halves: Array
     contradictory: Bools
@@ -64,10 +94,11 @@ class Estimate:
     correlation_s: Array
     stamp_error_s: float
     converged: bool
+    score: float
     evaluations: int
 
 
-def estimate(found: Descent, model: ForwardModel, weighing: Weighing, prior: Prior) -> Estimate:
+def estimate(found: Descent, model: ForwardModel, weighing: Weighing, prior: Prior, score: float) -> Estimate:
     """What is known where a descent ended."""
     point, tangent, u = found.point, found.tangent, found.point.u
     weights = weighing(point)
@@ -104,5 +135,6 @@ def estimate(found: Descent, model: ForwardModel, weighing: Weighing, prior: Pri
         correlation_s=weights.correlation_s,
         stamp_error_s=weights.stamp_error_s,
         converged=found.converged,
+        score=score,
         evaluations=model.evaluations,
     )

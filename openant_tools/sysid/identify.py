@@ -29,7 +29,7 @@ from openant_tools.recording.run import Run
 from openant_tools.robot.config import Effect as Entry
 from openant_tools.sysid.dataset import Dataset, gaps, sensor_floor
 from openant_tools.sysid.declared import Declaration, declared_parameters
-from openant_tools.sysid.estimate import Estimate
+from openant_tools.sysid.estimate import Estimate, Posterior
 from openant_tools.sysid.kinds import ACTUATOR_LAG, SPEED_LIMIT
 from openant_tools.sysid.parameter import (
     ACTION_DELAY,
@@ -268,7 +268,7 @@ def identify(
     also: Sequence[str] = (),
     tie: str = "joint",
     declared: Declaration | None = None,
-    measured_supply: bool = False,
+    measured_supply: bool | None = False,
     effects: Sequence[Entry] = (),
     checked: Sequence[str] | None = None,
     progress: Progress | None = None,
@@ -284,7 +284,8 @@ def identify(
         also: keys of KINDS besides the default ones.
         tie: `joint` (each its own values), `servo` (one value for all joints of a servo model) or `all`.
         declared: parameters that a user declared, fitted besides.
-        measured_supply: gains and torque limits follow the voltage that the runs logged, in the given model too.
+        measured_supply: gains and torque limits follow the voltage that the runs logged, in the given model too; None: if that
+            explains the fitted runs better.
         effects: `[[effect]]` entries that the robot has: those that act between steps act in every simulation as they are,
             unless they are fitted themselves.
         checked: what `check_runs` noted of all these runs, where they have gone through it before; default they do now.
@@ -309,7 +310,8 @@ def identify(
     wanted = _applicable(declared.kinds if kinds is None and declared else kinds, floored, everything)
     if also:
         wanted = _applicable([*wanted, *also], floored, everything)
-    if measured_supply and not any(run.facts.supply_v and run.has("volt", [joints[0]]) for run in everything):
+    logged = any(run.facts.supply_v and run.has("volt", [joints[0]]) for run in everything)
+    if measured_supply and not logged:
         raise BadInput(
             "no run has both a logged voltage (volt.*) and its nominal supply (supply_v)",
             remedy="leave --measured-supply out, or say supply_v in the run's facts",
@@ -318,8 +320,8 @@ def identify(
     played = _played(effects, wanted)
     acting = values_of(played, joints)
 
-    def datasets(of: Sequence[Run]) -> list[Dataset]:
-        return _datasets(of, model, joints, wanted, measured_supply, acting)
+    def datasets(of: Sequence[Run], supply: bool = bool(measured_supply)) -> list[Dataset]:
+        return _datasets(of, model, joints, wanted, supply, acting)
 
     data, judged = datasets(runs), datasets(hold_out)
     for one in (*data, *judged):
@@ -336,30 +338,37 @@ def identify(
     chosen += declared_parameters(plant, declared) if declared else []
     floor = np.maximum(sensor_floor(runs, joints), 1e-6)
 
-    problem = Problem(data, chosen, floor)
-    folds = [] if hold_out else _folds(runs)
-    total = 2 + len(folds)  # the fit, one of each fold, and judging them
-
     def share(part: int) -> Progress | None:
-        return progress and (lambda what, done: progress(what, (part + done) / total))
+        return progress and (lambda what, done: progress(what, (part + done) / 3))
 
+    problem = Problem(data, chosen, floor)
     estimate = problem.solve(progress=share(0))
-    trials: list[tuple[Estimate, list[Dataset]]]
-    if hold_out:
-        trials = [(estimate, judged)]
-    else:
-        trials = []
-        for k, (train, test) in enumerate(folds):
-            fold = Problem(datasets(train), chosen, floor, freed=problem.freed)
-            # Where all runs lead is near where most of them do; that it is only the start says nothing of the run left out.
-            trials.append((fold.solve(estimate.u, progress=share(1 + k)), datasets(test)))
+    if measured_supply is None and logged:
+        following = Problem(datasets(runs, True), chosen, floor)
+        other = following.solve(estimate.u, progress=share(0))
+        measured_supply = other.score < estimate.score
+        if measured_supply:
+            problem, estimate = following, other
+            data, judged = list(following.datasets), datasets(hold_out, True)
+    trials: list[tuple[Posterior, list[Dataset]]] = [(estimate, judged)]
+    tests: list[Run] = []
+    if not hold_out:
+        parts, folds = _folds(runs)
+        whole = (
+            problem
+            if len(parts) == len(runs)
+            else Problem(datasets(parts, bool(measured_supply)), chosen, floor, freed=problem.freed)
+        )
+        # Where all runs lead is near where most of them do; that it is only the start says nothing of the run left out.
+        posteriors = whole.solve_without(folds, estimate.u, share(1))
+        trials = [(one, datasets(test, bool(measured_supply))) for one, test in zip(posteriors, folds, strict=True)]
+        tests = [run for test in folds for run in test]
 
     untied = verdicts(estimate, np.ones(len(chosen), bool))
     undetermined = np.array([verdict.word == "not in the data" for verdict in untied], bool)
-    kept, before, after = _judge(trials, chosen, undetermined, share(total - 1))
-    u = np.where(kept, _conditional(estimate, ~kept), 0.0)
+    kept, before, after = _judge(trials, chosen, undetermined, share(2))
+    u = np.where(kept, estimate.with_given(~kept), 0.0)
     u[undetermined & kept] = problem.centre[undetermined & kept]
-    tests = [run for _, test in folds for run in test]
     found = verdicts(estimate, kept)
     values = tuple(
         _value(p, next(one.plant for one in data if p.belongs(one.plant)), estimate, k, found[k], float(u[k]))
@@ -496,46 +505,29 @@ def _applicable(kinds: Sequence[str] | None, plant: Plant, runs: Sequence[Run]) 
     return out
 
 
-def _folds(runs: Sequence[Run]) -> list[tuple[list[Run], list[Run]]]:
-    """Leave out in turn: each motion with its repeats, or where there are many a share of them; a single run is cut in three
-    and loses a third at a time."""
+def _folds(runs: Sequence[Run]) -> tuple[list[Run], list[list[Run]]]:
+    """What to leave out in turn: each motion with its repeats, or where there are many a share of them; a single motion is cut
+    in three and loses a third at a time.
+
+    Returns:
+        all runs, or the parts that they were cut into; and those to leave out, turn by turn.
+    """
     names = {run.name: run.facts.repeat_of or run.name for run in runs}
     motions = list(dict.fromkeys(names.values()))
     if len(motions) > 1:
         fold = {motion: k % MOST_FOLDS for k, motion in enumerate(motions)}
-        return [
-            ([run for run in runs if fold[names[run.name]] != k], [run for run in runs if fold[names[run.name]] == k])
-            for k in range(min(MOST_FOLDS, len(motions)))
-        ]
-    folds = []
-    for k in range(3):
-        train, test = [], []
-        for run in runs:
-            edges = np.linspace(run.t[0], run.t[-1] + 1e-9, 4)
-            parts = [replace(run.between(edges[i], edges[i + 1]), name=f"{run.name}[{i + 1}/3]") for i in range(3)]
-            test.append(parts[k])
-            train += [part for i, part in enumerate(parts) if i != k]
-        folds.append((train, test))
-    return folds
-
-
-def _conditional(estimate: Estimate, back: NDArray[np.bool_]) -> Array:
-    """The estimate's u given that the parameters in `back` are at the given model's values (0), to first order.
-
-    The mean of a normal posterior, conditioned: u_k − Σ_kb Σ_bb⁻¹ u_b.
-    """
-    u = estimate.u.copy()
-    if back.any():
-        cross = estimate.covariance[np.ix_(~back, back)]
-        within = estimate.covariance[np.ix_(back, back)]
-        u[~back] -= cross @ np.linalg.solve(within, u[back])
-        u[back] = 0.0
-        u[~back] = np.clip(u, estimate.low, estimate.high)[~back]
-    return u
+        turns = range(min(MOST_FOLDS, len(motions)))
+        return list(runs), [[run for run in runs if fold[names[run.name]] == k] for k in turns]
+    folds: list[list[Run]] = [[], [], []]
+    for run in runs:
+        edges = np.linspace(run.t[0], run.t[-1] + 1e-9, 4)
+        for k, fold_k in enumerate(folds):
+            fold_k.append(replace(run.between(edges[k], edges[k + 1]), name=f"{run.name}[{k + 1}/3]"))
+    return [run for fold_k in folds for run in fold_k], folds
 
 
 def _judge(
-    trials: Sequence[tuple[Estimate, Sequence[Dataset]]],
+    trials: Sequence[tuple[Posterior, Sequence[Dataset]]],
     parameters: Sequence[Parameter],
     undetermined: NDArray[np.bool_],
     progress: Progress | None = None,
@@ -587,7 +579,7 @@ def _score(figure: Gap, before: Gap) -> float:
 
 
 def _pooled(
-    trials: Sequence[tuple[Estimate, Sequence[Dataset]]],
+    trials: Sequence[tuple[Posterior, Sequence[Dataset]]],
     parameters: Sequence[Parameter],
     options: Sequence[NDArray[np.bool_]],
     undetermined: NDArray[np.bool_],
@@ -595,11 +587,10 @@ def _pooled(
     """The gap over all held-out rows of all trials, for each option of kept parameters."""
     squares = np.zeros((len(options), 2))
     count = 0
-    for estimate, test in trials:
+    for posterior, test in trials:
         us = []
         for kept in options:
-            u = _conditional(estimate, ~kept)
-            us.append(np.where(undetermined & kept, estimate.centre, u))
+            us.append(np.where(undetermined & kept, posterior.centre, posterior.with_given(~kept)))
         n = sum(int(np.isfinite(data.measured).sum()) for data in test)
         for k, figure in enumerate(gaps(test, parameters, us)):
             squares[k] += n * np.array([figure.horizon, figure.full]) ** 2

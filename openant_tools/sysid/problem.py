@@ -14,14 +14,16 @@ Jacobian foresees, so that one step goes as far as it would in many.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.recording.run import Run
 from openant_tools.sysid.dataset import Dataset
-from openant_tools.sysid.estimate import CONFLICT, Estimate, estimate
+from openant_tools.sysid.estimate import CONFLICT, Estimate, Posterior, estimate, posterior
 from openant_tools.sysid.forward import ForwardModel
 from openant_tools.sysid.parameter import ACTION_DELAY, Parameter
 from openant_tools.sysid.solve import (
@@ -73,6 +75,7 @@ class Problem:
             of which are wrong by the error that they leave. Trusting each stretch as far as the model can follow it, as is
             done otherwise, lets a wrong model choose what it is judged by.
         freed: (parameters,) whose priors the data contradict, so that they count for next to nothing; found by `solve`.
+        left_out: runs of the datasets that nothing is fitted to: they are simulated, and count for nothing.
     """
 
     datasets: Sequence[Dataset]
@@ -80,11 +83,12 @@ class Problem:
     floor: Array
     tempered: bool = False
     freed: Bools = field(default_factory=lambda: np.zeros(0, bool))
+    left_out: Sequence[Run] = ()
 
     def __post_init__(self) -> None:
         # Laws that are compared shall differ in nothing but themselves.
         self._model = ForwardModel(self.datasets, self.parameters, coarse=not self.tempered)
-        self._weighing = Weighing(stretches(self.datasets), self.floor, self.tempered)
+        self._weighing = Weighing(stretches(self.datasets, self.left_out), self.floor, self.tempered)
         self._valley = np.array([parameter.definition.valley for parameter in self.parameters], bool)
         self.centre: Array = np.array([parameter.centre for parameter in self.parameters])
         if not len(self.freed):
@@ -108,6 +112,26 @@ class Problem:
             start: (parameters,) first guess in prior deviations; default the prior.
             progress: called with what is being done and the share that is done.
         """
+        follow = self._following(progress)
+        found = self._best(follow("fitting", *(self._descend(u) for u in self._starts(start))))
+        (found,) = follow("following the data", self._further(found))
+        return estimate(found, self._model, self._weighing, self.prior, self._score(found.point))
+
+    def solve_without(
+        self, left_out: Sequence[Sequence[Run]], start: Array, progress: Progress | None = None
+    ) -> list[Posterior]:
+        """What the others say, where some runs are left out: for each choice of them, all choices side by side.
+
+        Args:
+            left_out: for each fit, the runs of the datasets that it does not see.
+            start: (parameters,) where each begins.
+            progress: as `solve` calls it.
+        """
+        others = [replace(self, left_out=runs, freed=self.freed.copy()) for runs in left_out]
+        found = self._following(progress)("leaving runs out in turn", *(other._from(start) for other in others))
+        return [posterior(one, other._weighing, other.prior) for one, other in zip(found, others, strict=True)]
+
+    def _following(self, progress: Progress | None) -> Callable[..., list[Descent]]:
         left = 1.0
 
         def follow(what: str, *descents: Steps) -> list[Descent]:
@@ -124,19 +148,29 @@ class Problem:
                 tell,
             )
 
-        found = self._best(follow("fitting", *(self._descend(u) for u in self._starts(start))))
+        return follow
+
+    def _from(self, start: Array) -> Steps:
+        prior = self.prior
+        found = yield from self._descend(np.clip(start, prior.low, prior.high))
+        return (yield from self._further(found))
+
+    def _further(self, found: Descent) -> Steps:
+        """Once more from where the data lead alone, if what is left may have something in it that the priors kept from view."""
         weights = self._weighing(found.point)
         lasting = weights.correlation_s >= WHITE * self._weighing.period
-        if (lasting & (weights.noise > CLEAN * self.floor)).any() and (alone := self._by_data_alone(found)) is not None:
-            (led,) = follow("following the data alone", alone)
-            before, score = self.freed, self._score(found.point)
-            self.freed = before | (np.abs(led.point.u - self.centre) > CONFLICT)
-            (again,) = follow("fitting once more", self._descend(led.point.u))
-            if self._explains(again, weights) or self._score(again.point) < score - DECISIVE:
-                found = again
-            else:
-                self.freed = before
-        return estimate(found, self._model, self._weighing, self.prior)
+        if not (lasting & (weights.noise > CLEAN * self.floor)).any():
+            return found
+        led = yield from self._by_data_alone(found)
+        if led is None:
+            return found
+        before, score = self.freed, self._score(found.point)
+        self.freed = before | (np.abs(led - self.centre) > CONFLICT)
+        again = yield from self._descend(led)
+        if self._explains(again, weights) or self._score(again.point) < score - DECISIVE:
+            return again
+        self.freed = before
+        return found
 
     def _starts(self, start: Array | None) -> list[Array]:
         prior = self.prior
@@ -210,22 +244,22 @@ class Problem:
             held=held,
         )
 
-    def _by_data_alone(self, found: Descent) -> Steps | None:
+    def _by_data_alone(self, found: Descent) -> Generator[Look | Derive, Any, Array | None]:
         """To where the data lead with the priors all but ignored, as if all that is left were the sensors' noise.
 
         None where a second descent could not win: derivatives taken there promise no step worth the name. (Those that a
         descent has corrected on its way say little of parameters that it hardly moved.)
         """
         point, prior = found.point, self.prior
-        weight = np.broadcast_to(1.0 / self.floor, point.residual.shape)
+        weight = self._weighing.counts(point.residual) / self.floor
         loose = replace(prior, precision=LOOSE**2 * prior.precision)
-        (tangent,) = self._model.derive([Derive(point, True, self._model.coarse and not self._model.on_floor)])
+        tangent = yield Derive(point, True, self._model.coarse and not self._model.on_floor)
         step = loose.step(*tangent.normal(point, weight, loose), point.u)
         if np.abs(step).max(initial=0.0) < STALE:
             moved = replace(point, u=point.u + step, residual=point.residual + tangent.along(step))
             if self._score(moved) > self._score(point) - DECISIVE:
                 return None
-        return descend(
+        led = yield from descend(
             point,
             loose,
             lambda there: weight,
@@ -234,6 +268,7 @@ class Problem:
             least=self._model.differences,
             tangent=tangent,
         )
+        return led.point.u
 
     def _best(self, descents: Sequence[Descent]) -> Descent:
         """Posteriors that are as good as each other are told apart by what they leave, in plain rad."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from openant_tools.recording.run import Run
 from openant_tools.sysid.dataset import Dataset, runs_of
 from openant_tools.sysid.solve import Point
 
@@ -37,10 +38,12 @@ class Stretch:
     period: float
 
 
-def stretches(datasets: Sequence[Dataset]) -> tuple[Stretch, ...]:
-    """Those of all runs."""
+def stretches(datasets: Sequence[Dataset], left_out: Sequence[Run] = ()) -> tuple[Stretch, ...]:
+    """Those of all runs but the ones left out."""
     out = []
     for data, run, part in runs_of(datasets):
+        if any(run is one for one in left_out):
+            continue
         rows = np.arange(part.start, part.stop)
         on = run.signal("torque", data.plant.joints, default=1.0) != 0
         period = float(np.median(np.diff(run.t)))
@@ -95,10 +98,18 @@ class Weighing:
         """Weights by what is left at a point; `driven_only`: none of what was recorded without torque."""
         return self._alike(point.residual) if self.tempered else self._apart(point, driven_only)
 
+    def counts(self, residual: Array) -> Array:
+        """1 where a residual, (rows, joints), is of a stretch, else 0."""
+        out = np.zeros_like(residual)
+        for stretch in self.stretches:
+            for j, rows in enumerate(stretch.rows):
+                out[rows, j] = 1.0
+        return out
+
     def score(self, residual: Array) -> float:
         """−log likelihood with unknown noise (each stretch's own, if not `tempered`), one effective sample per TEMPER_S."""
         score = 0.0
-        together = np.nanmean(residual**2, axis=0)
+        together = np.nanmean(np.where(self.counts(residual) > 0, residual, np.nan) ** 2, axis=0)
         for stretch in self.stretches:
             for j, rows in enumerate(stretch.rows):
                 part = residual[rows, j]
@@ -154,7 +165,8 @@ class Weighing:
     def _alike(self, residual: Array) -> Weights:
         """One deviation for all rows of a joint, and one effective sample per TEMPER_S."""
         each = np.zeros_like(residual)
-        noise = np.maximum(np.sqrt(np.nanmean(residual**2, axis=0)), self.floor)
+        noise = np.where(self.counts(residual) > 0, residual, np.nan)
+        noise = np.maximum(np.sqrt(np.nanmean(noise**2, axis=0)), self.floor)
         for stretch in self.stretches:
             for j, rows in enumerate(stretch.rows):
                 each[rows, j] = math.sqrt(stretch.period / TEMPER_S) / noise[j]
