@@ -59,7 +59,8 @@ class Posterior:
 def posterior(found: Descent, weighing: Weighing, prior: Prior) -> Posterior:
     """To first order, where a descent ended."""
     precision, _ = found.tangent.normal(found.point, weighing(found.point).each, prior)
-    return Posterior(found.point.u, np.linalg.inv(precision), prior.centre, prior.low, prior.high)
+    covariance: Array = np.linalg.inv(precision)
+    return Posterior(found.point.u, covariance, prior.centre, prior.low, prior.high)
 
 
 @dataclass(frozen=True)

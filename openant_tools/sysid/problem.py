@@ -254,7 +254,8 @@ class Problem:
         weight = self._weighing.counts(point.residual) / self.floor
         loose = replace(prior, precision=LOOSE**2 * prior.precision)
         tangent = yield Derive(point, True, self._model.coarse and not self._model.on_floor)
-        step = loose.step(*tangent.normal(point, weight, loose), point.u)
+        hessian, gradient = tangent.normal(point, weight, loose)
+        step = loose.step(hessian, gradient, point.u)
         if np.abs(step).max(initial=0.0) < STALE:
             moved = replace(point, u=point.u + step, residual=point.residual + tangent.along(step))
             if self._score(moved) > self._score(point) - DECISIVE:
