@@ -59,7 +59,7 @@ class Posterior:
 def posterior(found: Descent, weighing: Weighing, prior: Prior) -> Posterior:
     """To first order, where a descent ended."""
     precision, _ = found.tangent.normal(found.point, weighing(found.point).each, prior)
-    covariance: Array = np.linalg.inv(precision)
+    covariance = np.asarray(np.linalg.inv(precision), np.float64)
     return Posterior(found.point.u, covariance, prior.centre, prior.low, prior.high)
 
 
