@@ -24,8 +24,6 @@ Progress = Callable[[str, float], None]
 
 #: the effects, as kinds of parameters: on real gears (docs/effects.md) no law of constant friction explains as much
 TRIED = ("load_friction", "load_friction_at_rest")
-#: fitted beside them: a limit that a plain fit books friction in shows what it is once friction is where it belongs
-BESIDE = ("torque_limit",)
 #: residuals below this many deviations of the encoder's rounding are not worth a second fit
 WORTH_LOOKING = 3.0
 
@@ -70,7 +68,7 @@ def with_effects(
         plain.model,
         hold_out,
         joints=plain.joints,
-        also=[*dict.fromkeys((*also, *BESIDE, *tried))],
+        also=[*also, *tried],
         tie=tie,
         declared=declared,
         measured_supply=measured_supply or None,
