@@ -85,6 +85,11 @@ WORTH = 0.01
 MOST_FOLDS = 4
 #: share of a run's samples that may be missing without a word
 MISSING = 0.01
+#: what is said where gains and torque limits follow it
+FOLLOWED = (
+    "Gains and torque limits follow the logged supply, in the given model and in the fitted one: at the nominal supply, as "
+    "`openant gap measure` plays them, both leave other errors than are told here."
+)
 #: share by which a supply falls before it is worth a word: a servo measures it in steps of 0.1 V
 SAG = 0.03
 #: s; a row's time stamp may be off by this much without a word
@@ -320,10 +325,12 @@ def identify(
     played = _played(effects, wanted)
     acting = values_of(played, joints)
 
-    def datasets(of: Sequence[Run], supply: bool = bool(measured_supply)) -> list[Dataset]:
+    supply = bool(measured_supply)
+
+    def datasets(of: Sequence[Run], supply: bool) -> list[Dataset]:
         return _datasets(of, model, joints, wanted, supply, acting)
 
-    data, judged = datasets(runs), datasets(hold_out)
+    data, judged = datasets(runs, supply), datasets(hold_out, supply)
     for one in (*data, *judged):
         beside = check_pair(played, one.plant.model, one.plant.path)
         # An effect that is fitted makes a pair of its own.
@@ -338,16 +345,19 @@ def identify(
     chosen += declared_parameters(plant, declared) if declared else []
     floor = np.maximum(sensor_floor(runs, joints), 1e-6)
 
+    tried = 2 if measured_supply is None and logged else 1
+    total = tried + 2  # the fits, those with runs left out, and judging
+
     def share(part: int) -> Progress | None:
-        return progress and (lambda what, done: progress(what, (part + done) / 3))
+        return progress and (lambda what, done: progress(what, (part + done) / total))
 
     problem = Problem(data, chosen, floor)
     estimate = problem.solve(progress=share(0))
-    if measured_supply is None and logged:
+    if tried == 2:
         following = Problem(datasets(runs, True), chosen, floor)
-        other = following.solve(estimate.u, progress=share(0))
-        measured_supply = other.score < estimate.score
-        if measured_supply:
+        other = following.solve(estimate.u, progress=share(1))
+        supply = other.score < estimate.score
+        if supply:
             problem, estimate = following, other
             data, judged = list(following.datasets), datasets(hold_out, True)
     trials: list[tuple[Posterior, list[Dataset]]] = [(estimate, judged)]
@@ -355,18 +365,16 @@ def identify(
     if not hold_out:
         parts, folds = _folds(runs)
         whole = (
-            problem
-            if len(parts) == len(runs)
-            else Problem(datasets(parts, bool(measured_supply)), chosen, floor, freed=problem.freed)
+            problem if len(parts) == len(runs) else Problem(datasets(parts, supply), chosen, floor, freed=problem.freed)
         )
         # Where all runs lead is near where most of them do; that it is only the start says nothing of the run left out.
-        posteriors = whole.solve_without(folds, estimate.u, share(1))
-        trials = [(one, datasets(test, bool(measured_supply))) for one, test in zip(posteriors, folds, strict=True)]
+        posteriors = whole.solve_without(folds, estimate.u, share(tried))
+        trials = [(one, datasets(test, supply)) for one, test in zip(posteriors, folds, strict=True)]
         tests = [run for test in folds for run in test]
 
     untied = verdicts(estimate, np.ones(len(chosen), bool))
     undetermined = np.array([verdict.word == "not in the data" for verdict in untied], bool)
-    kept, before, after = _judge(trials, chosen, undetermined, share(2))
+    kept, before, after = _judge(trials, chosen, undetermined, share(tried + 1))
     u = np.where(kept, estimate.with_given(~kept), 0.0)
     u[undetermined & kept] = problem.centre[undetermined & kept]
     found = verdicts(estimate, kept)
@@ -399,7 +407,7 @@ def identify(
             *([doubt] if doubt else []),
             *_telemetry_notes(everything, telemetry),
             *_acting_notes(acting),
-            *(() if measured_supply else _supply_notes(everything, joints)),
+            *([FOLLOWED] if supply else _supply_notes(everything, joints)),
             *_notes(estimate, joints, runs, values),
         ),
     )

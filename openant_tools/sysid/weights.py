@@ -109,13 +109,13 @@ class Weighing:
     def score(self, residual: Array) -> float:
         """−log likelihood with unknown noise (each stretch's own, if not `tempered`), one effective sample per TEMPER_S."""
         score = 0.0
-        together = np.nanmean(np.where(self.counts(residual) > 0, residual, np.nan) ** 2, axis=0)
+        together = self._together(residual) if self.tempered else None
         for stretch in self.stretches:
             for j, rows in enumerate(stretch.rows):
                 part = residual[rows, j]
                 n = int(np.isfinite(part).sum())
                 if n:
-                    own = float(together[j] if self.tempered else np.nanmean(part**2))
+                    own = float(np.nanmean(part**2) if together is None else together[j])
                     score += 0.5 * n * stretch.period / TEMPER_S * math.log(max(own, self.floor[j] ** 2))
         return score
 
@@ -162,11 +162,14 @@ class Weighing:
                 if driven and not stretch.driven and weight > min(driven):
                     each[stretch.rows[j], j] *= min(driven) / weight
 
+    def _together(self, residual: Array) -> Array:
+        """(joints,) mean square of all that counts."""
+        return np.asarray(np.nanmean(np.where(self.counts(residual) > 0, residual, np.nan) ** 2, axis=0), np.float64)
+
     def _alike(self, residual: Array) -> Weights:
         """One deviation for all rows of a joint, and one effective sample per TEMPER_S."""
         each = np.zeros_like(residual)
-        noise = np.where(self.counts(residual) > 0, residual, np.nan)
-        noise = np.maximum(np.sqrt(np.nanmean(noise**2, axis=0)), self.floor)
+        noise = np.maximum(np.sqrt(self._together(residual)), self.floor)
         for stretch in self.stretches:
             for j, rows in enumerate(stretch.rows):
                 each[rows, j] = math.sqrt(stretch.period / TEMPER_S) / noise[j]
