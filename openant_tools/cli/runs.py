@@ -66,12 +66,7 @@ def effects_of(
     folder = robot_folder(robot, must_exist=False)
     if (model is not None and robot is None) or not (folder / CONFIG_NAME).is_file():
         return (), None
-    at = RobotFolder.at(folder)
-    config = at.config()
-    theirs = {(own_model(run) or path).resolve() for run in runs}
-    if theirs != {at.model_path(config).resolve()}:
-        return (), None
-    return config.effects, at.config_file
+    return RobotFolder.at(folder).effects_beside(own_model(run) or path for run in runs)
 
 
 def checked(

@@ -6,7 +6,7 @@ import contextlib
 import datetime
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -155,6 +155,17 @@ class RobotFolder:
             yield
         finally:
             claim.release()
+
+    def effects_beside(self, models: Iterable[Path]) -> tuple[tuple[Effect, ...], Path | None]:
+        """The robot's `[[effect]]` entries and where they stand, if all these models are its own; else none.
+
+        Raises:
+            BadInput: as `config`.
+        """
+        config = self.config()
+        own = self.model_path(config).resolve()
+        theirs = all(model.resolve() == own for model in models)
+        return (config.effects, self.config_file) if theirs else ((), None)
 
     def model_path(self, config: RobotConfig | None = None) -> Path:
         """The MJCF that simulates this robot."""

@@ -304,11 +304,7 @@ def _beside(plants: Sequence[Plant], file: File | None, robot: File | None) -> t
         return read_effects(Path(file), plants[0].joints), Path(file)
     if robot is None:
         return (), None
-    folder = RobotFolder.at(Path(robot))
-    config = folder.config()
-    own = folder.model_path(config).resolve()
-    theirs = all(plant.path.resolve() == own for plant in plants)
-    return (config.effects, folder.config_file) if theirs else ((), None)
+    return RobotFolder.at(Path(robot)).effects_beside(plant.path for plant in plants)
 
 
 def _as_fitted(runs: Sequence[Run], found: Identification) -> list[Run]:
