@@ -29,7 +29,7 @@ from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
 from openant_tools.sysid.declared import Declaration, declared_parameters, read_declarations
-from openant_tools.sysid.identify import Identification, Value, calibrated, identify, restated
+from openant_tools.sysid.identify import Identification, Value, applicable, calibrated, identify, restated
 from openant_tools.sysid.kinds import KINDS
 from openant_tools.sysid.parameter import apply, choose, restatements
 from openant_tools.sysid.protocols import CommandSpace, protocol
@@ -214,15 +214,13 @@ def test_what_belongs_to_the_body_stands_so_in_robot_toml(
 
 
 def test_the_floor_is_fitted_by_itself_where_a_robot_stood_on_it(on_floor: tuple[Path, Identification]) -> None:
-    from openant_tools.sysid.identify import _applicable
-
-    path, result = on_floor
-    plant = load_plant(path, setup=Setup.FLOOR)
-    runs = list(result.datasets[0].runs)
-    assert {"floor_friction", "contact_softness"} < set(_applicable(None, plant, runs))
-    assert "torso_mass" not in _applicable(None, plant, runs)
-    arm = load_plant(plants.write(path.with_name("arm.xml"), MODEL), setup=Setup.FLOOR)
-    assert "floor_friction" not in _applicable(None, arm, runs), "an arm that is bolted down walks on nothing"
+    plant = load_plant(on_floor[0], setup=Setup.FLOOR)
+    found = applicable(None, plant, limp=False, on_floor=True)
+    assert {"floor_friction", "contact_softness"} < set(found)
+    assert "torso_mass" not in found
+    arm = load_plant(plants.write(on_floor[0].with_name("arm.xml"), MODEL), setup=Setup.FLOOR)
+    bolted = applicable(None, arm, limp=False, on_floor=True)
+    assert "floor_friction" not in bolted, "an arm that is bolted down walks on nothing"
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if KINDS[kind].effect is None])

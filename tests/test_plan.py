@@ -62,6 +62,15 @@ def test_what_acts_alike_is_tied_and_named() -> None:
     assert knee.correlation < -0.7
 
 
+def test_a_model_that_brakes_in_joint_and_servo_is_planned_for_as_it_is_fitted(tmp_path: Path) -> None:
+    both = tmp_path / "both.xml"
+    both.write_text(nominal_mjcf("standard").replace('<position kp="', '<position kv="0.05" kp="'))
+    made = make_plan(replace(ASKED, model=both, tie="all"), [Protocol("still", "", (Rest(1.0),))])
+    names = {one.name for one in made.expectations}
+    assert {"damping.all", "velocity_gain.all"} <= names
+    assert "electrical_damping.all" not in names, "torque stays on"
+
+
 def test_nothing_moves_and_nothing_is_known() -> None:
     made = make_plan(replace(ASKED, kinds=("damping",), tie="all"), [Protocol("still", "", (Rest(3.0),))])
     # Only the ways from home and back.

@@ -13,7 +13,7 @@ from openant_tools.sysid.dataset import Dataset
 from openant_tools.sysid.parameter import Parameter, colours
 from openant_tools.sysid.solve import Derive, Movers, Point, Tangent
 
-__all__ = ["ForwardModel"]
+__all__ = ["STEP", "ForwardModel"]
 
 Array = NDArray[np.float64]
 

@@ -54,6 +54,7 @@ __all__ = [
     "NOT_IN_THE_DATA",
     "Identification",
     "Value",
+    "applicable",
     "calibrated",
     "dataset_of",
     "identify",
@@ -312,9 +313,13 @@ def identify(
     everything, telemetry = [run for run, _ in cleaned], [found for _, found in cleaned]
     runs, hold_out = everything[: len(runs)], everything[len(runs) :]
     floored = load_plant(model, joints, Setup.FLOOR)
-    wanted = _applicable(declared.kinds if kinds is None and declared else kinds, floored, everything)
-    if also:
-        wanted = _applicable([*wanted, *also], floored, everything)
+    wanted = applicable(
+        declared.kinds if kinds is None and declared else kinds,
+        floored,
+        limp=any((run.signal("torque", joints, default=1.0) == 0).any() for run in everything),
+        on_floor=any(setup_of(run.facts.setup) is Setup.FLOOR for run in everything),
+        also=also,
+    )
     logged = any(run.facts.supply_v and run.has("volt", [joints[0]]) for run in everything)
     if measured_supply and not logged:
         raise BadInput(
@@ -481,24 +486,39 @@ def dataset_of(identification: Identification, run: Run) -> Dataset:
     )[0]
 
 
-def _applicable(kinds: Sequence[str] | None, plant: Plant, runs: Sequence[Run]) -> list[str]:
-    """The kinds to fit. Of damping and velocity gain what stands in the model: torque clips the one and not the other, and
-    while it neither saturates nor is switched off only their sum shows, which priors then share out. The electrical share of damping shows only without
-    torque, what decides at the floor only on it. (The torso's mass is a torque scale to a standing robot: it must be asked
-    for.)"""
-    if kinds is not None:
-        unknown = [kind for kind in kinds if kind not in KINDS]
-        if unknown:
-            raise BadInput(f"no such parameter: {', '.join(unknown)}", remedy=f"choose from {', '.join(KINDS)}")
-        if SPEED_LIMIT in kinds and "damping" in kinds:
-            raise BadInput(
-                "speed_limit and damping are two words for one thing: the speed limit is torque limit over damping",
-                remedy="fit one of them",
-            )
-        return [kind for kind in KINDS if kind in kinds]
+def applicable(
+    kinds: Sequence[str] | None, plant: Plant, *, limp: bool, on_floor: bool, also: Sequence[str] = ()
+) -> list[str]:
+    """The kinds to fit: those named, else the default ones; `also` besides.
+
+    Of damping and velocity gain what stands in the model: torque clips the one and not the other, and
+    while it neither saturates nor is switched off only their sum shows, which priors then share out. The electrical share of
+    damping shows only without torque, what decides at the floor only on it. (The torso's mass is a torque scale to a standing
+    robot: it must be asked for.)
+
+    Args:
+        plant: the model with its position servos as they are (no motors).
+        limp: whether torque is off for a while.
+        on_floor: whether the robot stands on the floor.
+
+    Raises:
+        BadInput: there is no such kind, or two of them are words for one thing.
+    """
+    wanted = [*(_by_default(plant, limp=limp, on_floor=on_floor) if kinds is None else kinds), *also]
+    unknown = [kind for kind in wanted if kind not in KINDS]
+    if unknown:
+        raise BadInput(f"no such parameter: {', '.join(unknown)}", remedy=f"choose from {', '.join(KINDS)}")
+    if SPEED_LIMIT in wanted and "damping" in wanted:
+        raise BadInput(
+            "speed_limit and damping are two words for one thing: the speed limit is torque limit over damping",
+            remedy="fit one of them",
+        )
+    return [kind for kind in KINDS if kind in wanted]
+
+
+def _by_default(plant: Plant, *, limp: bool, on_floor: bool) -> list[str]:
     in_joint = sum(KINDS["damping"].read(plant.model, plant, j) for j in range(len(plant.joints)))
     in_servo = sum(KINDS["velocity_gain"].read(plant.model, plant, j) for j in range(len(plant.joints)))
-    limp = any((run.signal("torque", plant.joints, default=1.0) == 0).any() for run in runs)
     out = []
     for kind in DEFAULT_KINDS:
         if kind == "damping" and in_servo > 0:
@@ -508,7 +528,7 @@ def _applicable(kinds: Sequence[str] | None, plant: Plant, runs: Sequence[Run]) 
         if kind == "electrical_damping" and not limp:
             continue
         out.append(kind)
-    if plant.free_joint is not None and any(setup_of(run.facts.setup) is Setup.FLOOR for run in runs):
+    if plant.free_joint is not None and on_floor:
         out += ON_FLOOR
     return out
 

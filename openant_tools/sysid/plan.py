@@ -23,9 +23,10 @@ from openant_tools.recording.run import Run
 from openant_tools.sysid.dataset import Dataset
 from openant_tools.sysid.excitation import CommandSpace
 from openant_tools.sysid.forecast import Forecast, forecast
-from openant_tools.sysid.identify import DEFAULT_KINDS, IDENTIFIED, NOT_IN_THE_DATA, TWO_SIDED_95
+from openant_tools.sysid.forward import STEP
+from openant_tools.sysid.identify import IDENTIFIED, NOT_IN_THE_DATA, TWO_SIDED_95, applicable
 from openant_tools.sysid.intervals import TIMING_STD_S
-from openant_tools.sysid.kinds import ELECTRICAL_DAMPING, KINDS
+from openant_tools.sysid.kinds import ELECTRICAL_DAMPING
 from openant_tools.sysid.parameter import Parameter, apply, choose, colours
 from openant_tools.sysid.plan_file import as_table
 from openant_tools.sysid.protocols import Protocol
@@ -35,9 +36,8 @@ __all__ = ["Expectation", "Plan", "Planned", "Residual", "information", "make_pl
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
-#: difference step in prior deviations, on the stand as the fit's own; on the floor contacts chatter, and only a change that is
-#: physically large stands out
-STEP, FLOOR_STEP = 0.1, 1.0
+#: difference step in prior deviations on the floor, where contacts chatter and only a change that is physically large stands out
+FLOOR_STEP = 1.0
 #: s, what is unknown of when a servo samples: its own period, and where in a round trip of 3 ms (eight servos) its turn is
 SAMPLING_STD_S = math.hypot(TIMING_STD_S, 3e-3 / math.sqrt(3))
 #: |correlation| from which two parameters count as tied
@@ -229,26 +229,6 @@ def _plant(asked: Planned, protocols: Sequence[Protocol], setup: Setup) -> Plant
     return plant
 
 
-def _kinds(kinds: Sequence[str] | None, protocols: Sequence[Protocol], plant: Plant, space: CommandSpace) -> list[str]:
-    """The kinds to plan for: those named, else those that a fit takes of such recordings."""
-    if kinds is not None:
-        unknown = [kind for kind in kinds if kind not in KINDS]
-        if unknown:
-            raise BadInput(f"no such parameter: {', '.join(unknown)}", remedy=f"choose from {', '.join(KINDS)}")
-        return [kind for kind in KINDS if kind in kinds]
-    joints = range(len(plant.joints))
-    in_joint = any(KINDS["damping"].read(plant.model, plant, j) > 0 for j in joints)
-    in_servo = any(KINDS["velocity_gain"].read(plant.model, plant, j) > 0 for j in joints)
-    out = []
-    for kind in DEFAULT_KINDS:
-        if kind == ELECTRICAL_DAMPING and not any(protocol.limp(space, 10.0).any() for protocol in protocols):
-            continue
-        out.append("velocity_gain" if kind == "damping" and in_servo and not in_joint else kind)
-    if any(protocol.setup == "floor" for protocol in protocols):
-        out += [kind for kind in ("floor_friction", "contact_softness") if kind in KINDS]
-    return out
-
-
 def parameters_of(asked: Planned, protocols: Sequence[Protocol], plant: Plant) -> tuple[Plant, list[Parameter]]:
     """The plant as it is expected to be, and what is to be known of it."""
     parameters = _parameters(asked, protocols, {plant.setup: plant})
@@ -257,7 +237,12 @@ def parameters_of(asked: Planned, protocols: Sequence[Protocol], plant: Plant) -
 
 def _parameters(asked: Planned, protocols: Sequence[Protocol], plants: dict[Setup, Plant]) -> list[Parameter]:
     plant = plants.get(Setup.FLOOR) or next(iter(plants.values()))
-    kinds = _kinds(asked.kinds, protocols, plant, asked.space)
+    kinds = applicable(
+        asked.kinds,
+        load_plant(asked.model, asked.space.joints, Setup.FLOOR),
+        limp=any(protocol.limp(asked.space, 10.0).any() for protocol in protocols),
+        on_floor=any(setup_of(protocol.setup) is Setup.FLOOR for protocol in protocols),
+    )
     parameters = choose(plant, kinds, asked.tie, asked.motors)
     if not parameters:
         raise BadInput(f"the model has nothing of {', '.join(kinds)}", where=asked.model, remedy="choose other --kinds")
