@@ -1,9 +1,10 @@
 """How much of a real servo each law of friction explains: two gains fitted, the third held out, each in turn.
 
 Rungs: none, viscous, Coulomb, both, Stribeck, load-dependent, and that with more of it at rest; each with the nominal supply
-and with the logged voltage. The figure is the root mean square of measured minus simulated position over whole runs, pooled over the three gains
-held out; beside it what the same law leaves of runs that it was fitted to. Finished fits are kept in --cache, so that an
-interrupted run goes on where it was.
+and with the logged voltage. The last rung is what `sysid fit` chooses by itself, with its defaults: parameters, effects, supply.
+The figure is the root mean square of measured minus simulated position over whole runs, pooled over the three gains held out;
+beside it what the same law leaves of runs that it was fitted to. Of the gain that is held out the stiffness is the same share of
+the given one as of those that were fitted. Finished fits are kept in --cache, so that an interrupted run goes on where it was.
 
     python benchmarks/friction_ladder.py ../shared/realdata/bam-xl330 [--rung load] [--cache FILE]
     python benchmarks/friction_ladder.py ../shared/realdata/bam-xl330 --motions [--rung load]
@@ -19,12 +20,15 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from openant_tools import sysid
 from openant_tools.files import write_text
 from openant_tools.model.gap import gap
 from openant_tools.model.plant import Setup, load_plant
@@ -32,6 +36,7 @@ from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
 from openant_tools.sysid.dataset import Dataset, gaps, sensor_floor
+from openant_tools.sysid.identify import dataset_of
 from openant_tools.sysid.parameter import KINDS, choose
 from openant_tools.sysid.problem import Problem
 
@@ -48,6 +53,8 @@ RUNGS = {
     "load": ("damping", "coulomb_friction", "load_friction"),
     "load, at rest": ("damping", "coulomb_friction", "load_friction", "load_friction_at_rest"),
 }
+#: the last rung
+CHOSEN = "what the fit chooses"
 
 
 def by_model(runs: Sequence[Run], *, volts: bool) -> dict[Path, Dataset]:
@@ -81,6 +88,24 @@ def error(datasets: Sequence[Dataset], kinds: Sequence[str], u: dict[str, float]
     return float(gaps(datasets, parameters, [np.array([u[p.kind] for p in parameters])])[0].full)
 
 
+def chosen(fitted: Sequence[Run], judged: Sequence[Run]) -> dict[str, Any]:
+    """What `sysid fit` makes of runs, and its error (rad, full runs) on others, which may be of a gain that it has not seen."""
+    found = sysid.fit(fitted)
+    best = found.with_effects or found
+    u = dict(zip(best.parameters, best.u.tolist(), strict=True))
+    shares: dict[str, list[float]] = defaultdict(list)
+    for parameter, value in u.items():
+        if parameter.model is not None:
+            shares[parameter.kind].append(value)
+    for path in {run.model_path for run in judged} - set(best.models):
+        alike = {parameter.kind: parameter for parameter in u if parameter.model is not None}
+        u |= {replace(alike[kind], model=path): float(np.mean(values)) for kind, values in shares.items()}
+    sets = [dataset_of(best, run) for run in judged]
+    left = gaps(sets, list(u), [np.array(list(u.values()))])[0].full
+    values = {value.name: [value.value, value.words] for value in best.values}
+    return {"values": values, "effects": best is not found, "supply": best.datasets[0].measured_supply, "error": left}
+
+
 def by_motion(runs: Sequence[Run], rung: str, volts: bool, cache: dict[str, Any], file: Path) -> None:
     """Each motion of each gain, fitted to the others of that gain: a row of errors over the given model's."""
     models: dict[Path, list[Run]] = {}
@@ -112,7 +137,7 @@ def by_motion(runs: Sequence[Run], rung: str, volts: bool, cache: dict[str, Any]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--rung", action="append", choices=list(RUNGS))
+    parser.add_argument("--rung", action="append", choices=[*RUNGS, CHOSEN])
     parser.add_argument("--cache", type=Path, default=Path("friction_ladder.json"))
     parser.add_argument("--motions", action="store_true", help="one gain at a time, each motion held out")
     options = parser.parse_args()
@@ -124,18 +149,35 @@ def main() -> None:
                  if str(run.model_path) == path]  # fmt: skip
         print(f"| rung | supply | {' | '.join(names)} | pooled, rad | ratio |")
         print("|---|---|" + "---|" * (len(names) + 2))
-        for rung in options.rung or RUNGS:
+        for rung in [rung for rung in options.rung or RUNGS if rung in RUNGS]:
             for volts in (False, True):
                 by_motion(runs, rung, volts, cache, options.cache)
         return
-    print(
-        "| rung | supply | fitted to all | " + " | ".join(p.stem for p in by_model(runs, volts=False)) + " | held out |"
-    )
-    print("|---|---|---|" + "---|" * (len(by_model(runs, volts=False)) + 1))
-    for rung in options.rung or RUNGS:
+    gains = list(by_model(runs, volts=False))
+    print(f"| rung | supply | fitted to all | {' | '.join(path.stem for path in gains)} | held out |")
+    print("|---|---|---|" + "---|" * (len(gains) + 1))
+
+    def row(rung: str, supply: str, errors: Sequence[float]) -> None:
+        """`errors`: fitted to all, then each gain held out."""
+        samples = [sum(int(np.isfinite(run.signal("pos", run.joints)).sum()) for run in runs if run.model_path == path)
+                   for path in gains]  # fmt: skip
+        pooled = math.sqrt(float(np.average(np.square(errors[1:]), weights=samples)))
+        cells = " | ".join(f"{value:.4f}" for value in (*errors, pooled))
+        print(f"| {rung} | {supply} | {cells} |", flush=True)
+
+    for rung in options.rung or (*RUNGS, CHOSEN):
+        if rung == CHOSEN:
+            for held in (*gains, None):
+                key = f"{rung}, {held.stem if held else 'all'}"
+                if key not in cache:
+                    fitted = [run for run in runs if run.model_path != held]
+                    cache[key] = chosen(fitted, [run for run in runs if held in (None, run.model_path)])
+                    write_text(options.cache, json.dumps(cache, indent=1) + "\n")
+            row(rung, "its own", [cache[f"{rung}, {held.stem if held else 'all'}"]["error"] for held in (None, *gains)])
+            continue
         for volts in (False, True):
             sets = by_model(runs, volts=volts)
-            row = []
+            errors = []
             for held in (None, *sets):
                 key = f"{rung}, {'logged' if volts else 'nominal'}, {held.stem if held else 'all'}"
                 if key not in cache:
@@ -147,11 +189,8 @@ def main() -> None:
                     judged = list(sets.values()) if held is None else [sets[held]]
                     cache[key] = {"u": u, "error": error(judged, RUNGS[rung], u)}
                     write_text(options.cache, json.dumps(cache, indent=1) + "\n")
-                row.append(cache[key]["error"])
-            samples = np.array([np.isfinite(data.measured).sum() for data in sets.values()])
-            pooled = math.sqrt(float(np.average(np.square(row[1:]), weights=samples)))
-            cells = " | ".join(f"{value:.4f}" for value in (*row, pooled))
-            print(f"| {rung} | {'logged' if volts else 'nominal'} | {cells} |", flush=True)
+                errors.append(cache[key]["error"])
+            row(rung, "logged" if volts else "nominal", errors)
 
 
 if __name__ == "__main__":

@@ -1,29 +1,40 @@
-"""Identification on real recordings of other people's servos: held-out error before and after, motion by motion.
+"""Identification on real recordings of other people's servos: each motion in turn, by what was fitted to the others.
 
-    python benchmarks/real_recordings.py [--shared ../shared/realdata] [--only bam-xl330|sage-so101]
+    python benchmarks/real_recordings.py [--shared ../shared/realdata] [--only bam-xl330|sage-so101] [--cache FILE]
 
-Prints Markdown. For each group of runs that share a model, every run is held out once while the others are fitted; then all
-are fitted together and judged by leaving out in turn. Errors are root mean squares of position over the full run.
+Prints Markdown: the error of the model as given on a motion that no fit saw, root mean square of position over the full run,
+and what share of it a fit leaves. `pooled` is the root of summed squares over the root of summed squares, motion by motion.
+
+For the XL330 a peer runs beside ours, the *quick fit* that a user would write: seven numbers of one servo in plain MuJoCo, with
+weak priors, by Nelder–Mead on the full-run error; of five starts the one that fits best. It sees and is judged by the same
+runs. `plain` is our best model for plain MuJoCo, `with effects` the best that we find (the plain one where no effect pays).
+
+Finished cells are kept in --cache, so that an interrupted run goes on where it was.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
+import json
+import math
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import mujoco
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
 
+from openant_tools import sysid
+from openant_tools.files import write_text
 from openant_tools.model.gap import gap
-from openant_tools.model.plant import load_plant
+from openant_tools.model.plant import Plant, load_plant
 from openant_tools.model.rollout import Rollouts
-from openant_tools.recording.run import Run
-from openant_tools.recording.tables import read_run
-from openant_tools.sysid.identify import identify
-from openant_tools.sysid.result import write_fit
 
 #: A Feetech STS3215 of an SO-101 about an axis without gravity. Stiffness and damping: BAM's M1 figures of this servo at its
 #: default gain of 32 and 7.4 V, halved for the gain of 16 in the log; what it turns (kg·m²) is a guess that a fit may book
@@ -47,48 +58,109 @@ SO101 = """
 #: rad; less is no motion
 MOVES_RAD = 0.05
 
+#: the quick fit's unknowns, where each starts and the deviation of its prior: shares of the given stiffness and torque limit,
+#: velocity gain and damping (N·m·s/rad), dry friction (N·m), armature (kg·m²), zero (rad)
+START = np.array([1.0, 1.0, 0.0344, 0.002, 0.05, 0.0017, 0.0])
+DEVIATION = np.array([0.15, 0.2, 0.01, 0.01, 0.03, 0.0005, 0.01])
+#: what its errors weigh against its priors: a deviation in rad, and a factor; its simulations from each start, and its starts
+ERROR_RAD, PRIOR, SIMULATIONS, STARTS = 0.08, 0.005, 260, 5
 
-def full_error(run: Run, model: Path, joints: Sequence[str] | None) -> float:
-    plant = load_plant(model, joints)
-    return gap(run.signal("pos", plant.joints), Rollouts(plant, [run])().pos[0])
+Array = NDArray[np.float64]
+
+
+def quick_model(plant: Plant, u: Array) -> mujoco.MjModel:
+    """The given model with the quick fit's numbers, u deviations from where they start."""
+    stiffness, torque, velocity_gain, damping, friction, armature, zero = START + DEVIATION * u
+    model = copy.copy(plant.model)
+    model.actuator_gainprm[0, 0] *= abs(stiffness)
+    model.actuator_biasprm[0, 1] *= abs(stiffness)
+    model.actuator_biasprm[0, 2] = -max(velocity_gain, 0.0)
+    model.actuator_forcerange[0] *= abs(torque)
+    model.dof_damping[0], model.dof_frictionloss[0] = max(damping, 0.0), max(friction, 0.0)
+    model.dof_armature[0], model.qpos0[0] = abs(armature), zero
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def quick_fit(plant: Plant, runs: Sequence[sysid.Run]) -> mujoco.MjModel:
+    """The model that the quick fit ends with."""
+    rollouts = [Rollouts(plant, [run], nthread=1) for run in runs]
+    measured = [run.signal("pos", plant.joints) for run in runs]
+
+    def cost(u: Array) -> float:
+        model = [quick_model(plant, u)]
+        errors = [gap(told, one(model).pos[0]) for told, one in zip(measured, rollouts, strict=True)]
+        return float(np.square(errors).sum()) / ERROR_RAD**2 + PRIOR * float(u @ u)
+
+    ends = []
+    for seed in range(STARTS):
+        start = 0.3 * np.random.default_rng(seed).normal(size=len(START)) if seed else np.zeros(len(START))
+        simplex = start + np.vstack([np.zeros(len(START)), np.eye(len(START))])
+        options = {"maxfev": SIMULATIONS, "initial_simplex": simplex}
+        ends.append(minimize(cost, start, method="Nelder-Mead", options=options))
+    return quick_model(plant, min(ends, key=lambda end: float(end.fun)).x)
+
+
+def cell(
+    held: sysid.Run,
+    others: Sequence[sysid.Run],
+    model: Path,
+    joints: Sequence[str] | None,
+    also: Sequence[str],
+    peer: bool,
+) -> dict[str, Any]:
+    """The errors (rad) on one motion of the given model and of what was fitted to the others, with the peer and effects or not."""
+    given = sysid.judge(held, model, joints=joints)
+    out: dict[str, Any] = {"given": given.gap.full}
+    if peer:
+        plant = load_plant(model, joints)
+        shown = given.runs[0]
+        quick = quick_fit(plant, sysid.judge(others, model, joints=joints).runs)
+        out["quick fit"] = gap(shown.signal("pos", plant.joints), Rollouts(plant, [shown])([quick]).pos[0])
+    begun = time.monotonic()
+    found = sysid.fit(others, model, joints=joints, also=also, beyond_mujoco=peer)
+    out["seconds"] = time.monotonic() - begun
+    out["plain"] = sysid.judge(held, found).gap.full
+    if peer:
+        out["with effects"] = sysid.judge(held, found.with_effects or found).gap.full
+    best = found.with_effects or found
+    out["accepted"] = list(dict.fromkeys(name.partition(".")[0] for name in best.accepted))
+    return out
 
 
 def table(
     title: str,
-    groups: dict[Path, list[Run]],
-    work: Path,
+    groups: dict[Path, list[sysid.Run]],
+    cache: Path,
     joints: Sequence[str] | None = None,
     also: Sequence[str] = (),
-    together: bool = True,
+    peer: bool = False,
 ) -> None:
-    print(f"\n### {title}\n")
-    print("| held out | given (rad) | others fitted (rad) | ratio | all fitted (rad) | ratio | accepted |")
-    print("|---|---|---|---|---|---|---|")
+    kept = json.loads(cache.read_text()) if cache.exists() else {}
+    columns = ["quick fit", "plain", "with effects"] if peer else ["plain"]
+    print(f"\n### {title}\n\n| held out | given, rad | {' | '.join(columns)} | accepted |")
+    print(f"|---|---|{'---|' * len(columns)}---|")
+
+    def row(name: str, cells: Sequence[dict[str, Any]], accepted: str = "") -> None:
+        given, *left = (math.sqrt(sum(one[column] ** 2 for one in cells)) for column in ("given", *columns))
+        shares = " | ".join(f"{one / given:.2f}" for one in left)
+        print(f"| {name} | {given / math.sqrt(len(cells)):.4f} | {shares} | {accepted} |", flush=True)
+
+    everything = []
     for model, runs in groups.items():
-        out = work / model.stem
-        result = identify(runs, model, joints=joints, also=also) if together else None
-        if result is not None:
-            write_fit(result, out)
-        for run in runs:
-            others = [other for other in runs if other is not run]
-            begun = time.monotonic()
-            single = identify(others, model, [run], joints=joints, also=also)
-            write_fit(single, out / run.name)
-            given = full_error(run, model, joints)
-            held_out = full_error(run, out / run.name / "calibrated.xml", joints)
-            accepted = ", ".join(dict.fromkeys(name.partition(".")[0] for name in single.accepted)) or "nothing"
-            cells = [run.name, f"{given:.4f}", f"{held_out:.4f}", f"{held_out / given:.2f}"]
-            if result is not None:
-                error = full_error(run, out / "calibrated.xml", joints)
-                cells += [f"{error:.4f}", f"{error / given:.2f}"]
-            else:
-                cells += ["", ""]
-            print(f"| {' | '.join([*cells, accepted])} |", flush=True)
-            print(f"{run.name}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
-        if result is not None:
-            cells = [f"*in turn: {model.stem}*", f"{result.before.full:.4f}", f"{result.after.full:.4f}"]
-            cells += [f"{result.after.full / result.before.full:.2f}", "", "", ", ".join(result.accepted) or "nothing"]
-            print(f"| {' | '.join(cells)} |", flush=True)
+        cells = []
+        for held in runs:
+            key = f"{title}: {held.name}"
+            if key not in kept:
+                kept[key] = cell(held, [run for run in runs if run is not held], model, joints, also, peer)
+                write_text(cache, json.dumps(kept, indent=1) + "\n")
+                print(f"{held.name}: {kept[key]['seconds']:.0f} s", file=sys.stderr, flush=True)
+            cells.append(kept[key])
+            row(held.name, cells[-1:], ", ".join(kept[key]["accepted"]) or "nothing")
+        if len(groups) > 1:
+            row(f"*pooled: {model.stem}*", cells)
+        everything += cells
+    row("*pooled*", everything)
 
 
 def main() -> None:
@@ -97,16 +169,19 @@ def main() -> None:
     parser.add_argument("--only", choices=["bam-xl330", "sage-so101"])
     parser.add_argument("--joint", action="append", choices=list(TURNED_KG_M2), help="of sage-so101; default both")
     parser.add_argument("--work", type=Path, default=Path("/tmp/real_recordings"))
+    parser.add_argument("--cache", type=Path, default=Path("real_recordings.json"))
     options = parser.parse_args()
+    if not options.shared.is_dir():
+        parser.error(f"no recordings in {options.shared}")
     if options.only != "sage-so101":
-        groups: dict[Path, list[Run]] = defaultdict(list)
+        groups: dict[Path, list[sysid.Run]] = defaultdict(list)
         for path in sorted((options.shared / "bam-xl330").glob("*.parquet")):
-            run = read_run(path)
+            run = sysid.load(path)
             assert run.model_path is not None
             groups[run.model_path].append(run)
-        table("bam-xl330, full-run position error", groups, options.work)
+        table("bam-xl330", groups, options.cache, peer=True)
     if options.only != "bam-xl330":
-        recorded = [read_run(path) for path in sorted((options.shared / "sage-so101").glob("*.parquet"))]
+        recorded = [sysid.load(path) for path in sorted((options.shared / "sage-so101").glob("*.parquet"))]
         for joint in options.joint or TURNED_KG_M2:
             turned = TURNED_KG_M2[joint]
             model = options.work / f"so101_{joint}.xml"
@@ -115,7 +190,7 @@ def main() -> None:
             # Where the joint is not commanded to move there is nothing to identify.
             runs = [run for run in recorded if np.ptp(run.column(f"cmd.{joint}")) > MOVES_RAD]
             for words, also in (("delay", []), ("delay and lag", ["actuator_lag"])):
-                table(f"sage-so101, joint {joint}, {words}", {model: runs}, options.work, [joint], also, together=False)
+                table(f"sage-so101, joint {joint}, {words}", {model: runs}, options.cache, [joint], also)
 
 
 if __name__ == "__main__":
