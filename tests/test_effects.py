@@ -17,7 +17,7 @@ from plants import ENCODER_RAD, drive, pendulum, sweep, write
 
 from openant_tools.cli.sysid_fit import fit
 from openant_tools.effects.acting import Acting
-from openant_tools.effects.catalogue import catalogue, effect
+from openant_tools.effects.catalogue import acting, effect
 from openant_tools.effects.entries import as_toml, entries_of, values_of
 from openant_tools.effects.rollout import rollout
 from openant_tools.errors import BadInput
@@ -174,10 +174,10 @@ def test_gains_follow_the_logged_voltage(servo: Plant) -> None:
 
 
 def test_every_effect_says_what_it_is() -> None:
-    assert {name for name, _ in SHOWING} == set(catalogue())
-    for one in catalogue().values():
+    assert {name for name, _ in SHOWING} == set(acting())
+    for one in acting().values():
         assert one.words
-        assert one.quantities
+        assert one.parameters
     with pytest.raises(BadInput, match="no effect is called 'load_fricton' → did you mean 'load_friction'"):
         effect("load_fricton")
 

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 import openant_env  # noqa: F401
 from openant_tools.effects.commands import CommandEffects, CommandPath
+from openant_tools.effects.robot import Robot
 from openant_tools.errors import BadInput
 from openant_tools.gap import simulation
-from openant_tools.gap.robot import Robot
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run

@@ -17,15 +17,16 @@ from numpy.typing import NDArray
 from plants import pendulum, sweep, write
 
 from openant_tools.cli.gap import gap
+from openant_tools.effects.catalogue import catalogue
+from openant_tools.effects.effect import Cause, Scope
 from openant_tools.effects.entries import values_of
+from openant_tools.effects.robot import Form, Reference, Robot, Seen
 from openant_tools.effects.rollout import rollout
+from openant_tools.effects.stribeck_friction import BRISTLE_RAD
 from openant_tools.errors import BadInput
 from openant_tools.gap.apply import apply, robot_of, write_robot
-from openant_tools.gap.cause import Cause, Scope, catalogue
 from openant_tools.gap.diagnosis import Diagnosis, Found, Span, read_diagnosis
-from openant_tools.gap.native import BRISTLE_RAD
 from openant_tools.gap.report import diagnosis_report
-from openant_tools.gap.robot import Form, Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.words import sentence
 from openant_tools.model.mjcf import write_model

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from openant_tools.effects.robot import Form, Robot
 from openant_tools.gap.arrivals import Arrivals
-from openant_tools.gap.robot import Form, Robot
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.model.rollout import Rollouts

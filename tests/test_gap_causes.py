@@ -1,4 +1,4 @@
-"""The catalogue as causes: complete, consistent with effects.md, and extensible by one file."""
+"""The catalogue: complete, consistent with effects.md, and extensible by one file."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import pytest
 from plants import pendulum, write
 from test_gap_apply import diagnosis, found
 
-from openant_tools.effects.catalogue import catalogue as acting
-from openant_tools.gap.cause import Cause, catalogue
-from openant_tools.gap.next import ACTIONS, experiments
-from openant_tools.gap.robot import Reference, Robot, Seen
+from openant_tools.effects.catalogue import acting, action, catalogue
+from openant_tools.effects.effect import Cause
+from openant_tools.effects.robot import Reference, Robot, Seen
+from openant_tools.gap.next import experiments
 from openant_tools.model.plant import load_plant
 
 CATALOGUE = Path(__file__).parents[2] / "shared" / "effects.md"
@@ -60,14 +60,18 @@ def test_a_coordinate_is_the_value_and_back(cause: Cause, model: Path) -> None:
 
 
 def test_what_mujoco_does_not_carry_acts_between_steps_or_on_the_log() -> None:
-    log_or_bus = {"clock_jitter", "command_dropout", "imu_bias", "tracker_scale", "thermal_derating"}
-    assert {name for name, cause in catalogue().items() if not cause.native} <= set(acting()) | log_or_bus
+    befalls = {name for name, cause in catalogue().items() if cause.acts_on is not None}
+    assert befalls == {"clock_jitter", "command_dropout", "imu_bias", "tracker_scale"}
+    assert {name for name, cause in catalogue().items() if not cause.native} <= set(acting()) | befalls
 
 
-def test_actions_name_effects_of_the_catalogue() -> None:
-    for pair in ACTIONS:
-        assert len(pair) == 2
-        assert pair <= set(catalogue())
+def test_what_tells_two_effects_apart_is_said_once_and_whichever_is_asked_first() -> None:
+    for name, cause in catalogue().items():
+        for other in cause.told_from:
+            assert other in catalogue()
+            assert name not in catalogue()[other].told_from
+            assert action(name, other) is action(other, name) is cause.told_from[other]
+    assert action("backlash", "payload") is None
 
 
 def test_delay_in_the_log_or_in_the_command_is_no_matter_of_motion(model: Path) -> None:

@@ -12,11 +12,11 @@ import pytest
 from plants import BENCH, ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, write
 
 import openant_tools.gap.closure as closure
-from openant_tools.gap.cause import catalogue
+from openant_tools.effects.catalogue import catalogue
+from openant_tools.effects.robot import Robot
 from openant_tools.gap.closure import Refit, Windows, calibration_of, closures, heat_loss_of, nothing
 from openant_tools.gap.explain import Part
 from openant_tools.gap.protocol import Protocol
-from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import Log, simulate
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from openant_tools.effects.catalogue import catalogue
+from openant_tools.effects.robot import Form, Robot
 from openant_tools.errors import BadInput
-from openant_tools.gap.cause import catalogue
 from openant_tools.gap.features import COLUMNS
 from openant_tools.gap.judge import Judge, metric_of, train
 from openant_tools.gap.kept import judge_of
 from openant_tools.gap.population import Case, draw, play, robot_of, templates
 from openant_tools.gap.prepare import CACHE_VARIABLE, Kept, Prepared, cache_folder, prepare
 from openant_tools.gap.protocol import Protocol, same
-from openant_tools.gap.robot import Form, Robot
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from plants import SERVO, drive, pendulum, run_of, sweep, write
 
-from openant_tools.gap.cause import catalogue
+from openant_tools.effects.catalogue import catalogue
+from openant_tools.effects.robot import Robot
 from openant_tools.gap.closure import Windows, closures, nothing, unmoved
 from openant_tools.gap.explain import Explained, Part, Scene, known_to
 from openant_tools.gap.features import Floats
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.rivals import bodily, paired, placed, resized, rivals, told, unexpected
-from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.whitening import Metric
 from openant_tools.model.plant import Setup, load_plant

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from plants import BENCH, ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, write
 
-from openant_tools.gap.cause import catalogue
+from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap.closure import Windows
 from openant_tools.gap.explain import Part
 from openant_tools.gap.late import late_velocity

@@ -13,10 +13,10 @@ from openant_tools.blind.draw import Answer, Drawn
 from openant_tools.blind.log import logged
 from openant_tools.blind.robot import true_robot
 from openant_tools.blind.simulate import simulate as simulate_truth
-from openant_tools.gap.cause import catalogue, enter
+from openant_tools.effects.catalogue import catalogue, enter
+from openant_tools.effects.robot import Robot
 from openant_tools.gap.features import TAKES_UP_S, around_switching
 from openant_tools.gap.protocol import Players, Protocol
-from openant_tools.gap.robot import Robot
 from openant_tools.recording.run import Facts, Run
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path

@@ -8,8 +8,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap import verdict as of_verdict
-from openant_tools.gap.cause import catalogue
 from openant_tools.gap.closure import ClosureByJoint, Refit
 from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement

@@ -1,19 +1,33 @@
-"""Dry friction that differs by the direction of motion."""
+"""Dry friction differs by direction."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from openant_tools.effects.effect import Effect, Quantity, Values
+from openant_tools.effects.effect import Effect, Ints, Parameter, Scope, Table, Values, amount, usual_torque
+from openant_tools.effects.robot import Robot
 from openant_tools.effects.step import Law, Step
 
-__all__ = ["EFFECT"]
+__all__ = ["effect"]
 
 #: rad/s; at rest it is the torque that tells which way the joint would go
 AT_REST_RAD_S = 0.01
 
 
-def _law(values: Values) -> Law:
+def _enter(robot: Robot, joints: Ints, values: Values) -> None:
+    for name in ("positive_nm", "negative_nm"):
+        robot.law("asymmetric_friction", name)[joints] += values[name]
+
+
+def _simpler(x: Mapping[str, float]) -> str | None:
+    """Friction that is nearly alike either way is plain dry friction."""
+    high, low = max(x.values()), min(x.values())
+    return "coulomb_friction" if low > 0.75 * high else None
+
+
+def _law(values: Table) -> Law:
     positive, negative = values["positive_nm"], values["negative_nm"]
 
     def act(step: Step) -> None:
@@ -24,11 +38,23 @@ def _law(values: Values) -> Law:
     return act
 
 
-EFFECT = Effect(
+effect = Effect(
     name="asymmetric_friction",
     family="friction",
     words="dry friction differs by direction",
-    quantities=(Quantity("positive_nm", "N·m", 0.1), Quantity("negative_nm", "N·m", 0.1)),
-    order=30,
+    scopes=(Scope.JOINT, Scope.SERVO, Scope.ALL),
+    quantities=(
+        amount("positive_nm", "N·m", 0.035, 0.35, scale=usual_torque),
+        amount("negative_nm", "N·m", 0.035, 0.35, scale=usual_torque),
+    ),
+    enter=_enter,
+    native=False,
     law=_law,
+    order=30,
+    parameters=(
+        Parameter("positive_nm", "N·m", 0.1),
+        Parameter("negative_nm", "N·m", 0.1),
+    ),
+    vector=True,
+    simpler=_simpler,
 )

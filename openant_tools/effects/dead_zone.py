@@ -1,16 +1,21 @@
-"""A position loop that does nothing about small errors."""
+"""The position loop ignores small errors."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from openant_tools.effects.effect import Effect, Quantity, Values
+from openant_tools.effects.effect import Effect, Ints, Parameter, Scope, Table, Values, amount
+from openant_tools.effects.robot import Robot
 from openant_tools.effects.step import Law, Step
 
-__all__ = ["EFFECT"]
+__all__ = ["effect"]
 
 
-def _law(values: Values) -> Law:
+def _enter(robot: Robot, joints: Ints, values: Values) -> None:
+    robot.law("dead_zone", "width_rad")[joints] += values["width_rad"]
+
+
+def _law(values: Table) -> Law:
     half = values["width_rad"] / 2
 
     def act(step: Step) -> None:
@@ -21,11 +26,15 @@ def _law(values: Values) -> Law:
     return act
 
 
-EFFECT = Effect(
+effect = Effect(
     name="dead_zone",
     family="transmission",
-    words="the position loop ignores errors smaller than half a width",
-    quantities=(Quantity("width_rad", "rad", 0.01, high=0.5),),
-    order=20,
+    words="the position loop ignores small errors",
+    scopes=(Scope.JOINT, Scope.SERVO, Scope.ALL),
+    quantities=(amount("width_rad", "rad", 0.008, 0.12),),
+    enter=_enter,
+    native=False,
     law=_law,
+    order=20,
+    parameters=(Parameter("width_rad", "rad", 0.01, high=0.5),),
 )

@@ -11,7 +11,7 @@ import numpy as np
 import tomlkit
 from numpy.typing import NDArray
 
-from openant_tools.effects.catalogue import catalogue
+from openant_tools.effects.catalogue import acting, catalogue
 from openant_tools.effects.commands import SEND_S, CommandEffects
 from openant_tools.effects.rollout import EffectValues
 from openant_tools.effects.sensing import SensingEffects
@@ -22,11 +22,6 @@ from openant_tools.robot.config import Problem, parse_effects
 from openant_tools.robot.pair import OTHER_REMEDY, PLAIN, mark_of, stranger_words, strangers
 
 __all__ = ["as_toml", "check_pair", "commands_of", "entries_of", "read_effects", "sensing_of", "values_of"]
-
-#: effects that act between the steps of an environment, not between those of its physics, with their parameters
-ON_COMMANDS = {"clock_jitter": ("std_s",), "command_dropout": ("fraction", "longest_s")}
-_AXES = tuple(f"{sensor}_{axis}" for sensor in ("gyro", "acc") for axis in "xyz")
-ON_SENSORS = {"imu_bias": ("rad_s", "m_s2", *_AXES), "tracker_scale": ("scale", "yaw_rad", "latency_s")}
 
 
 def read_effects(path: Path, joints: Sequence[str]) -> tuple[Entry, ...]:
@@ -62,13 +57,13 @@ def check_pair(
     if others:
         raise BadInput(stranger_words(others, path), where=where or "robot.toml, [[effect]]", remedy=OTHER_REMEDY)
     own, active = mark_of(model), [entry for entry in entries if entry.enabled]
-    by_hand = dict.fromkeys(entry.effect for entry in active if entry.pair is None and entry.effect in catalogue())
+    by_hand = dict.fromkeys(entry.effect for entry in active if entry.pair is None and entry.effect in acting())
     if own == PLAIN and by_hand:
         return [
             f"{path} was fitted without effects: what it lacked of {', '.join(by_hand)} it has as friction or gain already, which "
             "counts twice now → fit it with these in robot.toml, or set enabled = false"
         ]
-    if own not in (None, PLAIN) and not any(entry.effect in catalogue() for entry in active):
+    if own not in (None, PLAIN) and not any(entry.effect in acting() for entry in active):
         return [
             f"{path} was fitted with effects that do not act here, and is not the best without → play it with its "
             "`calibrated.effects.toml` or from its robot's folder, or take the plain `calibrated.xml`"
@@ -89,9 +84,9 @@ def values_of(entries: Sequence[Entry], joints: Sequence[str], where: str | Path
     """
     values: dict[tuple[str, str], NDArray[np.float64]] = {}
     for entry in entries:
-        if not entry.enabled or entry.effect in ON_COMMANDS or entry.effect in ON_SENSORS:
+        if not entry.enabled or _acts_on(entry) is not None:
             continue
-        effect = catalogue().get(entry.effect)
+        effect = acting().get(entry.effect)
         if effect is None:
             raise BadInput(
                 f"the effect {entry.effect} does not act as an entry: MuJoCo carries it, in the model",
@@ -99,7 +94,7 @@ def values_of(entries: Sequence[Entry], joints: Sequence[str], where: str | Path
                 remedy="write it into the model with `openant gap apply`, or leave it out: effects=False, `--no-effects`, "
                 "enabled = false",
             )
-        known = {quantity.name: quantity for quantity in effect.quantities}
+        known = {parameter.name: parameter for parameter in effect.parameters}
         chosen = list(joints) if isinstance(entry.joints, str) else list(entry.joints)
         rows = [list(joints).index(joint) for joint in chosen if joint in joints]
         for name, value in entry.parameters.items():
@@ -108,16 +103,16 @@ def values_of(entries: Sequence[Entry], joints: Sequence[str], where: str | Path
                     f"{entry.effect} has no parameter {name!r}", where=where, remedy=f"it has {', '.join(known)}"
                 )
             number = value[0] if isinstance(value, list) and len(value) == 1 else value
-            quantity = known[name]
+            parameter = known[name]
             if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
                 raise BadInput(
-                    f"{entry.effect}.{name} is no number: {value!r}", where=where, remedy=f"in {quantity.unit}"
+                    f"{entry.effect}.{name} is no number: {value!r}", where=where, remedy=f"in {parameter.unit}"
                 )
-            if not quantity.low <= number <= quantity.high:
+            if not parameter.low <= number <= parameter.high:
                 raise BadInput(
-                    f"{entry.effect}.{name} = {number:g} {quantity.unit} is not physical",
+                    f"{entry.effect}.{name} = {number:g} {parameter.unit} is not physical",
                     where=where,
-                    remedy=f"it lies between {quantity.low:g} and {quantity.high:g}",
+                    remedy=f"it lies between {parameter.low:g} and {parameter.high:g}",
                 )
             values.setdefault((entry.effect, name), np.zeros(len(joints)))[rows] = float(number)
     return values
@@ -133,16 +128,16 @@ def commands_of(
     """
     jitter_s, longest_s, shared, fraction = 0.0, SEND_S, True, np.zeros(len(joints))
     for entry in entries:
-        if not entry.enabled or entry.effect not in ON_COMMANDS:
+        if not entry.enabled or _acts_on(entry) != "commands":
             continue
-        given = _numbers(entry, ON_COMMANDS[entry.effect], where)
+        given = _numbers(entry, where)
         if entry.effect == "clock_jitter":
-            jitter_s = float(np.hypot(jitter_s, _within(entry, "std_s", given, 0.0, 1.0, where)))
+            jitter_s = float(np.hypot(jitter_s, _within(entry, "std_s", given, where)))
             continue
         chosen = joints if isinstance(entry.joints, str) else entry.joints
         rows = [k for k, joint in enumerate(joints) if joint in chosen]
-        fraction[rows] = np.maximum(fraction[rows], _within(entry, "fraction", given, 0.0, 0.95, where))
-        longest_s = max(longest_s, _within(entry, "longest_s", given, 0.0, 10.0, where))
+        fraction[rows] = np.maximum(fraction[rows], _within(entry, "fraction", given, where))
+        longest_s = max(longest_s, _within(entry, "longest_s", given, where))
         shared = shared and len(rows) == len(joints)
     return CommandEffects(jitter_s, fraction, longest_s, shared) if jitter_s or fraction.any() else None
 
@@ -157,9 +152,9 @@ def sensing_of(entries: Sequence[Entry], where: str | Path | None = None) -> Sen
     """
     biases = {"gyro": np.zeros(3), "acc": np.zeros(3)}
     scale, yaw_rad, latency_s = 1.0, 0.0, 0.0
-    mine = [entry for entry in entries if entry.enabled and entry.effect in ON_SENSORS]
+    mine = [entry for entry in entries if entry.enabled and _acts_on(entry) == "sensors"]
     for entry in mine:
-        given = _numbers(entry, ON_SENSORS[entry.effect], where)
+        given = _numbers(entry, where)
         if entry.effect == "imu_bias":
             for sensor, whole in (("gyro", "rad_s"), ("acc", "m_s2")):
                 parts = [given.get(f"{sensor}_{axis}", [0.0])[0] for axis in "xyz"]
@@ -168,14 +163,21 @@ def sensing_of(entries: Sequence[Entry], where: str | Path | None = None) -> Sen
                     raise BadInput(f"imu_bias.{whole} is no vector of three", where=where, remedy="give x, y and z")
                 biases[sensor] += vector
             continue
-        scale *= _within(entry, "scale", given, 0.1, 10.0, where, 1.0)
-        yaw_rad += _within(entry, "yaw_rad", given, -math.pi, math.pi, where)
-        latency_s += _within(entry, "latency_s", given, 0.0, 2.0, where)
+        scale *= _within(entry, "scale", given, where)
+        yaw_rad += _within(entry, "yaw_rad", given, where)
+        latency_s += _within(entry, "latency_s", given, where)
     return SensingEffects(biases["gyro"], biases["acc"], scale, yaw_rad, latency_s) if mine else None
 
 
-def _numbers(entry: Entry, known: Sequence[str], where: str | Path | None) -> dict[str, list[float]]:
+def _acts_on(entry: Entry) -> str | None:
+    """What the environment applies an effect to, where it does not act between steps."""
+    effect = catalogue().get(entry.effect)
+    return None if effect is None else effect.acts_on
+
+
+def _numbers(entry: Entry, where: str | Path | None) -> dict[str, list[float]]:
     out = {}
+    known = [parameter.name for parameter in catalogue()[entry.effect].parameters]
     for name, value in entry.parameters.items():
         if name not in known:
             raise BadInput(
@@ -190,21 +192,14 @@ def _numbers(entry: Entry, known: Sequence[str], where: str | Path | None) -> di
     return out
 
 
-def _within(
-    entry: Entry,
-    name: str,
-    given: dict[str, list[float]],
-    low: float,
-    high: float,
-    where: str | Path | None,
-    absent: float = 0.0,
-) -> float:
-    number = given.get(name, [absent])[0]
-    if not low <= number <= high:
+def _within(entry: Entry, name: str, given: dict[str, list[float]], where: str | Path | None) -> float:
+    parameter = catalogue()[entry.effect].parameter(name)
+    number = given.get(name, [parameter.absent])[0]
+    if not parameter.low <= number <= parameter.high:
         raise BadInput(
             f"{entry.effect}.{name} = {number:g} is not physical",
             where=where,
-            remedy=f"it lies between {low:g} and {high:g}",
+            remedy=f"it lies between {parameter.low:g} and {parameter.high:g}",
         )
     return number
 

@@ -12,14 +12,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from openant_tools.effects.effect import Effect, Quantity, Values
+from openant_tools.effects.effect import Effect, Ints, Parameter, Scope, Table, Values, amount, share
+from openant_tools.effects.robot import Robot
 from openant_tools.effects.step import Law, Step
 from openant_tools.effects.stribeck_friction import USUAL_VELOCITY_RAD_S
 
-__all__ = ["EFFECT"]
+__all__ = ["effect"]
 
 
-def _law(values: Values) -> Law:
+def _enter(robot: Robot, joints: Ints, values: Values) -> None:
+    robot.law("load_friction", "coefficient")[joints] += values["coefficient"]
+    robot.law("load_friction", "electrical")[joints] = values["electrical"]
+
+
+def _law(values: Table) -> Law:
     motor = values["motor_side"] + values["coefficient"] / 2
     link = values["link_side"] + values["coefficient"] / 2
     greater, at_rest = values["greater_side"], values["at_rest"] / 2
@@ -38,18 +44,24 @@ def _law(values: Values) -> Law:
     return act
 
 
-EFFECT = Effect(
+effect = Effect(
     name="load_friction",
     family="friction",
     words="friction grows with the torque that the gears carry",
-    quantities=(
-        Quantity("coefficient", "N·m/(N·m)", 0.25, high=0.9),
-        Quantity("motor_side", "N·m/(N·m)", 0.25, high=0.9),
-        Quantity("link_side", "N·m/(N·m)", 0.25, high=0.9),
-        Quantity("greater_side", "N·m/(N·m)", 0.25, high=0.9),
-        Quantity("at_rest", "N·m/(N·m)", 0.25, high=0.9),
-        Quantity("electrical", "1", 0.5, high=1.0),
-    ),
-    order=30,
+    scopes=(Scope.JOINT, Scope.SERVO, Scope.ALL),
+    # How much of the damping is back-EMF, which the gears do not carry, no data sheet of a model says.
+    quantities=(amount("coefficient", "N·m/(N·m)", 0.06, 0.6), share("electrical")),
+    enter=_enter,
+    native=False,
     law=_law,
+    order=30,
+    parameters=(
+        Parameter("coefficient", "N·m/(N·m)", 0.25, high=0.9),
+        Parameter("motor_side", "N·m/(N·m)", 0.25, high=0.9),
+        Parameter("link_side", "N·m/(N·m)", 0.25, high=0.9),
+        Parameter("greater_side", "N·m/(N·m)", 0.25, high=0.9),
+        Parameter("at_rest", "N·m/(N·m)", 0.25, high=0.9),
+        Parameter("electrical", "1", 0.5, high=1.0),
+    ),
+    restored=lambda given, x, reference, joints: {"electrical": 0.0, **given},
 )

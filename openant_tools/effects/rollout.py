@@ -41,11 +41,12 @@ def laws_of(values: Sequence[EffectValues], joints: int) -> list[Law]:
     laws = []
     for found in sorted((effect(name) for name in names), key=lambda found: found.order):
         table = {
-            quantity.name: np.array(
-                [np.broadcast_to(one.get((found.name, quantity.name), 0.0), joints) for one in values], float
+            parameter.name: np.array(
+                [np.broadcast_to(one.get((found.name, parameter.name), 0.0), joints) for one in values], float
             )
-            for quantity in found.quantities
+            for parameter in found.parameters
         }
+        assert found.law is not None
         laws.append(found.law(table))
     return laws
 

@@ -13,10 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Law", "Step"]
+__all__ = ["DAMPED", "HARD", "TINY", "Law", "Step"]
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+
+#: share of the stiffest spring that a step can integrate, for what is to be hard
+HARD = 0.15
+#: share of critical damping in a spring
+DAMPED = 0.3
+#: numbers that only must not be zero
+TINY = 1e-9
 
 
 @dataclass

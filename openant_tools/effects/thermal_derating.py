@@ -9,10 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.effects.effect import Effect, Quantity, Values
-from openant_tools.effects.step import Step
+from openant_tools.effects.effect import Action, Effect, Ints, Parameter, Scope, Table, Values, amount, shape
+from openant_tools.effects.robot import Robot
+from openant_tools.effects.step import TINY, Step
 
-__all__ = ["EFFECT", "Heating"]
+__all__ = ["FULL_HEAT_C", "Heating", "effect"]
 
 #: °C by which a winding that gives all its torque warms up in the end
 FULL_HEAT_C = 60.0
@@ -20,8 +21,11 @@ FULL_HEAT_C = 60.0
 COLDEST = 0.2
 #: s, where only a loss is named
 USUAL_S = 20.0
-#: numbers that only must not be zero
-TINY = 1e-9
+
+
+def _enter(robot: Robot, joints: Ints, values: Values) -> None:
+    robot.derating[joints] += values["loss_per_c"]
+    robot.derating_s, robot.heat_c = values["time_constant_s"], values["start_c"]
 
 
 class Heating:
@@ -35,7 +39,7 @@ class Heating:
         state: (n, joints) °C above where it began.
     """
 
-    def __init__(self, values: Values, start_c: NDArray[np.float64] | float = 0.0) -> None:
+    def __init__(self, values: Table, start_c: NDArray[np.float64] | float = 0.0) -> None:
         self._loss = values["loss_per_c"]
         seconds = values["time_constant_s"]
         self._seconds = np.where(seconds > 0.0, seconds, USUAL_S)
@@ -50,14 +54,33 @@ class Heating:
         step.limit *= left
 
 
-EFFECT = Effect(
+_warm_it_up = Action("warm it up", "record the same motion cold and after five minutes of work")
+
+effect = Effect(
     name="thermal_derating",
     family="torque supply",
     words="torque falls as the servo warms up",
+    scopes=(Scope.JOINT, Scope.SERVO, Scope.ALL),
     quantities=(
-        Quantity("loss_per_c", "1/°C", 0.01, high=0.1),
-        Quantity("time_constant_s", "s", 10.0, high=3600.0),
+        # Copper's resistance grows by the tolerance, so that any motor's torque falls by it.
+        amount("loss_per_c", "1/°C", 0.005, 0.06, tolerance=0.0039),
+        shape("time_constant_s", "s", 5.0, 40.0),
+        shape("start_c", "°C", 0.5, 30.0),
     ),
-    order=5,
+    enter=_enter,
+    native=False,
     law=Heating,
+    order=5,
+    parameters=(
+        Parameter("loss_per_c", "1/°C", 0.01, high=0.1),
+        Parameter("time_constant_s", "s", 10.0, high=3600.0),
+    ),
+    # How warm it was as a recording began is the recording's, not the robot's.
+    stated=lambda values, reference, joints: {name: values[name] for name in ("loss_per_c", "time_constant_s")},
+    restored=lambda given, x, reference, joints: {**given, "start_c": x.get("start_c", 0.0)},
+    told_from={
+        "voltage_sag": _warm_it_up,
+        "torque_limit": _warm_it_up,
+        "weak_joint": _warm_it_up,
+    },
 )

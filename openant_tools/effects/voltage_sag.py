@@ -1,14 +1,15 @@
-"""A supply whose voltage falls with what all servos draw together."""
+"""The supply's voltage falls with what all servos draw together."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from openant_tools.effects.effect import Effect, Quantity, Values
+from openant_tools.effects.effect import Action, Effect, Ints, Parameter, Scope, Table, Values, amount
+from openant_tools.effects.robot import Robot
 from openant_tools.effects.step import Law, Step
 from openant_tools.robot.kit import PLATFORM_PWM_LIMIT
 
-__all__ = ["EFFECT"]
+__all__ = ["effect"]
 
 #: V, of the supply without load; the share of the drop is what counts
 NOMINAL_V = 12.0
@@ -18,7 +19,11 @@ AMPERE_PER_NM = 0.6
 LEAST_SHARE = 0.4
 
 
-def _law(values: Values) -> Law:
+def _enter(robot: Robot, joints: Ints, values: Values) -> None:
+    robot.law("voltage_sag", "resistance_ohm")[:] += values["resistance_ohm"]
+
+
+def _law(values: Table) -> Law:
     resistance = values["resistance_ohm"]
 
     def act(step: Step) -> None:
@@ -35,12 +40,27 @@ def _law(values: Values) -> Law:
     return act
 
 
-EFFECT = Effect(
+effect = Effect(
     name="voltage_sag",
     family="torque supply",
-    words="the supply's voltage falls with what all servos draw together",
-    quantities=(Quantity("resistance_ohm", "Ω", 0.5, high=20.0),),
-    order=10,
+    words="the supply's voltage falls with what all servos draw",
+    scopes=(Scope.ALL,),
+    # A supply and its cables have up to as many ohms as the tolerance on any robot.
+    quantities=(amount("resistance_ohm", "Ω", 0.15, 4.0, tolerance=0.05),),
+    enter=_enter,
+    native=False,
     law=_law,
+    order=10,
+    parameters=(Parameter("resistance_ohm", "Ω", 0.5, high=20.0),),
     shared=True,
+    witness="volt",
+    told_from={
+        "load_friction": Action(
+            "one joint alone, then all",
+            "record `one-by-one` with the supply's voltage logged: sag is shared, friction is not",
+        ),
+        "torque_limit": Action(
+            "one joint alone, then all", "record `one-by-one`: a limit does not care what others do"
+        ),
+    },
 )

@@ -14,27 +14,25 @@ import numpy as np
 from lxml import etree
 from numpy.typing import NDArray
 
-from openant_tools.effects.catalogue import catalogue as acting
+from openant_tools.effects.catalogue import acting, catalogue
+from openant_tools.effects.document import Document
 from openant_tools.effects.entries import as_toml, entries_of
+from openant_tools.effects.native import edit
+from openant_tools.effects.robot import Reference, Robot, Seen
+from openant_tools.effects.zero_offset import read_zero, write_zero
 from openant_tools.errors import BadInput
 from openant_tools.files import json_text, write_text
-from openant_tools.gap.cause import catalogue
 from openant_tools.gap.closure import BODY, adjust
 from openant_tools.gap.diagnosis import Diagnosis, Found
-from openant_tools.gap.native import Edit, edit
-from openant_tools.gap.robot import Reference, Robot, Seen
 from openant_tools.model.body import floor_contacts
 from openant_tools.model.mjcf import document_text, write_model
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.robot.config import Effect, Provenance
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.pair import PLAIN, mark_of
-from openant_tools.sysid.kinds import KINDS
 
 __all__ = ["Applied", "apply", "robot_of", "write_robot"]
 
-#: laws that a written model carries by itself
-NATIVE_LAWS = ("cogging", "stribeck_friction", "viscous_nonlinear")
 #: rad: farther than any joint of a legged robot goes
 ANYWHERE_RAD = 10.0
 
@@ -144,7 +142,7 @@ def robot_of(
     return robot
 
 
-def write_robot(source: Path, robot: Robot, out: Path, *, note: str, pair: str | None = None) -> Edit:
+def write_robot(source: Path, robot: Robot, out: Path, *, note: str, pair: str | None = None) -> Document:
     """Write an MJCF that moves as this robot does, by MuJoCo's own features as far as those go (formats, section 5).
 
     Args:
@@ -180,15 +178,14 @@ def _variant(plant: Plant, robot: Robot) -> mujoco.MjModel:
     plain = robot.copy()
     plain.payload_kg, plain.tilt = 0.0, np.zeros(2)
     variant = plain.model(plant)
-    zero = KINDS["zero_offset"]
     for j in np.flatnonzero(robot.zero):
-        zero.write(variant, plant, int(j), zero.read(variant, plant, int(j)) + float(robot.zero[j]))
+        write_zero(variant, plant, int(j), read_zero(variant, plant, int(j)) + float(robot.zero[j]))
     if robot.adhesion_n:
         variant.geom_adhesion[floor_contacts(plant.model).geoms] = robot.adhesion_n
     return variant
 
 
-def _lengthen_keys(root: etree._Element, plant: Plant, done: Edit) -> None:
+def _lengthen_keys(root: etree._Element, plant: Plant, done: Document) -> None:
     """Keyframes count coordinates: those of the added hinges are 0."""
     added: list[tuple[int, int]] = []
     for joint, hinges in done.hinges.items():
@@ -207,7 +204,7 @@ def _lengthen_keys(root: etree._Element, plant: Plant, done: Edit) -> None:
 def _entries(plant: Plant, selected: list[Found], robot: Robot) -> list[Effect]:
     """What stands beside the model: laws that act between steps, and what acts on commands and sensors."""
     laws: dict[tuple[str, str], NDArray[np.float64]] = {
-        key: values for key, values in robot.laws.items() if key[0] not in NATIVE_LAWS
+        key: values for key, values in robot.laws.items() if not catalogue()[key[0]].native
     }
     entries = [
         Effect(entry.effect, "all" if acting()[entry.effect].shared else entry.joints, entry.parameters)

@@ -18,8 +18,8 @@ from scipy.sparse import csr_array, hstack
 
 from openant_tools.gap.neighbours import beside_neighbours
 from openant_tools.model.plant import Plant
+from openant_tools.model.servo import read_damping, read_stiffness, read_velocity_gain
 from openant_tools.recording.run import Run
-from openant_tools.sysid.kinds import KINDS
 
 __all__ = ["KINDS_OF_ONE", "Arrivals"]
 
@@ -137,10 +137,8 @@ def _servos(run: Run, plant: Plant) -> tuple[Array, Array]:
     mujoco.mj_fullM(model, data, inertia)
     own = np.maximum(inertia[plant.dof, plant.dof], 1e-9)
     joints = range(len(plant.joints))
-    stiffness = np.array([max(KINDS["stiffness"].read(model, plant, j), 1e-9) for j in joints])
-    damping = np.array(
-        [KINDS["damping"].read(model, plant, j) + KINDS["velocity_gain"].read(model, plant, j) for j in joints]
-    )
+    stiffness = np.array([max(read_stiffness(model, plant, j), 1e-9) for j in joints])
+    damping = np.array([read_damping(model, plant, j) + read_velocity_gain(model, plant, j) for j in joints])
     return np.clip(np.sqrt(stiffness / own), *NATURAL_RAD_S), damping / (2 * np.sqrt(stiffness * own))
 
 

@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from openant_tools.gap.cause import Quantity, enter
+from openant_tools.effects.catalogue import enter
+from openant_tools.effects.effect import Quantity
+from openant_tools.effects.robot import Robot
 from openant_tools.gap.explain import Hypothesis, Part, bounds_of
 from openant_tools.gap.features import Floats, around_switching
 from openant_tools.gap.protocol import Played, Protocol
-from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
-from openant_tools.gap.tolerance import COPPER, COULOMB_NM, DELAY_S, FACTORS, FLOOR, TILT_RAD, ZERO_RAD, torso_kg
+from openant_tools.gap.tolerance import FACTORS, FLOOR, tolerance_of, torso_kg
 from openant_tools.model.floor import floors
 from openant_tools.model.gap import HORIZON_S, share_closed
 from openant_tools.model.plant import Setup
@@ -686,17 +687,21 @@ def _nuisances(protocol: Protocol) -> list[_Nuisance]:
         if kind != "torque_limit" or np.isfinite(protocol.reference.limit).all():
             out += [_Nuisance(kind, (j,), FACTORS[kind]) for j in joints]
     out += [
-        _Nuisance("coulomb_friction", (j,), COULOMB_NM * min(1.0, float(protocol.reference.torque[j]) / 0.2))
+        _Nuisance(
+            "coulomb_friction",
+            (j,),
+            tolerance_of("coulomb_friction") * min(1.0, float(protocol.reference.torque[j]) / 0.2),
+        )
         for j in joints
     ]
-    out += [_Nuisance("zero_offset", (j,), ZERO_RAD) for j in joints]
-    out.append(_Nuisance("delay", tuple(joints), DELAY_S))
+    out += [_Nuisance("zero_offset", (j,), tolerance_of("zero_offset")) for j in joints]
+    out.append(_Nuisance("delay", tuple(joints), tolerance_of("action_delay")))
     if protocol.warmed_c > WARMED_C:
-        out.append(_Nuisance(HEAT_LOSS, tuple(joints), COPPER))
+        out.append(_Nuisance(HEAT_LOSS, tuple(joints), tolerance_of("thermal_derating")))
     if protocol.reference.floor:
         out += [_Nuisance(kind, (), tolerance) for kind, tolerance in FLOOR.items()]
         out.append(_Nuisance("torso_kg", (), torso_kg(protocol.reference)))
-        out += [_Nuisance(kind, (), TILT_RAD / np.sqrt(2)) for kind in TILTS]
+        out += [_Nuisance(kind, (), tolerance_of("floor_tilt") / np.sqrt(2)) for kind in TILTS]
     return out
 
 

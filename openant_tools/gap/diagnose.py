@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.effects.catalogue import catalogue
 from openant_tools.errors import BadInput
-from openant_tools.gap.cause import catalogue
 from openant_tools.gap.diagnosis import NONE, Diagnosis
 from openant_tools.gap.explain import Scene, explain
 from openant_tools.gap.judge import Judgement

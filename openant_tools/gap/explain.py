@@ -14,11 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.cause import Cause, Quantity, catalogue, enter
+from openant_tools.effects.catalogue import catalogue, enter
+from openant_tools.effects.effect import Cause, Quantity
+from openant_tools.effects.robot import Reference, Robot
 from openant_tools.gap.features import Floats
 from openant_tools.gap.judge import Judgement
 from openant_tools.gap.protocol import Played, Players, Protocol
-from openant_tools.gap.robot import Reference, Robot
 from openant_tools.gap.thresholds import HEAT
 from openant_tools.gap.whitening import Metric
 from openant_tools.model.plant import Setup

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap.by_joint import FEWEST_JOINTS, ByJoint, places_of
-from openant_tools.gap.cause import catalogue
 from openant_tools.gap.features import Floats
 from openant_tools.gap.networks import Networks
 from openant_tools.gap.prepare import Prepared

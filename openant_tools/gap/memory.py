@@ -10,9 +10,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.effects.robot import Robot
 from openant_tools.effects.step import Step
 from openant_tools.effects.thermal_derating import Heating
-from openant_tools.gap.robot import Robot
 from openant_tools.model.rollout import Measured, Staircase
 
 __all__ = ["heats", "setpoints"]

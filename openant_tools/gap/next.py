@@ -2,7 +2,7 @@
 
 What is still possible is simulated on every protocol of the library; the protocol on which the two that are most alike differ
 most, against how robots of one build differ, is the one to record. Where physics forbids commands and positions to tell two
-effects apart, a table knows what to do with one's hands.
+effects apart, the effects know what to do with one's hands (`Effect.told_from`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import copy
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.effects.catalogue import action
+from openant_tools.effects.robot import USUAL_NOISE, Reference, Robot, Seen
 from openant_tools.errors import BadInput
 from openant_tools.gap.apply import robot_of
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
 from openant_tools.gap.protocol import FLOOR_STEP_S, STAND_STEP_S
-from openant_tools.gap.robot import USUAL_NOISE, Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.tolerance import scatter
 from openant_tools.model.plant import Plant, Setup, load_plant
@@ -51,39 +52,6 @@ SHOWN = 5
 KINDS = 3
 #: rad, of joints without a range
 REACH_RAD = 0.6
-
-#: what commands and positions alone cannot tell apart, or hardly (effects.md), and what can
-ACTIONS: Mapping[frozenset[str], tuple[str, str]] = {
-    frozenset(pair.split()): action
-    for pair, action in {
-        "action_delay sensor_delay": (
-            "tap the robot", "hold it still, tap a leg sharply and log current or the IMU beside positions: what comes late "
-            "without any command is the sensor",
-        ),
-        "payload torque_limit": ("hang a known mass", "weigh the robot, or record once more with 100 g on the torso"),
-        "payload stiffness_error": ("hang a known mass", "weigh the robot, or record once more with 100 g on the torso"),
-        "payload link_mass": ("stand and floor", "weigh one leg; legs show on the stand, the torso's load on the floor only"),
-        "link_mass stiffness_error": ("weigh one leg", "a scale of mass, gains and friction in common shows in no position"),
-        "floor_tilt cable_drag": (
-            "turn the robot", "record `shifts`, which plays in two headings, and unplug the cable or hold it up for one of them",
-        ),
-        "cable_drag floor_friction": ("hold the cable up", "record `gait` with the cable held up, and once more without"),
-        "imu_misalignment floor_tilt": ("turn the robot", "at rest, in two headings: a tilt turns in the body's frame, an IMU does not"),
-        "imu_bias floor_tilt": ("turn the robot", "at rest, in two headings: a tilt turns in the body's frame, a bias does not"),
-        "imu_bias imu_misalignment": ("turn it over", "at rest on each side: a bias stays, a turned sensor follows"),
-        "voltage_sag load_friction": (
-            "one joint alone, then all", "record `one-by-one` with the supply's voltage logged: sag is shared, friction is not",
-        ),
-        "voltage_sag torque_limit": ("one joint alone, then all", "record `one-by-one`: a limit does not care what others do"),
-        "thermal_derating voltage_sag": ("warm it up", "record the same motion cold and after five minutes of work"),
-        "thermal_derating torque_limit": ("warm it up", "record the same motion cold and after five minutes of work"),
-        "thermal_derating weak_joint": ("warm it up", "record the same motion cold and after five minutes of work"),
-        "weak_joint torque_limit": ("swap two servos", "what moves with the servo is the servo's, what stays is the leg's"),
-        "weak_joint stiffness_error": ("swap two servos", "what moves with the servo is the servo's, what stays is the leg's"),
-        "damping_error electrical_damping": ("let it fall", "record `drops` and `releases`: without torque back-EMF is gone"),
-        "tracker_scale floor_friction": ("move it by hand", "push it a metre along a ruler with torque off: a scale shows at once"),
-    }.items()
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -169,9 +137,9 @@ def suggestion(verdict: str, together: Sequence[Sequence[str]], kinds: int) -> s
         )
     for group in together:
         for pair in itertools.combinations(group, 2):
-            action = ACTIONS.get(frozenset(pair))
-            if action is not None:
-                return f"{action[0]}: {action[1]}"
+            found = action(*pair)
+            if found is not None:
+                return f"{found.name}: {found.words}"
     if verdict == AMBIGUOUS:
         return "record another motion: `openant gap next` on the JSON of this diagnosis says which tells these causes apart best"
     return (
@@ -204,9 +172,9 @@ def _nothing_open(found: Diagnosis) -> str:
 def _by_hand(possible: Sequence[Found]) -> list[Experiment]:
     out = []
     for a, b in itertools.combinations([one.effect for one in possible], 2):
-        action = ACTIONS.get(frozenset((a, b)))
-        if action is not None:
-            out.append(Experiment(action[0], action[1], None, (a, b)))
+        told = action(a, b)
+        if told is not None:
+            out.append(Experiment(told.name, told.words, None, (a, b)))
     return out
 
 

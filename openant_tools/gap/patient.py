@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.cause import Scope, catalogue
+from openant_tools.effects.catalogue import catalogue
+from openant_tools.effects.effect import Scope
 from openant_tools.gap.closure import Closure, Refit, Windows, calibration_of, heat_loss_of
 from openant_tools.gap.diagnosis import Diagnosis, Found, Span
 from openant_tools.gap.explain import Explained

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.cause import Cause, Scope, catalogue, enter
+from openant_tools.effects.catalogue import catalogue, enter
+from openant_tools.effects.effect import Cause, Scope
+from openant_tools.effects.robot import Robot
 from openant_tools.gap.features import Floats, with_noise
 from openant_tools.gap.protocol import Protocol
-from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.tolerance import random_form, resting, scatter
 from openant_tools.model.plant import Setup

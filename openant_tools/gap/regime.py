@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.model.plant import Plant
+from openant_tools.model.servo import read_stiffness, torque_limit
 from openant_tools.recording.run import Run
-from openant_tools.sysid.kinds import KINDS, torque_limit
 
 __all__ = ["Regime", "regimes"]
 
@@ -59,7 +59,7 @@ def regimes(run: Run, plant: Plant) -> NDArray[np.str_]:
         for row in np.flatnonzero(_turns(moving)):
             near = np.abs(t - t[row]) <= REVERSAL_S
             out[near, j] = Regime.REVERSAL
-        stiffness, limit = KINDS["stiffness"].read(plant.model, plant, j), torque_limit(plant.model, plant, j)
+        stiffness, limit = read_stiffness(plant.model, plant, j), torque_limit(plant.model, plant, j)
         out[np.abs(stiffness * (cmd[:, j] - pos[:, j])) > SATURATED * limit, j] = Regime.SATURATED
     out[run.signal("torque", plant.joints, default=1.0) == 0] = Regime.RELEASED
     return out

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.effects.robot import Robot
 from openant_tools.gap.apply import robot_of
 from openant_tools.gap.diagnosis import NONE, UNEXPLAINED, Diagnosis, Found
-from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.words import closed, rest_words, sentence, standing, what_next, where_words
 from openant_tools.model.gap import HORIZON_S

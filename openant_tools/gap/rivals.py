@@ -11,7 +11,8 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from openant_tools.gap.cause import Cause, Scope, catalogue
+from openant_tools.effects.catalogue import catalogue
+from openant_tools.effects.effect import Cause, Scope
 from openant_tools.gap.closure import Windows, unmoved
 from openant_tools.gap.explain import Explained, Part
 from openant_tools.gap.judge import Judgement

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from openant_tools.gap.cause import Quantity
+from openant_tools.effects.effect import Quantity
 from openant_tools.gap.closure import END, INDEPENDENT_S, LEAST_SIGMA_RAD, SPREAD, Closure, Refit, Windows
 from openant_tools.gap.explain import Part, bounds_of
 from openant_tools.gap.features import Floats

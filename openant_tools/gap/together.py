@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from openant_tools.gap.cause import catalogue
+from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap.closure import Windows
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis
 from openant_tools.gap.explain import Explained, Part

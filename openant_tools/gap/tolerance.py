@@ -8,40 +8,47 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.robot import USUAL_NOISE, Form, Reference, Robot
+from openant_tools.effects.catalogue import catalogue
+from openant_tools.effects.robot import USUAL_NOISE, Form, Reference, Robot
 
-__all__ = ["FACTORS", "FLOOR", "random_form", "resting", "scatter", "torso_kg"]
+__all__ = ["FACTORS", "FLOOR", "random_form", "resting", "scatter", "tolerance_of", "torso_kg"]
 
 Array = NDArray[np.float64]
 
+
+def tolerance_of(effect: str, quantity: str | None = None) -> float:
+    """Within what robots of one build differ, as it stands with the effect: of its first quantity, or the one named."""
+    found = catalogue()[effect]
+    return (found.quantities[0] if quantity is None else found.quantity(quantity)).tolerance
+
+
 #: kind → how far the logarithm of a robot's factor may lie from 0
-FACTORS = {"stiffness": 0.15, "torque_limit": 0.15, "damping": 0.25, "armature": 0.30, "link_mass": 0.05}
-COULOMB_NM, ZERO_RAD, DELAY_S = 0.02, math.radians(0.5), 0.002
-TORSO_KG, TILT_RAD = 0.03, math.radians(0.5)
+FACTORS = {
+    "stiffness": tolerance_of("stiffness_error"),
+    "torque_limit": tolerance_of("torque_limit"),
+    "damping": tolerance_of("damping_error"),
+    "armature": tolerance_of("armature_error"),
+    "link_mass": tolerance_of("link_mass"),
+}
 #: the same of the floor's contacts; of what only says how their simulation is made, how far it is from any contact's
 FLOOR = {
-    "floor_friction": 0.15, "softness": 0.30, "contact_damping": 0.4, "contact_give": 0.6, "contact_depth": 0.6,
-    "impratio": math.log(10.0),
+    "floor_friction": tolerance_of("floor_friction"), "softness": tolerance_of("contact_softness"), "contact_damping": 0.4,
+    "contact_give": 0.6, "contact_depth": 0.6, "impratio": math.log(10.0),
 }  # fmt: skip
-#: 1/°C by which copper's resistance grows, and with it a motor's torque falls; a case's thermometer is not its winding's
-COPPER = 0.0039
-IMU_RAD, GYRO_RAD_S, ACC_M_S2 = math.radians(1.0), 0.01, 0.1
-#: share of its length by which a link may be longer; Ω of a supply and its cables
-LENGTH, SUPPLY_OHM = 0.01, 0.05
-#: share of what a model calls damping that may be back-EMF, and is gone with torque off
-ELECTRICAL = 0.15
+#: share of its length by which a link may be longer
+LENGTH = 0.01
 #: of the torso mass's tolerance on a robot that is not an Ant: share of its mass
 TORSO_SHARE = 0.03
 #: share by which a current or load sensor's scale is uncertain
 TORQUE_SCALE = 0.03
 #: share of its usual size by which a current sensor may be off at no torque
 TORQUE_ZERO = 0.06
-#: s by which a velocity register is late at most on a healthy servo, and by which a row's stamp is off its samples
-VELOCITY_LATE_S, STAMP_S = 0.012, 0.0015
+#: s by which a row's stamp is off its samples at most
+STAMP_S = 0.0015
 #: s, deviation of when a row is read about its stamp, on the worst healthy robot: hosts are no clocks
 ROW_S = 0.001
-#: s by which low-pass filters make a gyroscope late at most (25 Hz), and an accelerometer beyond it (Betaflight's is 10 to 25 Hz)
-IMU_LATE_S, ACC_LATE_S = 0.007, 0.010
+#: s by which low-pass filters make an accelerometer later than a gyroscope at most (Betaflight's is 10 to 25 Hz)
+ACC_LATE_S = 0.010
 #: steps of a voltage sensor between which the supply may lie: which of its steps is nearest is a matter of chance
 VOLT_BETWEEN = 0.5
 #: logarithms of factors on what a contact is like beside its softness
@@ -71,22 +78,24 @@ def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width:
     for kind, tolerance in FACTORS.items():
         robot.factor(kind)[:] *= np.exp(tolerance * spread())
     # Where the model has almost no friction it has as little to lose.
-    robot.more("coulomb_friction")[:] += COULOMB_NM * np.minimum(1.0, reference.torque / 0.2) * spread()
-    robot.zero += width * ZERO_RAD * rng.uniform(-1, 1, n)
-    robot.delay += DELAY_S * spread()
-    robot.electrical += float(rng.uniform(0, ELECTRICAL))
+    robot.more("coulomb_friction")[:] += (
+        tolerance_of("coulomb_friction") * np.minimum(1.0, reference.torque / 0.2) * spread()
+    )
+    robot.zero += width * tolerance_of("zero_offset") * rng.uniform(-1, 1, n)
+    robot.delay += tolerance_of("action_delay") * spread()
+    robot.electrical += float(rng.uniform(0, tolerance_of("electrical_damping")))
     robot.length *= 1 + width * LENGTH * rng.uniform(-1, 1, n)
-    robot.law("voltage_sag", "resistance_ohm")[:] += float(rng.uniform(0, SUPPLY_OHM))
+    robot.law("voltage_sag", "resistance_ohm")[:] += float(rng.uniform(0, tolerance_of("voltage_sag")))
     robot.torso_kg += width * rng.uniform(-1, 1) * torso_kg(reference)
     robot.floor_friction *= math.exp(width * FLOOR["floor_friction"] * rng.uniform(-1, 1))
     robot.softness *= math.exp(width * FLOOR["softness"] * rng.uniform(-1, 1))
-    robot.tilt += width * TILT_RAD * rng.uniform(-1, 1, 2) / math.sqrt(2)
-    robot.imu_rotation += width * IMU_RAD * rng.uniform(-1, 1, 3)
-    robot.gyro_bias += width * GYRO_RAD_S * rng.uniform(-1, 1, 3)
-    robot.acc_bias += width * ACC_M_S2 * rng.uniform(-1, 1, 3)
+    robot.tilt += width * tolerance_of("floor_tilt") * rng.uniform(-1, 1, 2) / math.sqrt(2)
+    robot.imu_rotation += width * tolerance_of("imu_misalignment") * rng.uniform(-1, 1, 3)
+    robot.gyro_bias += width * tolerance_of("imu_bias", "gyro_x") * rng.uniform(-1, 1, 3)
+    robot.acc_bias += width * tolerance_of("imu_bias", "acc_x") * rng.uniform(-1, 1, 3)
     # A servo's velocity register is a filtered one, and stamps are not exactly those of the samples.
-    robot.late["vel"] = robot.late.get("vel", 0.0) + float(rng.uniform(0, VELOCITY_LATE_S))
-    robot.late["imu"] = robot.late.get("imu", 0.0) + float(rng.uniform(0, IMU_LATE_S))
+    robot.late["vel"] = robot.late.get("vel", 0.0) + float(rng.uniform(0, tolerance_of("sensor_delay", "vel")))
+    robot.late["imu"] = robot.late.get("imu", 0.0) + float(rng.uniform(0, tolerance_of("sensor_delay", "imu")))
     robot.late["acc"] = float(rng.uniform(0, ACC_LATE_S))
     stamp = float(rng.uniform(-STAMP_S, STAMP_S))
     for signal in ("pos", "vel", "torque"):
@@ -101,7 +110,7 @@ def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width:
 
 def torso_kg(reference: Reference) -> float:
     """How far from the model a torso's mass may be."""
-    return min(TORSO_KG, TORSO_SHARE * reference.robot_kg)
+    return min(tolerance_of("payload"), TORSO_SHARE * reference.robot_kg)
 
 
 def random_form(rng: np.random.Generator, encoder_rad: float) -> Form:

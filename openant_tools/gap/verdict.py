@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openant_tools.gap.cause import catalogue
+from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap.closure import STRAINED, ClosureByJoint, Refit, Windows, closures, nothing, unmoved
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis
 from openant_tools.gap.explain import Explained, Hypothesis, Part, Scene, explain, fit, known_to, robot_with, scene_of

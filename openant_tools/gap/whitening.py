@@ -6,23 +6,21 @@ Tolerances, chatter, numerical form and sensors are in one covariance, by which 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap import tolerance
-from openant_tools.gap.cause import catalogue
+from openant_tools.effects.catalogue import catalogue
+from openant_tools.effects.robot import Reference
 from openant_tools.gap.features import Floats
 from openant_tools.gap.population import Case
-from openant_tools.gap.robot import Reference
 
 __all__ = ["CLIP", "Metric", "Whitening", "whiten"]
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 #: share by which what healthy robots show beyond their tolerances is taken for independent noise
 SHRUNK = 0.5
@@ -30,22 +28,6 @@ SHRUNK = 0.5
 CLIP = 40.0
 #: standard deviation of a robot within a tolerance, as a share of it
 SPREAD = 0.6
-#: causes whose templates show what tolerances do: cause → the tolerance of its coordinate, for a robot's reference
-NUISANCES: dict[str, Callable[[Reference, Ints], float]] = {
-    "stiffness_error": lambda reference, joints: tolerance.FACTORS["stiffness"],
-    "damping_error": lambda reference, joints: tolerance.FACTORS["damping"],
-    "torque_limit": lambda reference, joints: tolerance.FACTORS["torque_limit"],
-    "armature_error": lambda reference, joints: tolerance.FACTORS["armature"],
-    "link_mass": lambda reference, joints: tolerance.FACTORS["link_mass"],
-    "coulomb_friction": lambda reference, joints: tolerance.COULOMB_NM / float(reference.torque[joints].mean()),
-    "zero_offset": lambda reference, joints: tolerance.ZERO_RAD,
-    "action_delay": lambda reference, joints: tolerance.DELAY_S,
-    "floor_friction": lambda reference, joints: tolerance.FLOOR["floor_friction"],
-    "contact_softness": lambda reference, joints: tolerance.FLOOR["softness"],
-    "floor_tilt": lambda reference, joints: tolerance.TILT_RAD,
-    "imu_misalignment": lambda reference, joints: tolerance.IMU_RAD,
-    "payload": lambda reference, joints: tolerance.TORSO_KG / reference.robot_kg,
-}
 
 
 @dataclass(frozen=True)
@@ -126,14 +108,15 @@ def _tolerances(templates: Array, bank: Sequence[Case], reference: Reference) ->
     taken = set()
     for template, case in zip(templates, bank, strict=True):
         ((name, (joints, x)),) = case.causes.items()
-        if name not in NUISANCES:
+        effect = catalogue()[name]
+        if not effect.nuisance:
             continue
-        main = max((q for q in catalogue()[name].quantities if not q.shape), key=lambda q: abs(x[q.name]) / q.small)
+        main = max((q for q in effect.quantities if not q.shape), key=lambda q: abs(x[q.name]) / q.small)
         key = (name, joints, main.name)
         # The smallest template of a place: the nearest to a derivative.
         if key in taken:
             continue
         taken.add(key)
-        out.append(template * (SPREAD * NUISANCES[name](reference, np.array(joints)) / x[main.name]))
+        out.append(template * (SPREAD * main.allowed(reference, np.array(joints)) / x[main.name]))
     found: Floats = np.array(out).T.astype(np.float32)
     return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from openant_tools.gap.cause import catalogue
+from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
 from openant_tools.model.gap import share_closed
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
@@ -10,8 +11,9 @@ from numpy.typing import NDArray
 
 from openant_tools.model.plant import Plant, world_bodies
 
-__all__ = ["Contacts", "floor_contacts", "link_bodies", "scale_mass", "torso_body"]
+__all__ = ["Contacts", "contact_number", "floor_contacts", "link_bodies", "scale_mass", "torso_body"]
 
+Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
@@ -56,3 +58,31 @@ def floor_contacts(model: mujoco.MjModel) -> Contacts:
     geoms = np.flatnonzero(alone if alone.any() else robot | (of_world & touches)).astype(np.int64)
     with_world = of_world[model.pair_geom1] | of_world[model.pair_geom2]
     return Contacts(geoms, np.flatnonzero(with_world).astype(np.int64))
+
+
+def contact_number(field: str, columns: int) -> tuple[Callable[..., float], Callable[..., None]]:
+    """Reader and writer of the first number of a contact's field: the greatest of all; all are scaled alike.
+
+    Args:
+        field: as after `geom_` and `pair_`.
+        columns: how many of a pair's numbers mean the same (its friction has two sliding directions).
+    """
+
+    def numbers(model: mujoco.MjModel) -> tuple[Array, Array]:
+        contacts = floor_contacts(model)
+        # A negative time constant is a stiffness (`solref`): it is none, and stays.
+        geoms = np.asarray(getattr(model, f"geom_{field}"))[contacts.geoms, 0]
+        pairs = np.asarray(getattr(model, f"pair_{field}"))[contacts.pairs, 0]
+        return geoms, pairs
+
+    def read(model: mujoco.MjModel, plant: Plant, j: int) -> float:
+        return max(float(part.max(initial=0.0)) for part in numbers(model))
+
+    def write(model: mujoco.MjModel, plant: Plant, j: int, value: float) -> None:
+        contacts, factor = floor_contacts(model), value / read(model, plant, j)
+        geoms, pairs = numbers(model)
+        getattr(model, f"geom_{field}")[contacts.geoms, 0] *= np.where(geoms > 0, factor, 1.0)
+        for column in range(columns):
+            getattr(model, f"pair_{field}")[contacts.pairs, column] *= np.where(pairs > 0, factor, 1.0)
+
+    return read, write

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from openant_tools.comms.motion import catch
 from openant_tools.model.plant import Plant, Setup
 from openant_tools.model.rollout import fill_setpoints
+from openant_tools.model.servo import read_damping, read_electrical, read_velocity_gain, torque_limit
 from openant_tools.recording.run import Facts, Run
 from openant_tools.sysid.excitation import CommandSpace
-from openant_tools.sysid.kinds import KINDS, torque_limit
 from openant_tools.sysid.protocols import Protocol
 
 __all__ = ["ENCODER_RAD", "Forecast", "Peak", "forecast"]
@@ -233,10 +233,10 @@ def _run(plant: Plant, protocol: Protocol, commands: Array, limp: Bools, pos: Ar
 def _peak(plant: Plant, j: int, pos: Array, vel: Array, torque: Array, limp: Bools) -> Peak:
     model = plant.model
     limit = torque_limit(model, plant, j)
-    damping = KINDS["damping"].read(model, plant, j) + KINDS["velocity_gain"].read(model, plant, j)
+    damping = read_damping(model, plant, j) + read_velocity_gain(model, plant, j)
     driven = torque[~limp]
     # What a DC motor's actuator gives is what its back-EMF leaves; its duty is saturated where it gives all of that.
-    back = KINDS["electrical_damping"].read(model, plant, j) * KINDS["damping"].read(model, plant, j)
+    back = read_electrical(model, plant, j) * read_damping(model, plant, j)
     full = np.abs(driven + back * vel[~limp]) > SATURATED * limit
     return Peak(
         plant.joints[j],

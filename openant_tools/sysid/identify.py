@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.effects.catalogue import catalogue
+from openant_tools.effects.catalogue import acting
 from openant_tools.effects.entries import check_pair, entries_of, values_of
 from openant_tools.effects.rollout import EffectValues
 from openant_tools.errors import BadInput
@@ -451,7 +451,7 @@ def _played(entries: Sequence[Entry], kinds: Sequence[str]) -> list[Entry]:
     What the rest of a model carries (a written delay, a hinge with play) is in the model already.
     """
     fitted = {key[0] for kind in kinds if (key := KINDS[kind].effect) is not None}
-    return [entry for entry in entries if entry.effect in catalogue() and entry.effect not in fitted]
+    return [entry for entry in entries if entry.effect in acting() and entry.effect not in fitted]
 
 
 def _datasets(

@@ -23,7 +23,8 @@ from openant_tools.effects.catalogue import effect
 from openant_tools.effects.rollout import EffectValues
 from openant_tools.model.attribute import Attribute, stated
 from openant_tools.model.plant import Plant
-from openant_tools.sysid.kinds import ACTION_DELAY, KINDS, Kind, usual_torque
+from openant_tools.model.servo import usual_torque
+from openant_tools.sysid.kinds import ACTION_DELAY, KINDS, Kind
 
 __all__ = [
     "ACTION_DELAY",

@@ -20,10 +20,10 @@ from openant_tools.errors import BadInput
 from openant_tools.model.floor import resolution
 from openant_tools.model.plant import Plant
 from openant_tools.model.rollout import Rollouts
+from openant_tools.model.servo import read_stiffness, torque_limit
 from openant_tools.model.stability import NUDGE, growth
 from openant_tools.recording.run import Run
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE, RAD_S_PER_COUNT
-from openant_tools.sysid.kinds import KINDS, torque_limit
 from openant_tools.sysid.quality import without_errors
 
 __all__ = ["RULES", "Finding", "Rule", "Verdict", "check_runs", "findings", "with_rows", "without_turns"]
@@ -597,7 +597,7 @@ def _share_saturated(case: Case, j: int) -> float:
         full = duty > 0.98 * limit
         known = np.isfinite(duty) & case.on[:, j]
     else:
-        torque = KINDS["stiffness"].read(plant.model, plant, j) * np.abs(case.cmd[:, j] - case.pos[:, j])
+        torque = read_stiffness(plant.model, plant, j) * np.abs(case.cmd[:, j] - case.pos[:, j])
         full = torque > torque_limit(plant.model, plant, j)
         known = np.isfinite(torque) & case.on[:, j]
     return float(full[known].mean()) if known.any() else 0.0
