@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import shlex
 import shutil
 import sys
 import tomllib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,9 @@ from hypothesis import strategies as st
 from openant_tools.blind import commands
 from openant_tools.blind import make as make_module
 from openant_tools.blind.answers import read_answers
+from openant_tools.blind.by_command import is_made
 from openant_tools.blind.commands import Motion
-from openant_tools.blind.draw import OUTSIDE, Answer, Drawn, Mix, draw_answers
+from openant_tools.blind.draw import ELSEWHERE, OUTSIDE, Answer, Drawn, Mix, draw_answers
 from openant_tools.blind.log import logged
 from openant_tools.blind.make import make_set, seed_of_commit
 from openant_tools.blind.robot import true_robot
@@ -40,7 +42,7 @@ from openant_tools.procedure.intervals import wilson
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.joints import JOINTS
 from openant_tools.virtual.scenario import parse_scenario
-from openant_tools.virtual.seal import make_key
+from openant_tools.virtual.seal import make_key, read_key
 
 HEALTHY = Answer("none", (), 5, "batch", True)
 
@@ -312,7 +314,7 @@ def test_the_score_counts_what_is_right_and_shows_what_is_not(
         gap, ["blind", "score", str(folder), "--key-file", str(key_file), "--json", str(out), "--docs", str(docs)]
     )
     assert done.exit_code == 0, done.output
-    assert "| false alarms on robots without effect | 0 % | 0 … 79 % | 1 |" in done.output
+    assert "| false alarms on robots without effect | 0 % (0 … 79 %) of 1 |" in done.output
     rows = {row["what"]: row for row in json.loads(out.read_text())["rows"]}
     assert rows["right name first, medium and large, joint, servo, bus"]["k"] == 1
     assert rows["outside the catalogue: not given a name"]["k"] == 1
@@ -334,7 +336,7 @@ def test_several_sets_are_scored_together(sealed_set: tuple[Path, Path, bytes], 
     assert done.exit_code == 0, done.output
     told = json.loads(out.read_text())
     assert (told["robots"], told["missing"], len(told["sets"])) == (6, 0, 2)
-    assert "| false alarms on robots without effect | 0 % | 0 … 66 % | 2 |" in done.output
+    assert "| false alarms on robots without effect | 0 % (0 … 66 %) of 2 |" in done.output
     assert docs.read_text().count("commitment of the answers") == 2
     refused = CliRunner().invoke(gap, [*asked, "--key-file", str(key_file)])
     assert "1 keys for 2 sets" in str(refused.exception)
@@ -357,8 +359,8 @@ def test_a_set_that_is_judged_in_part_can_be_scored_so_far(
     out, docs = tmp_path / "score.json", tmp_path / "blind.md"
     done = CliRunner().invoke(gap, [*asked, "--so-far", "--json", str(out), "--docs", str(docs)])
     assert done.exit_code == 0, done.output
-    assert "| robots that have no verdict yet, left out | 1 |  | 3 |" in done.output
-    assert "| right name first, medium and large, joint, servo, bus | – |  | 0 |" in done.output
+    assert "1 of 3 robots have no verdict yet and are left out" in done.output
+    assert "| right name first, medium and large, joint, servo, bus | – |" in done.output
     assert {name: json.loads(out.read_text())[name] for name in ("robots", "missing")} == {"robots": 2, "missing": 1}
     assert "2 robots, those judged so far of 3, seed 3" in docs.read_text()
 
@@ -375,7 +377,7 @@ def test_a_false_alarm_and_a_wrong_name_are_shown() -> None:
     ]  # fmt: skip
     found = score([{"seed": 1, "commitment": "x"}], cases)
     assert [case.robot for case in found.failures] == ["robot-000", "robot-001", "robot-004"]
-    alarms = next(row for row in found.rows if row.words.startswith("false alarms"))
+    alarms = next(row for row in found.makers["batch"] if row.words.startswith("false alarms"))
     assert (alarms.k, alarms.n, alarms.reached) == (1, 1, "below")
     assert found.confusions[("action_delay", "actuator_lag")] == 1
     page = score_report(found).html()
@@ -390,6 +392,166 @@ def test_wilson_holds_the_proportion(counts: tuple[int, int]) -> None:
     assert wilson(0, 120)[1] == pytest.approx(0.031, abs=1e-3)
 
 
+# ---- robots of other programs ----
+
+#: A program of somebody's own: a pendulum that follows late, or not, by what its answer says; its log is a CSV.
+OTHERS = """
+import json, math, sys
+from pathlib import Path
+answer, folder = json.loads(Path(sys.argv[-2]).read_text()), Path(sys.argv[-1])
+assert not list(folder.iterdir()), "the folder is not empty"
+assert Path(answer["model"]).is_file()
+say, stop_at = sys.argv[1], folder.parents[2] / "stop-at"
+if stop_at.exists() and answer["robot"] == stop_at.read_text():
+    print("reading the answer\\nthe spring \\x1b[31msnapped", file=sys.stderr)
+    sys.exit(7)
+if say == "cannot" and answer["group"] == "outside":
+    sys.exit(3)
+late = 0.1 if answer["effects"] else 0.0
+rows = ["t,cmd.swing,pos.swing"]
+for k in range(150):
+    t = k / 50
+    rows.append(f"{t},{math.sin(3 * t)},{math.sin(3 * (t - late))}")
+if say == "garbage":
+    rows[40] = "0.78,nonsense,0.1"
+(folder / "swing_1.csv").write_text("\\n".join(rows) + "\\n")
+facts = {"joints": ["swing"], "setup": "stand"}
+if say != "nameless":
+    facts["answer_joints"] = {f"{p}_{s}": "swing" for p in ("hip", "knee") for s in ("rr", "fr", "fl", "rl")}
+(folder / "swing_1.json").write_text(json.dumps(facts))
+with open(folder.parents[2] / "made", "a") as done:
+    done.write(answer["robot"] + " ")
+"""
+
+
+@pytest.fixture
+def others(tmp_path: Path) -> Callable[..., Any]:
+    """Make a set of five robots by that program, told one word."""
+    program = tmp_path / "their generator.py"
+    program.write_text(OTHERS)
+
+    def make(word: str, *more: str) -> Any:
+        command = f"{shlex.quote(sys.executable)} {shlex.quote(str(program))} {word}"
+        shares = ["--none", "0.4", "--two", "0", "--outside", "0.2"]
+        asked = ["blind", "make", "--out", str(tmp_path / "theirs"), "--robots", "5", "--seed", "11", *shares]
+        return CliRunner().invoke(gap, [*asked, "--maker", command, *more])
+
+    return make
+
+
+def says_of_others(robot: Path, model: Path) -> dict[str, Any]:
+    """A judge that looks whether the swing is late."""
+    (run,) = [read_run(path) for path in sorted(robot.glob("*.csv"))]
+    late = float(np.max(np.abs(run.signal("cmd") - run.signal("pos")))) > 0.1
+    found = {"effect": "action_delay", "joints": ["swing"], "probability": 0.9}
+    return {"verdict": "action_delay" if late else "none", "effects": [found] if late else [], "selected": []}
+
+
+def test_another_program_makes_the_robots_and_each_maker_has_a_column(
+    others: Callable[..., Any], sealed_set: tuple[Path, Path, bytes], tmp_path: Path
+) -> None:
+    key = str(tmp_path / "their.key")
+    done = others("fine", "--key-file", key)
+    assert done.exit_code == 0, done.output
+    folder = tmp_path / "theirs"
+    facts = tomllib.loads((folder / "set.toml").read_text())
+    assert sorted(path.name for path in (folder / "robot-000").iterdir()) == ["swing_1.csv", "swing_1.json"]
+    answers = read_answers(folder, read_key(Path(key)), facts["commitment"])
+    assert Counter(answer.group for answer in answers.values()) == {"none": 2, "single": 2, "outside": 1}
+    # Judged, and scored beside robots of the batch.
+    assert run_set(folder, diagnose=says_of_others) == 5
+    run_set(sealed_set[0], diagnose=says)
+    out = tmp_path / "score.json"
+    asked = ["blind", "score", str(sealed_set[0]), str(folder), "--json", str(out)]
+    told = CliRunner().invoke(gap, [*asked, "--key-file", str(sealed_set[1]), "--key-file", key])
+    assert "| what | batch | their generator.py fine | first | then | reached by all |" in told.output
+    assert (
+        "| false alarms on robots without effect | 0 % (0 … 79 %) of 1 | 0 % (0 … 66 %) of 2 | ≤ 3 % |" in told.output
+    )
+    makers = {row["maker"] for row in json.loads(out.read_text())["rows"]}
+    assert makers == {"batch", "their generator.py fine"}
+    # The answer's joints are told as the tables name them.
+    _, cases = read(folder, read_key(Path(key)))
+    at = {case.answer.effects[0].joints for case in cases if case.answer.effects}
+    assert at <= {("swing",), "all", "body"}
+
+
+def test_a_program_that_fails_is_named_with_its_last_words_and_the_set_goes_on_there(
+    others: Callable[..., Any], tmp_path: Path
+) -> None:
+    folder = tmp_path / "theirs"
+    # What stands in its way on the first call, away on the second.
+    (tmp_path / "stop-at").write_text("robot-003")
+    failed = others("fine", "--open")
+    assert isinstance(failed.exception, BadInput)
+    line = str(failed.exception)
+    assert line.startswith("robot-003, made by their generator.py fine: the maker failed (exit code 7): ")
+    assert "snapped" in line
+    assert "reading the answer" not in line
+    assert line.isprintable()
+    assert (tmp_path / "made").read_text().split() == ["robot-000", "robot-001", "robot-002"]
+    # It is not judged until it is whole.
+    assert run_set(folder, diagnose=says_of_others) == 3
+    (tmp_path / "stop-at").unlink()
+    (folder / "robot-003" / "left-by-the-first-try.csv").write_text("t\n")
+    done = others("fine", "--open")
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "made").read_text().split() == [f"robot-00{k}" for k in range(5)]
+    assert sorted(path.name for path in (folder / "robot-003").iterdir()) == [
+        "swing_1.csv",
+        "swing_1.json",
+        "truth.toml",
+    ]
+    another = others("garbage", "--open")
+    assert "another set is here already" in str(another.exception)
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("garbage", "the maker's swing_1.csv cannot be used"),
+        ("nameless", "does not have the joints that answers name"),
+    ],
+)
+def test_runs_that_cannot_be_used_are_said_before_they_are_taken_over(
+    word: str, message: str, others: Callable[..., Any], tmp_path: Path
+) -> None:
+    failed = others(word, "--open")
+    assert isinstance(failed.exception, BadInput)
+    assert message in str(failed.exception)
+    assert str(failed.exception).startswith("robot-00")
+    assert not is_made(tmp_path / "theirs" / "robot-004")
+
+
+def test_robots_that_a_program_cannot_have_are_left_out_and_counted(others: Callable[..., Any], tmp_path: Path) -> None:
+    done = others("cannot", "--open")
+    assert "4 robots in" in done.output
+    assert "1 left out that their maker cannot have" in done.output
+    folder = tmp_path / "theirs"
+    assert others("cannot", "--open").exit_code == 0
+    assert run_set(folder, diagnose=says_of_others) == 4
+    docs = tmp_path / "blind.md"
+    CliRunner().invoke(gap, ["blind", "score", str(folder), "--docs", str(docs)])
+    page = docs.read_text()
+    assert "seed 11 without 1 that their maker cannot have" in page
+    assert '"schema": "openant.blind-answer/1"' in page
+
+
+def test_one_maker_makes_all_and_is_asked_only_for_what_it_can_have() -> None:
+    assert {answer.maker for answer in draw_answers(40, 5, maker="batch")} == {"batch"}
+    of_the_bus = draw_answers(120, 5, Mix(none=0.1, two=0.4), maker="virtual")
+    assert {answer.maker for answer in of_the_bus} == {"virtual"}
+    assert not [answer for answer in of_the_bus if answer.outside]
+    names = {drawn.effect for answer in of_the_bus for drawn in answer.effects}
+    assert not names & {"speed_limit", "viscous_nonlinear", "tracker_scale"}
+    # Who makes them changes nothing else of what is drawn.
+    mixed, alone = draw_answers(40, 5), draw_answers(40, 5, Mix(virtual=0.0))
+    assert [replace(answer, maker="batch") for answer in draw_answers(40, 5, maker="batch")] == alone
+    assert {answer.maker for answer in mixed} == {"batch", "virtual"}
+    elsewhere = draw_answers(60, 5, Mix(outside=1.0, none=0.0, two=0.0), maker="their generator")
+    assert {answer.outside for answer in elsewhere} == {*OUTSIDE, *ELSEWHERE}
+
+
 # ---- bad input ----
 
 
@@ -402,6 +564,19 @@ def test_wilson_holds_the_proportion(counts: tuple[int, int]) -> None:
         (["make", "--out", "S", "--seed", "1", "--key-file", "S/key"], "beside what it seals"),
         (["make", "--out", ".", "--seed", "1", "--open"], "not empty"),
         (["make", "--out", "S", "--seed", "1", "--open", "--none", "0.9", "--two", "0.4"], "together at most"),
+        (
+            ["make", "--out", "S", "--seed", "1", "--open", "--maker", "no-such-program x"],
+            "there is no program 'no-such-program'",
+        ),
+        (["make", "--out", "S", "--seed", "1", "--open", "--maker", "python 'x"], "does not read as a command"),
+        (
+            ["make", "--out", "S", "--seed", "1", "--open", "--maker", "batch", "--virtual", "0.2"],
+            "leave it out beside --maker",
+        ),
+        (
+            ["make", "--out", "S", "--seed", "1", "--open", "--maker", "bus", "--outside", "0.2"],
+            "outside the catalogue",
+        ),
         (["run", "."], "no set.toml"),
         (["score", "."], "no set.toml"),
     ],

@@ -6,7 +6,7 @@ of a random salt and the plain text, stands in `set.toml` and is to be committed
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +39,9 @@ def committed(out: Path, facts: Mapping[str, Any]) -> str | None:
     return None
 
 
-def write_answers(out: Path, names: Sequence[str], answers: Sequence[Answer], key: bytes | None) -> str:
-    """Write the answers of robots of these names; their commitment."""
-    tables = {name: answer.as_table() for name, answer in zip(names, answers, strict=True)}
+def write_answers(out: Path, answers: Mapping[str, Answer], key: bytes | None) -> str:
+    """Write the answers of these robots; their commitment."""
+    tables = {name: answer.as_table() for name, answer in answers.items()}
     if key is not None:
         return seal(tomlkit.dumps({"answer": tables}), key, out / SEALED)
     for name, table in tables.items():

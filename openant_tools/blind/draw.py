@@ -12,10 +12,11 @@ from openant_tools.blind.sizes import KINDS, SIZES, STANDARD, Size
 from openant_tools.errors import BadInput
 from openant_tools.robot.joints import JOINTS
 
-__all__ = ["OUTSIDE", "Answer", "Drawn", "Mix", "draw_answers"]
+__all__ = ["BATCH", "BUS", "ELSEWHERE", "OUTSIDE", "Answer", "Drawn", "Mix", "draw_answers"]
 
 Group = Literal["none", "single", "two", "outside"]
-Maker = Literal["batch", "virtual"]
+#: the two makers that live here, as answers name them; any other is a command
+BATCH, BUS = "batch", "virtual"
 
 #: What the catalogue has no name for, in words for the report.
 OUTSIDE: Mapping[str, str] = {
@@ -29,6 +30,14 @@ OUTSIDE: Mapping[str, str] = {
     "uneven_floor": "one foot stands on a slab",
     "forgotten_integral": "an integral gain left in the servos",
     "eccentric_encoder": "the encoder's magnet is off its axis",
+}
+
+#: More of the kind, which only commands are asked for.
+ELSEWHERE: Mapping[str, str] = {
+    "soft_gain": "a gain that depends on the angle",
+    "command_prefilter": "the firmware smooths commands by a filter of second order",
+    "spring_hysteresis": "a spring at a joint that gives back less than it takes",
+    "tether": "a line to a hook above, which pulls once it is taut",
 }
 
 #: Effects that the batch simulator has to make: the virtual robot gives them another form (speed_limit brakes always,
@@ -64,14 +73,14 @@ class Answer:
     Attributes:
         effects: of the catalogue. outside: a name of OUTSIDE, with its joint and strength in `parameters`.
         seed: of its scatter, sensors and clocks.
-        maker: which of the two simulators makes it.
+        maker: BATCH, BUS, or the command that makes it.
         tracker: whether its floor runs have `base.*`.
     """
 
     group: Group
     effects: tuple[Drawn, ...]
     seed: int
-    maker: Maker
+    maker: str
     tracker: bool
     outside: str | None = None
     parameters: Mapping[str, Any] = field(default_factory=dict)
@@ -138,33 +147,45 @@ class Mix:
             raise BadInput("the shares of a set lie between 0 and 1, and together at most at 1", remedy="change --mix")
 
 
-def draw_answers(count: int, seed: int, mix: Mix | None = None) -> list[Answer]:
-    """`count` robots; every effect of the catalogue in turn before one comes again."""
+def draw_answers(count: int, seed: int, mix: Mix | None = None, maker: str | None = None) -> list[Answer]:
+    """`count` robots; every effect of the catalogue in turn before one comes again.
+
+    Args:
+        maker: BATCH, BUS or a command for all of them: what it cannot make is not drawn. None: of the two that live here either.
+    """
     mix = mix or Mix()
+    if maker == BUS:
+        mix = replace(mix, outside=0.0)
     chance = np.random.default_rng(seed)
     groups: list[Group] = []
     for group, share in (("none", mix.none), ("two", mix.two), ("outside", mix.outside)):
         groups += [group] * round(share * count)  # type: ignore[list-item]
     groups = groups[:count] + ["single"] * (count - len(groups))
     chance.shuffle(groups)
-    singles, strange = _deck(tuple(KINDS), chance), _deck(tuple(OUTSIDE), chance)
+    names = tuple(name for name in KINDS if maker != BUS or name not in _BATCH_ONLY)
+    singles = _deck(names, chance)
+    strange = _deck((*OUTSIDE,) if maker in (None, BATCH, BUS) else (*OUTSIDE, *ELSEWHERE), chance)
     sizes = np.asarray(mix.sizes) / sum(mix.sizes)
     answers = []
     for number, group in enumerate(groups):
-        answer = Answer(group, (), int(chance.integers(2**31)), "batch", bool(number % 2))
+        answer = Answer(group, (), int(chance.integers(2**31)), maker or BATCH, bool(number % 2))
         if group == "single":
             size = SIZES[int(chance.choice(3, p=sizes))]
-            answer = replace(answer, effects=(_effect(next(singles), size, chance, mix.widest),))
+            name = next(singles)
+            answer = replace(answer, effects=(_effect(name, size, chance, mix.widest),))
+            while maker == BUS and _batch_only(answer.effects[0]):
+                answer = replace(answer, effects=(_effect(name, size, chance, False),))
         elif group == "two":
             answer = replace(answer, effects=_pair(chance, mix.widest))
+            while maker == BUS and any(map(_batch_only, answer.effects)):
+                answer = replace(answer, effects=_pair(chance, mix.widest))
         elif group == "outside":
-            name = next(strange)
-            answer = replace(answer, outside=name, parameters=_outside(chance))
+            answer = replace(answer, outside=next(strange), parameters=_outside(chance))
         if any(KINDS[drawn.effect].needs_tracker for drawn in answer.effects):
             answer = replace(answer, tracker=True)
-        possible = not answer.outside and not any(_batch_only(drawn) for drawn in answer.effects)
-        if possible and chance.random() < mix.virtual:
-            answer = replace(answer, maker="virtual")
+        possible = not answer.outside and not any(map(_batch_only, answer.effects))
+        if possible and chance.random() < mix.virtual and maker is None:
+            answer = replace(answer, maker=BUS)
         answers.append(answer)
     return answers
 

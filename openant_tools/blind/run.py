@@ -11,14 +11,16 @@ import contextlib
 import json
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
 from joblib import Parallel, delayed, parallel_config
 
+from openant_tools.blind.by_command import is_made, tables_of
+from openant_tools.blind.draw import BATCH
 from openant_tools.errors import BadInput, OpenAntError
-from openant_tools.files import read_json, write_text
+from openant_tools.files import read_json, read_toml, write_text
 from openant_tools.recording.tables import read_run
 from openant_tools.workers import tied
 
@@ -50,10 +52,12 @@ def diagnose_robot(robot: Path, model: Path) -> dict[str, Any]:
     """The diagnosis of one robot from its tables alone, as JSON (formats, section 2)."""
     from openant_tools.gap.diagnose import diagnose
 
-    runs = [read_run(path) for path in sorted(robot.glob("*.parquet"))]
+    runs = [read_run(path) for path in tables_of(robot)]
+    # A robot of another program may come with a nominal model of its own.
+    named = next((path for run in runs if (path := run.model_path) is not None and path.is_file()), model)
     kept = [run for run in runs if not run.facts.extra.get("held_out")]
     held_out = [run for run in runs if run.facts.extra.get("held_out")]
-    found: dict[str, Any] = diagnose(kept, model, hold_out=held_out).as_json()
+    found: dict[str, Any] = diagnose(kept, named, hold_out=held_out).as_json()
     return found
 
 
@@ -76,7 +80,7 @@ def run_set(
     Raises:
         BadInput: no set, or the backend is not installed.
     """
-    todo = [robot for robot in _whole(folders_of(folder)) if not _judged(verdict_path(folder, robot.name))]
+    todo = [robot for robot in _whole(folder) if not _judged(verdict_path(folder, robot.name))]
     if not todo:
         return 0
     # Who is to help is asked for first: the first robot may take half an hour.
@@ -93,8 +97,11 @@ def run_set(
     return len(todo)
 
 
-def _whole(robots: Sequence[Path]) -> list[Path]:
-    """Those that have every run: one whose making was stopped lacks some until the set is made further."""
+def _whole(folder: Path) -> list[Path]:
+    """Robots that have every run: one whose making was stopped lacks some until the set is made further."""
+    robots = folders_of(folder)
+    if read_toml(folder / "set.toml").get("maker", BATCH) not in (BATCH, "bus"):
+        return [robot for robot in robots if is_made(robot)]
     runs = {robot: len(list(robot.glob("*.json"))) for robot in robots}
     return [robot for robot in robots if runs[robot] == max(runs.values())]
 

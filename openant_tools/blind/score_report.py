@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from openant_tools.blind.by_command import answer_for
+from openant_tools.blind.draw import ELSEWHERE, OUTSIDE, Answer, Drawn
 from openant_tools.blind.score import Row, Score, truth_in_words
 from openant_tools.blind.sizes import size_table
 from openant_tools.files import write_bytes, write_text
@@ -20,42 +24,48 @@ if TYPE_CHECKING:
 
 __all__ = ["score_report", "table_lines", "write_docs"]
 
-_COLUMNS = ["what", "result", "95 %", "n", "first", "then", "reached"]
+
+def _shown(row: Row, value: float) -> str:
+    return f"{value:.0f} s" if row.unit == "s" else f"{value:.2f}" if row.k is None else f"{100 * value:.0f} %"
 
 
-def _cells(row: Row) -> list[str]:
-    def shown(value: float) -> str:
-        return f"{value:.0f} s" if row.unit == "s" else f"{value:.2f}" if row.k is None else f"{100 * value:.0f} %"
-
-    result = "–" if row.figure is None else shown(row.figure)
+def _cell(row: Row) -> str:
+    """A figure with its interval, and of how many."""
+    if row.figure is None:
+        return "–"
     interval = ""
-    if row.k is not None and row.n:
+    if row.k is not None:
         low, high = wilson(row.k, row.n)
-        interval = f"{100 * low:.0f} … {100 * high:.0f} %"
-    sign = "≤ " if row.fewer else ""
-    return [row.words, result, interval, str(row.n), sign + shown(row.first), sign + shown(row.then), row.reached]
+        interval = f" ({100 * low:.0f} … {100 * high:.0f} %)"
+    return f"{_shown(row, row.figure)}{interval} of {row.n}"
+
+
+def _asked(row: Row, mark: float) -> str:
+    return ("≤ " if row.fewer else "") + _shown(row, mark)
+
+
+def _columns(found: Score) -> list[str]:
+    return ["what", *found.makers, "first", "then", "reached by all"]
 
 
 def _table(found: Score) -> list[list[str]]:
-    rows = [_cells(row) for row in found.rows]
-    if found.missing:
-        rows.append(
-            [
-                "robots that have no verdict yet, left out",
-                str(found.missing),
-                "",
-                str(found.robots),
-                "",
-                "",
-                "",
-            ]
-        )
-    return rows
+    return [
+        [rows[0].words, *map(_cell, rows), _asked(rows[0], rows[0].first), _asked(rows[0], rows[0].then), _reached(rows)]
+        for rows in zip(*found.makers.values(), strict=True)
+    ]  # fmt: skip
+
+
+def _reached(rows: Sequence[Row]) -> str:
+    """What the worst of the makers reaches, of those that measure it."""
+    worst_first = ("below", "first", "then")
+    reached = {row.reached for row in rows}
+    return next((name for name in worst_first if name in reached), "not measured")
 
 
 def table_lines(found: Score) -> list[str]:
-    """The table as Markdown."""
-    lines = [f"| {' | '.join(_COLUMNS)} |", "|" + "---|" * len(_COLUMNS)]
+    """The table as Markdown, a column for each maker."""
+    columns = _columns(found)
+    lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
     return lines + [f"| {' | '.join(row)} |" for row in _table(found)]
 
 
@@ -145,16 +155,18 @@ def _failures(found: Score) -> list[list[str]]:
 
 def _origin(found: Score) -> str:
     whole = f", those judged so far of {found.robots}" if found.missing else ""
-    virtual = sum(case.answer.maker == "virtual" for case in found.cases)
-    bus = f" {virtual} came from the virtual robot's bus." if virtual else ""
-    return f"{len(found.cases)} robots{whole}, {'; and '.join(map(_seed, found.sets))}.{bus}"
+    counts = Counter(case.maker for case in found.cases)
+    by = ", ".join(f"{count} by {maker}" for maker, count in counts.items())
+    return f"{len(found.cases)} robots{whole}, {'; and '.join(map(_seed, found.sets))}. Made: {by}."
 
 
 def _seed(facts: Mapping[str, Any]) -> str:
     seed = f"seed {facts['seed']}"
     if "seed_from_commit" in facts:
         seed += f" (the first 8 digits of commit `{facts['seed_from_commit']}`)"
-    return f"{seed}, commitment of the answers `{facts['commitment']}`"
+    left_out = len(facts.get("left_out", []))
+    without = f" without {left_out} that their maker cannot have" if left_out else ""
+    return f"{seed}{without}, commitment of the answers `{facts['commitment']}`"
 
 
 def _drawn(found: Score) -> list[str]:
@@ -171,11 +183,15 @@ def _drawn(found: Score) -> list[str]:
 def score_report(found: Score) -> Report:
     """Everything about how the diagnosis did."""
     report = Report("The blind benchmark", _origin(found), made_by="openant gap blind score")
-    marks = [row for row in found.rows if row.figure is not None]
-    report.key_figures(
-        *(KeyFigure(row.words, _cells(row)[1], f"asked: {_cells(row)[4]}") for row in marks[:3]),
-    )
-    report.section("Table").table(_COLUMNS, _table(found))
+    for maker, rows in found.makers.items():
+        measured = [(row, value) for row in rows if (value := row.figure) is not None]
+        report.key_figures(
+            *(
+                KeyFigure(f"{row.words}: {maker}", _shown(row, value), f"asked: {_asked(row, row.first)}")
+                for row, value in measured[:3]
+            )
+        )
+    report.section("Table").table(_columns(found), _table(found))
     report.section("Confusions").figure(confusion(found), "How often which verdict was given, by what was true.")
     report.section("Probabilities").figure(
         reliability(found), "Every effect of every diagnosis; figures are counts, lines 95 % intervals."
@@ -205,13 +221,13 @@ def write_docs(found: Score, path: Path) -> None:
         f"![Stated probability against frequency]({relative}/blind-reliability.png)", "",
         "## Every failure", "", "| robot | truth | verdict | ranked |", "|---|---|---|---|",
         *(f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in _failures(found)), "",
-        "## Sizes", "", "Drawn evenly between the two figures of each size. " + _SCOPES, "", size_table(), "",
+        *_makers(), "## Sizes", "", "Drawn evenly between the two figures of each size. " + _SCOPES, "", size_table(), "",
     ]  # fmt: skip
     write_text(path, "\n".join(lines))
 
 
 _COMMANDS = (
-    "openant gap blind make --out SET --robots 240 --seed-from COMMIT --key-file KEY    # answers sealed",
+    "openant gap blind make --out SET --robots 240 --seed-from COMMIT --key-file KEY    # answers sealed; --maker: whose robots",
     "openant gap blind run SET --jobs 2                                                 # or --backend dask, ray",
     "openant gap blind score SET… --key-file KEY… --docs docs/blind.md                  # opens the answers",
 )
@@ -220,13 +236,16 @@ _HOW = (
     "**What they do.** Three runs on the stand and four on the floor of about 9 s each, one table of commands for all, 50 rows a",
     "second; the last run of either is held out. Rows scatter by up to 0.6 ms, stamps by up to 0.3 ms.",
     "",
-    "**How truth is simulated**, by two makers, both of other code than the candidates' (a rule of the linter keeps it so).",
+    "**How truth is simulated.** By other code than the candidates' (a rule of the linter keeps it so). Two makers live here:",
     "",
-    "- A simulator of many robots at once (`blind/simulate.py`): half a millisecond, Euler or implicit, elliptic cones with an",
+    "- `batch` simulates many robots at once (`blind/simulate.py`): half a millisecond, Euler or implicit, elliptic cones with an",
     "  impratio from 1 to 30 or (15 %) pyramidal ones, masses and lengths a little off; firmware at 1 kHz on the quantised",
     "  encoder, rotors behind gears with play and spring, LuGre friction, one supply, heat.",
-    "- The virtual robot (`blind/through_bus.py`): its servos' firmware, its physics, real packets in their real time on the wire.",
-    "  Half of the robots whose effect it can have in the catalogue's form. There a command comes before its row's samples.",
+    "- `bus` is the virtual robot (`blind/through_bus.py`): its servos' firmware, its physics, real packets in their real time on",
+    "  the wire. There a command comes before its row's samples. Effects that it has in another form are not asked of it.",
+    "",
+    "Unless `--maker` names one, they share the robots: half of those whose effect the bus can have are its. Others' robots have",
+    "motions, rates, sensors and tolerances of their own ([below](#makers)).",
     "",
     "**How it is counted.** A right name is the verdict itself; `ambiguous` is right of small effects only. A small effect may be",
     "called none where its size lies within 2.5 times a tolerance that the catalogue states. Any verdict but none is a false alarm",
@@ -236,3 +255,31 @@ _HOW = (
     "`openant gap blind run SET --backend dask --scheduler tcp://HOST:8786`; all see SET under the same path. What was stopped goes",
     "on where it was.",
 )
+
+
+def _makers() -> list[str]:
+    """What a program has to do whose robots are to be judged."""
+    drawn = Drawn("backlash", ("knee_fl",), {"gap_rad": 0.0195}, "medium")
+    example = answer_for(Answer("single", (drawn,), 1630172453, "", True), "robot-003", Path("/home/me/SET/model.xml"))
+    strange = ", ".join(f"`{name}` ({words})" for name, words in {**OUTSIDE, **ELSEWHERE}.items())
+    return [
+        "## Makers", "",
+        "`openant gap blind make --maker COMMAND` lets any program make the robots, so that the diagnosis meets simulators that its",
+        "authors did not write. `benchmarks/second_generator` is one, in Drake. For each robot COMMAND is called once, without a shell:",
+        "", "```sh", "COMMAND ANSWER.json FOLDER", "```", "",
+        "It leaves run tables in FOLDER, which is empty ([their form](recordings.md#bring-your-own-logs)): at least one `NAME.parquet`",
+        "or `NAME.csv` with columns `t`, `cmd.J`, `pos.J`, each with its facts in `NAME.json` (`\"held_out\": true` keeps a run to judge",
+        "by; else each is left out in turn). ANSWER.json is what is true of the robot:",
+        "", "```json", json.dumps(example, indent=1), "```", "",
+        "- `model`: the nominal MJCF, which the diagnosis is given unless the facts of the runs name another (`\"model\"`, beside them).",
+        "- `seed`: of all that the answer leaves open: scatter within tolerance, motions, rates, sensors, clocks.",
+        "- `group`: `none` (healthy), `single`, `two`, or `outside`. `tracker`: whether runs on the floor have `base.*`.",
+        "- `effects`: by the names of the catalogue; `joints` is a list, `\"all\"` or `\"body\"`; `parameters` in SI, `size` for the record.",
+        "- `outside`: null, or what the catalogue has no name for, with a `joint` and a `strength` of about 1 in `parameters`:",
+        f"  {strange}.", "",
+        'A robot with other joint names says in the facts of its runs which is which: `"answer_joints": {"hip_rr": "j1", …}`, all',
+        "eight, so that nothing is told. Several may be played by one joint (an arm's).", "",
+        "Exit code 0: done. 3: this physics cannot have what was drawn; the robot is left out of the set, and the table says how",
+        "many were. Any other: the command stops with one line, which names the robot and ends with the last line of the program's",
+        "stderr; made again, the set goes on there. `--jobs N` runs N of them at a time.", "",
+    ]  # fmt: skip

@@ -51,6 +51,12 @@ def _share(name: str, words: str) -> Callable[[click.decorators.FC], click.decor
 @_share("--two", "Robots with two effects. Default 0.15.")
 @_share("--outside", "Robots outside the catalogue. Default 0.12.")
 @_share("--virtual", "Robots from the virtual robot's bus, where it can have the effect; a minute each. Default 0.5.")
+@click.option(
+    "--maker",
+    metavar="batch|bus|COMMAND",
+    help="Who makes all of the robots; COMMAND is called with ANSWER.json and an empty folder (docs/blind.md). "
+    "Default: batch and bus, by --virtual.",
+)
 @key_option
 @click.option("--open", "unsealed", is_flag=True, help="Leave the answers open, beside the runs: for development.")
 @jobs_option("Robots")
@@ -60,6 +66,7 @@ def make(
     seed: int | None,
     commit: str | None,
     motion_seed: int | None,
+    maker: str | None,
     key_file: Path | None,
     unsealed: bool,
     jobs: int,
@@ -70,10 +77,18 @@ def make(
     \b
       openant gap blind make --out set --robots 240 --seed-from v1.0 --key-file set.key
       openant gap blind make --out dev --robots 60 --seed 1 --open
+      openant gap blind make --out drake --seed 1 --open --maker "drake/bin/python benchmarks/second_generator"
     """
     from openant_tools.blind.draw import Mix
     from openant_tools.blind.make import make_set
+    from openant_tools.files import read_toml
 
+    if maker is not None and shares["virtual"] is not None:
+        raise BadInput("--virtual shares robots out between batch and bus", remedy="leave it out beside --maker")
+    if maker == "bus" and shares["outside"]:
+        raise BadInput(
+            "the bus has no robots outside the catalogue", remedy="leave --outside out, or say --maker batch"
+        )
     drawn_from, full = seed_of_set(seed, commit)
     key = key_of_set(out, key_file, unsealed)
     given: dict[str, Any] = {name: value for name, value in shares.items() if value is not None}
@@ -86,10 +101,15 @@ def make(
             commit=full,
             key=key,
             motion_seed=motion_seed,
+            maker=maker,
             jobs=jobs,
             progress=progress,
         )
-    click.echo(f"{count} robots in {out}")
+    left_out = len(read_toml(out / "set.toml").get("left_out", []))
+    click.echo(
+        f"{count - left_out} robots in {out}"
+        + (f", {left_out} left out that their maker cannot have" if left_out else "")
+    )
     click.echo(f"commitment of their answers: {commitment}")
 
 
@@ -167,6 +187,8 @@ def score(
     for line in table_lines(found):
         click.echo(line)
     click.echo(f"{len(found.failures)} of {len(cases)} robots went wrong")
+    if found.missing:
+        click.echo(f"{found.missing} of {found.robots} robots have no verdict yet and are left out")
     if json_file:
         write_text(json_file, json_text(found.as_json()))
     if report:
@@ -174,5 +196,5 @@ def score(
     if docs:
         write_docs(found, docs)
         click.echo(f"wrote {docs}", err=True)
-    if any(row.reached == "below" for row in found.rows):
+    if any(row.reached == "below" for rows in found.makers.values() for row in rows):
         click.get_current_context().exit(1)
