@@ -182,14 +182,14 @@ def main() -> None:
         table("bam-xl330", groups, options.cache, peer=True)
     if options.only != "bam-xl330":
         recorded = [sysid.load(path) for path in sorted((options.shared / "sage-so101").glob("*.parquet"))]
-        for joint in options.joint or TURNED_KG_M2:
-            turned = TURNED_KG_M2[joint]
-            model = options.work / f"so101_{joint}.xml"
-            model.parent.mkdir(parents=True, exist_ok=True)
-            model.write_text(SO101.format(joint=joint, turned=turned).strip())
-            # Where the joint is not commanded to move there is nothing to identify.
-            runs = [run for run in recorded if np.ptp(run.column(f"cmd.{joint}")) > MOVES_RAD]
-            for words, also in (("delay", []), ("delay and lag", ["actuator_lag"])):
+        for words, also in (("delay", []), ("delay and lag", ["actuator_lag"])):
+            for joint in options.joint or TURNED_KG_M2:
+                turned = TURNED_KG_M2[joint]
+                model = options.work / f"so101_{joint}.xml"
+                model.parent.mkdir(parents=True, exist_ok=True)
+                model.write_text(SO101.format(joint=joint, turned=turned).strip())
+                # Where the joint is not commanded to move there is nothing to identify.
+                runs = [run for run in recorded if np.ptp(run.column(f"cmd.{joint}")) > MOVES_RAD]
                 table(f"sage-so101, joint {joint}, {words}", {model: runs}, options.cache, [joint], also)
 
 

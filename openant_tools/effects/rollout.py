@@ -70,7 +70,7 @@ def rollout(
     """
     plant, segments, nv = rollouts.plant, rollouts.segments, len(models)
     lengths = np.array([len(segment.control) for segment in segments])
-    longest = int(lengths[0])
+    longest, timestep = int(lengths[0]), plant.timestep
     # Threads meet after every step: what few joints take is less than waiting for each other.
     few = len(segments) * nv * len(plant.joints) < WORTH_THREADS
     lean = [rollouts.lean(model) for model in models]
@@ -87,16 +87,20 @@ def rollout(
             flips.setdefault(step, []).append(s)
     control: Array = np.empty(0)
     before = servos.state
+    # Segments come longest first: at each step the first so many go on. None is all of them.
+    active, ids = len(segments), None
     for step in range(longest):
-        active = int((lengths > step).sum())
+        if lengths[active - 1] <= step:
+            active = int((lengths > step).sum())
+            ids = np.arange(active * nv, dtype=np.int32)
         if step % CHUNK == 0:
             control = _controls(rollouts, active, nv, step, min(step + CHUNK, longest), delays)
         for s in flips.get(step, ()):
             servos.switch(slice(s * nv, (s + 1) * nv), segments[s].torque_off[step])
         ctrl[: active * nv] = control[: active * nv, step % CHUNK]
         servos.prepare(laws, time, before, None if supply is None else supply.share(step))
-        batch.step(ids=np.arange(active * nv, dtype=np.int32))
-        time += plant.timestep
+        batch.step(ids=ids)
+        time += timestep
         after = servos.state
         samples.take(step, before, after)
         before = after
@@ -135,7 +139,7 @@ class _Supply:
 
     def share(self, step: int) -> Array:
         """(segments · variants, joints) at a step."""
-        return np.repeat(self._share[:, step], self._nv, axis=0).astype(np.float64)
+        return self._share[:, step].astype(np.float64).repeat(self._nv, axis=0)
 
 
 class _Samples:
@@ -145,7 +149,7 @@ class _Samples:
         segments, nj = rollouts.segments, len(rollouts.plant.joints)
         step = np.concatenate([segment.step for segment in segments])
         order = np.argsort(step, kind="stable")
-        self._edges = np.searchsorted(step[order], np.arange(int(step.max()) + 2))
+        self._edges: list[int] = np.searchsorted(step[order], np.arange(int(step.max()) + 2)).tolist()
         whose = np.repeat(np.arange(len(segments)), [len(segment.step) for segment in segments])
         self._segment = whose[order]
         self._row = np.concatenate([segment.row for segment in segments])[order]

@@ -17,6 +17,7 @@ from openant_tools.model.plant import KD, KP, MOTOR_CONSTANT, RESISTANCE, TORQUE
 __all__ = ["Servos", "batch_of", "single"]
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 #: setpoint filters of a position servo (`timeconst`): the servo follows their state instead of its control
 FILTERS = (int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT))
 #: fields of the models that servos are read from and written to
@@ -53,7 +54,7 @@ class Servos:
     """
 
     def __init__(self, plant: Plant, base: mujoco.MjModel, fields: Fields) -> None:
-        self.plant, self._fields, self._n = plant, fields, len(fields.qpos)
+        self.plant, self._fields, self._n, self._dt = plant, fields, len(fields.qpos), plant.timestep
         i = plant.actuator
         self._motor = np.array([is_motor(base, int(k)) for k in i])
         self._limited = np.array([bool(base.actuator_forcelimited[k]) for k in i])
@@ -65,9 +66,14 @@ class Servos:
         self._on = np.ones((self._n, len(i)), bool)
         self._rest = self._read()
         self._full = np.ones((self._n, len(i)))
-        self._motors, self._others = np.flatnonzero(self._motor), np.flatnonzero(~self._motor)
-        self._proportional = self._others[self._fixed[self._others]]
-        self._bounded = self._others[self._limited[self._others]]
+        self._qpos, self._dof, self._ctrl = _taken(plant.qpos), _taken(plant.dof), _taken(plant.ctrl)
+        self._filters = bool(self._filtered.any())
+        motors, others = np.flatnonzero(self._motor), np.flatnonzero(~self._motor)
+        # Of each sort of servo its joints and its actuators; None where there is none.
+        self._motors, self._others, self._proportional, self._bounded = (
+            (_taken(joints), _taken(i[joints])) if len(joints) else None
+            for joints in (motors, others, others[self._fixed[others]], others[self._limited[others]])
+        )
         # Of the gain on the setpoint to that on the position; from here, so that no rounding piles up from step to step.
         stiffness = -fields.actuator_biasprm[:, i, 1]
         self._ratio = fields.actuator_gainprm[:, i, 0] / np.where(stiffness == 0.0, 1.0, stiffness)
@@ -76,7 +82,7 @@ class Servos:
     @property
     def state(self) -> tuple[Array, Array]:
         """Positions (rad) and velocities (rad/s) now, (n, joints) each."""
-        return self._fields.qpos[:, self.plant.qpos], self._fields.qvel[:, self.plant.dof]
+        return self._fields.qpos[:, self._qpos].copy(), self._fields.qvel[:, self._dof].copy()
 
     def switch(self, rows: slice, off: NDArray[np.bool_]) -> None:
         """Torque off at the joints marked, on at the others, in these simulations."""
@@ -94,15 +100,17 @@ class Servos:
             state: what `state` says now.
             supply: (n, joints) shares of the nominal voltage; None for all of it.
         """
-        plant, rest, fields = self.plant, self._rest, self._fields
-        setpoint = fields.ctrl[:, plant.ctrl]
-        told = np.where(self._filtered, fields.act[:, self._act], setpoint) if self._filtered.any() else setpoint
-        view = self.view(plant.timestep, time, state, told, supply=supply)
+        rest, fields = self._rest, self._fields
+        setpoint = fields.ctrl[:, self._ctrl].copy()
+        told = np.where(self._filtered, fields.act[:, self._act], setpoint) if self._filters else setpoint
+        view = self.view(self._dt, time, state, told, supply=supply)
         for law in laws:
             law(view)
-        fields.ctrl[:, plant.ctrl] = np.where(self._filtered, setpoint, view.setpoint)
-        fields.dof_frictionloss[:, plant.dof] = view.friction
-        fields.qfrc_applied[:, plant.dof] = view.torque
+        fields.ctrl[:, self._ctrl] = (
+            np.where(self._filtered, setpoint, view.setpoint) if self._filters else view.setpoint
+        )
+        fields.dof_frictionloss[:, self._dof] = view.friction
+        fields.qfrc_applied[:, self._dof] = view.torque
         changed = {"stiffness": view.stiffness, "velocity_gain": view.velocity_gain, "limit": view.limit}
         for name, value in changed.items():
             if self._changed[name] or not np.array_equal(value, rest[name]):
@@ -132,7 +140,7 @@ class Servos:
             time=time,
             position=state[0],
             velocity=state[1],
-            load=self._fields.qfrc_bias[rows, self.plant.dof],
+            load=self._fields.qfrc_bias[rows, self._dof].copy(),
             on=self._on[rows],
             setpoint=setpoint,
             stiffness=rest["stiffness"] * share,
@@ -141,8 +149,8 @@ class Servos:
             back_emf=rest["back_emf"],
             damping=rest["damping"],
             friction=friction,
-            torque=np.zeros_like(friction),
-            supply=self._full[rows] if supply is None else np.broadcast_to(supply, friction.shape),
+            torque=np.zeros(friction.shape),
+            supply=self._full[rows] if supply is None else supply,
         )
 
     def _read(self) -> dict[str, Array]:
@@ -166,26 +174,39 @@ class Servos:
 
     def _put(self, name: str, value: Array) -> None:
         """Write one number of every servo, (n, joints), into the models of all simulations."""
-        i, fields = self.plant.actuator, self._fields
+        gain, bias, force = (
+            self._fields.actuator_gainprm,
+            self._fields.actuator_biasprm,
+            self._fields.actuator_forcerange,
+        )
         motors, others = self._motors, self._others
-        gain, bias = fields.actuator_gainprm, fields.actuator_biasprm
         if name == "stiffness":
-            if len(motors):
-                gain[:, i[motors], KP] = value[:, motors]
-            fixed = self._proportional
-            gain[:, i[fixed], 0] = self._ratio[:, fixed] * value[:, fixed]
-            bias[:, i[others], 1] = -value[:, others]
+            if motors:
+                gain[:, motors[1], KP] = value[:, motors[0]]
+            if self._proportional:
+                joints, actuators = self._proportional
+                gain[:, actuators, 0] = self._ratio[:, joints] * value[:, joints]
+            if others:
+                bias[:, others[1], 1] = -value[:, others[0]]
         elif name == "velocity_gain":
-            if len(motors):
-                gain[:, i[motors], KD] = value[:, motors] + self._rest["back_emf"][:, motors]
-            bias[:, i[others], 2] = -value[:, others]
+            if motors:
+                gain[:, motors[1], KD] = value[:, motors[0]] + self._rest["back_emf"][:, motors[0]]
+            if others:
+                bias[:, others[1], 2] = -value[:, others[0]]
         else:
-            if len(motors):
-                k = i[motors]
-                gain[:, k, VMAX] = value[:, motors] * gain[:, k, RESISTANCE] / gain[:, k, MOTOR_CONSTANT]
-            limited = self._bounded
-            most = value[:, limited]
-            fields.actuator_forcerange[:, i[limited], 0], fields.actuator_forcerange[:, i[limited], 1] = -most, most
+            if motors:
+                joints, k = motors
+                gain[:, k, VMAX] = value[:, joints] * gain[:, k, RESISTANCE] / gain[:, k, MOTOR_CONSTANT]
+            if self._bounded:
+                joints, k = self._bounded
+                most = value[:, joints]
+                force[:, k, 0], force[:, k, 1] = -most, most
+
+
+def _taken(ids: Ints) -> Ints | slice:
+    """Ids that follow each other as a slice, which reads and writes several times as fast."""
+    first = int(ids[0])
+    return slice(first, first + len(ids)) if np.array_equal(ids, first + np.arange(len(ids))) else ids
 
 
 def batch_of(plant: Plant, models: Sequence[mujoco.MjModel], copies: int, nthread: int = 0) -> tuple[Batch, Servos]:
