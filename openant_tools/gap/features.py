@@ -143,6 +143,25 @@ class Layout:
             parts.append(self.following(seen["pos"], seen["gyro"]))
         return np.concatenate(parts, axis=1).astype(np.float32)
 
+    def known(self, seen: Signals) -> Bools:
+        """(features,) which of them a log of (1, rows, columns) signals has: those of which it has any sample."""
+        parts: list[Bools] = []
+        for signal in self.signals:
+            n = _width(signal, self.joints)
+            there = np.isfinite(seen[signal][:1]) if signal in seen else np.zeros((1, len(self.t), n), bool)
+            if signal not in COLUMNS:
+                there = there & ~self.unsure
+            counts = _means(np.where(there, 1.0, np.nan).astype(np.float32), self.t, self.blocks(signal))
+            ever = there[0, self.t >= SKIP_S].any(axis=0)
+            parts += [np.isfinite(counts[0]).ravel(), ever, ever]
+        groups = self.groups()
+        parts += [np.ones(len(groups[LATENESS]), bool)]
+        if self.arrivals is not None:
+            parts += [np.ones(len(groups[ARRIVAL]), bool)]
+        if self.following is not None:
+            parts += [np.full(len(groups[FOLLOWING]), "gyro" in seen)]
+        return np.concatenate(parts)
+
     def _late(self, x: Floats, simulated: Floats) -> list[Floats]:
         """Logarithms of how far rows scatter in time, and of how much of that is in few of them; (robots, joints + 1) each.
 
@@ -190,10 +209,14 @@ def logged(run: Run, joints: Sequence[str]) -> dict[str, Floats]:
     for name in ("pos", "vel"):
         if run.has(name, joints):
             out[name] = run.signal(name, joints)[None].astype(np.float32)
-    for name in TORQUES:
-        if all(run.has(name, [joint]) for joint in joints):
-            out["torque"] = run.signal(name, joints)[None].astype(np.float32)
-            break
+    # Servos of two models on one bus say it in two ways, each joint in its own.
+    torque = np.full((len(run.t), len(joints)), np.nan, np.float32)
+    for j, joint in enumerate(joints):
+        said = next((name for name in TORQUES if run.has(name, [joint])), None)
+        if said:
+            torque[:, j] = run.column(f"{said}.{joint}")
+    if np.isfinite(torque).any():
+        out["torque"] = torque[None]
     if run.has("volt", joints):
         volts = run.signal("volt", joints)
         supply = run.facts.supply_v or float(np.nanpercentile(volts, 95))
@@ -218,6 +241,10 @@ def differences(seen: Signals, simulated: Signals, names: Sequence[str]) -> dict
         x, model = seen[name], simulated[name]
         if name == "torque":
             known = np.where(np.isfinite(x), model, 0.0)
+            # A driver without a sign tells only how much.
+            negative = np.any(np.nan_to_num(x) < 0, axis=(1, 2), keepdims=True)
+            unsigned = ~negative & np.any(known < 0, axis=(1, 2), keepdims=True)
+            known, model = np.where(unsigned, np.abs(known), known), np.where(unsigned, np.abs(model), model)
             power = np.einsum("rtj,rtj->rj", known, known)
             slope = np.einsum("rtj,rtj->rj", np.nan_to_num(x), np.broadcast_to(known, x.shape)) / np.maximum(
                 power, 1e-12

@@ -64,11 +64,11 @@ class Played:
     """One run of a protocol.
 
     Attributes:
-        run: its commands. Where its base was on the floor is left out: it starts from a settled stand at its heading, as
-            every other robot that plays these commands does.
+        run: its commands. Where its base was on the floor is left out of a run that is simulated as a whole.
         plant: how it is simulated. signals: those that a robot on it can have.
         seen: what its log has of them.
         warm_c: (joints,) °C, by which its servos were warmer than in the coolest run beside it, as far as that was logged.
+        horizon: s after which simulations begin anew from what was measured; None simulates the whole run.
     """
 
     run: Run
@@ -76,15 +76,19 @@ class Played:
     signals: tuple[str, ...]
     seen: Mapping[str, Floats]
     warm_c: Array
+    horizon: float | None = None
 
     @classmethod
-    def of(cls, run: Run, plant: Plant, warm_c: Array) -> Played:
+    def of(cls, run: Run, plant: Plant, warm_c: Array, horizon: float | None = None) -> Played:
         """A run on a plant."""
         free = plant.setup is Setup.FLOOR and plant.free_joint is not None
         signals = ("pos", "vel", "torque", "volt", *(COLUMNS if free else ()))
         seen = {name: values for name, values in logged(run, plant.joints).items() if name in signals}
-        columns = {name: values for name, values in run.columns.items() if not name.startswith("base.")}
-        return cls(dataclasses.replace(run, columns=columns), plant, signals, seen, warm_c)
+        if horizon is None and "torque" in seen and not np.isfinite(seen["torque"]).any(axis=1).all():
+            del seen["torque"]  # judges that saw a whole protocol know of no log with some joints' torque alone
+        # Amid a run a simulation begins where the base was; a whole one from a settled stand, as every other robot does.
+        columns = {name: values for name, values in run.columns.items() if horizon or not name.startswith("base.")}
+        return cls(dataclasses.replace(run, columns=columns), plant, signals, seen, warm_c, horizon)
 
     @cached_property
     def layout(self) -> Layout:
@@ -135,7 +139,10 @@ class Players:
         on: dict[int, list[int]] = {}
         for k, one in enumerate(runs):
             on.setdefault(id(one.plant), []).append(k)
-        groups = ((tuple(mine), Rollouts(runs[mine[0]].plant, [runs[k].run for k in mine])) for mine in on.values())
+        groups = (
+            (tuple(mine), Rollouts(runs[mine[0]].plant, [runs[k].run for k in mine], horizon=runs[mine[0]].horizon))
+            for mine in on.values()
+        )
         return cls(tuple(runs), tuple(groups))
 
     def play(self, robots: Sequence[Robot]) -> list[dict[str, Floats]]:
@@ -164,11 +171,19 @@ class Protocol:
     reference: Reference
 
     @classmethod
-    def of(cls, runs: Sequence[Run], model: Path, joints: Sequence[str], models: Sequence[Path | None]) -> Protocol:
+    def of(
+        cls,
+        runs: Sequence[Run],
+        model: Path,
+        joints: Sequence[str],
+        models: Sequence[Path | None],
+        horizons: Mapping[Setup, float] | None = None,
+    ) -> Protocol:
         """The protocol that these runs played.
 
         Args:
             models: of each run its own MJCF, None for `model`.
+            horizons: of each setup, s after which simulations begin anew from what was measured; default never.
         """
         plants: dict[tuple[Path, Setup], Plant] = {}
         played = []
@@ -176,7 +191,7 @@ class Protocol:
             key = (own or model, setup_of(run.facts.setup))
             if key not in plants:
                 plants[key] = load_plant(key[0], joints, key[1])
-            played.append(Played.of(run, plants[key], warm_c))
+            played.append(Played.of(run, plants[key], warm_c, (horizons or {}).get(key[1])))
         seen = {name for one in played for name in one.seen}
         first = next((one.plant for one in played if one.plant.setup is Setup.FLOOR), played[0].plant)
         reference = Reference.of(

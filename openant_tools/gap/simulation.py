@@ -25,7 +25,7 @@ from openant_tools.gap.memory import heats, setpoints
 from openant_tools.gap.robot import Cable, Form, Robot, tilted
 from openant_tools.model.body import torso_body
 from openant_tools.model.plant import Plant, Setup
-from openant_tools.model.rollout import Rollouts, Segment
+from openant_tools.model.rollout import VELOCITY_SPAN_S, Rollouts, Segment
 
 __all__ = ["BASE", "Log", "simulate"]
 
@@ -41,6 +41,8 @@ FINE_S = 0.002
 LED_S = 1.0
 #: time constants of a lag after which what was commanded is forgotten
 REMEMBERS = 5.0
+#: m/s and rad/s, deviations of how fast a body is taken to move where a simulation begins anew
+BASE_M_S, BASE_RAD_S = 0.01, 0.05
 #: mjtCone of forms that are elliptic, or not
 _CONES = {False: int(mujoco.mjtCone.mjCONE_PYRAMIDAL), True: int(mujoco.mjtCone.mjCONE_ELLIPTIC)}
 #: signals that are as late as others, together with what makes them so
@@ -67,6 +69,7 @@ def simulate(
     seed: int = 0,
     signals: Sequence[str] | None = None,
     warm_c: Sequence[Array] | None = None,
+    misread: bool = False,
 ) -> Log:
     """Let robots do what runs command.
 
@@ -76,6 +79,7 @@ def simulate(
         seed: of what is random in time (jitter, lost commands).
         signals: those wanted; default all that there are.
         warm_c: of each run (joints,) °C, by which servos are known to be warmer than in the coolest one; default none.
+        misread: simulations that begin anew begin where noisy sensors say, as those of a real log do.
     """
     plant, rows = rollouts.plant, rollouts.rows[-1].stop
     floor = plant.setup is Setup.FLOOR and plant.free_joint is not None
@@ -98,7 +102,7 @@ def simulate(
             # A run of its own of random numbers to each portion, whatever the others are.
             rng = np.random.default_rng((seed, int(some[0])))
             mine = {name: np.full((len(some), *whole.shape[1:]), np.nan, np.float32) for name, whole in out.items()}
-            _Batch(stepped, [robots[k] for k in some], rng, warm_c).play(mine)
+            _Batch(stepped, [robots[k] for k in some], rng, warm_c, misread=misread).play(mine)
             for name, values in mine.items():
                 out[name][some] = values
     return Log(out)
@@ -123,6 +127,8 @@ class _Batch:
         robots: Sequence[Robot],
         rng: np.random.Generator,
         warm_c: Sequence[Array] | None,
+        *,
+        misread: bool = False,
     ) -> None:
         self._rollouts, self._robots, self._rng = rollouts, robots, rng
         self._plant, self._segments = rollouts.plant, rollouts.segments
@@ -136,12 +142,28 @@ class _Batch:
         self._take_forms()
         state = np.repeat([segment.state for segment in self._segments], self._n, axis=0)
         state[:, 1 + plant.qpos] += np.tile(np.array([robot.start for robot in robots]), (copies, 1)) - self._zero
+        if misread:
+            self._misread(state)
         self._batch.state[:] = state
         self._batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
         hidden = rollouts.horizon is not None and any(_hides(robot) for robot in robots)
         self._led = round(LED_S / plant.timestep) if hidden else 0
         warm = np.zeros((len(rollouts.runs), len(plant.joints))) if warm_c is None else np.array(warm_c)
         self._laws = self._make_laws(warm[[segment.run for segment in self._segments]][:, None])
+
+    def _misread(self, state: Array) -> None:
+        """Move where simulations begin, in place, by what each robot's sensors make of it."""
+        plant, sims = self._plant, len(state)
+        noise = np.tile([robot.noise.get("pos", 0.0) for robot in self._robots], len(self._segments))[:, None]
+        amid = np.repeat([segment.first > 0 for segment in self._segments], self._n)[:, None]
+        off = noise * self._rng.standard_normal((sims, len(plant.joints)))
+        state[:, 1 + plant.qpos] += off
+        speed = 1 + plant.model.nq
+        state[:, speed + plant.dof] += amid * noise / VELOCITY_SPAN_S * self._rng.standard_normal(off.shape)
+        if plant.free_joint is not None:
+            dof = int(plant.model.jnt_dofadr[plant.free_joint])
+            unsure = np.repeat([BASE_M_S, BASE_RAD_S], 3) * (noise > 0)
+            state[:, speed + dof : speed + dof + 6] += amid * unsure * self._rng.standard_normal((sims, 6))
 
     def _take_forms(self) -> None:
         """What a batch takes from its models are their arrays; these are options."""

@@ -68,7 +68,7 @@ class Templates:
         return out
 
     @cached_property
-    def _of_cause(self) -> list[NDArray[np.int64]]:
+    def of_cause(self) -> list[NDArray[np.int64]]:
         names = np.array([name for name, _, _ in self.bank])
         return [np.flatnonzero(names == cause) for cause in self.causes]
 
@@ -95,7 +95,7 @@ class Templates:
 
     def by_cause(self, fit: Floats) -> Floats:
         """(robots, causes) the best fit of each."""
-        return np.stack([fit[:, some].max(axis=1) for some in self._of_cause], axis=1)
+        return np.stack([fit[:, some].max(axis=1) for some in self.of_cause], axis=1)
 
     def by_joint(self, fit: Floats) -> Floats:
         """(robots, joints) the best fit of any cause that sits there alone."""

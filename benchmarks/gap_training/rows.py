@@ -1,0 +1,108 @@
+"""From shards to what is learned from: rows of evidence, and which of them are of a cause that the robot has."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.arrays import read_arrays
+from openant_tools.effects.robot import Reference
+from openant_tools.gap.evidence import Evidence, Layouts, RunLayout, Scale, evidence_of
+from openant_tools.gap.features import ARRIVAL, FOLLOWING, LATENESS
+from openant_tools.gap.population import Case
+
+__all__ = ["Learned", "Shard", "read_shard"]
+
+Bools = NDArray[np.bool_]
+
+#: signal → what its absence takes with it
+WITH = {"gyro": ("gyro", FOLLOWING), "pos": ("pos", LATENESS, ARRIVAL)}
+#: signals that a log may lack
+MAY_LACK = ("vel", "torque", "volt", "gyro", "acc", "base", "yaw")
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One experiment as `shards` wrote it.
+
+    Attributes:
+        robots: (robots, features), of them the first `measure` make the measure. log: (features,) of the robot that recorded it.
+    """
+
+    seed: int
+    layouts: Layouts
+    known: Bools
+    robots: NDArray[np.float32]
+    templates: NDArray[np.float32]
+    log: NDArray[np.float32]
+    bank: list[Case]
+    cases: list[Case]
+    truth: Case
+    measure: int
+    reference: Reference
+
+    def scale(self, known: Bools, without: str | None = None) -> Scale:
+        """What evidence is measured by; without a cause as if no catalogue had it."""
+        some = [n for n, case in enumerate(self.bank) if without not in case.causes]
+        bank, templates = [self.bank[n] for n in some], self.templates[some]
+        return Scale.of(self.layouts, known, self.robots[: self.measure], templates, bank, self.reference)
+
+    def evidence(self, known: Bools, without: str | None = None, some: NDArray[np.int64] | None = None) -> Evidence:
+        """Rows of all robots that do not make the measure (or of some of them), and of the log itself as the last."""
+        robots = np.concatenate([self.robots[self.measure :], self.log[None]])
+        return evidence_of(self.scale(known, without), robots if some is None else robots[some])
+
+    @property
+    def learned(self) -> list[Case]:
+        return [*self.cases[self.measure :], self.truth]
+
+    def lacking(self, rng: np.random.Generator) -> Bools:
+        """(features,) what a log with fewer sensors would have."""
+        known = self.known.copy()
+        signals = sorted({str(s) for s in self.layouts.signal})
+        for signal in MAY_LACK:
+            if signal in signals and rng.random() < 0.4:
+                for gone in WITH.get(signal, (signal,)):
+                    known &= self.layouts.signal != gone
+        return known
+
+
+def read_shard(folder: Path, seed: int) -> Shard:
+    facts = json.loads((folder / f"{seed:05d}.json").read_text())
+    arrays = read_arrays(folder / f"{seed:05d}.npz")
+    runs = range(len(facts["runs"]))
+
+    def side_by_side(name: str) -> NDArray[np.float32]:
+        return np.concatenate([np.atleast_2d(arrays[f"{name}{k}"].astype(np.float32)) for k in runs], axis=1)
+
+    numbers = {name: np.array(value) for name, value in facts["reference"].items()}
+    reference = Reference(
+        **{name: numbers[name] for name in ("torque", "stiffness", "damping", "limit", "armature", "friction")},
+        robot_kg=float(numbers["robot_kg"]), floor=True, imu=True, tracker=True, seen=None,
+    )  # fmt: skip
+    layouts = [RunLayout(one["setup"], one["seconds"], one["groups"], one["joints"]) for one in facts["runs"]]
+    return Shard(
+        seed, Layouts.of(layouts, len(reference.torque)),
+        np.concatenate([arrays[f"known{k}"] for k in runs]).astype(bool),
+        side_by_side("robots"), side_by_side("templates"), side_by_side("log")[0],
+        [_case(one, -1) for one in facts["bank"]], [_case(one, 0) for one in facts["cases"]], _case(facts["truth"], 0),
+        facts["measure"], reference,
+    )  # fmt: skip
+
+
+def _case(stated: dict[str, list[object]], seed: int) -> Case:
+    return Case({name: (tuple(joints), dict(x)) for name, (joints, x) in stated.items()}, seed)
+
+
+@dataclass(frozen=True)
+class Learned:
+    """Rows to learn from: `x` (rows, columns), `y` (rows,) whether the robot has the cause, `robot` (rows,), `shard` (rows,)."""
+
+    x: NDArray[np.float16]
+    y: Bools
+    robot: NDArray[np.int32]
+    shard: NDArray[np.int32]
