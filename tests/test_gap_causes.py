@@ -87,11 +87,11 @@ def test_delay_in_the_log_or_in_the_command_is_no_matter_of_motion(model: Path) 
 
 def test_joint_positions_do_not_show_that_another_sensor_is_late() -> None:
     late = catalogue()["sensor_delay"]
-    assert late.beside_joints_at({"pos": 0.001, "vel": 0.0, "imu": 0.02})
-    assert not late.beside_joints_at({"pos": 0.02, "vel": 0.0, "imu": 0.02})
-    assert not late.beside_joints_at({"pos": 0.001, "vel": 0.0, "imu": 0.001})
-    assert catalogue()["payload"].beside_joints_at(catalogue()["payload"].starts(0.5)[0])
-    assert not catalogue()["backlash"].beside_joints_at(catalogue()["backlash"].starts(0.5)[0])
+    assert late.unseen_in_joints_at({"pos": 0.001, "vel": 0.0, "imu": 0.02})
+    assert not late.unseen_in_joints_at({"pos": 0.02, "vel": 0.0, "imu": 0.02})
+    assert not late.unseen_in_joints_at({"pos": 0.001, "vel": 0.0, "imu": 0.001})
+    assert catalogue()["payload"].unseen_in_joints_at(catalogue()["payload"].starts(0.5)[0])
+    assert not catalogue()["backlash"].unseen_in_joints_at(catalogue()["backlash"].starts(0.5)[0])
 
 
 def test_a_large_motion_tells_a_limit_from_stiffness(model: Path) -> None:

@@ -36,7 +36,22 @@ effect = Effect(
     writer=servo,
     kinds=(
         # A loop of 50 Hz may act a period late.
-        Kind("action_delay", "s", _read, _ignore, None, lambda limit: 0.02, high=LONGEST_DELAY_S),
+        Kind(
+            "action_delay",
+            "s",
+            _read,
+            _ignore,
+            None,
+            lambda limit: 0.02,
+            high=LONGEST_DELAY_S,
+            shown_by="`steps`",
+            told_from={
+                "actuator_lag": "`steps` and `square`: a delay shifts an edge, a lag rounds it",
+                "damping": "`chirp` and `steps`: a delay grows with frequency where damping does not",
+                "velocity_gain": "`chirp` and `steps`: a delay grows with frequency where damping does not",
+                "armature": "`steps`: inertia shows in the overshoot, a delay in the start",
+            },
+        ),
     ),
     nuisance=True,
     told_from={
@@ -44,6 +59,6 @@ effect = Effect(
             "tap the robot",
             "hold it still, tap a leg sharply and log current or the IMU beside positions: what comes late "
             "without any command is the sensor",
-        ),
+        )
     },
 )

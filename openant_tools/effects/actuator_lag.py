@@ -46,6 +46,7 @@ effect = Effect(
             lambda limit: 0.02,
             high=1.0,
             holds=lambda model, plant, j: is_filtered(model, int(plant.actuator[j])),
+            shown_by="`steps` and `square`",
         ),
     ),
 )

@@ -33,6 +33,8 @@ effect = Effect(
             _scale.tolerance / 2,
             lambda limit: 0.005 * limit,
             constants=True,
+            shown_by="`chirp`",
+            told_from={"damping": "`chirp`: inertia rules above the resonance, damping at it"},
         ),
     ),
     nuisance=True,

@@ -51,10 +51,7 @@ effect = Effect(
     native=False,
     law=_law,
     order=30,
-    parameters=(
-        Parameter("positive_nm", "N·m", 0.1),
-        Parameter("negative_nm", "N·m", 0.1),
-    ),
+    parameters=(Parameter("positive_nm", "N·m", 0.1), Parameter("negative_nm", "N·m", 0.1)),
     vector=True,
     simpler=_simpler,
 )

@@ -68,6 +68,6 @@ effect = Effect(
     vector=True,
     shows=lambda reference: reference.floor,
     told_from={
-        "floor_friction": Action("hold the cable up", "record `gait` with the cable held up, and once more without"),
+        "floor_friction": Action("hold the cable up", "record `gait` with the cable held up, and once more without")
     },
 )

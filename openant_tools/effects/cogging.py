@@ -51,8 +51,5 @@ effect = Effect(
     writer=Writer(32, joint=_write),
     law=_law,
     order=25,
-    parameters=(
-        Parameter("amplitude_nm", "N·m", 0.05),
-        Parameter("periods", "per turn", 12.0, high=2000.0),
-    ),
+    parameters=(Parameter("amplitude_nm", "N·m", 0.05), Parameter("periods", "per turn", 12.0, high=2000.0)),
 )

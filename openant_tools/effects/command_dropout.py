@@ -21,10 +21,7 @@ effect = Effect(
     family="communication",
     words="some commands never arrive",
     scopes=(Scope.JOINT, Scope.ALL),
-    quantities=(
-        amount("fraction", "1", 0.03, 0.4),
-        shape("longest_s", "s", 0.02, 0.25),
-    ),
+    quantities=(amount("fraction", "1", 0.03, 0.4), shape("longest_s", "s", 0.02, 0.25)),
     enter=_enter,
     native=False,
     parameters=(Parameter("fraction", "1", high=0.95), Parameter("longest_s", "s", high=10.0)),

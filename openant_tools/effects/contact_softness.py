@@ -35,6 +35,7 @@ effect = Effect(
             low=1e-6,
             holds=lambda model, plant, j: _read(model, plant, j) > 0,
             body=True,
+            shown_by="`full`, on the floor",
         ),
         # `solimp` is tuned, not measured: between MuJoCo's default of 0.9 and the platform's 0.7.
         Kind(
@@ -47,6 +48,7 @@ effect = Effect(
             high=0.9999,
             holds=lambda model, plant, j: _read_impedance(model, plant, j) > 0,
             body=True,
+            shown_by="`full`, on the floor",
         ),
     ),
     nuisance=True,

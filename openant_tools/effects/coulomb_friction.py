@@ -24,7 +24,19 @@ effect = Effect(
     native=True,
     kinds=(
         # Of a small geared servo it is of the order of a tenth of the stall torque; a model that has none says nothing about it.
-        Kind("coulomb_friction", "N·m", read_friction, write_friction, None, lambda limit: 0.1 * limit),
+        Kind(
+            "coulomb_friction",
+            "N·m",
+            read_friction,
+            write_friction,
+            None,
+            lambda limit: 0.1 * limit,
+            shown_by="`slow-reversals`",
+            told_from={
+                "damping": "`slow-reversals` beside `chirp`: dry friction stays where damping fades",
+                "load_friction": "`slow-reversals` in loaded and in hanging poses",
+            },
+        ),
     ),
     nuisance=True,
 )

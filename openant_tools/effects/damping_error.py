@@ -29,11 +29,32 @@ effect = Effect(
     enter=_enter,
     native=True,
     kinds=(
-        Kind("velocity_gain", "N·m·s/rad", read_velocity_gain, write_velocity_gain, _scale.tolerance / 2, _usual),
-        Kind("damping", "N·m·s/rad", read_damping, write_damping, _scale.tolerance / 2, _usual),
+        Kind(
+            "velocity_gain",
+            "N·m·s/rad",
+            read_velocity_gain,
+            write_velocity_gain,
+            _scale.tolerance / 2,
+            _usual,
+            shown_by="`chirp`",
+            told_from={
+                "damping": "`drops` or `saturating-steps`: without torque, or at its limit, only damping brakes",
+                "electrical_damping": "`drops` or `saturating-steps`: without torque both vanish, at its limit one",
+            },
+        ),
+        Kind(
+            "damping",
+            "N·m·s/rad",
+            read_damping,
+            write_damping,
+            _scale.tolerance / 2,
+            _usual,
+            shown_by="`chirp`",
+            told_from={"electrical_damping": "`releases` or `drops`: without torque only the mechanical share brakes"},
+        ),
     ),
     nuisance=True,
     told_from={
-        "electrical_damping": Action("let it fall", "record `drops` and `releases`: without torque back-EMF is gone"),
+        "electrical_damping": Action("let it fall", "record `drops` and `releases`: without torque back-EMF is gone")
     },
 )

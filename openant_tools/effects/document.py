@@ -96,7 +96,7 @@ class Document:
             self.notes.append(note)
         return sensors
 
-    def late(self, sensor: Element, delay: float) -> None:
+    def delayed(self, sensor: Element, delay: float) -> None:
         """Let a sensor say what was so many s ago."""
         if delay > 0:
             sensor.set("delay", number(delay))

@@ -165,6 +165,7 @@ class Parameter:
         std: a size of which a robot's own is expected, one standard deviation of a fit's prior; of a torque (N·m), as a
             share of the servo's torque limit; None for what is not fitted.
         low, high: between which it is physical. absent: its value where nothing is said.
+        shown_by: the protocols that show it best.
     """
 
     name: str
@@ -173,6 +174,7 @@ class Parameter:
     low: float = 0.0
     high: float = float("inf")
     absent: float = 0.0
+    shown_by: str = ""
 
 
 class Action(NamedTuple):
@@ -246,7 +248,7 @@ class Effect:
     restored: Callable[[Values, Values, Reference, Ints], dict[str, float]] = lambda given, x, reference, joints: dict(
         given
     )
-    told_from: Mapping[str, Action] = field(default_factory=dict)
+    told_from: Mapping[str, Action] = field(default_factory=dict, hash=False)
 
     @property
     def chief(self) -> Parameter | None:
@@ -268,14 +270,14 @@ class Effect:
         return self.scopes == (Scope.BODY,)
 
     @property
-    def beside_joints(self) -> bool:
+    def unseen_in_joints(self) -> bool:
         """Whether joint positions say little of it: it acts on the body, or on another signal of the log."""
         return self.of_body or self.signal is not None or self.silent
 
-    def beside_joints_at(self, x: Mapping[str, float]) -> bool:
+    def unseen_in_joints_at(self, x: Mapping[str, float]) -> bool:
         """Whether joint positions say little of it at these coordinates: what they would show is within tolerance there."""
         beyond = {q.name for q in self.quantities if not q.shape and abs(x[q.name]) >= q.small}
-        return self.beside_joints or (bool(beyond) and beyond <= self.unseen)
+        return self.unseen_in_joints or (bool(beyond) and beyond <= self.unseen)
 
     def values(self, x: Mapping[str, float], reference: Reference, joints: Ints) -> dict[str, float]:
         """The parameters at a point of the coordinates."""

@@ -65,6 +65,7 @@ effect = Effect(
             valley=True,
             prior=1.0,
             holds=lambda model, plant, j: is_motor(model, int(plant.actuator[j])),
+            shown_by="`releases` and `drops`",
         ),
     ),
 )

@@ -34,6 +34,7 @@ effect = Effect(
             low=1e-6,
             holds=lambda model, plant, j: _read(model, plant, j) > 0,
             body=True,
+            shown_by="`full`, on the floor",
         ),
     ),
     nuisance=True,

@@ -51,6 +51,6 @@ effect = Effect(
         "cable_drag": Action(
             "turn the robot",
             "record `shifts`, which plays in two headings, and unplug the cable or hold it up for one of them",
-        ),
+        )
     },
 )

@@ -52,6 +52,6 @@ effect = Effect(
     told_from={
         "floor_tilt": Action(
             "turn the robot", "at rest, in two headings: a tilt turns in the body's frame, an IMU does not"
-        ),
+        )
     },
 )

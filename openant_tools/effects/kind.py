@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import mujoco
 
@@ -33,6 +33,7 @@ class Kind:
         holds: whether a joint can have it at all; default every one.
         body: of the body or the world: one number whatever the joints, which moves all of them.
         alike: of links: those of the same mass are the same part, and share it.
+        shown_by: the protocols that show it best. told_from: kind → what separates this one from it; said with one of the two.
         effect: the effect and its parameter, for what acts between steps because MuJoCo has no feature for it.
     """
 
@@ -51,3 +52,5 @@ class Kind:
     body: bool = False
     alike: bool = False
     effect: tuple[str, str] | None = None
+    shown_by: str = ""
+    told_from: Mapping[str, str] = field(default_factory=dict, hash=False)

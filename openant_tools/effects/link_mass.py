@@ -45,12 +45,11 @@ effect = Effect(
             constants=True,
             holds=lambda model, plant, j: _read(model, plant, j) > 0,
             alike=True,
+            shown_by="`drops` and `long-holds`",
         ),
     ),
     nuisance=True,
     told_from={
-        "stiffness_error": Action(
-            "weigh one leg", "a scale of mass, gains and friction in common shows in no position"
-        ),
+        "stiffness_error": Action("weigh one leg", "a scale of mass, gains and friction in common shows in no position")
     },
 )

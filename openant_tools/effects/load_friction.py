@@ -56,7 +56,7 @@ effect = Effect(
     law=_law,
     order=30,
     parameters=(
-        Parameter("coefficient", "N·m/(N·m)", 0.25, high=0.9),
+        Parameter("coefficient", "N·m/(N·m)", 0.25, high=0.9, shown_by="`slow-reversals` in loaded poses"),
         Parameter("motor_side", "N·m/(N·m)", 0.25, high=0.9),
         Parameter("link_side", "N·m/(N·m)", 0.25, high=0.9),
         Parameter("greater_side", "N·m/(N·m)", 0.25, high=0.9),

@@ -83,6 +83,8 @@ effect = Effect(
             constants=True,
             holds=lambda model, plant, j: _carried(model, plant),
             body=True,
+            shown_by="`full`, on the floor",
+            told_from={"link_mass": "`drops` on the stand, where the torso is held"},
         ),
     ),
     nuisance=True,

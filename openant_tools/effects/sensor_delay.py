@@ -16,13 +16,13 @@ def _enter(robot: Robot, joints: Ints, values: Values) -> None:
 
 def _write_encoder(document: Document, j: int) -> None:
     for signal in ("pos", "vel"):
-        document.late(document.encoder(signal, j), document.robot.late.get(signal, 0.0))
+        document.delayed(document.encoder(signal, j), document.robot.late.get(signal, 0.0))
 
 
 def _write_imu(document: Document) -> None:
     late = document.robot.late.get("imu", 0.0)
     for sensor in document.inertial() if late > 0 else ():
-        document.late(sensor, late)
+        document.delayed(sensor, late)
 
 
 effect = Effect(

@@ -68,6 +68,7 @@ effect = Effect(
             0.125,
             low=1e-6,
             holds=lambda model, plant, j: math.isfinite(_read(model, plant, j)),
+            shown_by="`saturating-steps`",
         ),
     ),
 )

@@ -23,6 +23,22 @@ effect = Effect(
     quantities=(_scale,),
     enter=_enter,
     native=True,
-    kinds=(Kind("stiffness", "N·m/rad", read_stiffness, write_stiffness, _scale.tolerance / 2, low=1e-6),),
+    kinds=(
+        Kind(
+            "stiffness",
+            "N·m/rad",
+            read_stiffness,
+            write_stiffness,
+            _scale.tolerance / 2,
+            low=1e-6,
+            shown_by="`long-holds`",
+            told_from={
+                "zero_offset": "`long-holds` in poses on both sides of the vertical",
+                "link_mass": "`long-holds` with a known mass on the foot, or `openant sysid scale`",
+                "torque_limit": "`saturating-steps`: only there the limit shows",
+                "coulomb_friction": "`holds` and `slow-reversals`: poses that are reached from both sides",
+            },
+        ),
+    ),
     nuisance=True,
 )

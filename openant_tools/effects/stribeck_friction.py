@@ -62,10 +62,7 @@ effect = Effect(
     family="friction",
     words="dry friction is larger at rest than in motion",
     scopes=(Scope.JOINT, Scope.SERVO, Scope.ALL),
-    quantities=(
-        amount("static_nm", "N·m", 0.03, 0.6, scale=usual_torque),
-        shape("velocity_rad_s", "rad/s", 0.05, 0.6),
-    ),
+    quantities=(amount("static_nm", "N·m", 0.03, 0.6, scale=usual_torque), shape("velocity_rad_s", "rad/s", 0.05, 0.6)),
     enter=_enter,
     native=True,
     writer=Writer(31, joint=_write),

@@ -71,16 +71,9 @@ effect = Effect(
     native=False,
     law=Heating,
     order=5,
-    parameters=(
-        Parameter("loss_per_c", "1/°C", 0.01, high=0.1),
-        Parameter("time_constant_s", "s", 10.0, high=3600.0),
-    ),
+    parameters=(Parameter("loss_per_c", "1/°C", 0.01, high=0.1), Parameter("time_constant_s", "s", 10.0, high=3600.0)),
     # How warm it was as a recording began is the recording's, not the robot's.
     stated=lambda values, reference, joints: {name: values[name] for name in ("loss_per_c", "time_constant_s")},
     restored=lambda given, x, reference, joints: {**given, "start_c": x.get("start_c", 0.0)},
-    told_from={
-        "voltage_sag": _warm_it_up,
-        "torque_limit": _warm_it_up,
-        "weak_joint": _warm_it_up,
-    },
+    told_from={"voltage_sag": _warm_it_up, "torque_limit": _warm_it_up, "weak_joint": _warm_it_up},
 )

@@ -36,6 +36,10 @@ effect = Effect(
             _limit.tolerance / 2,
             low=1e-6,
             holds=lambda model, plant, j: math.isfinite(torque_limit(model, plant, j)),
+            shown_by="`saturating-steps`",
+            told_from={
+                "speed_limit": "`saturating-steps`: slow ones stop at the torque limit, long ones at the speed limit"
+            },
         ),
     ),
     nuisance=True,

@@ -49,6 +49,6 @@ effect = Effect(
     told_from={
         "floor_friction": Action(
             "move it by hand", "push it a metre along a ruler with torque off: a scale shows at once"
-        ),
+        )
     },
 )

@@ -27,8 +27,5 @@ effect = Effect(
     shows=lambda reference: len(reference.torque) > 1,
     stated=lambda values, reference, joints: {"scale": 1 - values["loss"]},
     restored=lambda given, x, reference, joints: {"loss": 1 - given["scale"]},
-    told_from={
-        "torque_limit": _swap,
-        "stiffness_error": _swap,
-    },
+    told_from={"torque_limit": _swap, "stiffness_error": _swap},
 )

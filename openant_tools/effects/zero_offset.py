@@ -51,6 +51,7 @@ effect = Effect(
             low=-math.pi,
             high=math.pi,
             constants=True,
+            shown_by="`long-holds`; a joint with a vertical axis shows its zero only with the robot tilted",
         ),
     ),
     nuisance=True,

@@ -73,15 +73,15 @@ def apply(found: Diagnosis, model: Path, out: Path, *, robot: Path | None = None
     with (
         folder.hold() if folder is not None else contextlib.nullcontext()
     ):  # between reading its effects and writing them
-        kept = [] if folder is None else _kept(folder, found, mark_of(plant.model))
-        together = [entry for entry in (*entries, *kept) if entry.effect in acting() and entry.enabled]
-        word = _mark(found, model, together) if together else PLAIN
-        entries = [replace(entry, pair=word) if entry in together else entry for entry in entries]
-        kept = [replace(entry, pair=word) if entry.pair and entry in together else entry for entry in kept]
+        others = [] if folder is None else _others(folder, found, mark_of(plant.model))
+        acts = [entry for entry in (*entries, *others) if entry.effect in acting() and entry.enabled]
+        word = _mark(found, model, acts) if acts else PLAIN
+        entries = [replace(entry, pair=word) if entry in acts else entry for entry in entries]
+        others = [replace(entry, pair=word) if entry.pair and entry in acts else entry for entry in others]
         edited = write_robot(model, improved, out, note=f"Written by `openant gap apply`: {found.verdict}", pair=word)
         written = [out]
         if folder is not None:
-            _into_folder(folder, out, [*kept, *entries], found)
+            _into_folder(folder, out, [*others, *entries], found)
             written.append(folder.config_file)
         elif entries:
             write_text(beside, as_toml(entries, f"What MuJoCo has no feature for; goes with {out.name}"))
@@ -218,7 +218,7 @@ def _entries(plant: Plant, selected: list[Found], robot: Robot) -> list[Effect]:
     return entries
 
 
-def _kept(folder: RobotFolder, found: Diagnosis, given: str | None) -> list[Effect]:
+def _others(folder: RobotFolder, found: Diagnosis, given: str | None) -> list[Effect]:
     """The robot's entries that a diagnosis says nothing of, but for those that were fitted with another model than was diagnosed.
 
     Args:
@@ -232,9 +232,9 @@ def _kept(folder: RobotFolder, found: Diagnosis, given: str | None) -> list[Effe
     ]
 
 
-def _mark(found: Diagnosis, model: Path, together: Sequence[Effect]) -> str:
+def _mark(found: Diagnosis, model: Path, acts: Sequence[Effect]) -> str:
     """The mark of an improved model and its effects (`robot.pair`)."""
-    told = [[entry.effect, entry.joints, dict(entry.parameters)] for entry in together]
+    told = [[entry.effect, entry.joints, dict(entry.parameters)] for entry in acts]
     text = json_text({"model": model.name, "calibration": found.calibration, "effects": told})
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 

@@ -70,7 +70,7 @@ def placed(
         out.setdefault(tried[k].part.cause, (tried[k], float(left[k])))
     for one, cost in zip(tried, left, strict=True):
         name = one.part.cause
-        if one is explained[name] and catalogue()[name].beside_joints and cost < UNDECIDED * out[name][1]:
+        if one is explained[name] and catalogue()[name].unseen_in_joints and cost < UNDECIDED * out[name][1]:
             out[name] = one, float(cost)
     return {name: out[name] for name in explained}
 
@@ -290,4 +290,4 @@ def carries(cause: Cause) -> bool:
 
 def moves_joints(cause: Cause) -> bool:
     """Whether windows of joint positions can tell it: it acts on joints, and the same way each time."""
-    return not cause.beside_joints and not cause.random
+    return not cause.unseen_in_joints and not cause.random

@@ -30,7 +30,7 @@ def decide_together(
     fits = SetFits(windows, patient.training, patient.held_out)
     probability = dict(ranked)
     late = _late_register(patient)
-    moving = [name for name in explained if not catalogue()[name].beside_joints]
+    moving = [name for name in explained if not catalogue()[name].unseen_in_joints]
     if late is not None:
         # What the log itself shows needs no fit to positions, and none may make something else of it.
         moving = [name for name in moving if name != late[0].part.cause]

@@ -345,7 +345,7 @@ def _led(evidence: _Evidence, names: Sequence[str]) -> _Leader:
     closed, without = evidence.closed(whole), evidence.closed(evidence.plain)
     gained = closed - without
     # Joint positions say little of the body: there closure alone proves nothing that the judge does not half believe.
-    beside = catalogue()[best].beside_joints_at(whole.refit.x[0])
+    beside = catalogue()[best].unseen_in_joints_at(whole.refit.x[0])
     # Of what is left of a healthy robot a cause may take a third by chance.
     healthy = evidence.plain.after < LARGE * evidence.floor and evidence.judgement.energy < STRANGE
     proves = gained > ADDS_ALONE or (not healthy and 1 - closed < PROVES * (1 - without))
@@ -429,7 +429,7 @@ def _joined(evidence: _Evidence, leader: _Leader, left: Judgement, chosen: _Chos
         both = together.get(one.part, whole)
         with_it, without_it = calm.get(one.part, (whole, whole))
         # What moves no joint, or not twice alike, no closure can prove: there the judge's word is enough.
-        moves = moves_joints(catalogue()[name]) and not catalogue()[name].beside_joints_at(both.refit.x[-1])
+        moves = moves_joints(catalogue()[name]) and not catalogue()[name].unseen_in_joints_at(both.refit.x[-1])
         # Unless it takes away so much of what is strange that nothing within tolerance does.
         much = (moves or carries(catalogue()[name])) and 1 - with_it.closed < PROVES * (1 - without_it.closed)
         # What looks like the leader is hardly there beside it, whatever a judge says that cannot tell them apart.

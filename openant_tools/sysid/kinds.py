@@ -58,6 +58,7 @@ def _of_laws() -> Iterator[Kind]:
                 high=parameter.high,
                 body=effect.shared,
                 effect=(effect.name, parameter.name),
+                shown_by=parameter.shown_by,
             )
 
 

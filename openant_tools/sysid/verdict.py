@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.sysid.estimate import Estimate
+from openant_tools.sysid.kinds import KINDS
 
 __all__ = ["SILENT", "Verdict", "Word", "experiment", "verdicts"]
 
@@ -25,49 +26,6 @@ IDENTIFIED = 0.75
 NOT_IN_THE_DATA = 0.1
 #: two estimates are tied if they correlate beyond this, and knowing one would make the other identified
 TIED = 0.8
-
-#: what separates two kinds, by what moves one of them and not the other
-_APART: dict[frozenset[str], str] = {
-    frozenset(pair.split()): words
-    for pair, words in {
-        "velocity_gain damping": "`drops` or `saturating-steps`: without torque, or at its limit, only damping brakes",
-        "velocity_gain electrical_damping": "`drops` or `saturating-steps`: without torque both vanish, at its limit one",
-        "damping electrical_damping": "`releases` or `drops`: without torque only the mechanical share brakes",
-        "action_delay actuator_lag": "`steps` and `square`: a delay shifts an edge, a lag rounds it",
-        "action_delay damping": "`chirp` and `steps`: a delay grows with frequency where damping does not",
-        "action_delay velocity_gain": "`chirp` and `steps`: a delay grows with frequency where damping does not",
-        "action_delay armature": "`steps`: inertia shows in the overshoot, a delay in the start",
-        "armature damping": "`chirp`: inertia rules above the resonance, damping at it",
-        "stiffness zero_offset": "`long-holds` in poses on both sides of the vertical",
-        "stiffness link_mass": "`long-holds` with a known mass on the foot, or `openant sysid scale`",
-        "stiffness torque_limit": "`saturating-steps`: only there the limit shows",
-        "stiffness coulomb_friction": "`holds` and `slow-reversals`: poses that are reached from both sides",
-        "coulomb_friction damping": "`slow-reversals` beside `chirp`: dry friction stays where damping fades",
-        "coulomb_friction load_friction": "`slow-reversals` in loaded and in hanging poses",
-        "torso_mass link_mass": "`drops` on the stand, where the torso is held",
-        "torque_limit speed_limit": "`saturating-steps`: slow ones stop at the torque limit, long ones at the speed limit",
-    }.items()
-}
-#: what shows a kind best
-_SHOWS = {
-    "stiffness": "`long-holds`",
-    "zero_offset": "`long-holds`; a joint with a vertical axis shows its zero only with the robot tilted",
-    "link_mass": "`drops` and `long-holds`",
-    "torso_mass": "`full`, on the floor",
-    "damping": "`chirp`",
-    "velocity_gain": "`chirp`",
-    "armature": "`chirp`",
-    "coulomb_friction": "`slow-reversals`",
-    "load_friction": "`slow-reversals` in loaded poses",
-    "electrical_damping": "`releases` and `drops`",
-    "action_delay": "`steps`",
-    "actuator_lag": "`steps` and `square`",
-    "torque_limit": "`saturating-steps`",
-    "speed_limit": "`saturating-steps`",
-    "floor_friction": "`full`, on the floor",
-    "contact_softness": "`full`, on the floor",
-    "contact_impedance": "`full`, on the floor",
-}
 
 
 @dataclass(frozen=True)
@@ -119,7 +77,10 @@ def _partner(correlation: Array, k: int, deviation: float) -> int | None:
 
 def experiment(kind: str, other: str | None = None) -> str:
     """What to record so that a kind of parameter is told, or told from another one; empty where nothing is known."""
-    if other is not None and (words := _APART.get(frozenset((kind, other)))):
-        return words
-    shown = [_SHOWS[each] for each in dict.fromkeys((kind, other)) if each in _SHOWS]
-    return " and ".join(dict.fromkeys(shown))
+    asked = [KINDS[name] for name in dict.fromkeys((kind, other)) if name in KINDS]
+    if len(asked) == 2:
+        one, two = asked
+        words = one.told_from.get(two.name) or two.told_from.get(one.name)
+        if words:
+            return words
+    return " and ".join(dict.fromkeys(each.shown_by for each in asked if each.shown_by))
