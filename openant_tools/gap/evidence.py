@@ -120,16 +120,16 @@ class Layouts:
 
     def folds(self) -> Ints:
         """(features,) the contiguous part of a run that each belongs to; at least FOLDS in all."""
-        lengths = [float(self.time[self.run == k].max(initial=0.0)) for k in range(int(self.run.max()) + 1)]
-        parts = [max(1, round(length / FOLD_S)) for length in lengths]
-        while sum(parts) < FOLDS:
-            parts[int(np.argmax(np.array(lengths) / parts))] += 1
+        runs = range(int(self.run.max()) + 1)
+        times = [self.time[self.run == k] for k in runs]
+        begin = np.array([some.min(initial=np.inf) for some in times])
+        length = np.array([some.max(initial=0.0) - some.min(initial=np.inf) for some in times]).clip(1e-6)
+        parts = np.maximum(1, np.round(length / FOLD_S)).astype(int)
+        while parts.sum() < FOLDS:
+            parts[int(np.argmax(length / parts))] += 1
         first = np.concatenate([[0], np.cumsum(parts)[:-1]])
-        inside = [
-            np.minimum((self.time / (lengths[k] + 1e-9) * parts[k]).astype(int), parts[k] - 1)
-            for k in range(len(parts))
-        ]
-        out: Ints = np.array([first[k] + inside[k][i] for i, k in enumerate(self.run)], np.int64)
+        inside = ((self.time - begin[self.run]) / length[self.run] * parts[self.run]).astype(np.int64)
+        out: Ints = first[self.run] + np.minimum(inside, parts[self.run] - 1)
         return out
 
 

@@ -1,0 +1,58 @@
+"""Boosted trees as plain arrays: the same judgement as the library that taught them, from a file that holds nothing but numbers."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sklearn.ensemble import HistGradientBoostingClassifier
+
+from openant_tools.arrays import read_arrays, write_arrays
+from openant_tools.gap.classifier import Classifier
+from openant_tools.gap.evidence import COLUMN_NAMES
+from openant_tools.gap.posterior import COLUMNS, NONE, OUTSIDE, WEIGHTS, features_of, log_posterior
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def taught() -> tuple[HistGradientBoostingClassifier, Classifier, np.ndarray]:
+    sys.path.insert(0, str(ROOT))
+    from benchmarks.gap_training.train import exported
+
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(400, 6)).astype(np.float16).astype(np.float32)
+    y = x[:, 0] * x[:, 1] + 0.3 * rng.normal(size=400) > 0
+    model = HistGradientBoostingClassifier(max_iter=20, max_leaf_nodes=8, random_state=0).fit(x, y)
+    return model, exported(model), x
+
+
+def test_arrays_judge_as_the_library_does(
+    taught: tuple[HistGradientBoostingClassifier, Classifier, np.ndarray],
+) -> None:
+    model, arrays, x = taught
+    np.testing.assert_allclose(arrays(x), model.decision_function(x), atol=1e-4)
+    assert arrays(x.reshape(20, 20, 6)).shape == (20, 20)
+
+
+def test_a_file_of_numbers_brings_it_back(
+    taught: tuple[HistGradientBoostingClassifier, Classifier, np.ndarray], tmp_path: Path
+) -> None:
+    _, arrays, x = taught
+    write_arrays(tmp_path / "trees.npz", arrays.arrays())
+    again = Classifier.of(read_arrays(tmp_path / "trees.npz"))
+    np.testing.assert_array_equal(again(x), arrays(x))
+
+
+def test_nothing_a_cause_or_something_unknown_share_what_is_likely() -> None:
+    weights = dict.fromkeys(WEIGHTS, 0.0) | {"odds": 1.0, "none": 1.0, "none: size": -8.0, "outside: left": 4.0}
+    rows = np.zeros((3, 2, len(COLUMN_NAMES) + 1), np.float32)
+    rows[:, :, COLUMN_NAMES.index("size")] = np.array([0.0, 0.8, 0.8])[:, None]
+    rows[:, :, COLUMN_NAMES.index("left after 1")] = np.array([0.0, 0.0, 0.8])[:, None]
+    odds = np.array([[-5, -6], [4, -5], [-3, -3]], np.float32)
+    p = log_posterior(features_of(rows, odds), weights)
+    np.testing.assert_allclose(np.exp(p).sum(axis=1), 1.0)
+    assert p.argmax(axis=1).tolist() == [NONE, 2, OUTSIDE]
+    assert set(COLUMNS) < set(WEIGHTS)

@@ -1,0 +1,139 @@
+"""What speaks for each cause: templates and healthy robots of a recording, and rows that mean the same whatever was recorded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from openant_tools.gap.cloud import HORIZONS_S, robots_at, templates_at, templates_of
+from openant_tools.gap.evidence import COLUMN_NAMES, Layouts, RunLayout, Scale, evidence_of
+from openant_tools.gap.population import Case, draw
+from openant_tools.gap.protocol import Protocol
+from openant_tools.recording.run import Facts, Run
+
+PENDULUM = """
+<mujoco model="pendulum"><option timestep="0.002" integrator="implicitfast"/>
+  <worldbody><body pos="0 0 1"><inertial pos="0 0 -0.1" mass="0.1" diaginertia="1e-4 1e-4 1e-5"/>
+    <joint name="hinge" axis="0 1 0" damping="0.03" armature="0.002" frictionloss="0.01"/></body></worldbody>
+  <actuator><position name="hinge" joint="hinge" kp="1.5" forcerange="-0.5 0.5"/></actuator>
+</mujoco>"""
+#: two legs that stand apart, of two joints each
+TWO_LEGS = """
+<mujoco model="legs"><option timestep="0.002" integrator="implicitfast"/><worldbody>{}</worldbody><actuator>{}</actuator></mujoco>"""
+
+
+def _recorded(model: Path, joints: tuple[str, ...], seconds: float, *, torque: bool = True) -> Protocol:
+    """Runs of a robot that goes where it is told to, exactly."""
+    runs = []
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        t = np.arange(0.0, seconds, 0.01)
+        columns = {}
+        for joint in joints:
+            hz, phase = rng.uniform(0.3, 1.5, 3), rng.uniform(0, 6, 3)
+            command = 0.3 * np.sin(2 * np.pi * hz * t[:, None] + phase).sum(axis=1)
+            columns[f"cmd.{joint}"] = command
+            columns[f"pos.{joint}"] = np.round(command / 0.0015) * 0.0015
+            columns[f"vel.{joint}"] = np.gradient(command, t)
+            if torque:
+                columns[f"cur.{joint}"] = 0.1 * np.sin(t)
+        runs.append(Run(f"run{seed}", Facts(joints=joints, setup="stand"), t, columns))
+    return Protocol.of(runs, model, joints, [None, None], HORIZONS_S).coarse()
+
+
+@pytest.fixture(scope="module")
+def pendulum(tmp_path_factory: pytest.TempPathFactory) -> Protocol:
+    model = tmp_path_factory.mktemp("model") / "pendulum.xml"
+    model.write_text(PENDULUM)
+    return _recorded(model, ("hinge",), 4.0)
+
+
+def _layouts(protocol: Protocol) -> Layouts:
+    runs = [
+        RunLayout(
+            str(one.plant.setup), one.run.duration_s, one.layout.groups(), {s: one.layout.joints_of(s) for s in one.layout.groups()}
+        )
+        for one in protocol.runs
+    ]  # fmt: skip
+    return Layouts.of(runs, len(protocol.joints))
+
+
+def _healthy(protocol: Protocol, count: int, first: int = 0) -> list[Case]:
+    return [Case({}, seed) for seed in range(first, first + count)]
+
+
+def _with(protocol: Protocol, cause: str, count: int) -> list[Case]:
+    """Robots at random that have one cause alone, clearly."""
+    found = (draw(protocol, seed) for seed in range(10_000))
+    alone = (case for case in found if list(case.causes) == [cause])
+    return [next(alone) for _ in range(count)]
+
+
+def _features(parts: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    return np.concatenate(parts, axis=1)
+
+
+@pytest.mark.slow
+def test_each_cause_is_recognised_by_what_it_would_do_to_this_very_recording(pendulum: Protocol) -> None:
+    bank, layouts = templates_of(pendulum), _layouts(pendulum)
+    templates = _features(templates_at(pendulum, bank))
+    healthy = _features(robots_at(pendulum, _healthy(pendulum, 60), 1))
+    known = np.concatenate([one.layout.known(one.seen) for one in pendulum.runs])
+    # Nothing was logged of the supply, and no block of it says anything.
+    assert not known[layouts.signal == "volt"].any()
+    scale = Scale.of(layouts, known, healthy, templates, bank, pendulum.reference)
+
+    others = evidence_of(scale, _features(robots_at(pendulum, _healthy(pendulum, 20, 500), 2)))
+    assert 0.5 < np.median(others.size) < 1.5, "a healthy robot differs as healthy ones do"
+    assert others.rows.shape == (20, len(others.causes), len(COLUMN_NAMES) + 1)
+    assert np.isfinite(others.rows).all()
+
+    share = COLUMN_NAMES.index("share")
+    # On a stand nothing tells a late command from a late reading, and little from a lag.
+    late = {"action_delay", "sensor_delay", "actuator_lag"}
+    for cause, alike in (
+        ("stiffness_error", {"stiffness_error"}),
+        ("action_delay", late),
+        ("zero_offset", {"zero_offset"}),
+    ):
+        found = evidence_of(scale, _features(robots_at(pendulum, _with(pendulum, cause, 6), 3)))
+        first = [found.causes[k] for k in found.rows[:, :, share].argmax(axis=1)]
+        assert sum(one in alike for one in first) >= 4, (cause, first)
+        best = found.rows[np.arange(6), found.causes.index(cause)]
+        assert np.median(best[:, COLUMN_NAMES.index("gain")]) > np.median(
+            others.rows[:, others.causes.index(cause), COLUMN_NAMES.index("gain")]
+        ), "what is fitted to some folds foretells the others"
+
+
+def test_on_a_stand_legs_that_do_not_move_each_other_are_simulated_side_by_side(tmp_path: Path) -> None:
+    leg = (
+        '<body pos="0 {y} 1"><inertial pos="0 0 -0.1" mass="0.1" diaginertia="1e-4 1e-4 1e-5"/>'
+        '<joint name="{n}_hip" axis="0 1 0" damping="0.03" armature="0.002"/><body pos="0 0 -0.2"><inertial pos="0 0 -0.1" '
+        'mass="0.05" diaginertia="1e-4 1e-4 1e-5"/><joint name="{n}_knee" axis="0 1 0" damping="0.03" armature="0.002"/></body></body>'
+    )
+    joints = ("a_hip", "a_knee", "b_hip", "b_knee")
+    drives = "".join(f'<position name="{one}" joint="{one}" kp="2" forcerange="-1 1"/>' for one in joints)
+    model = tmp_path / "legs.xml"
+    model.write_text(TWO_LEGS.format(leg.format(n="a", y=0) + leg.format(n="b", y=1), drives))
+    protocol = _recorded(model, joints, 1.5)
+    bank = [
+        case for case in templates_of(protocol)
+        for name, (at, _x) in case.causes.items() if len(at) == 1 and name in {"stiffness_error", "backlash", "zero_offset"}
+    ]  # fmt: skip
+    side_by_side = _features(templates_at(protocol, bank))
+    alone = np.concatenate([_features(templates_at(protocol, [case])) for case in bank])
+    # The scale of torques is asked of all joints at once.
+    layouts = _layouts(protocol)
+    means = layouts.mean & np.isin(layouts.signal, ["pos", "vel"])
+    np.testing.assert_allclose(side_by_side[:, means], alone[:, means], atol=2e-5)
+
+
+def test_a_log_is_cut_into_folds_that_tell_of_each_other() -> None:
+    groups = {"pos": ["mean"] * 60 + ["size"] * 2 + ["rough"] * 2}
+    layouts = Layouts.of([RunLayout("stand", 3.5, groups, {"pos": [0, 1] * 32})], joints=2)
+    folds = layouts.only(layouts.mean).folds()
+    assert set(folds.tolist()) == {0, 1, 2, 3}, "one run by itself is enough"
+    assert (np.diff(folds) >= 0).all(), "each is contiguous"
