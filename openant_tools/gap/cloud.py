@@ -17,7 +17,7 @@ from openant_tools.effects.robot import Robot
 from openant_tools.gap.features import Floats
 from openant_tools.gap.population import WARMING_C, Case, applicable, robot_of
 from openant_tools.gap.protocol import Played, Protocol
-from openant_tools.gap.sensors import logged_by
+from openant_tools.gap.sensors import logged_by, widened
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.plant import Setup
 from openant_tools.model.rollout import Rollouts
@@ -82,6 +82,8 @@ def robots_at(protocol: Protocol, cases: Sequence[Case], seed: int) -> list[Floa
     """Of each run, (robots, features): what robots with all the scatter of one build do otherwise than the model, as they log it."""
     rng = np.random.default_rng((551, seed))
     robots = [robot_of(protocol, case) for case in cases]
+    for robot, case in zip(robots, cases, strict=True):
+        widened(robot, np.random.default_rng((983, case.seed)))
     order, heat, steps = rng.permutation(len(protocol.runs)), [one.heat_c for one in robots], protocol.resolution()
     out = []
     for k, played in enumerate(protocol.runs):

@@ -33,7 +33,7 @@ from openant_tools.gap.population import Case
 from openant_tools.gap.templates import Template, Templates
 from openant_tools.gap.whitening import Whitening, whiten
 
-__all__ = ["COLUMN_NAMES", "Evidence", "Layouts", "RunLayout", "Scale", "evidence_of"]
+__all__ = ["COLUMN_NAMES", "Evidence", "Layouts", "RunLayout", "Scale", "evidence_of", "unknown_signals"]
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -58,6 +58,8 @@ LEAST_SPREAD, FARTHEST = 0.05, 8.0
 RIDGE = 0.02
 #: between which an amplitude is believed, in templates
 AMPLITUDE = (0.0, 2.5)
+#: causes that may explain a signal, and times the farthest healthy robot beyond which it is unknown
+EXPLAINING, OUTSIDE_HEALTHY = 3, 1.3
 #: of what does not apply
 ABSENT = -20.0
 
@@ -272,6 +274,31 @@ def evidence_of(scale: Scale, features: Floats) -> Evidence:
     columns.append(np.broadcast_to(np.array([names.index(cause) for cause in t.causes], np.float32), by.shape))
     rows = np.nan_to_num(np.stack([np.asarray(one, np.float32) for one in columns], axis=2), nan=ABSENT)
     return Evidence(t.causes, rows, (size[:, 0] / root).astype(np.float32), best, t.bank)
+
+
+def unknown_signals(scale: Scale, healthy: Floats, features: Floats) -> dict[str, float]:
+    """Signals that behave as none that is known: signal → how far outside healthy robots', as a factor.
+
+    Beyond what the likeliest causes do, a signal of a sensor stays outside everything that healthy robots with sensors of all
+    forms show. What is known of it so is wrong, and it may lend no certainty to anything.
+
+    Args:
+        healthy: (robots, features) not those of the scale. features: (features,) of the robot at hand.
+    """
+    means, t = scale.means, scale.templates
+    z = scale.whitening(np.vstack([healthy, features])[:, scale.some][:, scale.layouts.mean].astype(np.float32))
+    left = t.without_best(z[-1], EXPLAINING)
+    out = {}
+    for signal in SIGNALS[1:]:
+        beyond = 0.0
+        for floor in (False, True):
+            mine = (means.signal == signal) & (means.floor == floor)
+            if mine.any():
+                usual = float(np.linalg.norm(z[:-1, mine], axis=1).max())
+                beyond = max(beyond, float(np.linalg.norm(left[mine])) / usual)
+        if beyond > OUTSIDE_HEALTHY:
+            out[signal] = beyond
+    return out
 
 
 def _best_other(by: Floats) -> Floats:

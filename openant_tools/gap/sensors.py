@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.features import Floats, Signals, with_noise
 
-__all__ = ["TorqueSensor", "logged_by"]
+__all__ = ["TorqueSensor", "logged_by", "widened"]
 
 Array = NDArray[np.float64]
 
@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 FILTER_S, OLDER_S = (0.002, 0.06), 0.02
 #: logarithm of how unequal the scales of joints are; shares of the usual torque: standby, offsets, steps, and where it clips
 UNEQUAL, STANDBY, OFFSET, STEP, CLIPS = 0.08, 0.4, 0.1, (0.01, 0.3), (0.8, 3.0)
+#: s by which a tracker's poses are older than joints, and velocities beyond what a register's filter makes them; scale of a tracker
+TRACKER_LATE_S, VELOCITY_LATE_S, TRACKER_SCALE = 0.05, 0.01, 0.01
 #: of how many robots each is true
 FILTERED, OLD, STANDS_BY, OFF, STEPS, CLIPPED, UNSIGNED = 0.5, 0.3, 0.35, 0.3, 0.6, 0.2, 0.08
 
@@ -80,6 +82,13 @@ class TorqueSensor:
         if self.step:
             y = np.round(y / (self.step * usual)) * self.step * usual
         return y.astype(np.float32)
+
+
+def widened(robot: Robot, rng: np.random.Generator) -> None:
+    """Let a robot's sensors differ, in place, by what is no effect of theirs but how trackers and filters are."""
+    robot.late["base"] = robot.late.get("base", 0.0) + float(rng.uniform(0, TRACKER_LATE_S))
+    robot.late["vel"] = robot.late.get("vel", 0.0) + float(rng.uniform(0, VELOCITY_LATE_S))
+    robot.base_scale *= math.exp(float(rng.normal(0, TRACKER_SCALE)))
 
 
 def logged_by(

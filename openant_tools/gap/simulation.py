@@ -163,6 +163,9 @@ class _Batch:
         if plant.free_joint is not None:
             dof = int(plant.model.jnt_dofadr[plant.free_joint])
             unsure = np.repeat([BASE_M_S, BASE_RAD_S], 3) * (noise > 0)
+            adr = 1 + int(plant.model.jnt_qposadr[plant.free_joint])
+            seen = np.tile([robot.noise.get("base", 0.0) for robot in self._robots], len(self._segments))[:, None]
+            state[:, adr : adr + 2] += amid * seen * self._rng.standard_normal((sims, 2))
             state[:, speed + dof : speed + dof + 6] += amid * unsure * self._rng.standard_normal((sims, 6))
 
     def _take_forms(self) -> None:

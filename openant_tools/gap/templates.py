@@ -93,6 +93,15 @@ class Templates:
         out: Floats = np.maximum(z @ unit.T, 0.0)
         return out
 
+    def without_best(self, z: Floats, times: int) -> Floats:
+        """(features,) what is left of one robot's differences once the causes that fit best are taken out, one after another."""
+        left = z.astype(np.float64)
+        for _ in range(times):
+            mine = self._beside[int((self._unit @ left).argmax())]
+            unit = self._unit[mine].astype(np.float64)
+            left = left - np.linalg.solve(unit @ unit.T + NOISE * np.eye(len(mine)), unit @ left) @ unit
+        return left.astype(np.float32)
+
     def by_cause(self, fit: Floats) -> Floats:
         """(robots, causes) the best fit of each."""
         return np.stack([fit[:, some].max(axis=1) for some in self.of_cause], axis=1)
