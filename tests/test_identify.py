@@ -220,6 +220,30 @@ def test_runs_of_two_gains_are_one_servo(tmp_path: Path) -> None:
     assert sorted(path.name for path in out.glob("*.xml")) == ["calibrated.xml"]
 
 
+def test_one_file_is_one_model_and_two_of_one_name_are_two(tmp_path: Path) -> None:
+    """A folder of recordings for each day, and a folder for each gain."""
+    for gain in (8, 4):
+        (tmp_path / f"gain{gain}").mkdir()
+        plants.write(tmp_path / f"gain{gain}" / "arm.xml", MODEL.replace('kp="8"', f'kp="{gain}"'))
+    runs = []
+    for seed, (day, gain) in enumerate((("monday", 8), ("friday", 8), ("friday", 4), ("sunday", 8))):
+        (tmp_path / day).mkdir(exist_ok=True)
+        robot = Robot(0.9 * gain, coulomb_friction=0.05)
+        run = robot.record(f"{day} {gain}", 2.0, seed, model=f"../gain{gain}/arm.xml")
+        runs.append(replace(run, path=tmp_path / day / f"{gain}.parquet"))
+    kinds = ["stiffness", "coulomb_friction"]
+    given = tmp_path / "gain8" / "arm.xml"
+    same = identify(runs[:2], given, [runs[3]], kinds=kinds)
+    assert value(same, "stiffness.joint").value == pytest.approx(7.2, rel=0.02)
+    result = identify([runs[0], runs[2]], given, [runs[3]], kinds=kinds)
+    assert result.after.full < 0.2 * result.before.full
+    assert value(result, "stiffness.joint.gain8-arm").value == pytest.approx(7.2, rel=0.02)
+    assert value(result, "stiffness.joint.gain4-arm").value == pytest.approx(3.6, rel=0.02)
+    write_fit(result, tmp_path / "fit")
+    written = {path.name for path in (tmp_path / "fit").glob("*.xml")}
+    assert written == {"calibrated-gain8-arm.xml", "calibrated-gain4-arm.xml"}
+
+
 @pytest.fixture(scope="module")
 def ant(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, dict[str, float]], Identification]:
     """The nominal Ant's file (with a coarser step), an Ant's true values by kind and joint, and what is found of them."""

@@ -20,7 +20,10 @@ _log = logging.getLogger(__name__)
 
 
 def own_model(run: Run) -> Path | None:
-    """The model that a run itself names, where that file is; one elsewhere is not followed, and that is said."""
+    """The model that a run itself names, where that file is: one file is one model, from wherever runs name it.
+
+    One elsewhere is not followed, and that is said.
+    """
     own = run.model_path
     if own is None or not own.is_file():
         return None
@@ -28,7 +31,7 @@ def own_model(run: Run) -> Path | None:
     if run.path is not None and follows(str(run.facts.model), run.path) is None:
         _say_elsewhere(str(run.path), str(run.facts.model))
         return None
-    return own
+    return own.resolve()
 
 
 @functools.cache
@@ -75,7 +78,7 @@ def models_of(
         return list(runs), first, ()
     if robot is None:
         raise BadInput("no model is named", remedy="name an MJCF of this robot, or the robot's folder")
-    return list(runs), robot().model_path(), ()
+    return list(runs), robot().model_path().resolve(), ()
 
 
 def plants_of(runs: Sequence[Run], model: Path, joints: Sequence[str]) -> list[Plant]:

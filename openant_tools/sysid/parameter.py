@@ -40,6 +40,7 @@ __all__ = [
     "delays",
     "effect_values",
     "given_numbers",
+    "names_of",
     "restatements",
 ]
 
@@ -271,18 +272,33 @@ def by_register(parameters: Sequence[Parameter], plants: Sequence[Plant]) -> lis
 
     Friction, inertia and zeros are the servo's, whatever its gains.
     """
-    paths = dict.fromkeys(plant.path for plant in plants)
+    paths = list(dict.fromkeys(plant.path for plant in plants))
     if len(paths) < 2:
         return list(parameters)
+    names = names_of(paths)
     return [
         one
         for parameter in parameters
         for one in (
-            [replace(parameter, model=path, label=f"{parameter.label}.{path.stem}") for path in paths]
+            [
+                replace(parameter, model=path, label=f"{parameter.label}.{name}")
+                for path, name in zip(paths, names, strict=True)
+            ]
             if parameter.kind in OF_REGISTERS
             else [parameter]
         )
     ]
+
+
+def names_of(paths: Sequence[Path]) -> list[str]:
+    """What models are called beside each other: by their files, with as many of their folders as tells them apart."""
+    parts = [(*path.relative_to(path.anchor).parent.parts, path.stem) for path in paths]
+    names: list[str] = []
+    for folders in range(max(map(len, parts))):
+        names = ["-".join(each[-1 - folders :]) for each in parts]
+        if len(set(names)) == len(names):
+            break
+    return names
 
 
 def _groups(plant: Plant, kind: Kind, tie: str, motors: Mapping[str, str]) -> dict[str, list[int]]:

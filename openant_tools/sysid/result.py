@@ -28,6 +28,7 @@ from openant_tools.sysid.beyond import TRIED, better
 from openant_tools.sysid.fit_report import fit_report
 from openant_tools.sysid.identify import Identification, calibrated, restated
 from openant_tools.sysid.kinds import KINDS
+from openant_tools.sysid.parameter import names_of
 
 __all__ = ["WITH_EFFECTS", "effects_beside", "pair_of", "pairs", "stating_both", "write_fit", "write_robot"]
 
@@ -142,7 +143,7 @@ def pairs(plain: Identification, richer: Identification) -> dict[str, Any]:
 
 def _models(result: Identification) -> list[str]:
     models = result.models
-    return [CALIBRATED] if len(models) == 1 else [f"calibrated-{path.stem}.xml" for path in models]
+    return [CALIBRATED] if len(models) == 1 else [f"calibrated-{name}.xml" for name in names_of(models)]
 
 
 def _written_before(out: Path) -> set[str]:
