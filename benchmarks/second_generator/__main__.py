@@ -22,7 +22,7 @@ from machine import ant, arm, truth
 from motions import protocol, walks
 from play import clocks_of, play
 
-STEPS_S = (5e-4, 8e-4, 1e-3)
+STEPS_S = (6e-4, 1e-3, 1e-3)
 
 
 def make(answer: Answer, folder: Path, *, robot: str = "ant", motion: str = "protocol", short: bool = False) -> None:
@@ -37,10 +37,13 @@ def make(answer: Answer, folder: Path, *, robot: str = "ant", motion: str = "pro
     body = truth(machine, answer, chance)
     dt = float(chance.choice(STEPS_S))
     if answer.names & {"backlash", "joint_compliance"}:
-        dt = min(dt, 5e-4)
+        dt = 5e-4
     drives = Drives(machine, answer, body.armature, dt, chance)
     clocks = clocks_of(machine, answer, policy, chance)
     senses = senses_of(machine, answer, policy, chance)
+    if not senses.cmd_t:
+        # A log that does not say when its commands left sends them right after its rows.
+        clocks.gap_s = min(clocks.gap_s, 3e-4)
     played = (walks if policy else protocol)(machine, chance)
     if short:
         played = list({one.setup: one for one in reversed(played)}.values())

@@ -91,7 +91,8 @@ class Drives:
         )
         self.uneven = bool(self.cogging.any() or self.quadratic.any() or self.chipped.any())
         self.off_axis = bool(self.runout.any())
-        self.heats_every = max(1, round(HEAT_S / dt))
+        self.loads = bool(self.by_load.any())
+        self.heats_every, self.follows = max(1, round(HEAT_S / dt)), 1 - math.exp(-dt / 2e-3)
         self.start(np.zeros(n))
 
     def _apply(self, at: np.ndarray, effect: Effect) -> None:
@@ -185,9 +186,7 @@ class Drives:
         electric = self.limit * u * (self.volts / 12.0) - self.braking * rate * on
         drawn = electric / self.kt
         # The supply follows in 2 ms. A full u is half the duty, and draws half of what flows in the winding.
-        self.volts += (self.supply_v - self.ohm * float(np.abs(0.5 * u * drawn).sum()) - self.volts) * min(
-            1.0, dt / 2e-3
-        )
+        self.volts += (self.supply_v - 0.5 * self.ohm * float(u @ drawn) - self.volts) * self.follows
         if self.capped:
             electric = np.minimum(np.maximum(electric, -self.cap), self.cap)
         self.current = electric / self.kt
@@ -251,7 +250,8 @@ class Drives:
         level = np.where(rate < 0, self.kinetic[0], self.kinetic[1]) + self.breakaway * np.exp(
             -np.square(rate / self.stribeck)
         )
-        level = level + self.by_load * np.abs(self.load)
+        if self.loads:
+            level = level + self.by_load * np.abs(self.load)
         if not self.lugre:
             # As steep as the step allows: friction must not turn the motion round.
             slope = np.maximum(self.creep, level * dt / (0.6 * self.inertia))

@@ -76,7 +76,7 @@ def senses_of(machine: Machine, answer: Answer, policy: bool, chance: np.random.
         e.name.startswith("imu_") or (e.name == "sensor_delay" and e.joints == "body") for e in answer.effects
     )
     senses = Senses(
-        velocity_s=float(chance.uniform(2e-3, 1e-2)), current=str(chance.choice(["", "knees", "knees", "all"])),
+        velocity_s=float(chance.uniform(2e-3, 6e-3)), current=str(chance.choice(["", "knees", "knees", "all"])),
         load=likely(0.6), pwm=likely(0.4), volt=likely(0.5), temp=likely(0.4), imu=likely(0.75) or imu_asked,
         tracker=answer.tracker, cmd_t=likely(0.75), csv=likely(0.15),
         current_s=float(np.exp(chance.uniform(math.log(1e-3), math.log(3e-2)))),
@@ -85,7 +85,7 @@ def senses_of(machine: Machine, answer: Answer, policy: bool, chance: np.random.
         current_count=float(chance.choice([0.00269, 0.00269, 0.0065, 0.01])),
         clip_a=float(chance.choice([9.0, chance.uniform(0.5, 1.0)])), noise_a=float(chance.uniform(1e-3, 1.2e-2)),
         gyro_noise=float(chance.uniform(1e-3, 8e-3)), acc_noise=float(chance.uniform(0.02, 0.15)),
-        imu_hz=float(chance.uniform(20, 100)), mount=math.radians(0.5) * chance.uniform(-1, 1, 3),
+        imu_hz=float(chance.uniform(80, 200)), mount=math.radians(0.5) * chance.uniform(-1, 1, 3),
         gyro_bias=5e-3 * chance.uniform(-1, 1, 3), acc_bias=0.05 * chance.uniform(-1, 1, 3),
         tracker_hz=float(chance.choice([0.0, 28.0, 40.0])), tracker_m=float(chance.uniform(5e-4, 3e-3)),
         tracker_rad=float(chance.uniform(2e-3, 1e-2)), tracker_late_s=float(chance.uniform(0.0, 4e-3)),
@@ -167,7 +167,8 @@ def write_run(
 
     # Clocks of the host and of the truth begin apart.
     stamp = trace.row + np.clip(noise(clocks.stamp_s, rows), -3 * clocks.stamp_s, 3 * clocks.stamp_s)
-    stamp = np.maximum.accumulate(stamp + 1e-7 * np.arange(rows))
+    least = 1e-5 * np.arange(rows)
+    stamp = np.maximum.accumulate(stamp - least) + least
     offset = float(chance.uniform(0, 1e4)) - stamp[0] if chance.random() < 0.3 else -stamp[0]
     columns: dict[str, np.ndarray] = {"t": stamp + offset}
     when = trace.row[:, None] + clocks.apart_s * np.arange(n) - clocks.joints_s

@@ -122,15 +122,15 @@ def _within(machine: Machine, commands: np.ndarray) -> np.ndarray:
 
 
 def protocol(machine: Machine, chance: np.random.Generator) -> list[Motion]:
-    """Two to four runs on the stand, and as many on the floor where there is a floor, of 5 to 9 s each."""
+    """Two runs on the stand, sometimes three, and as many on the floor where there is one, of 5 to 7 s each."""
     n, home, reach = len(machine.joints), _home(machine), _reach(machine)
     period = 1 / float(chance.choice([20.0, 25.0, 30.0, 40.0, 50.0]))
     releases = bool(chance.random() < 0.5)
     found = []
-    for number in range(int(chance.integers(2, 4)) + (0 if machine.walks else 2)):
+    for number in range((2 if chance.random() < 0.7 else 3) + (0 if machine.walks else 2)):
         names = chance.choice(list(_STAND), 2 if chance.random() < 0.6 else 1, replace=False)
         pieces = [
-            _STAND[name](np.arange(0, chance.uniform(3.0, 4.5) if len(names) > 1 else 6.0, period), n, chance)
+            _STAND[name](np.arange(0, chance.uniform(2.6, 3.5) if len(names) > 1 else 5.5, period), n, chance)
             for name in names
         ]
         commands = _within(machine, home + reach * np.concatenate(pieces))
@@ -140,11 +140,11 @@ def protocol(machine: Machine, chance: np.random.Generator) -> list[Motion]:
             limp[-held : -held // 3] = True
             commands[-held:] = commands[-held - 1]
         found.append(Motion(f"stand_{number + 1}", "+".join(names), "stand", 0.0, period, commands, limp))
-    for number in range(int(chance.integers(2, 4)) if machine.walks else 0):
+    for number in range((2 if chance.random() < 0.7 else 3) if machine.walks else 0):
         names = chance.choice(list(_FLOOR)[1:], 2 if chance.random() < 0.5 else 1, replace=False)
         pieces = [_still(np.arange(0, 0.4, period), machine, chance)]
         pieces += [
-            _FLOOR[name](np.arange(0, chance.uniform(2.8, 4.0) if len(names) > 1 else 6.0, period), machine, chance)
+            _FLOOR[name](np.arange(0, chance.uniform(2.4, 3.2) if len(names) > 1 else 5.0, period), machine, chance)
             for name in names
         ]
         commands = _within(machine, home + np.concatenate(pieces))

@@ -51,8 +51,8 @@ def clocks_of(machine: Machine, answer: Answer, policy: bool, chance: np.random.
     rate = 100.0 if policy else float(chance.choice([50.0, 60.0, 80.0, 100.0, 125.0, 200.0]))
     clocks = Clocks(
         1 / rate, float(chance.uniform(5e-5, 1e-3)), float(chance.uniform(2e-5, 5e-4)), float(chance.uniform(3e-4, 3e-3)),
-        float(chance.uniform(0.0, 1.0e-3)), float(chance.uniform(0.0, 3e-4)), np.zeros(n), np.zeros(n), np.full(n, np.inf),
-        np.zeros(n), np.zeros(n), imu_s=float(chance.uniform(0.0, 2e-3)),
+        float(chance.uniform(0.0, 6e-4)), float(chance.uniform(0.0, 3e-4)), np.zeros(n), np.zeros(n), np.full(n, np.inf),
+        np.zeros(n), np.zeros(n), imu_s=float(chance.uniform(0.0, 8e-4)),
         apart_s=float(chance.uniform(0.0, 1e-3)) / n if chance.random() < 0.5 else 0.0,
     )  # fmt: skip
     for effect in answer.effects:
@@ -179,7 +179,7 @@ def play(
         world.step(drives.step(goal[0], on[0], world.q, world.v))
     n, tenth = drives.n, max(1, round(0.1 / dt))
     encoder, rate, current, u = (np.empty((steps, n)) for _ in range(4))
-    volts, case, pose = np.empty(steps), np.empty((steps // tenth + 1, n)), np.empty((steps, 13)) if floor else None
+    volts, case, states = np.empty(steps), np.empty((steps // tenth + 1, n)), np.empty((steps, len(world.state)))
     for k in range(steps):
         torque = drives.step(goal[k], on[k], world.q, world.v)
         encoder[k], rate[k], current[k], u[k], volts[k] = (
@@ -191,9 +191,9 @@ def play(
         )
         if k % tenth == 0:
             case[k // tenth] = drives.case
-        if pose is not None:
-            pose[k] = world.pose()
+        states[k] = world.state
         world.step(torque)
+    pose = world.pose(states.T).T if floor else None
     return Trace(dt, encoder, rate, current, u, volts, case[: (steps - 1) // tenth + 1], pose, row, sent, in_force)
 
 

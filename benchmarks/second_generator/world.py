@@ -7,7 +7,7 @@ import math
 import xml.etree.ElementTree as ET
 
 import numpy as np
-from machine import FOOT_N_M, NOMINAL_S, Machine, TrueBody
+from machine import FOOT_N_M, HOME, NOMINAL_S, Machine, TrueBody
 from pydrake.geometry import AddContactMaterial, ProximityProperties, Role, RoleAssign
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
@@ -53,6 +53,11 @@ def _for_drake(machine: Machine, body: TrueBody, floor: bool, at_joint: np.ndarr
             world.remove(one)
         elif one.tag == "geom":
             one.set("friction", f"{body.friction:.6g}")
+    ranges = {
+        str(default.get("class")): tuple(float(v) for v in str(joint.get("range")).split())
+        for default in root.iter("default")
+        if (joint := default.find("joint")) is not None
+    }
     for one in root.iter("joint"):
         name = one.get("name")
         if name not in machine.joints:
@@ -61,12 +66,10 @@ def _for_drake(machine: Machine, body: TrueBody, floor: bool, at_joint: np.ndarr
         one.set("armature", f"{at_joint[k]:.8g}")
         one.set("damping", f"{viscous[k]:.8g}")
         if name in body.blocked:
-            kind = machine.kinds[k]
-            low, high = (-0.785398, 0.785398) if kind == "hip" else (-1.22173, 1.22173)
             # The way home stays open: the stop lies on the far side.
-            angle = body.blocked[name]
-            home = 0.0 if kind == "hip" else -0.8727
-            low, high = (low, angle) if angle > home else (angle, high)
+            kind, angle = machine.kinds[k], body.blocked[name]
+            low, high = ranges[kind]
+            low, high = (low, angle) if angle > HOME[kind] else (angle, high)
             one.set("range", f"{low:.6g} {high:.6g}")
     return ET.tostring(root, encoding="unicode")
 
@@ -114,7 +117,7 @@ class World:
         order = [plant.get_joint_actuator(index).joint().name() for index in plant.GetJointActuatorIndices()]
         self.order = np.array([machine.joints.index(name) for name in order])
         for joint, kind in zip(joints, machine.kinds, strict=True):
-            joint.set_angle(self.here, 0.0 if kind == "hip" else -0.8727)
+            joint.set_angle(self.here, HOME[kind])
         if floor:
             torso = plant.GetBodyByName("torso")
             plant.SetFreeBodyPose(self.here, torso, RigidTransform(RollPitchYaw(0, 0, heading), [0, 0, START_M]))
@@ -150,14 +153,13 @@ class World:
         self.diagram.ExecuteForcedEvents(self.context)
         self._read()
 
-    def pose(self) -> np.ndarray:
-        """(13,) place, quaternion (w first), velocity, angular velocity in the world."""
-        q, v = self.state[: self.plant.num_positions()], self.state[self.plant.num_positions() :]
-        a, m = self.at, self.moves
-        return np.concatenate([q[a + 4 : a + 7], q[a : a + 4], v[m + 3 : m + 6], v[m : m + 3]])
+    def pose(self, state: np.ndarray) -> np.ndarray:
+        """(13, …) place, quaternion (w first), velocity, angular velocity in the world, of states of the plant."""
+        a, m = self.at, self.plant.num_positions() + self.moves
+        return np.concatenate([state[a + 4 : a + 7], state[a : a + 4], state[m + 3 : m + 6], state[m : m + 3]])
 
     def _pull(self) -> np.ndarray:
-        body, out, pose = self.body, np.zeros(self.plant.num_velocities()), self.pose()
+        body, out, pose = self.body, np.zeros(self.plant.num_velocities()), self.pose(self.state)
         place, speed = pose[:3], pose[7:10]
         m = self.moves
         if body.cable is not None:

@@ -135,8 +135,9 @@ def make_by_command(command: str, answer: Answer, robot: Path, model: Path) -> b
         )
     _check(making, answer, where)
     for path in sorted(making.iterdir()):
-        os.replace(path, robot / path.name)
-    making.rmdir()
+        if path.name != OPEN:  # that is ours
+            os.replace(path, robot / path.name)
+    shutil.rmtree(making)
     return True
 
 
