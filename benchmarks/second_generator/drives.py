@@ -76,7 +76,10 @@ class Drives:
             self._apply_outside(machine, answer)
         #: kg·m², of what turns with the joint and of the motor, where a spring lies between
         self.behind = behind
-        at_joint = float(chance.uniform(0.08, 0.25)) if behind else 1.0
+        share = float(
+            chance.uniform(0.08, 0.25)
+        )  # drawn either way: a healthy robot and an ill one differ in nothing else
+        at_joint = share if behind else 1.0
         self.at_joint, self.rotor = at_joint * armature, (1 - at_joint) * armature
         self.inertia = np.maximum(self.rotor, self.at_joint)
         self.gear_damping = 2 * float(chance.uniform(0.1, 0.4)) * np.sqrt(self.gear * self.at_joint)
