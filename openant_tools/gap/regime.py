@@ -11,7 +11,7 @@ from openant_tools.model.plant import Plant
 from openant_tools.model.servo import read_stiffness, torque_limit
 from openant_tools.recording.run import Run
 
-__all__ = ["Regime", "regimes"]
+__all__ = ["Regime", "regimes", "slope"]
 
 Array = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ def regimes(run: Run, plant: Plant) -> NDArray[np.str_]:
     the servo's own.
     """
     t, pos, cmd = run.t, run.signal("pos", plant.joints), run.signal("cmd", plant.joints)
-    velocity = np.stack([_slope(t, pos[:, j]) for j in range(pos.shape[1])], axis=1)
+    velocity = np.stack([slope(t, pos[:, j]) for j in range(pos.shape[1])], axis=1)
     out = np.full(pos.shape, Regime.SLOW.value, dtype="<U9")
     out[np.abs(velocity) > FAST_RAD_S] = Regime.FAST
     out[np.abs(velocity) < REST_RAD_S] = Regime.HOLD
@@ -65,7 +65,7 @@ def regimes(run: Run, plant: Plant) -> NDArray[np.str_]:
     return out
 
 
-def _slope(t: Array, pos: Array) -> Array:
+def slope(t: Array, pos: Array) -> Array:
     """rad/s, by differences over SLOPE_S on both sides, across gaps."""
     known = np.isfinite(pos)
     if known.sum() < 2:

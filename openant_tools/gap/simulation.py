@@ -235,7 +235,7 @@ class _Batch:
         def servos(dt: float, state: tuple[Array, Array], setpoint: Array) -> Step:
             return self._servos.view(dt, np.zeros(self._n), state, setpoint, rows=rows)
 
-        for k in range(len(self._rollouts.runs)):
+        for k in sorted({segment.run for segment in self._segments}):
             mine = [s for s, segment in enumerate(self._segments) if segment.run == k]
             commands, starts = self._segments[mine[0]].commands, [self._start(self._segments[s]) for s in mine]
             asked[mine] = setpoints(commands, starts, self._robots) - self._zero[rows]

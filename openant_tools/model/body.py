@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from openant_tools.model.plant import Plant, world_bodies
 
-__all__ = ["Contacts", "contact_number", "floor_contacts", "link_bodies", "scale_mass", "torso_body"]
+__all__ = [
+    "Contacts", "colliding", "contact_number", "floor_contacts", "link_bodies", "lowest", "scale_mass", "torso_body", "upright",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -86,3 +88,34 @@ def contact_number(field: str, columns: int) -> tuple[Callable[..., float], Call
             getattr(model, f"pair_{field}")[contacts.pairs, column] *= np.where(pairs > 0, factor, 1.0)
 
     return read, write
+
+
+def colliding(model: mujoco.MjModel) -> Ints:
+    """The geoms of the robot that can touch something."""
+    touches = (model.geom_contype | model.geom_conaffinity) != 0
+    return np.flatnonzero(touches & ~np.isin(model.geom_bodyid, list(world_bodies(model)))).astype(np.int64)
+
+
+def lowest(plant: Plant, data: mujoco.MjData) -> float:
+    """m, how high the lowest point of the robot is, after `mj_kinematics`; boxes about its meshes stand for them."""
+    model, geoms = plant.model, colliding(plant.model)
+    if not len(geoms):
+        return 0.0
+    down = np.abs(data.geom_xmat[geoms].reshape(-1, 3, 3)[:, 2])
+    size, kind = model.geom_size[geoms], model.geom_type[geoms]
+    half, centre = model.geom_aabb[geoms, 3:], model.geom_aabb[geoms, :3]
+    below: Array = np.sum(down * half, axis=1) - np.sum(data.geom_xmat[geoms].reshape(-1, 3, 3)[:, 2] * centre, axis=1)
+    ball = kind == mujoco.mjtGeom.mjGEOM_SPHERE
+    pill = kind == mujoco.mjtGeom.mjGEOM_CAPSULE
+    can = kind == mujoco.mjtGeom.mjGEOM_CYLINDER
+    below[ball] = size[ball, 0]
+    below[pill] = size[pill, 0] + down[pill, 2] * size[pill, 1]
+    below[can] = size[can, 0] * np.sqrt(np.maximum(1 - down[can, 2] ** 2, 0.0)) + down[can, 2] * size[can, 1]
+    return float(np.min(data.geom_xpos[geoms, 2] - below))
+
+
+def upright(up: Array) -> Array:
+    """(4,) the shortest turn that brings `up` (3,) to the world's z."""
+    x, y, z = up / max(float(np.linalg.norm(up)), 1e-12)
+    quat: Array = np.array([1.0 + z, y, -x, 0.0]) if z > -1.0 + 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
+    return quat / np.linalg.norm(quat)

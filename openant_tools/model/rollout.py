@@ -4,7 +4,8 @@ Contract
 
 * **What is simulated.** Each run is cut into *segments*. A segment starts at a row in which every joint was measured,
   with the measured positions and the velocities that fit the neighbouring positions, and is simulated with the run's
-  own commands until the next one starts: every `horizon` seconds, or once for the whole run (`horizon=None`).
+  own commands until the next one starts: every `horizon` seconds, or once for the whole run (`horizon=None`). With
+  `windows` each of these is a segment, from its first complete row on, and what lies outside them is not simulated.
 * **Time.** Rows may come at any strictly increasing times. A segment steps from its first row's time on the model's own
   time step; positions between two steps are interpolated linearly. A command acts from its own time on (`cmd_t`, else
   the row's `t`), held until the next; each step sees its mean over the step, so that results vary smoothly with delays
@@ -12,13 +13,17 @@ Contract
   each step: to a limiter a part of a change is as good as the whole.) A missing command leaves the one before in force.
 * **Start of a segment.** Setpoint filters and slew limiters hold the first command; delay buffers hold the commands before it,
   of which there are none at the start of a run, so that there they hold the first; all other activations are zero (formats,
-  section 5). Without a measured base, a robot on the floor starts a run settled on its
+  section 5). A base whose pose was measured at most POSES_S before and after is between the two. Without a measured
+  base, a robot on the floor starts a run settled on its
   feet; a later segment starts where the base has come to and as fast as it moves when the joints are led along their
   measured positions from there. (Started at rest amid a gait, it would first have to catch up with its own feet.)
+  A window's base is led from a settled stand LEAD_S before, however well it was measured: a degree of a tracker's or an
+  IMU's error puts feet through the floor or above it. A tracker says where it is and heads. At the beginning of a run, or
+  after a pause in its rows, nothing leads there, and it starts as a run does.
 * **Torque off** (`torque.J` = 0) disables that joint's actuator from its row to the next; what stands in the joint
   stays.
 * **Gaps.** A row with a missing sample is simulated all the same; what to compare is the caller's choice. Rows before
-  the first complete one are NaN.
+  the first complete one, of the run or of each window, are NaN, and so are those outside windows.
 * **Many models.** A call rolls out V variants of the model in one batch on all cores. They must share the layout of the
   plant's model (same compiled sizes); parameters may differ freely. Results do not depend on the number of threads.
 * **Nothing idle is computed.** Sensors are off (positions and velocities are read from the state), and so are contacts on the
@@ -66,6 +71,12 @@ FALLS_APART = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in 
 SETTLE_S = 1.0
 #: cosine of how far from its attitude at the start a base may lean that is led along
 FALLEN = 0.5
+#: s for which a base is led along before a window, and s between rows across which it is not
+LEAD_S, ROWS_S = 0.5, 0.1
+#: s between two poses of a base that tell where it was between them
+POSES_S = 0.1
+#: columns of a base's pose; rows about one in whose motion it is led to that row
+POSE, AROUND = ("x", "y", "z", "qw", "qx", "qy", "qz", "yaw"), 20
 
 
 @dataclass(frozen=True)
@@ -117,16 +128,23 @@ class Rollouts:
         horizon: seconds between re-initialisations from measurement; None simulates each run from its start.
         nthread: threads; 0 takes as many as the environment variable OMP_NUM_THREADS allows, else all cores.
         leader: a variant of the plant's model by which a base that nobody measured is led along; default that model.
+        windows: of each run, from and up to (s of its `t`), in order: what alone is simulated, in place of `horizon`.
+
+    Attributes:
+        horizon: s; of windows, the longest. None: simulations begin where runs do.
 
     Raises:
         BadInput: a run has no row in which all joints were measured, or no commands.
+        ValueError: windows overlap, or none has two rows from a complete one on.
     """
 
     def __init__(
         self, plant: Plant, runs: Sequence[Run], horizon: float | None = None, nthread: int = 0,
-        leader: mujoco.MjModel | None = None,
+        leader: mujoco.MjModel | None = None, windows: Sequence[Sequence[tuple[float, float]]] | None = None,
     ) -> None:  # fmt: skip
         self.runs = tuple(runs)
+        if windows is not None:
+            horizon = max((stop - start for own in windows for start, stop in own), default=0.0)
         self.horizon = horizon
         self.nthread = nthread or _allowed_threads()
         ends = np.cumsum([0, *(len(run.t) for run in runs)])
@@ -135,8 +153,12 @@ class Rollouts:
         segments = [
             segment
             for k, run in enumerate(runs)
-            for segment in _segments(plant, leads, run, k, self.rows[k].start, horizon)
+            for segment in _segments(
+                plant, leads, run, k, self.rows[k].start, horizon, None if windows is None else windows[k]
+            )
         ]
+        if not segments:
+            raise ValueError("no window has two rows to simulate")
         # The longest first, so that those still running are always the first simulations of the batch.
         self._segments = sorted(segments, key=lambda segment: -len(segment.control))
         self._batches: dict[int, Batch] = {}
@@ -348,7 +370,10 @@ def _measured_around(t: Array, pos: Array, row: int, span: float, neighbours: in
     return rows
 
 
-def _segments(plant: Plant, leads: Plant, run: Run, index: int, offset: int, horizon: float | None) -> list[Segment]:
+def _segments(
+    plant: Plant, leads: Plant, run: Run, index: int, offset: int, horizon: float | None,
+    windows: Sequence[tuple[float, float]] | None,
+) -> list[Segment]:  # fmt: skip
     t, pos = run.t, run.signal("pos", plant.joints)
     cmd = _held(run.signal("cmd", plant.joints))
     if cmd is None:
@@ -360,21 +385,23 @@ def _segments(plant: Plant, leads: Plant, run: Run, index: int, offset: int, hor
             where=run.path or run.name,
             remedy="check the pos.* columns, or choose fewer joints with --joint",
         )
-    starts = [int(whole[0])]
-    if horizon is not None:
-        for row in whole[1:]:
-            if t[row] - t[starts[-1]] >= horizon - 1e-9 and row < len(t) - 1:
-                starts.append(int(row))
+    parts = _parts(t, whole, horizon) if windows is None else _parts_of(t, whole, windows)
     h, model = plant.timestep, plant.model
     torque_off = run.signal("torque", plant.joints, default=1.0) == 0
     flips = 1 + np.flatnonzero((torque_off[1:] != torque_off[:-1]).any(axis=1))
     commands = Staircase.of(run.command_times, cmd)
     rest = _at_rest(model)
     buffered = int(model.actuator_history[plant.actuator, 0].max(initial=0))
-    bases = _led(leads, run, starts, pos, commands)
+    bases: list[tuple[Array, Array] | None]
+    if windows is None:
+        poses: Array = np.stack([run.column(f"base.{axis}") for axis in POSE[:7]], axis=1)
+        measured: Bools = np.logical_and.reduce(np.isfinite(poses), axis=1)
+        led = _led(leads, run, [first for first, _ in parts], pos, commands)
+        bases = [base if n and not measured[parts[n][0]] else None for n, base in enumerate(led)]
+    else:
+        bases = [_led_in(leads, run, whole, first, pos, commands) for first, _ in parts]
     segments = []
-    for n, (first, stop) in enumerate(zip(starts, [*starts[1:], len(t)], strict=True)):
-        # The row at which the next segment starts belongs to that one.
+    for (first, stop), base in zip(parts, bases, strict=True):
         rows = np.arange(first, stop)
         at = (t[rows] - t[first]) / h
         step = np.floor(at + 1e-9).astype(np.int64)
@@ -398,7 +425,7 @@ def _segments(plant: Plant, leads: Plant, run: Run, index: int, offset: int, hor
                     pos[first],
                     velocity,
                     setpoint[0],
-                    bases[n] if n else None,
+                    base,
                     _setpoints(plant, commands, t[first] + h * np.arange(-buffered, 1.0)) if buffered else None,
                 ),
                 control=control,
@@ -411,6 +438,58 @@ def _segments(plant: Plant, leads: Plant, run: Run, index: int, offset: int, hor
             )
         )
     return segments
+
+
+def _parts(t: Array, whole: Ints, horizon: float | None) -> list[tuple[int, int]]:
+    """First row and first row beyond of each segment of a run; the row at which the next one starts belongs to that one."""
+    starts = [int(whole[0])]
+    if horizon is not None:
+        for row in whole[1:]:
+            if t[row] - t[starts[-1]] >= horizon - 1e-9 and row < len(t) - 1:
+                starts.append(int(row))
+    return list(itertools.pairwise([*starts, len(t)]))
+
+
+def _parts_of(t: Array, whole: Ints, windows: Sequence[tuple[float, float]]) -> list[tuple[int, int]]:
+    """The same of each window that has two rows from a complete one on."""
+    parts = []
+    end = -np.inf
+    for start, stop in windows:
+        if start < end or stop <= start:
+            raise ValueError(
+                f"the window from {start:g} to {stop:g} s ends before it begins, or overlaps the one before"
+            )
+        first, beyond = np.searchsorted(t, [start, stop]).tolist()
+        complete = whole[(whole >= first) & (whole < beyond - 1)]
+        if len(complete):
+            parts.append((int(complete[0]), beyond))
+        end = stop
+    return parts
+
+
+def _led_in(
+    plant: Plant, run: Run, whole: Ints, row: int, pos: Array, commands: Staircase
+) -> tuple[Array, Array] | None:
+    """Pose and velocity of a free base at a complete row, led there from a settled stand that heads as it was tracked.
+
+    How it leans and moves the joints on the floor say better than a tracker or an IMU does.
+    """
+    before = _lead_row(run.t, whole, row)
+    if before == row or plant.free_joint is None:
+        return None
+    yaw = _pose(run, before)[0][7]
+    facts = replace(run.facts, heading_rad=float(yaw)) if np.isfinite(yaw) else run.facts
+    near = slice(max(0, before - AROUND), row + AROUND + 1)
+    # Of what a tracker says no more than the heading: its own errors would have to settle first.
+    bare = replace(run, facts=facts, t=run.t[near], columns={})
+    return _led(plant, bare, [before - near.start, row - near.start], pos[near], commands)[1]
+
+
+def _lead_row(t: Array, whole: Ints, row: int) -> int:
+    """The complete row from which a base is led to a row: LEAD_S before, or as far back as rows go on."""
+    apart = np.flatnonzero(np.diff(t[: row + 1]) > ROWS_S)
+    earliest = max(float(t[apart[-1] + 1]) if len(apart) else -np.inf, float(t[row]) - LEAD_S)
+    return int(whole[np.searchsorted(t[whole], earliest)])
 
 
 def _setpoints(plant: Plant, commands: Staircase, edges: Array) -> Array:
@@ -570,7 +649,7 @@ def _initial_state(
 ) -> Array:  # fmt: skip
     """(nstate,) integration state at a row: measured joints, base, filled setpoints and buffers.
 
-    The base is where it was measured, else as it was `led` (pose and velocity), else settled. `past`: (steps, joints)
+    The base is as it was `led` (pose and velocity), else where it was measured, else settled. `past`: (steps, joints)
     setpoints of the steps before.
     """
     model = plant.model
@@ -619,28 +698,24 @@ def _limits_slew(model: mujoco.MjModel, actuator: int) -> bool:
 def _place_base(
     plant: Plant, data: mujoco.MjData, run: Run, row: int, command: Array, led: tuple[Array, Array] | None
 ) -> None:
-    """Put the free base where it was measured, else where it was led to, else settled on the floor with the run's heading."""
+    """Put the free base where it was led to, else where it was measured, else settled on the floor with the run's heading."""
     model, joint = plant.model, plant.free_joint
     assert joint is not None
     adr, dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-    place = np.array([run.column(f"base.{axis}")[row] for axis in "xyz"])
-    quat = np.array([run.column(f"base.{axis}")[row] for axis in ("qw", "qx", "qy", "qz")])
-    yaw = run.column("base.yaw")[row]
-    if not np.isfinite(yaw):
-        yaw = run.facts.heading_rad or 0.0
-    if np.isfinite(place).all() and np.isfinite(quat).all():
-        data.qpos[adr : adr + 3], data.qpos[adr + 3 : adr + 7] = place, quat / np.linalg.norm(quat)
-        around = slice(max(0, row - 5), row + 6)
-        where = np.stack([run.column(f"base.{axis}")[around] for axis in "xyz"], axis=1)
-        data.qvel[dof : dof + 3] = initial_velocities(run.t[around], where, row - around.start)
-        gyro = np.array([run.column(f"gyro.{axis}")[row] for axis in "xyz"])
-        data.qvel[dof + 3 : dof + 6] = np.where(np.isfinite(gyro), gyro, 0.0)
-        return
+    pose, velocity = _pose(run, row)
+    place, quat = pose[:3], pose[3:7]
     # How high it stands follows from how it leans: a tracker's millimetres of one without the other let it drop.
     seen = np.isfinite(place) & (True, True, False)
     if led is not None:
         data.qpos[adr : adr + 7], data.qvel[dof : dof + 6] = led
         data.qpos[adr : adr + 3][seen] = place[seen]
+        return
+    yaw = pose[7] if np.isfinite(pose[7]) else run.facts.heading_rad or 0.0
+    if np.isfinite(pose[:7]).all():
+        data.qpos[adr : adr + 3], data.qpos[adr + 3 : adr + 7] = place, quat / np.linalg.norm(quat)
+        data.qvel[dof : dof + 3] = velocity
+        gyro = np.array([run.column(f"gyro.{axis}")[row] for axis in "xyz"])
+        data.qvel[dof + 3 : dof + 6] = np.where(np.isfinite(gyro), gyro, 0.0)
         return
     # Let the robot find its own height and attitude, then turn it to the heading and move it to where it was seen.
     settling = copy.copy(model)
@@ -654,6 +729,40 @@ def _place_base(
         mujoco.mj_step(settling, rest)
     data.qpos[adr : adr + 7] = rest.qpos[adr : adr + 7]
     data.qpos[adr : adr + 3][seen] = place[seen]
+
+
+def _pose(run: Run, row: int) -> tuple[Array, Array]:
+    """Place, attitude and heading (8,) of the base at a row, and how fast it moves, (3,) m/s; NaN where the tracker does not say.
+
+    Between two poses that are at most POSES_S apart it says.
+    """
+    poses: Array = np.stack([run.column(f"base.{axis}") for axis in POSE], axis=1)
+    tracked: Bools = np.logical_or.reduce(np.isfinite(poses), axis=0)
+    known = np.flatnonzero(np.isfinite(poses[:, tracked]).all(axis=1)) if tracked.any() else np.zeros(0, np.int64)
+    here = poses[row]
+    at = int(np.searchsorted(known, row))
+    if not np.isfinite(here).any() and 0 < at < len(known) and run.t[known[at]] - run.t[known[at - 1]] <= POSES_S:
+        before, after = poses[known[at - 1]], poses[known[at]].copy()
+        share = (run.t[row] - run.t[known[at - 1]]) / (run.t[known[at]] - run.t[known[at - 1]])
+        # The same attitude has two quaternions, the same heading many angles.
+        after[3:7] *= -1.0 if before[3:7] @ after[3:7] < 0 else 1.0
+        after[7] = before[7] + np.remainder(after[7] - before[7] + np.pi, 2 * np.pi) - np.pi
+        here = (1 - share) * before + share * after
+        around = known[max(0, at - 2) : at + 2]
+        powers = (run.t[around] - run.t[row])[:, None] ** np.arange(2)
+        velocity = np.linalg.lstsq(powers, poses[around, :3], rcond=None)[0][1] if tracked[:3].all() else np.zeros(3)
+    else:
+        near = slice(max(0, row - 5), row + 6)
+        velocity = initial_velocities(run.t[near], poses[near, :3], row - near.start)
+    if not np.isfinite(here[7]) and np.isfinite(here[3:7]).all():
+        here = np.append(here[:7], _heading(here[3:7]))
+    return here, velocity
+
+
+def _heading(quat: Array) -> float:
+    """rad, about the world's z."""
+    w, x, y, z = quat
+    return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
 def _turned(quat: Array, yaw: float) -> Array:
