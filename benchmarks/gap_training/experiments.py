@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.cloud import HORIZONS_S
+from openant_tools.gap import experiment as recorded
 from openant_tools.gap.population import Case, draw, robot_of
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.sensors import logged_by
@@ -35,8 +35,8 @@ Array = NDArray[np.float64]
 ANTS = 0.65
 #: steps of encoders, rad: 4096 a turn, 1024 in 300°, 14 bits; and how often each comes
 ENCODERS_RAD, ENCODERS = (2 * math.pi / 4096, math.radians(300) / 1024, 2 * math.pi / 16384), (0.7, 0.15, 0.15)
-#: s that a run lasts, and all of an experiment
-LASTS_S, WHOLE_S = (2.5, 5.5), 10.0
+#: s that a run lasts, of several and by itself, and all of an experiment
+LASTS_S, ALONE_S, WHOLE_S = (2.5, 5.5), (7.0, 10.0), 10.0
 #: Hz, rows of logs of Ants and of others
 RATES_HZ = {True: (40.0, 150.0), False: (20.0, 300.0)}
 #: s that a policy's command is held; share of runs in which commands are held so long
@@ -68,7 +68,8 @@ def experiment(seed: int, folder: Path) -> Experiment:
     rate = math.exp(rng.uniform(*np.log(RATES_HZ[ant])))
     encoder = float(rng.choice(ENCODERS_RAD, p=ENCODERS))
     setups = _setups(rng, ant=ant)
-    asked = [_asked(rng, setup, joints, rate, min(LASTS_S[1], WHOLE_S / len(setups))) for setup in setups]
+    lasts = ALONE_S if len(setups) == 1 else (LASTS_S[0], min(LASTS_S[1], WHOLE_S / len(setups)))
+    asked = [_asked(rng, setup, joints, rate, lasts) for setup in setups]
     played = Protocol.of(asked, model, joints, [None] * len(asked)).coarse()
     truth = draw(played, seed)
     steps = {"pos": encoder, "vel": float(rng.choice([0.024, 0.0, 0.005])), "volt": 0.1 / 12}
@@ -76,7 +77,8 @@ def experiment(seed: int, folder: Path) -> Experiment:
     for k, one in enumerate(played.runs):
         found = simulate(Rollouts(one.plant, [one.run], nthread=1), [robot], seed * 64 + k, one.signals).signals
         runs.append(_logged(one.run, logged_by([robot], found, steps, rng, one.layout.t), joints, has))
-    return Experiment(Protocol.of(runs, model, joints, [None] * len(runs), HORIZONS_S).coarse(), truth)
+    cut = recorded.Experiment.of(runs, model, joints, [None] * len(runs))
+    return Experiment(cut.protocol.coarse(), truth)
 
 
 def _setups(rng: np.random.Generator, *, ant: bool) -> list[Setup]:
@@ -153,9 +155,11 @@ def _arm(rng: np.random.Generator) -> str:
     )
 
 
-def _asked(rng: np.random.Generator, setup: Setup, joints: tuple[str, ...], rate: float, longest: float) -> Run:
+def _asked(
+    rng: np.random.Generator, setup: Setup, joints: tuple[str, ...], rate: float, lasts: tuple[float, float]
+) -> Run:
     """A run that only commands yet."""
-    seconds = float(rng.uniform(LASTS_S[0], longest))
+    seconds = float(rng.uniform(*lasts))
     t = np.arange(0.0, seconds, 1 / rate)
     space = _space(rng, joints)
     offsets, limp = _motion(rng, setup, space, t, seconds)

@@ -16,18 +16,15 @@ from openant_tools.effects.effect import Scope
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.features import Floats
 from openant_tools.gap.population import WARMING_C, Case, applicable, robot_of
-from openant_tools.gap.protocol import Played, Protocol
+from openant_tools.gap.protocol import Played, Protocol, rollouts_of
 from openant_tools.gap.sensors import logged_by, widened
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.plant import Setup
-from openant_tools.model.rollout import Rollouts
 
-__all__ = ["HORIZONS_S", "robots_at", "templates_at", "templates_of"]
+__all__ = ["robots_at", "templates_at", "templates_of"]
 
 Ints = NDArray[np.int64]
 
-#: s after which simulations begin anew from what was measured: on a floor, what a push or a slope does takes longer to show
-HORIZONS_S = {Setup.STAND: 1.0, Setup.FLOOR: 2.0}
 #: strengths of templates where one joint has a cause, and where more have
 OF_ONE, OF_MORE = (0.6,), (0.35, 0.8)
 #: beyond which a feature says only that it is large
@@ -96,7 +93,7 @@ def robots_at(protocol: Protocol, cases: Sequence[Case], seed: int) -> list[Floa
 
 
 def _simulated(played: Played, robots: Sequence[Robot], seed: int, *, misread: bool = False) -> dict[str, Floats]:
-    rollouts = Rollouts(played.plant, [played.run], horizon=played.horizon, nthread=1)
+    rollouts = rollouts_of([played], nthread=1)
     return simulate(rollouts, robots, seed, played.signals, [played.warm_c], misread=misread).signals
 
 

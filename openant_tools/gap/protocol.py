@@ -37,7 +37,7 @@ from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 
-__all__ = ["Played", "Players", "Protocol", "alike", "same", "shown"]
+__all__ = ["Played", "Players", "Protocol", "alike", "rollouts_of", "same", "shown"]
 
 Array = NDArray[np.float64]
 
@@ -68,7 +68,7 @@ class Played:
         plant: how it is simulated. signals: those that a robot on it can have.
         seen: what its log has of them.
         warm_c: (joints,) °C, by which its servos were warmer than in the coolest run beside it, as far as that was logged.
-        horizon: s after which simulations begin anew from what was measured; None simulates the whole run.
+        windows: from, up to (s of the run's t) what alone is simulated, each begun from what was measured; None: the whole run.
     """
 
     run: Run
@@ -76,19 +76,28 @@ class Played:
     signals: tuple[str, ...]
     seen: Mapping[str, Floats]
     warm_c: Array
-    horizon: float | None = None
+    windows: tuple[tuple[float, float], ...] | None = None
 
     @classmethod
-    def of(cls, run: Run, plant: Plant, warm_c: Array, horizon: float | None = None) -> Played:
+    def of(cls, run: Run, plant: Plant, warm_c: Array, windows: Sequence[tuple[float, float]] | None = None) -> Played:
         """A run on a plant."""
         free = plant.setup is Setup.FLOOR and plant.free_joint is not None
         signals = ("pos", "vel", "torque", "volt", *(COLUMNS if free else ()))
         seen = {name: values for name, values in logged(run, plant.joints).items() if name in signals}
-        if horizon is None and "torque" in seen and not np.isfinite(seen["torque"]).any(axis=1).all():
+        if windows is None and "torque" in seen and not np.isfinite(seen["torque"]).any(axis=1).all():
             del seen["torque"]  # judges that saw a whole protocol know of no log with some joints' torque alone
         # Amid a run a simulation begins where the base was; a whole one from a settled stand, as every other robot does.
-        columns = {name: values for name, values in run.columns.items() if horizon or not name.startswith("base.")}
-        return cls(dataclasses.replace(run, columns=columns), plant, signals, seen, warm_c, horizon)
+        columns = {
+            name: values for name, values in run.columns.items() if windows is not None or not name.startswith("base.")
+        }
+        return cls(
+            dataclasses.replace(run, columns=columns),
+            plant,
+            signals,
+            seen,
+            warm_c,
+            None if windows is None else tuple(windows),
+        )
 
     @cached_property
     def layout(self) -> Layout:
@@ -123,6 +132,12 @@ class Played:
         return np.concatenate([np.full(len(groups[name]), _read_from(name) in seen) for name in groups])
 
 
+def rollouts_of(runs: Sequence[Played], nthread: int = 0) -> Rollouts:
+    """Runs on one plant, in their windows, ready to be simulated."""
+    windows = [one.windows for one in runs if one.windows is not None]
+    return Rollouts(runs[0].plant, [one.run for one in runs], nthread=nthread, windows=windows or None)
+
+
 @dataclass(frozen=True)
 class Players:
     """Runs made ready to be played: those on one plant are simulated side by side.
@@ -139,10 +154,7 @@ class Players:
         on: dict[int, list[int]] = {}
         for k, one in enumerate(runs):
             on.setdefault(id(one.plant), []).append(k)
-        groups = (
-            (tuple(mine), Rollouts(runs[mine[0]].plant, [runs[k].run for k in mine], horizon=runs[mine[0]].horizon))
-            for mine in on.values()
-        )
+        groups = ((tuple(mine), rollouts_of([runs[k] for k in mine])) for mine in on.values())
         return cls(tuple(runs), tuple(groups))
 
     def play(self, robots: Sequence[Robot]) -> list[dict[str, Floats]]:
@@ -177,21 +189,21 @@ class Protocol:
         model: Path,
         joints: Sequence[str],
         models: Sequence[Path | None],
-        horizons: Mapping[Setup, float] | None = None,
+        windows: Sequence[Sequence[tuple[float, float]]] | None = None,
     ) -> Protocol:
         """The protocol that these runs played.
 
         Args:
             models: of each run its own MJCF, None for `model`.
-            horizons: of each setup, s after which simulations begin anew from what was measured; default never.
+            windows: of each run, what alone is simulated; default all of it.
         """
         plants: dict[tuple[Path, Setup], Plant] = {}
         played = []
-        for run, own, warm_c in zip(runs, models, _warmer(runs, joints), strict=True):
+        for k, (run, own, warm_c) in enumerate(zip(runs, models, _warmer(runs, joints), strict=True)):
             key = (own or model, setup_of(run.facts.setup))
             if key not in plants:
                 plants[key] = load_plant(key[0], joints, key[1])
-            played.append(Played.of(run, plants[key], warm_c, (horizons or {}).get(key[1])))
+            played.append(Played.of(run, plants[key], warm_c, None if windows is None else windows[k]))
         seen = {name for one in played for name in one.seen}
         first = next((one.plant for one in played if one.plant.setup is Setup.FLOOR), played[0].plant)
         reference = Reference.of(

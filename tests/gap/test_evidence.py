@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from openant_tools.gap.cloud import HORIZONS_S, robots_at, templates_at, templates_of
+from openant_tools.gap.cloud import robots_at, templates_at, templates_of
 from openant_tools.gap.evidence import COLUMN_NAMES, Layouts, RunLayout, Scale, evidence_of
+from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.population import Case, draw
 from openant_tools.gap.protocol import Protocol
 from openant_tools.recording.run import Facts, Run
@@ -41,7 +42,7 @@ def _recorded(model: Path, joints: tuple[str, ...], seconds: float, *, torque: b
             if torque:
                 columns[f"cur.{joint}"] = 0.1 * np.sin(t)
         runs.append(Run(f"run{seed}", Facts(joints=joints, setup="stand"), t, columns))
-    return Protocol.of(runs, model, joints, [None, None], HORIZONS_S).coarse()
+    return Experiment.of(runs, model, joints, [None, None]).protocol.coarse()
 
 
 @pytest.fixture(scope="module")
