@@ -154,7 +154,7 @@ class Drives:
             case "slipping_horn":
                 self.slips[at] = np.where(np.array(machine.kinds)[at] == "hip", 0.10, 0.16) / strength
             case "chipped_tooth":
-                self.chipped[at] = 0.5 * strength
+                self.chipped[at] = 0.8 * strength
             case "forgotten_integral":
                 self.integral[:] = 4.0 * strength
             case "eccentric_encoder":
@@ -246,7 +246,7 @@ class Drives:
 
     def _bumps(self, turned: np.ndarray, rate: np.ndarray) -> np.ndarray:
         phase = (turned + 0.07) % 0.25
-        return np.where(phase < 0.025, self.chipped * np.tanh(rate / 0.05), 0.0)
+        return np.where(phase < 0.035, self.chipped * np.tanh(rate / 0.05), 0.0)
 
     def _friction(self, rate: np.ndarray) -> np.ndarray:
         dt = self.dt

@@ -281,6 +281,9 @@ def _apply_outside(machine: Machine, body: TrueBody, answer: Answer) -> None:
         case "mount_resonance":
             x, y = (float(v) for v in str(_body(tree, f"upper_leg_{leg}").get("pos")).split()[:2])
             joint = ET.Element("joint", name="mount", type="hinge", axis=f"{-y:.4f} {x:.4f} 0", damping="0.02")
+            # The legs' roots meet in the torso: what turns there must not touch them.
+            for key in ("contype", "conaffinity"):
+                _geom(tree, f"root_{leg}").set(key, "0")
             _body(tree, f"leg_{leg}").insert(0, joint)
             body.mount = ("mount", 8.0 / strength)
         case "rubber_band":
@@ -295,8 +298,8 @@ def _apply_outside(machine: Machine, body: TrueBody, answer: Answer) -> None:
                 pos=f"{x:.3f} {y:.3f} {0.015 * strength - 0.05:.4f}",
             )  # fmt: skip
         case "tether":
-            # A line of a metre or less to a hook above: it pulls only once it is taut.
-            body.tether = (0.4 * strength, 25.0 * strength, float(strength * 0.04))
+            # A line to a hook above, with 2 mm to spare: it pulls only once it is taut.
+            body.tether = (0.4 * strength, 150.0 * strength, 0.002 * strength)
 
 
 _OF_BODIES = (
