@@ -78,7 +78,7 @@ def _features(parts: list[NDArray[np.float32]]) -> NDArray[np.float32]:
 
 
 @pytest.mark.slow
-def test_each_cause_is_recognised_by_what_it_would_do_to_this_very_recording(pendulum: Protocol) -> None:
+def test_each_cause_is_among_the_first_by_what_it_would_do_to_this_very_recording(pendulum: Protocol) -> None:
     bank, layouts = templates_of(pendulum), _layouts(pendulum)
     templates = _features(templates_at(pendulum, bank))
     healthy = _features(robots_at(pendulum, _healthy(pendulum, 60), 1))
@@ -101,8 +101,8 @@ def test_each_cause_is_recognised_by_what_it_would_do_to_this_very_recording(pen
         ("zero_offset", {"zero_offset"}),
     ):
         found = evidence_of(scale, _features(robots_at(pendulum, _with(pendulum, cause, 6), 3)))
-        first = [found.causes[k] for k in found.rows[:, :, share].argmax(axis=1)]
-        assert sum(one in alike for one in first) >= 4, (cause, first)
+        first = [{found.causes[k] for k in order[:3]} for order in np.argsort(-found.rows[:, :, share], axis=1)]
+        assert sum(bool(alike & some) for some in first) >= 5, (cause, first)
         best = found.rows[np.arange(6), found.causes.index(cause)]
         assert np.median(best[:, COLUMN_NAMES.index("gain")]) > np.median(
             others.rows[:, others.causes.index(cause), COLUMN_NAMES.index("gain")]
