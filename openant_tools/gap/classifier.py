@@ -6,6 +6,7 @@ it had not seen: benchmarks/gap_training, docs/gap.md.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -18,12 +19,12 @@ from numpy.typing import NDArray
 from openant_tools.arrays import read_arrays
 from openant_tools.gap.features import Floats
 
-__all__ = ["Classifier", "classifier"]
+__all__ = ["Classifier", "classifier", "weights"]
 
 Ints = NDArray[np.int32]
 
-#: the file in this package
-FILE = "classifier.npz"
+#: the files in this package
+FILE, WEIGHTS_FILE = "classifier.npz", "posterior.json"
 #: a node that is a leaf
 LEAF = -1
 
@@ -71,6 +72,13 @@ class Classifier:
             total += self.value[node]
         out: Floats = total.reshape(rows.shape[:-1]).astype(np.float32)
         return out
+
+
+@cache
+def weights() -> Mapping[str, float]:
+    """Those of `gap.posterior` that were learned with it."""
+    text = json.loads((files("openant_tools.gap") / WEIGHTS_FILE).read_text())
+    return {str(name): float(value) for name, value in text.items()}
 
 
 @cache

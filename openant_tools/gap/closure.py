@@ -6,6 +6,7 @@ Everything is judged as the gap is defined (formats, section 3): re-initialised 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -261,9 +262,9 @@ class Windows:
         self.names = _nuisances(protocol)
         self._coarse = protocol.coarse()
         self._before: dict[int, Array] = {}
-        self._given = [Rollouts(one.plant, [one.run], HORIZON_S) for one in protocol.runs]
+        self._given = [_restarted(one) for one in protocol.runs]
         self._rollouts = self._given.copy()
-        whole = [Rollouts(one.plant, [one.run], HORIZON_S) for one in self._coarse.runs]
+        whole = [_restarted(one) for one in self._coarse.runs]
         self._quick = [one.thinned(FOLLOWED[one.plant.setup]) for one in whole]
         self._glance = [one.thinned(GLANCE[one.plant.setup]) for one in whole]
         unsure = [around_switching(one.run, protocol.joints) for one in protocol.runs]
@@ -331,7 +332,7 @@ class Windows:
         for k, one in enumerate((self._coarse if quick else self.protocol).runs):
             if one.plant.setup is not Setup.FLOOR:
                 continue
-            led = Rollouts(one.plant, [one.run], HORIZON_S, leader=self.robot(refit, k).model(one.plant))
+            led = _restarted(one, self.robot(refit, k).model(one.plant))
             if quick:
                 self._quick[k], self._glance[k] = led.thinned(FOLLOWED[Setup.FLOOR]), led.thinned(GLANCE[Setup.FLOOR])
             else:
@@ -611,6 +612,17 @@ class Windows:
             else:
                 used.append((mine, [(n + k, mask)]))
         return out + [members for _, members in used]
+
+
+def _restarted(one: Played, leader: mujoco.MjModel | None = None) -> Rollouts:
+    """A run, begun anew from measurement as the gap is defined: all of it, or what of it is simulated."""
+    if one.windows is None:
+        return Rollouts(one.plant, [one.run], HORIZON_S, leader=leader)
+    parts = []
+    for start, stop in one.windows:
+        edges = np.linspace(start, stop, max(1, round((stop - start) / HORIZON_S)) + 1).tolist()
+        parts += list(itertools.pairwise(edges))
+    return Rollouts(one.plant, [one.run], leader=leader, windows=[parts])
 
 
 def closures(

@@ -32,10 +32,12 @@ class Experiment:
 
     Attributes:
         protocol: the runs, in windows; their times are compressed: between windows far apart little is left.
+        folds: the same cut into what is held out in turn, each as a run of its own.
         selection: what was chosen, in the times of the recordings.
     """
 
     protocol: Protocol
+    folds: Protocol
     selection: Selection
 
     @classmethod
@@ -59,11 +61,23 @@ class Experiment:
         ]
         selection = select(runs, plants, at_most_s=at_most_s)
         some = [k for k in range(len(runs)) if selection.windows[k]]
-        cut = [_compressed(runs[k], selection.windows[k]) for k in some]
-        protocol = Protocol.of(
-            [run for run, _ in cut], model, joints, [models[k] for k in some], [windows for _, windows in cut]
-        )
-        return cls(protocol, selection)
+        protocol = _protocol([(runs[k], models[k], selection.windows[k]) for k in some], model, joints)
+        if len(some) > 1:
+            return cls(protocol, protocol, selection)
+        (k,) = some
+        parts = []
+        for f, part in enumerate(selection.folds):
+            mine = [window for window, fold in zip(selection.windows[k], selection.fold[k], strict=True) if fold == f]
+            parts.append((dataclasses.replace(runs[k], name=str(part)), models[k], mine))
+        return cls(protocol, _protocol(parts, model, joints), selection)
+
+
+def _protocol(
+    parts: Sequence[tuple[Run, Path | None, Sequence[Window]]], model: Path, joints: Sequence[str]
+) -> Protocol:
+    cut = [_compressed(run, windows) for run, _, windows in parts]
+    own = [own for _, own, _ in parts]
+    return Protocol.of([run for run, _ in cut], model, joints, own, [windows for _, windows in cut])
 
 
 def _compressed(run: Run, windows: Sequence[Window]) -> tuple[Run, tuple[Window, ...]]:

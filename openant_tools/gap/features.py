@@ -131,9 +131,9 @@ class Layout:
             edges = self.blocks(signal)
             means = _means(x, self.t, edges)
             if signal in DRIFTING:
-                means = means - np.nanmean(means, axis=1, keepdims=True)
+                means = means - _mean(means)[:, None]
             n = x.shape[0]
-            size = np.log10(np.sqrt(np.nanmean(np.square(means), axis=1)) + _least(signal))
+            size = np.log10(np.sqrt(_mean(np.square(means))) + _least(signal))
             rough = self._roughness(signal, x)
             parts += [np.nan_to_num(means).reshape(n, -1), np.nan_to_num(size), np.nan_to_num(rough)]
         parts += self._late(apart["pos"], simulated["pos"])
@@ -186,7 +186,7 @@ class Layout:
         """(robots, columns): logarithm of what scatters faster than blocks."""
         seen = self.t >= SKIP_S
         change = np.diff(x[:, seen], axis=1)
-        out: Floats = np.log10(np.sqrt(np.nanmean(np.square(change), axis=1)) + LEAST * _least(signal))
+        out: Floats = np.log10(np.sqrt(_mean(np.square(change))) + LEAST * _least(signal))
         return out
 
 
@@ -310,8 +310,17 @@ def _unloaded(x: Floats) -> Floats:
 
 
 def _from_start(x: Floats) -> Floats:
-    first = np.nanmean(x[:, :3], axis=1, keepdims=True)
-    out: Floats = x - first
+    """(robots, rows, columns) from where each log begins, which may be later than its run."""
+    known = np.flatnonzero(np.isfinite(x[0]).all(axis=1))[:3]
+    out: Floats = x - x[:, known].mean(axis=1, keepdims=True) if len(known) else x
+    return out
+
+
+def _mean(x: Floats) -> Floats:
+    """(robots, columns) means over rows of what is finite; NaN where nothing is."""
+    known = np.isfinite(x)
+    count = known.sum(axis=1)
+    out: Floats = np.where(count > 0, np.where(known, x, 0.0).sum(axis=1) / np.maximum(count, 1), np.nan)
     return out
 
 

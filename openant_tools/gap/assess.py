@@ -1,0 +1,149 @@
+"""The evidence of one recording, and what it comes to by what was learned: how likely nothing, each cause or something unknown is.
+
+Templates and healthy robots are simulated for the recording at hand and kept under a name that says all that they follow from; what
+is simulated is counted in robots, never in seconds, so that the same recording gives the same answer on any computer.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import joblib
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.arrays import read_arrays, write_arrays
+from openant_tools.errors import BadInput
+from openant_tools.gap.classifier import classifier, weights
+from openant_tools.gap.cloud import robots_at, templates_at, templates_of
+from openant_tools.gap.evidence import Evidence, Layouts, RunLayout, Scale, evidence_of, unknown_signals
+from openant_tools.gap.features import Floats
+from openant_tools.gap.population import Case
+from openant_tools.gap.posterior import NONE, OUTSIDE, features_of, log_posterior
+from openant_tools.gap.prepare import cache_folder
+from openant_tools.gap.protocol import Protocol
+
+__all__ = ["Assessment", "assess", "layouts_of"]
+
+Bools = NDArray[np.bool_]
+
+#: healthy robots that make the measure, and others that say how far one may be outside it; robots of one batch
+MEASURE, OTHERS, BATCH = 96, 32, 32
+#: of simulated robots: raise it where the same recording gives others
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """What the evidence of a recording comes to.
+
+    Attributes:
+        none, outside: probabilities. leads: cause → that it leads the gap. present: cause → that it is there, whatever leads.
+        set_aside: signal → times the farthest healthy robot by which it behaves as none that is known: it had no part in this.
+        evidence: the rows, of one robot.
+    """
+
+    none: float
+    outside: float
+    leads: Mapping[str, float]
+    present: Mapping[str, float]
+    set_aside: Mapping[str, float]
+    evidence: Evidence
+
+    def ranked(self) -> list[str]:
+        """Causes, the likeliest to lead first."""
+        return sorted(self.leads, key=lambda name: -self.leads[name])
+
+    def place(self, cause: str) -> tuple[int, ...]:
+        """Where its best template sits: indices of joints."""
+        return self.evidence.bank[int(self.evidence.places[0, self.evidence.causes.index(cause)])][1]
+
+
+def assess(
+    protocol: Protocol, progress: Callable[[float, str], None] = lambda share, words: None, jobs: int = -1
+) -> Assessment:
+    """Assess a recording (`Experiment.protocol`).
+
+    Args:
+        progress: told a share and words. jobs: processes; none of the result depends on it.
+    """
+    coarse = protocol.coarse()
+    bank = templates_of(coarse)
+    templates, healthy = _simulated(coarse, bank, progress, jobs)
+    layouts = layouts_of(coarse)
+    nominal = coarse.nominal()
+    seen = np.concatenate([one.features(there)[0] for one, there in zip(coarse.runs, nominal, strict=True)])
+    known = np.concatenate([one.layout.known(one.seen) for one in coarse.runs])
+    set_aside: dict[str, float] = {}
+    while True:
+        scale = Scale.of(layouts, known, healthy[:MEASURE], templates, bank, coarse.reference)
+        beyond = unknown_signals(scale, healthy[MEASURE:], seen)
+        if not beyond:
+            break
+        worst = max(beyond, key=lambda name: beyond[name])
+        set_aside[worst] = beyond[worst]
+        known = known & (layouts.signal != worst)
+    evidence = evidence_of(scale, seen[None])
+    odds = classifier()(evidence.rows)
+    p = np.exp(log_posterior(features_of(evidence.rows, odds), weights()))[0]
+    progress(1.0, "evidence")
+    return Assessment(
+        float(p[NONE]),
+        float(p[OUTSIDE]),
+        dict(zip(evidence.causes, p[2:].tolist(), strict=True)),
+        dict(zip(evidence.causes, (1 / (1 + np.exp(-odds[0].astype(np.float64)))).tolist(), strict=True)),
+        set_aside,
+        evidence,
+    )
+
+
+def layouts_of(protocol: Protocol) -> Layouts:
+    """What the features of its runs are of."""
+    runs = []
+    for one in protocol.runs:
+        groups = one.layout.groups()
+        joints = {signal: one.layout.joints_of(signal) for signal in groups}
+        runs.append(RunLayout(str(one.plant.setup), one.run.duration_s, groups, joints))
+    return Layouts.of(runs, len(protocol.joints))
+
+
+def _simulated(
+    protocol: Protocol, bank: list[Case], progress: Callable[[float, str], None], jobs: int
+) -> tuple[Floats, Floats]:
+    """(templates, features) and (healthy robots, features), of all runs side by side."""
+    place = cache_folder() / f"recording-{_name(protocol)}.npz"
+    if place.exists():
+        try:
+            stored = read_arrays(place)
+            return stored["templates"], stored["healthy"]
+        except (BadInput, OSError, KeyError):
+            pass  # cut or another's: it is made anew
+    step = -(-len(bank) // 4)
+    work = [joblib.delayed(templates_at)(protocol, bank[n : n + step]) for n in range(0, len(bank), step)]
+    parts = len(work)
+    healthy = [Case({}, seed) for seed in range(MEASURE + OTHERS)]
+    work += [joblib.delayed(robots_at)(protocol, healthy[n : n + BATCH], n) for n in range(0, len(healthy), BATCH)]
+    found = []
+    for done in joblib.Parallel(n_jobs=jobs, return_as="generator")(work):
+        found.append(np.concatenate(done, axis=1))
+        progress(len(found) / (len(work) + 1), "what each cause does to this recording")
+    templates, robots = np.concatenate(found[:parts]), np.concatenate(found[parts:])
+    write_arrays(place, {"templates": templates, "healthy": robots})
+    return templates, robots
+
+
+def _name(protocol: Protocol) -> str:
+    """Of everything that simulations of a recording follow from."""
+    state = hashlib.sha256(f"{VERSION} {protocol.fingerprint()}".encode())
+    for one in protocol.runs:
+        state.update(json.dumps([str(one.plant.setup), one.windows, one.run.facts.heading_rad], default=float).encode())
+        state.update(np.ascontiguousarray(one.run.t).tobytes())
+        for name in sorted(one.run.columns):
+            values = one.run.columns[name]
+            if values.dtype.kind in "fiub":
+                state.update(name.encode())
+                state.update(np.ascontiguousarray(values, np.float64).tobytes())
+    return state.hexdigest()[:24]
