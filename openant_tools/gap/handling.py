@@ -59,7 +59,7 @@ def lifted(run: Run, plant: Plant) -> Bools:
     if plant.setup is not Setup.FLOOR:
         return out
     place = run.signal("base", ("x", "y", "z"))
-    seen: Bools = np.isfinite(place[:, :2]).all(axis=1)
+    seen: Bools = np.asarray(np.isfinite(place[:, :2]).all(axis=1))
     rows = _looks(run.t, seen)
     if len(rows) > 2:
         ahead, behind = (
@@ -76,7 +76,7 @@ def lifted(run: Run, plant: Plant) -> Bools:
 def _off_the_floor(run: Run, plant: Plant, place: Array) -> Bools:
     """(rows,) where the lowest part of the robot is above the floor, by its joints, its tracked height and its attitude."""
     pos = run.signal("pos", plant.joints)
-    there: Bools = np.isfinite(np.column_stack([place[:, 2], pos])).all(axis=1)
+    there: Bools = np.asarray(np.isfinite(np.column_stack([place[:, 2], pos])).all(axis=1))
     rows = _looks(run.t, there)
     out = np.zeros(len(run.t), bool)
     if len(rows) < 3 or plant.free_joint is None:

@@ -180,7 +180,7 @@ def _uncommanded(cmd: Array, off: Bools) -> Bools:
     row = np.arange(len(cmd))[:, None]
     said = np.maximum.accumulate(np.where(given, row, -1), axis=0)
     gone = np.maximum.accumulate(np.where(off, row, -1), axis=0)
-    out: Bools = (~off & ((said < 0) | (said < gone))).any(axis=1)
+    out: Bools = np.asarray((~off & ((said < 0) | (said < gone))).any(axis=1))
     return out
 
 
