@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import re
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from plants import pendulum, write
+from plants import pendulum, sweep, write
 from test_gap_apply import diagnosis, found
 
+from openant_tools import effects
 from openant_tools.effects.catalogue import acting, action, catalogue
 from openant_tools.effects.effect import Cause
+from openant_tools.effects.entries import entries_of, values_of
 from openant_tools.effects.robot import Reference, Robot, Seen
+from openant_tools.effects.rollout import rollout
 from openant_tools.gap.next import experiments
+from openant_tools.gap.simulation import simulate
 from openant_tools.model.plant import load_plant
+from openant_tools.model.rollout import Rollouts
+from openant_tools.recording.run import Facts, Run
 
 CATALOGUE = Path(__file__).parents[2] / "shared" / "effects.md"
 
@@ -113,3 +121,41 @@ def test_friction_that_is_alike_either_way_is_plain_friction() -> None:
     cause = catalogue()["asymmetric_friction"]
     assert cause.simpler({"positive_nm": 0.17, "negative_nm": 0.168}) == "coulomb_friction"
     assert cause.simpler({"positive_nm": 0.14, "negative_nm": 0.06}) is None
+
+
+@pytest.fixture
+def rubbing_cable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """The effect that docs/new-effect.md adds, as a file of the package."""
+    page = (Path(__file__).parents[1] / "docs" / "new-effect.md").read_text(encoding="utf-8")
+    code = re.search(r"```python\n(.*?)```", page, re.S)
+    assert code is not None
+    write(tmp_path / "rubbing_cable.py", code[1])
+    monkeypatch.setattr(effects, "__path__", [*effects.__path__, str(tmp_path)])
+    for known in (catalogue, acting):
+        known.cache_clear()
+    yield "rubbing_cable"
+    monkeypatch.undo()
+    sys.modules.pop("openant_tools.effects.rubbing_cable", None)
+    for known in (catalogue, acting):
+        known.cache_clear()
+
+
+def test_one_file_adds_an_effect_to_the_diagnosis_the_environment_and_what_to_do_next(
+    rubbing_cable: str, model: Path
+) -> None:
+    plant = load_plant(model)
+    cause, known, joints = catalogue()[rubbing_cable], reference(model), np.array([0])
+    robot = Robot(1, known.low, known.high)
+    cause.enter(robot, joints, cause.values(cause.starts(1.0)[0], known, joints))
+    t = np.arange(0.0, 2.0, 0.01)
+    command = sweep(t, 1)[:, 0]
+    run = Run("sweep", Facts(joints=("joint",)), t, {"cmd.joint": command, "pos.joint": np.zeros_like(t)})
+    rollouts = Rollouts(plant, [run])
+    given, diagnosed = simulate(rollouts, [Robot(1), robot], signals=["pos"]).signals["pos"]
+    assert np.abs(diagnosed - given).max() > 1e-3
+    values = values_of(entries_of(robot.laws, plant.joints), plant.joints)
+    (played,) = rollout(rollouts, [plant.model], [values]).pos
+    assert played == pytest.approx(diagnosed, abs=1e-4)
+    told = action("coulomb_friction", rubbing_cable)
+    assert told is not None
+    assert told.name == "hold the cable"
