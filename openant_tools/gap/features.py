@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.effects.robot import USUAL_NOISE, Robot
 from openant_tools.gap.arrivals import KINDS_OF_ONE, Arrivals
 from openant_tools.gap.following import KINDS, Following
 from openant_tools.gap.neighbours import beside_neighbours
-from openant_tools.gap.robot import USUAL_NOISE, Robot
 from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
 

@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.effects.robot import Reference, Robot, Seen
 from openant_tools.gap.arrivals import Arrivals
 from openant_tools.gap.features import (
     ARRIVAL,
@@ -30,7 +31,6 @@ from openant_tools.gap.features import (
     logged,
 )
 from openant_tools.gap.following import Following
-from openant_tools.gap.robot import Reference, Robot, Seen
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.floor import resolution
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of

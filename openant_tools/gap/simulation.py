@@ -1,7 +1,7 @@
 """Many simulated robots at work on the same commands, and what their sensors would have logged.
 
 The clocks, segments and starts are those of `model.rollout`, whose contract holds here too. Every robot may differ from the
-model in everything that `gap.robot` names, so that one batch holds thousands of different robots, or the variants of a fit.
+model in everything that `effects.robot` names, so that one batch holds thousands of different robots, or the variants of a fit.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from openant_tools.effects.robot import Cable, Form, Robot, tilted
 from openant_tools.effects.rollout import laws_of
 from openant_tools.effects.servos import batch_of
 from openant_tools.effects.step import Law, Step
 from openant_tools.gap.laws import Fields, Transmission, back_emf, first_laws, last_laws
 from openant_tools.gap.memory import heats, setpoints
-from openant_tools.gap.robot import Cable, Form, Robot, tilted
 from openant_tools.model.body import torso_body
 from openant_tools.model.plant import Plant, Setup
 from openant_tools.model.rollout import VELOCITY_SPAN_S, Rollouts, Segment
