@@ -54,7 +54,7 @@ def biased(robot: Robot) -> None:
 
 
 def tracked(robot: Robot) -> None:
-    robot.base_scale, robot.base_yaw, robot.late["base"] = 1.2, 0.1, 0.15
+    robot.base_scale, robot.base_yaw, robot.log_delay["base"] = 1.2, 0.1, 0.15
 
 
 def late(robot: Robot) -> None:
@@ -116,7 +116,7 @@ def test_a_walk_of_the_environment_is_that_of_the_diagnosis(name, robot, monkeyp
     change(theirs)
     for signal in ("pos", "vel", "imu", "base"):
         # MuJoCo's sensors read at the beginning of the last step, and so does the environment.
-        theirs.late[signal] = theirs.late.get(signal, 0.0) + plant.timestep
+        theirs.log_delay[signal] = theirs.log_delay.get(signal, 0.0) + plant.timestep
     monkeypatch.setattr(simulation.np.random, "default_rng", Forward)
     log = simulation.simulate(rollouts, [theirs]).signals
 

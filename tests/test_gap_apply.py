@@ -208,7 +208,7 @@ def test_feet_stick_by_what_decides_at_the_floor(walk: tuple[Plant, Run], tmp_pa
 def test_a_turned_and_late_imu(tmp_path: Path) -> None:
     robot = Robot(8)
     robot.imu_rotation[:] = 0.0, 0.2, 0.0
-    robot.late["imu"] = 0.015
+    robot.log_delay["imu"] = 0.015
     write_robot(ANT, robot, tmp_path / "improved.xml", note="a test")
     written = mujoco.MjModel.from_xml_path(str(tmp_path / "improved.xml"))
     assert written.sensor("gyro").id >= 0

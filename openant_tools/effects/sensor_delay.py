@@ -11,18 +11,18 @@ __all__ = ["effect"]
 
 def _enter(robot: Robot, joints: Ints, values: Values) -> None:
     for signal in ("pos", "vel", "imu"):
-        robot.late[signal] = robot.late.get(signal, 0.0) + values[signal]
+        robot.log_delay[signal] = robot.log_delay.get(signal, 0.0) + values[signal]
 
 
 def _write_encoder(document: Document, j: int) -> None:
     for signal in ("pos", "vel"):
-        document.delayed(document.encoder(signal, j), document.robot.late.get(signal, 0.0))
+        document.delayed(document.encoder(signal, j), document.robot.log_delay.get(signal, 0.0))
 
 
 def _write_imu(document: Document) -> None:
-    late = document.robot.late.get("imu", 0.0)
-    for sensor in document.inertial() if late > 0 else ():
-        document.delayed(sensor, late)
+    delay = document.robot.log_delay.get("imu", 0.0)
+    for sensor in document.inertial() if delay > 0 else ():
+        document.delayed(sensor, delay)
 
 
 effect = Effect(

@@ -13,7 +13,7 @@ __all__ = ["effect"]
 def _enter(robot: Robot, joints: Ints, values: Values) -> None:
     robot.base_scale *= 1 + values["scale_error"]
     robot.base_yaw += values["yaw_rad"]
-    robot.late["base"] = robot.late.get("base", 0.0) + values["latency_s"]
+    robot.log_delay["base"] = robot.log_delay.get("base", 0.0) + values["latency_s"]
 
 
 effect = Effect(

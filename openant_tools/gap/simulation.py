@@ -424,7 +424,7 @@ class _Batch:
             for r, robot in enumerate(self._robots):
                 k = s * self._n + r
                 for name, values in out.items():
-                    late = sum(robot.late.get(group, 0.0) for group in LATE_WITH.get(name, (name,)))
+                    late = sum(robot.log_delay.get(group, 0.0) for group in LATE_WITH.get(name, (name,)))
                     when = np.clip(at - late / h, 0.0, steps)
                     values[r, segment.row] = states.at(name, k, when, steps, robot)
 

@@ -94,12 +94,16 @@ def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width:
     robot.gyro_bias += width * tolerance_of("imu_bias", "gyro_x") * rng.uniform(-1, 1, 3)
     robot.acc_bias += width * tolerance_of("imu_bias", "acc_x") * rng.uniform(-1, 1, 3)
     # A servo's velocity register is a filtered one, and stamps are not exactly those of the samples.
-    robot.late["vel"] = robot.late.get("vel", 0.0) + float(rng.uniform(0, tolerance_of("sensor_delay", "vel")))
-    robot.late["imu"] = robot.late.get("imu", 0.0) + float(rng.uniform(0, tolerance_of("sensor_delay", "imu")))
-    robot.late["acc"] = float(rng.uniform(0, ACC_LATE_S))
+    robot.log_delay["vel"] = robot.log_delay.get("vel", 0.0) + float(
+        rng.uniform(0, tolerance_of("sensor_delay", "vel"))
+    )
+    robot.log_delay["imu"] = robot.log_delay.get("imu", 0.0) + float(
+        rng.uniform(0, tolerance_of("sensor_delay", "imu"))
+    )
+    robot.log_delay["acc"] = float(rng.uniform(0, ACC_LATE_S))
     stamp = float(rng.uniform(-STAMP_S, STAMP_S))
     for signal in ("pos", "vel", "torque"):
-        robot.late[signal] = robot.late.get(signal, 0.0) + stamp
+        robot.log_delay[signal] = robot.log_delay.get(signal, 0.0) + stamp
     for signal, noise in USUAL_NOISE.items():
         robot.noise[signal] = noise * float(np.exp(rng.uniform(*NOISE)))
     robot.noise["stamp"] = float(rng.uniform(0, ROW_S))
