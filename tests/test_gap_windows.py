@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from openant_tools.effects.robot import Robot
 from openant_tools.errors import BadInput
 from openant_tools.gap.folds import Part
-from openant_tools.gap.robot import Robot
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.usable import Reason, Usable, usable
 from openant_tools.gap.windows import cut, select
