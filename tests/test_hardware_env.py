@@ -27,6 +27,8 @@ from openant_tools.cli import main
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.restart import MotionStopped, StopCause
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.gap.usable import Reason, usable
+from openant_tools.model.plant import Setup, load_plant
 from openant_tools.recording.reader import read_recording
 from openant_tools.robot.config import Provenance
 from openant_tools.robot.derating import derating_of
@@ -455,6 +457,12 @@ def test_what_walks_is_recorded_and_the_gap_reads_it(scenario: Path, folder: Rob
     played = run.signal("cmd")[np.isfinite(run.signal("cmd")).all(axis=1)]
     wanted = one.env.actions.centre + one.env.actions.half * commands[4]
     assert np.abs(played - wanted).max(axis=1).min() < 2e-3
+    able = usable(run, load_plant(one.env.robot.model_path, run.joints, Setup.FLOOR))
+    [(start, stop)] = able.stretches
+    assert 0.7 < stop - start < 0.72 + hardware.SETTLE_S + 0.3, (
+        "what was walked and waited for; not how it stood up and lay down"
+    )
+    assert Reason.RAMP in {one.reason for one in able.excluded}
     out = tmp_path / "gap.json"
     with pytest.raises(SystemExit) as end:
         main(["gap", "measure", str(path), "--model", str(one.env.robot.model_path), "--json", str(out)])

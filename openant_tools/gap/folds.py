@@ -36,10 +36,6 @@ class Part:
             return self.run
         return f"{self.run}[{_seconds(self.start)},{_seconds(self.stop)}]"
 
-    def holds(self, start: float, stop: float) -> bool:
-        """Whether a stretch of its run lies in it."""
-        return self.start <= start and stop <= self.stop
-
     @classmethod
     def parse(cls, text: str, runs: Collection[str] = ()) -> Part:
         """The part that a text names.

@@ -155,9 +155,10 @@ def _unheard(t: Array, heard: Bools, gap_s: float) -> Bools:
     rows = np.flatnonzero(heard)
     if not len(rows):
         return ~out
-    for before, after in zip([*rows.tolist()], [*rows[1:].tolist(), len(t)], strict=True):
-        if after > before + 1 and t[min(after, len(t) - 1)] - t[before] > gap_s:
-            out[before + 1 : after] = True
+    ends = np.append(rows[1:], len(t))
+    far = (ends > rows + 1) & (t[np.minimum(ends, len(t) - 1)] - t[rows] > gap_s)
+    for before, after in zip(rows[far], ends[far], strict=True):
+        out[before + 1 : after] = True
     count = np.concatenate([[0], np.cumsum(heard)])
     first, stop = np.searchsorted(t, t - 0.5), np.searchsorted(t, t + 0.5, side="right")
     few: Bools = (count[stop] - count[first]) < ANSWERS * (stop - first)
