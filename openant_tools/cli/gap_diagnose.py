@@ -207,9 +207,7 @@ def _print(found: Diagnosis) -> None:
     click.echo(sentence(found))
     click.echo("effect               where               present  closes  parameters")
     for one in found.effects[:SHOWN]:
-        values = ", ".join(
-            f"{name} {span.value:.3g} [{span.low:.3g}, {span.high:.3g}]" for name, span in one.parameters.items()
-        )
+        values = ", ".join(f"{name} {span}" for name, span in one.parameters.items())
         closed = "–" if one.gap_closed is None else f"{100 * one.gap_closed:.0f} %"
         mark = "*" if one.effect in found.selected else " "
         click.echo(

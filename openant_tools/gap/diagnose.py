@@ -27,6 +27,7 @@ from openant_tools.gap.measure import measure
 from openant_tools.gap.patient import Patient, diagnosis_of, shown, unfitted
 from openant_tools.gap.prepare import Prepared, prepare
 from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.recording import diagnose_recording
 from openant_tools.gap.thresholds import (
     BEFOREHAND_S,
     COPPER,
@@ -81,6 +82,8 @@ def diagnose(
     """
     tell, began = progress or (lambda share, words: None), time.monotonic()
     everything = [*runs, *hold_out]
+    if len(everything) == 1:
+        return diagnose_recording(runs, model, joints, progress)
     _check(runs, hold_out)
     _check_prior(prior)
     wanted = joints_in_common(everything, model, joints)

@@ -25,6 +25,10 @@ class Span:
     low: float
     high: float
 
+    def __str__(self) -> str:
+        known = math.isfinite(self.low) and math.isfinite(self.high)
+        return f"{self.value:.3g} [{self.low:.3g}, {self.high:.3g}]" if known else f"{self.value:.3g}"
+
 
 @dataclass(frozen=True)
 class Found:
@@ -64,6 +68,7 @@ class Diagnosis:
         calibration: kind → joint → factor or amount that the re-fit within tolerance found, for the improved model.
         refuted: effect → what signature speaks against it, in words.
         notes: what it rests on, and what more signals would add.
+        sensors: what was found about signals, and whether they had a part in the verdict.
     """
 
     model: str
@@ -82,6 +87,7 @@ class Diagnosis:
     refuted: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     rest: Mapping[str, Any] = field(default_factory=dict)
+    sensors: Sequence[Mapping[str, Any]] = ()
 
     def as_json(self) -> dict[str, Any]:
         """As formats, section 2, has it; what is ours alone comes after."""
@@ -111,6 +117,7 @@ class Diagnosis:
             ],
             "selected": list(self.selected),
             "ambiguous_with": [list(group) for group in self.ambiguous_with],
+            "sensors": [dict(one) for one in self.sensors],
             "next_experiment": self.next_experiment,
             "gap": dict(self.gap),
             "where": [dict(place) for place in self.where],
@@ -158,7 +165,7 @@ def read_diagnosis(path: Path) -> Diagnosis:
             selected=tuple(text["selected"]), ambiguous_with=tuple(tuple(group) for group in text["ambiguous_with"]),
             next_experiment=text["next_experiment"], gap=text["gap"], where=text["where"],
             calibration=text.get("calibration", {}), removal=text.get("removal", {}), notes=tuple(text.get("notes", ())),
-            rest=text.get("rest", {}), refuted=text.get("refuted", {}),
+            rest=text.get("rest", {}), sensors=tuple(text.get("sensors", ())), refuted=text.get("refuted", {}),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise BadInput(

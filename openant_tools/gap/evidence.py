@@ -166,6 +166,7 @@ class Evidence:
         rows: (robots, causes, columns), see COLUMN_NAMES; the last is the cause's number in the catalogue.
         size: (robots,) root mean square of the whitened residual: 1 where a robot differs as healthy ones do.
         places: (robots, causes) the template that fits best, an index into `bank`.
+        amplitudes: (robots, causes) how many times that template; deviations: their standard deviations.
         bank: what templates are of.
     """
 
@@ -173,6 +174,8 @@ class Evidence:
     rows: Floats
     size: Floats
     places: Ints
+    amplitudes: Floats
+    deviations: Floats
     bank: tuple[Template, ...]
 
 
@@ -273,7 +276,11 @@ def evidence_of(scale: Scale, features: Floats) -> Evidence:
     names = sorted(catalogue())
     columns.append(np.broadcast_to(np.array([names.index(cause) for cause in t.causes], np.float32), by.shape))
     rows = np.nan_to_num(np.stack([np.asarray(one, np.float32) for one in columns], axis=2), nan=ABSENT)
-    return Evidence(t.causes, rows, (size[:, 0] / root).astype(np.float32), best, t.bank)
+    length = np.maximum(np.linalg.norm(t.vectors, axis=1), 1e-6)
+    amplitudes = np.take_along_axis(fit, best, axis=1) / length[best]
+    # What the best causes leave is as large as the noise that an amplitude is known by.
+    deviations = np.maximum(size / root, 1.0) / length[best]
+    return Evidence(t.causes, rows, (size[:, 0] / root).astype(np.float32), best, amplitudes, deviations, t.bank)
 
 
 def unknown_signals(scale: Scale, healthy: Floats, features: Floats) -> dict[str, float]:

@@ -255,7 +255,9 @@ def differences(seen: Signals, simulated: Signals, names: Sequence[str]) -> dict
         elif name == "volt":
             out[name] = (x / _unloaded(x) - 1).astype(np.float32)
         elif name in ("base", "yaw"):
-            out[name] = (_from_start(x) - _from_start(model)).astype(np.float32)
+            apart = _from_start(x) - _from_start(model)
+            # Whole turns are those of whoever counted them.
+            out[name] = (np.remainder(apart + np.pi, 2 * np.pi) - np.pi if name == "yaw" else apart).astype(np.float32)
         else:
             out[name] = (x - model).astype(np.float32)
     return out

@@ -250,7 +250,4 @@ def _percent(value: float | None) -> str | None:
 
 
 def _parameters(one: Found) -> str:
-    return ", ".join(
-        f"{name} {span.value:.3g} [{span.low:.3g}, {span.high:.3g}]".replace("-", "−")
-        for name, span in one.parameters.items()
-    )
+    return ", ".join(f"{name} {span}".replace("-", "−") for name, span in one.parameters.items())
