@@ -96,8 +96,8 @@ def test_the_order_in_which_runs_are_named_does_not_matter(model: Path, late: Di
 
 def test_bad_input_is_one_line(model: Path) -> None:
     runs = recorded(pendulum())
-    with pytest.raises(BadInput, match="one run is not enough"):
-        diagnose(runs[:1], model)
+    with pytest.raises(BadInput, match="only held-out runs"):
+        diagnose([], model, hold_out=runs[:1])
     with pytest.raises(BadInput, match="the same as motion-0"):
         diagnose(runs, model, hold_out=[runs[0]])
     with pytest.raises(BadInput, match="no effect 'stiction'"):

@@ -82,12 +82,12 @@ def diagnose(
     """
     tell, began = progress or (lambda share, words: None), time.monotonic()
     everything = [*runs, *hold_out]
-    if len(everything) == 1:
-        return diagnose_recording(runs, model, joints, progress)
     _check(runs, hold_out)
     _check_prior(prior)
     wanted = joints_in_common(everything, model, joints)
     _check_motion(everything, wanted)
+    if len(everything) == 1:
+        return diagnose_recording(runs, model, wanted, progress)
     played = Protocol.of(runs, model, wanted, [own_model(run) for run in runs])
     measured = measure(list(hold_out) or list(runs), model, wanted)
     tell(0.02, "simulated robots")
@@ -134,12 +134,6 @@ def diagnose(
 
 
 def _check(runs: Sequence[Run], hold_out: Sequence[Run]) -> None:
-    if len(runs) + len(hold_out) < 2:
-        raise BadInput(
-            "one run is not enough to diagnose: nothing is left to judge on",
-            where=(runs[0].path or runs[0].name) if runs else None,
-            remedy="record at least two runs of different motions, `openant sysid record`",
-        )
     if not runs:
         raise BadInput("only held-out runs", remedy="name runs to diagnose beside --hold-out")
     for one in hold_out:
