@@ -3,11 +3,13 @@
     python benchmarks/real_recordings.py [--shared ../shared/realdata] [--only bam-xl330|sage-so101] [--cache FILE]
 
 Prints Markdown: the error of the model as given on a motion that no fit saw, root mean square of position over the full run,
-and what share of it a fit leaves. `pooled` is the root of summed squares over the root of summed squares, motion by motion.
+and what share of it a fit leaves. `plain` is our best model for plain MuJoCo and `with effects` the best that we find (the plain
+one where no effect pays): neither fitted nor chosen by that motion. With `--hold-out` it was named as the run to judge by, so that
+what does not serve it went back to the given values. `pooled` is the root of summed squares over the root of summed squares, motion by motion.
 
 For the XL330 a peer runs beside ours, the *quick fit* that a user would write: seven numbers of one servo in plain MuJoCo, with
 weak priors, by Nelder–Mead on the full-run error; of five starts the one that fits best. It sees and is judged by the same
-runs. `plain` is our best model for plain MuJoCo, `with effects` the best that we find (the plain one where no effect pays).
+runs.
 
 Finished cells are kept in --cache, so that an interrupted run goes on where it was.
 """
@@ -101,31 +103,30 @@ def quick_fit(plant: Plant, runs: Sequence[sysid.Run]) -> mujoco.MjModel:
     return quick_model(plant, min(ends, key=lambda end: float(end.fun)).x)
 
 
-def cell(
+def fill(
+    cell: dict[str, Any],
+    columns: Sequence[str],
     held: sysid.Run,
     others: Sequence[sysid.Run],
     model: Path,
     joints: Sequence[str] | None,
     also: Sequence[str],
-    peer: bool,
-) -> dict[str, Any]:
-    """The errors (rad) on one motion of the given model and of what was fitted to the others, with the peer and effects or not."""
+) -> None:
+    """What is missing of the errors (rad) on one motion of the given model and of what was fitted to the others."""
     given = sysid.judge(held, model, joints=joints)
-    out: dict[str, Any] = {"given": given.gap.full}
-    if peer:
-        plant = load_plant(model, joints)
-        shown = given.runs[0]
+    cell["given"] = given.gap.full
+    if "quick fit" in columns and "quick fit" not in cell:
+        plant, shown = load_plant(model, joints), given.runs[0]
         quick = quick_fit(plant, sysid.judge(others, model, joints=joints).runs)
-        out["quick fit"] = gap(shown.signal("pos", plant.joints), Rollouts(plant, [shown])([quick]).pos[0])
-    begun = time.monotonic()
-    found = sysid.fit(others, model, joints=joints, also=also, beyond_mujoco=peer)
-    out["seconds"] = time.monotonic() - begun
-    out["plain"] = sysid.judge(held, found).gap.full
-    if peer:
-        out["with effects"] = sysid.judge(held, found.with_effects or found).gap.full
-    best = found.with_effects or found
-    out["accepted"] = list(dict.fromkeys(name.partition(".")[0] for name in best.accepted))
-    return out
+        cell["quick fit"] = gap(shown.signal("pos", plant.joints), Rollouts(plant, [shown])([quick]).pos[0])
+    if "plain" in columns and "plain" not in cell:
+        found = sysid.fit(others, model, joints=joints, also=also)
+        best = found.with_effects or found
+        cell["plain"], cell["with effects"] = (sysid.judge(held, one).gap.full for one in (found, best))
+    if "--hold-out" not in cell:
+        found = sysid.fit(others, model, held, joints=joints, also=also, beyond_mujoco=False)
+        cell["--hold-out"] = sysid.judge(held, found).gap.full
+        cell["accepted"] = list(dict.fromkeys(name.partition(".")[0] for name in found.accepted))
 
 
 def table(
@@ -137,8 +138,8 @@ def table(
     peer: bool = False,
 ) -> None:
     kept = json.loads(cache.read_text()) if cache.exists() else {}
-    columns = ["quick fit", "plain", "with effects"] if peer else ["plain"]
-    print(f"\n### {title}\n\n| held out | given, rad | {' | '.join(columns)} | accepted |")
+    columns = [*(["quick fit", "plain", "with effects"] if peer else []), "--hold-out"]
+    print(f"\n### {title}\n\n| held out | given, rad | {' | '.join(columns)} | accepted with --hold-out |")
     print(f"|---|---|{'---|' * len(columns)}---|")
 
     def row(name: str, cells: Sequence[dict[str, Any]], accepted: str = "") -> None:
@@ -151,10 +152,11 @@ def table(
         cells = []
         for held in runs:
             key = f"{title}: {held.name}"
-            if key not in kept:
-                kept[key] = cell(held, [run for run in runs if run is not held], model, joints, also, peer)
+            if not {*columns} <= {*kept.setdefault(key, {})}:
+                begun = time.monotonic()
+                fill(kept[key], columns, held, [run for run in runs if run is not held], model, joints, also)
                 write_text(cache, json.dumps(kept, indent=1) + "\n")
-                print(f"{held.name}: {kept[key]['seconds']:.0f} s", file=sys.stderr, flush=True)
+                print(f"{held.name}: {time.monotonic() - begun:.0f} s", file=sys.stderr, flush=True)
             cells.append(kept[key])
             row(held.name, cells[-1:], ", ".join(kept[key]["accepted"]) or "nothing")
         if len(groups) > 1:
