@@ -97,7 +97,7 @@ def chosen(fitted: Sequence[Run], judged: Sequence[Run]) -> dict[str, Any]:
     for parameter, value in u.items():
         if parameter.model is not None:
             shares[parameter.kind].append(value)
-    for path in {run.model_path for run in judged} - set(best.models):
+    for path in {run.model_path.resolve() for run in judged if run.model_path} - set(best.models):
         alike = {parameter.kind: parameter for parameter in u if parameter.model is not None}
         u |= {replace(alike[kind], model=path): float(np.mean(values)) for kind, values in shares.items()}
     sets = [dataset_of(best, run) for run in judged]
