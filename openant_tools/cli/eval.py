@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 
 import click
@@ -105,6 +106,7 @@ def eval_(
             f"the robot it was trained on is no longer at {options['robot']}", where=run, remedy="name it with --robot"
         )
     more = {"render_mode": "rgb_array"} if name == SIMULATED_ID else {}
+    before = set((run / "recordings").glob("*.mcap"))
     with environment(name, options, run / "recordings", **more) as env:
         policy = load_policy(run, env, explore=explore)
         apart = max(1, round(STRIP_EVERY_S / env.unwrapped.dt))
@@ -137,5 +139,9 @@ def eval_(
         f"{speed:+.1f} cm/s over {result.seconds:.0f} s: {result.progress_m:+.2f} m of progress,"
         f" {result.path_m:.2f} m walked, {result.turns} turns{helped} (policy of step {policy.step})"
     )
+    recorded = sorted(set((run / "recordings").glob("*.mcap")) - before, key=lambda path: path.stat().st_mtime)
+    if recorded and "robot" in options:
+        words = shlex.join(["openant", "gap", "diagnose", str(recorded[-1]), "--robot", str(options["robot"])])
+        click.echo(f"what of it the simulation lacks: {words}")
     if json_file is not None:
         write_text(json_file, json_text({**result.as_dict(), "run": str(run), "step": policy.step}, indent=2))

@@ -10,7 +10,7 @@ import pytest
 from sklearn.ensemble import HistGradientBoostingClassifier
 
 from openant_tools.arrays import read_arrays, write_arrays
-from openant_tools.gap.classifier import Classifier
+from openant_tools.gap.classifier import LEAF, Classifier, classifier, weights
 from openant_tools.gap.evidence import COLUMN_NAMES
 from openant_tools.gap.posterior import COLUMNS, NONE, OUTSIDE, WEIGHTS, features_of, log_posterior
 
@@ -56,3 +56,14 @@ def test_nothing_a_cause_or_something_unknown_share_what_is_likely() -> None:
     np.testing.assert_allclose(np.exp(p).sum(axis=1), 1.0)
     assert p.argmax(axis=1).tolist() == [NONE, 2, OUTSIDE]
     assert set(COLUMNS) < set(WEIGHTS)
+
+
+def test_what_comes_with_the_package_is_whole_and_small() -> None:
+    found = classifier()
+    inner = found.column != LEAF
+    assert found.column[inner].max() <= len(COLUMN_NAMES), "a column, or the cause's number after them"
+    for way in (found.left, found.right):
+        assert (way[inner] > np.flatnonzero(inner)).all(), "every tree ends"
+    assert set(weights()) == set(WEIGHTS)
+    size = sum((ROOT / "openant_tools" / "gap" / name).stat().st_size for name in ("classifier.npz", "posterior.json"))
+    assert size < 10e6
