@@ -452,3 +452,14 @@ def test_a_window_amid_a_gait_begins_with_the_base_in_motion_whoever_measured_it
     inside = np.isfinite(place[:, 0])
     assert np.abs(place[inside, 0] - 0.3 - swaying.column("base.x")[inside]).max() < 5e-3, "where the camera says"
     assert settled.horizon == 1.0
+
+
+def test_a_window_heads_as_tracked_where_it_begins_however_feet_slipped_on_the_way(floor: Plant, swaying: Run) -> None:
+    turned = np.linspace(0.0, 3.0, 400)  # which nothing but another floor explains
+    yaw = {f"base.{axis}": c for axis, c in (("x", np.zeros(400)), ("y", np.zeros(400)), ("yaw", turned))}
+    bare = {name: c for name, c in swaying.columns.items() if not name.startswith("base.")}
+    run = replace(swaying, columns=bare | yaw)
+    rollouts = Rollouts(floor, [run], windows=[[(4.0, 5.0), (6.0, 7.0)]])
+    heads = simulate(rollouts, [Robot(8)], signals=["yaw"]).signals["yaw"][0, :, 0]
+    for row in (100, 300):
+        assert heads[row] == pytest.approx(turned[row], abs=0.02)

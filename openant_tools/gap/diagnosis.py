@@ -147,7 +147,7 @@ def read_diagnosis(path: Path) -> Diagnosis:
                 effect=str(one["effect"]),
                 joints=one["joints"] if isinstance(one["joints"], str) else tuple(one["joints"]),
                 parameters={
-                    name: Span(float(span["value"]), float(span["low"]), float(span["high"]))
+                    name: Span(_told(span["value"]), _told(span["low"], -math.inf), _told(span["high"]))
                     for name, span in one["parameters"].items()
                 },
                 probability=float(one["probability"]),
@@ -171,6 +171,11 @@ def read_diagnosis(path: Path) -> Diagnosis:
         raise BadInput(
             f"lacks or misstates {error}", where=path, remedy="make it anew with `openant gap diagnose`"
         ) from None
+
+
+def _told(value: float | None, unknown: float = math.inf) -> float:
+    """A number of JSON, which has none for a limit that is nowhere and for an end that nobody knows."""
+    return unknown if value is None else float(value)
 
 
 def _number(value: float | None) -> float | None:

@@ -482,7 +482,17 @@ def _led_in(
     near = slice(max(0, before - AROUND), row + AROUND + 1)
     # Of what a tracker says no more than the heading: its own errors would have to settle first.
     bare = replace(run, facts=facts, t=run.t[near], columns={})
-    return _led(plant, bare, [before - near.start, row - near.start], pos[near], commands)[1]
+    led = _led(plant, bare, [before - near.start, row - near.start], pos[near], commands)[1]
+    heads = _pose(run, row)[0][7]
+    if led is None or not np.isfinite(heads):
+        return led
+    # Feet that slipped otherwise on the way turned it otherwise; on a floor every heading is as good.
+    pose, velocity = led
+    turn = float(heads) - 2 * float(np.arctan2(pose[6], pose[3]))
+    c, s = np.cos(turn), np.sin(turn)
+    pose[3:] = _turned(pose[3:], turn)
+    velocity[:2] = c * velocity[0] - s * velocity[1], s * velocity[0] + c * velocity[1]
+    return pose, velocity
 
 
 def _lead_row(t: Array, whole: Ints, row: int) -> int:
