@@ -33,7 +33,7 @@ Bools = NDArray[np.bool_]
 #: healthy robots that make the measure, and others that say how far one may be outside it; robots of one batch
 MEASURE, OTHERS, BATCH = 96, 32, 32
 #: of simulated robots: raise it where the same recording gives others
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True)
