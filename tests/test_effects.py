@@ -23,6 +23,7 @@ from openant_tools.effects.rollout import rollout
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.model.rollout import Rollouts
+from openant_tools.model.servo import usual_torque
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import write_table
 from openant_tools.robot.config import Effect as Entry
@@ -31,7 +32,7 @@ from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
 from openant_tools.robot.pair import mark_of
 from openant_tools.sysid import rules
-from openant_tools.sysid.parameter import choose, colours
+from openant_tools.sysid.parameter import choose, colours, unloaded
 
 #: a size of each parameter that shows
 SHOWING = {
@@ -261,6 +262,8 @@ def test_load_friction_of_another_simulation_is_found_unasked_and_written_beside
     assert richer["held_out"]["after"]["gap_full_rad"] < 0.6 * plain["held_out"]["after"]["gap_full_rad"]
     assert "load_friction.joint" in richer["accepted"]
     assert not any(name.startswith("load_friction") for name in plain["parameters"])
+    # Torque was never off: that a motor's damping goes with it the plain model has from the other one.
+    assert plain["parameters"]["electrical_damping.joint"]["verdict"] == "not in the data"
     value = richer["parameters"]["load_friction.joint"]["value"]
     # Another law of friction at rest: near, if not within an interval that knows this one only.
     assert value == pytest.approx(0.25, abs=0.06)
@@ -280,6 +283,19 @@ def test_load_friction_of_another_simulation_is_found_unasked_and_written_beside
     ran = CliRunner().invoke(fit, [*(str(word) for word in asked), "--no-effects"], standalone_mode=False)
     assert ran.exception is None
     assert sorted(file.name for file in out.iterdir()) == ["calibrated.xml", "fit.json", "report.html"]
+
+
+def test_beside_load_friction_a_gear_rubs_a_little_unloaded_unless_the_model_says_how_much(tmp_path: Path) -> None:
+    """Motions with torque on hardly tell; without any friction of its own a hanging joint would swing for ever."""
+    for rubs, share in ((0.0, 0.03), (0.05, None)):
+        plant = load_plant(write(tmp_path / f"{rubs}.xml", pendulum(joint=f'damping="0.12" frictionloss="{rubs}"')))
+        (given,) = choose(plant, ["coulomb_friction"])
+        beside, limit = unloaded(given, plant), usual_torque(plant.model, plant, 0)
+        if share is None:
+            assert beside == given
+        else:
+            assert beside.value(rubs, beside.centre) == pytest.approx(share * limit)
+            assert beside.value(rubs, 0.0) == 0.0, "what falls back goes to the given model"
 
 
 def test_entries_and_values_say_the_same() -> None:

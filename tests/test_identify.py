@@ -17,6 +17,7 @@ import plants
 import pytest
 
 from openant_tools.errors import BadInput
+from openant_tools.model.gap import Gap
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
@@ -26,7 +27,7 @@ from openant_tools.robot.kit import PLATFORM_PWM_LIMIT_COUNTS
 from openant_tools.robot.kit import kit as kit_by_name
 from openant_tools.robot.mjcf import nominal_mjcf
 from openant_tools.sysid.data_sheet import data_sheet_model
-from openant_tools.sysid.identify import Identification, Value, calibrated, identify
+from openant_tools.sysid.identify import Identification, Value, _helps, calibrated, identify
 from openant_tools.sysid.protocols import CommandSpace, protocol
 from openant_tools.sysid.result import write_fit
 from openant_tools.sysid.weights import autocorrelation_time
@@ -474,6 +475,18 @@ def test_without_held_out_runs_each_motion_is_left_out_in_turn(model: Path) -> N
     assert result.accepted
     # Two recordings of the same commands differ by what no model can know.
     assert result.floor == pytest.approx(FLOOR, rel=0.5)
+
+
+@pytest.mark.parametrize(
+    ("without", "goes"),
+    [([0.05, 0.05], True), ([0.02, 0.099], False), ([0.02, 0.12], False), ([0.04, 0.05, 0.06], True)],
+    ids=["alike on both", "on one", "at the other's cost", "on all of three"],
+)
+def test_of_few_motions_each_must_agree_that_a_parameter_goes_back(without: list[float], goes: bool) -> None:
+    """What the error on each left-out motion would be without a kind that leaves 0.1 rad of 0.2."""
+    figures = [[Gap(error, error) for error in (0.0, *errors)] for errors in
+               (without, [0.1] * len(without), [0.2] * len(without))]  # fmt: skip
+    assert _helps(*figures) == goes
 
 
 def test_a_single_run_is_cut_in_three(model: Path) -> None:

@@ -10,15 +10,16 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
 from openant_tools.robot.config import Effect as Entry
 from openant_tools.sysid.dataset import sensor_floor
 from openant_tools.sysid.declared import Declaration
 from openant_tools.sysid.identify import WORTH, Identification, identify
-from openant_tools.sysid.kinds import KINDS
+from openant_tools.sysid.kinds import ELECTRICAL_DAMPING, KINDS
 from openant_tools.sysid.weights import WHITE
 
-__all__ = ["TRIED", "better", "with_effects"]
+__all__ = ["TRIED", "better", "brakes_alike", "with_effects"]
 
 Progress = Callable[[str, float], None]
 
@@ -83,3 +84,14 @@ def better(richer: Identification, plain: Identification) -> bool:
     found = any(value.accepted and value.name.partition(".")[0] in TRIED for value in richer.values)
     short, long = richer.after.horizon / plain.after.horizon, richer.after.full / plain.after.full
     return found and max(short, long) < 1.0 and min(short, long) < 1.0 - WORTH
+
+
+def brakes_alike(plain: Identification, richer: Identification) -> bool:
+    """Whether the plain model shall lose its damping with the torque as the better one with effects does.
+
+    No motion with torque on tells the plain model, so that it would fall as if the motor still braked it.
+    """
+    unknown = all(parameter.kind != ELECTRICAL_DAMPING for parameter in plain.parameters)
+    goes = any(p.kind == ELECTRICAL_DAMPING and u > 0 for p, u in zip(richer.parameters, richer.u, strict=True))
+    on_floor = any(data.plant.setup is Setup.FLOOR for data in plain.datasets)
+    return unknown and goes and not on_floor and better(richer, plain)

@@ -15,6 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from openant_tools.effects.catalogue import acting
 from openant_tools.effects.entries import check_pair, entries_of, values_of
@@ -30,7 +31,7 @@ from openant_tools.robot.config import Effect as Entry
 from openant_tools.sysid.dataset import Dataset, gaps, sensor_floor
 from openant_tools.sysid.declared import Declaration, declared_parameters
 from openant_tools.sysid.estimate import Estimate, Posterior
-from openant_tools.sysid.kinds import ACTUATOR_LAG, SPEED_LIMIT
+from openant_tools.sysid.kinds import ACTUATOR_LAG, LOAD_FRICTION, SPEED_LIMIT
 from openant_tools.sysid.parameter import (
     ACTION_DELAY,
     KINDS,
@@ -42,6 +43,7 @@ from openant_tools.sysid.parameter import (
     delays,
     effect_values,
     restatements,
+    unloaded,
 )  # fmt: skip
 from openant_tools.sysid.problem import Problem
 from openant_tools.sysid.quality import Telemetry, check_model, without_errors
@@ -82,6 +84,8 @@ ON_FLOOR = ("floor_friction", "contact_softness")
 
 #: going back must pay this much on held-out runs (relative, over both horizons): less is luck
 WORTH = 0.01
+#: and, where two or three motions are left out in turn, must pay with this probability
+CERTAIN = 0.95
 #: times that runs are left out in turn, at most: each is another fit
 MOST_FOLDS = 4
 #: share of a run's samples that may be missing without a word
@@ -316,7 +320,9 @@ def identify(
     wanted = applicable(
         declared.kinds if kinds is None and declared else kinds,
         floored,
-        limp=any((run.signal("torque", joints, default=1.0) == 0).any() for run in everything),
+        limp=any((run.signal("torque", joints, default=1.0) == 0).any() for run in everything)
+        # What brakes in the motor never reaches the gears, so that a friction that follows their load tells it apart.
+        or LOAD_FRICTION in also,
         on_floor=any(setup_of(run.facts.setup) is Setup.FLOOR for run in everything),
         also=also,
     )
@@ -347,6 +353,8 @@ def identify(
     plant = data[0].plant
     motors = {k: v for run in everything for k, v in run.facts.motors.items()}
     chosen = by_register(choose(plant, wanted, tie, motors), [one.plant for one in data])
+    if LOAD_FRICTION in wanted:
+        chosen = [unloaded(parameter, plant) for parameter in chosen]
     chosen += declared_parameters(plant, declared) if declared else []
     floor = np.maximum(sensor_floor(runs, joints), 1e-6)
 
@@ -493,12 +501,12 @@ def applicable(
 
     Of damping and velocity gain what stands in the model: torque clips the one and not the other, and
     while it neither saturates nor is switched off only their sum shows, which priors then share out. The electrical share of
-    damping shows only without torque, what decides at the floor only on it. (The torso's mass is a torque scale to a standing
+    damping shows only without torque or in what load the gears carry, what decides at the floor only on it. (The torso's mass is a torque scale to a standing
     robot: it must be asked for.)
 
     Args:
         plant: the model with its position servos as they are (no motors).
-        limp: whether torque is off for a while.
+        limp: whether torque is off for a while, or the load of the gears counts.
         on_floor: whether the robot stands on the floor.
 
     Raises:
@@ -563,7 +571,7 @@ def _judge(
     """Which parameters keep their estimates: the rule of formats, section 6.
 
     Starting from all, the kind or joint whose return to the given model helps most on held-out runs goes back, as long as
-    one does; and on, while what is left does not beat the given model at both horizons.
+    one does, by more than chance; and on, while what is left does not beat the given model at both horizons.
     """
     told = 0.0
 
@@ -575,16 +583,17 @@ def _judge(
         told += (1.0 - told) / 3
 
     tell()
-    before = _pooled(trials, parameters, [np.zeros(len(parameters), bool)], undetermined)[0]
+    before = _left(trials, parameters, [np.zeros(len(parameters), bool)], undetermined)[0]
     kept = np.ones(len(parameters), bool)
-    after = _pooled(trials, parameters, [kept], undetermined)[0]
+    after = _left(trials, parameters, [kept], undetermined)[0]
     while kept.any():
         tell()
-        # What is kept must pay too.
-        beats = after.horizon < before.horizon and after.full < before.full and _score(after, before) < -WORTH
+        # What is kept must pay too. Where physics knows better than the given model, its value is no safer one.
+        short, full, pays = after[0].horizon, after[0].full, _score(after[0], before[0])
+        beats = short < before[0].horizon and full < before[0].full and pays < -WORTH
         groups = [
             np.array([bool(kept[k]) and p.kind == kind for k, p in enumerate(parameters)])
-            for kind in dict.fromkeys(p.kind for p in parameters)
+            for kind in dict.fromkeys(p.kind for p in parameters if not beats or p.centre == 0)
         ]
         labels = list(dict.fromkeys(p.label for p in parameters))
         if len(labels) > 1:
@@ -592,12 +601,30 @@ def _judge(
                 np.array([bool(kept[k]) and p.label == label for k, p in enumerate(parameters)]) for label in labels
             ]
         options = [kept & ~group for group in groups if group.any()]
-        results = _pooled(trials, parameters, options, undetermined)
-        best = min(range(len(options)), key=lambda k: _score(results[k], before))
-        if beats and _score(results[best], before) > _score(after, before) - WORTH:
+        results = _left(trials, parameters, options, undetermined)
+        if beats:
+            # What helps on one motion and hardly on another is luck, and two or three motions have much of it.
+            helps = [_helps(result, after, before) for result in results]
+            options = [option for option, one in zip(options, helps, strict=True) if one]
+            results = [result for result, one in zip(results, helps, strict=True) if one]
+            if not options:
+                break
+        best = min(range(len(options)), key=lambda k: _score(results[k][0], before[0]))
+        if beats and _score(results[best][0], before[0]) > pays - WORTH:
             break
         kept, after = options[best], results[best]
-    return kept, before, after
+    return kept, before[0], after[0]
+
+
+def _helps(one: Sequence[Gap], other: Sequence[Gap], before: Sequence[Gap]) -> bool:
+    """Whether one choice of parameters follows what was left out better than another, where trials are few by more than they
+    differ (Student)."""
+    gains = [_score(b, given) - _score(a, given) for a, b, given in zip(one[1:], other[1:], before[1:], strict=True)]
+    n = len(gains)
+    if n in (1, MOST_FOLDS):
+        return True
+    error = float(np.std(gains, ddof=1)) / math.sqrt(n)
+    return float(np.mean(gains)) > float(student.ppf(CERTAIN, n - 1)) * error
 
 
 def _score(figure: Gap, before: Gap) -> float:
@@ -606,24 +633,25 @@ def _score(figure: Gap, before: Gap) -> float:
     return float(np.mean(np.where(ratios > 0, 3 * ratios, ratios)))
 
 
-def _pooled(
+def _left(
     trials: Sequence[tuple[Posterior, Sequence[Dataset]]],
     parameters: Sequence[Parameter],
     options: Sequence[NDArray[np.bool_]],
     undetermined: NDArray[np.bool_],
-) -> list[Gap]:
-    """The gap over all held-out rows of all trials, for each option of kept parameters."""
-    squares = np.zeros((len(options), 2))
-    count = 0
-    for posterior, test in trials:
+) -> list[list[Gap]]:
+    """For each option of kept parameters the gap over all held-out rows, and then that of each trial."""
+    squares = np.zeros((len(options), len(trials), 2))
+    count = np.zeros((len(trials), 1))
+    for t, (posterior, test) in enumerate(trials):
         us = []
         for kept in options:
             us.append(np.where(undetermined & kept, posterior.centre, posterior.with_given(~kept)))
-        n = sum(int(np.isfinite(data.measured).sum()) for data in test)
+        count[t] = sum(int(np.isfinite(data.measured).sum()) for data in test)
         for k, figure in enumerate(gaps(test, parameters, us)):
-            squares[k] += n * np.array([figure.horizon, figure.full]) ** 2
-        count += n
-    return [Gap(*np.sqrt(row / count)) for row in squares]
+            squares[k, t] = count[t] * np.array([figure.horizon, figure.full]) ** 2
+    return [
+        [Gap(*np.sqrt(one.sum(axis=0) / count.sum())), *(Gap(*row) for row in np.sqrt(one / count))] for one in squares
+    ]
 
 
 def _value(parameter: Parameter, plant: Plant, estimate: Estimate, k: int, verdict: Verdict, u: float) -> Value:

@@ -15,11 +15,12 @@ from openant_tools.effects.catalogue import acting, catalogue
 from openant_tools.effects.kind import Kind
 from openant_tools.model.plant import Plant
 
-__all__ = ["ACTION_DELAY", "ACTUATOR_LAG", "ELECTRICAL_DAMPING", "KINDS", "SPEED_LIMIT", "Kind"]
+__all__ = ["ACTION_DELAY", "ACTUATOR_LAG", "ELECTRICAL_DAMPING", "KINDS", "LOAD_FRICTION", "SPEED_LIMIT", "Kind"]
 
 ACTION_DELAY = "action_delay"
 ACTUATOR_LAG = "actuator_lag"
 ELECTRICAL_DAMPING = "electrical_damping"
+LOAD_FRICTION = "load_friction"
 SPEED_LIMIT = "speed_limit"
 #: what is fitted, in the order in which it is set: what is a share of another, or a ratio to it, comes after that
 NAMES = (

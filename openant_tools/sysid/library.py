@@ -29,10 +29,11 @@ from openant_tools.recording.tables import read_run, run_of_columns
 from openant_tools.robot.config import Effect
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.pair import strangers
-from openant_tools.sysid.beyond import with_effects
+from openant_tools.sysid.beyond import brakes_alike, with_effects
 from openant_tools.sysid.dataset import Dataset
 from openant_tools.sysid.declared import Declaration
 from openant_tools.sysid.identify import Identification, Progress, Value, dataset_of, identify, joints_in_common
+from openant_tools.sysid.kinds import ELECTRICAL_DAMPING
 from openant_tools.sysid.quality import without_errors
 from openant_tools.sysid.result import stating_both, write_fit, write_robot
 from openant_tools.sysid.rules import Finding, check_runs, findings, with_rows, without_turns
@@ -160,13 +161,13 @@ def fit(
     if not beyond_mujoco:  # a plain model takes the place of the robot's pair, wherever it comes from
         others = strangers(effects, load_plant(given).model)
         effects = tuple(entry for entry in effects if entry not in others)
-    found = identify(
+    plain = partial(
+        identify,
         runs,
         given,
         hold_out,
         joints=joints,
         kinds=kinds,
-        also=also,
         tie=tie,
         declared=declared,
         measured_supply=measured_supply,
@@ -174,6 +175,7 @@ def fit(
         checked=(*said, *noted),
         progress=progress,
     )
+    found = plain(also=also)
     # A list of kinds that was given is the builder's word that nothing else is wanted.
     if not beyond_mujoco or kinds or (declared and declared.kinds):
         return found
@@ -188,6 +190,8 @@ def fit(
         effects=effects,
         progress=progress and (lambda what, done: progress(f"with effects: {what}", done)),
     )
+    if tried and brakes_alike(found, tried):
+        found = plain(also=[*also, ELECTRICAL_DAMPING])
     return stating_both(found, tried) if tried else found
 
 

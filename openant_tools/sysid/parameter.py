@@ -42,11 +42,14 @@ __all__ = [
     "given_numbers",
     "names_of",
     "restatements",
+    "unloaded",
 ]
 
 Array = NDArray[np.float64]
 #: kinds that a servo's registers set: its P gain, its D gain
 OF_REGISTERS = ("stiffness", "velocity_gain")
+#: share of its torque limit that a servo's gear takes unloaded, and its deviation
+UNLOADED, UNLOADED_STD = 0.03, 0.015
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,7 @@ class Parameter:
         declared: the kind, where a user declared it (`declared.py`).
         places: of what was declared, the attributes that change together, and which of an attribute's numbers.
         model: the file whose servos alone it belongs to, where runs were made with several; None for all.
+        middle: u in the middle of its prior, where that is known better than by its kind.
     """
 
     kind: str
@@ -72,6 +76,7 @@ class Parameter:
     declared: Kind | None = None
     places: tuple[Place, ...] = ()
     model: Path | None = None
+    middle: float | None = None
 
     def belongs(self, plant: Plant) -> bool:
         """Whether it says anything of this plant."""
@@ -101,6 +106,8 @@ class Parameter:
     def centre(self) -> float:
         """Where the prior has its middle: 0, the given model's value, unless physics knows better."""
         prior = self.definition.prior
+        if self.middle is not None:
+            return self.middle
         return 0.0 if prior is None else prior / self.std
 
 
@@ -265,6 +272,19 @@ def choose(
             std = kind.relative_std if relative and kind.relative_std is not None else kind.absolute_std(limit)
             chosen.append(Parameter(name, label, tuple(joints), relative, std))
     return chosen
+
+
+def unloaded(parameter: Parameter, plant: Plant) -> Parameter:
+    """Dry friction beside one that follows the load: the share of the torque limit that a gear takes while it carries nothing.
+
+    What the model says of it stays its prior. Where it says nothing, none at all is the least likely: a joint that then falls
+    and swings would never come to rest, and motions with torque on hardly tell.
+    """
+    kind, joints = parameter.definition, parameter.joints
+    if parameter.kind != "coulomb_friction" or any(kind.read(plant.model, plant, j) > 0 for j in joints):
+        return parameter
+    limit = float(np.mean([usual_torque(plant.model, plant, j) for j in joints]))
+    return replace(parameter, std=UNLOADED_STD * limit, middle=UNLOADED / UNLOADED_STD)
 
 
 def by_register(parameters: Sequence[Parameter], plants: Sequence[Plant]) -> list[Parameter]:
