@@ -20,8 +20,8 @@ __all__ = ["Decision", "Row", "decide"]
 AGAINST, EXPECTED = 2.0, 4.0
 #: share of the foretold gain that has to be seen
 SEEN = 0.15
-#: what it costs to give a wrong name, to give none where there is one, and to leave open what is known
-WRONG, MISSED, OPEN = 1.0, 0.7, 0.35
+#: what it costs to give a wrong name, to give none where there is one, to leave open what is known, and to name it as one of two
+WRONG, MISSED, OPEN, EITHER = 1.0, 0.7, 0.35, 0.2
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def decide(rows: Sequence[Row], outside: float) -> Decision:
     if named:
         costs[named[0][0].causes[0]] = WRONG * (1 - named[0][1])
     if len(named) > 1:
-        costs[AMBIGUOUS] = OPEN * (named[0][1] + named[1][1]) + WRONG * (1 - named[0][1] - named[1][1])
+        costs[AMBIGUOUS] = EITHER * (named[0][1] + named[1][1]) + WRONG * (1 - named[0][1] - named[1][1])
     verdict = min(costs, key=lambda name: costs[name])
     if verdict == NONE:
         return Decision(NONE, p_none)
