@@ -15,7 +15,7 @@ from openant_tools.gap.evidence import Evidence, Layouts, RunLayout, Scale, evid
 from openant_tools.gap.features import ARRIVAL, FOLLOWING, LATENESS
 from openant_tools.gap.population import Case
 
-__all__ = ["Learned", "Shard", "read_shard"]
+__all__ = ["Shard", "read_shard"]
 
 Bools = NDArray[np.bool_]
 
@@ -96,13 +96,3 @@ def read_shard(folder: Path, seed: int) -> Shard:
 
 def _case(stated: dict[str, list[object]], seed: int) -> Case:
     return Case({name: (tuple(joints), dict(x)) for name, (joints, x) in stated.items()}, seed)
-
-
-@dataclass(frozen=True)
-class Learned:
-    """Rows to learn from: `x` (rows, columns), `y` (rows,) whether the robot has the cause, `robot` (rows,), `shard` (rows,)."""
-
-    x: NDArray[np.float16]
-    y: Bools
-    robot: NDArray[np.int32]
-    shard: NDArray[np.int32]

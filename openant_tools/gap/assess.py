@@ -23,7 +23,7 @@ from openant_tools.gap.evidence import Evidence, Layouts, RunLayout, Scale, evid
 from openant_tools.gap.features import Floats
 from openant_tools.gap.population import Case
 from openant_tools.gap.posterior import NONE, OUTSIDE, features_of, log_posterior
-from openant_tools.gap.prepare import cache_folder
+from openant_tools.gap.prepare import cache_folder, keep_small
 from openant_tools.gap.protocol import Protocol
 
 __all__ = ["Assessment", "assess", "layouts_of"]
@@ -118,6 +118,7 @@ def _simulated(
     if place.exists():
         try:
             stored = read_arrays(place)
+            place.touch()  # used now
             return stored["templates"], stored["healthy"]
         except (BadInput, OSError, KeyError):
             pass  # cut or another's: it is made anew
@@ -132,6 +133,7 @@ def _simulated(
         progress(len(found) / (len(work) + 1), "what each cause does to this recording")
     templates, robots = np.concatenate(found[:parts]), np.concatenate(found[parts:])
     write_arrays(place, {"templates": templates, "healthy": robots})
+    keep_small(place)
     return templates, robots
 
 

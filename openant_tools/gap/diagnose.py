@@ -87,7 +87,10 @@ def diagnose(
     wanted = joints_in_common(everything, model, joints)
     _check_motion(everything, wanted)
     if len(everything) == 1:
-        return diagnose_recording(runs, model, wanted, progress)
+        unasked = (
+            [f"that {' and '.join(prior)} is expected had no part in the diagnosis of a single run"] if prior else []
+        )
+        return diagnose_recording(runs, model, wanted, progress, unasked)
     played = Protocol.of(runs, model, wanted, [own_model(run) for run in runs])
     measured = measure(list(hold_out) or list(runs), model, wanted)
     tell(0.02, "simulated robots")

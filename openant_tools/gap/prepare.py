@@ -30,7 +30,7 @@ from openant_tools.gap.protocol import Protocol, same, shown
 from openant_tools.recording.run import Run
 from openant_tools.workers import tied
 
-__all__ = ["Prepared", "cache_folder", "find", "finished_since", "prepare"]
+__all__ = ["Prepared", "cache_folder", "find", "finished_since", "keep_small", "prepare"]
 
 _log = logging.getLogger(__name__)
 
@@ -211,7 +211,7 @@ def _simulate(
                 write_text(folder / CLOSED, "")
                 made.close()
                 break
-    _keep_small(folder)
+    keep_small(folder)
 
 
 def _make(protocol: Protocol, part: int, size: int, path: Path) -> None:
@@ -341,13 +341,18 @@ def _part(folder: Path, part: int) -> Path:
     return folder / (f"part-{part:04d}.npz" if part >= 0 else f"bank-{-part:04d}.npz")
 
 
-def _keep_small(kept: Path) -> None:
-    """Drop what was used longest ago until the cache is within its bound."""
-    folders = sorted((f for f in cache_folder().iterdir() if f.is_dir()), key=lambda folder: folder.stat().st_mtime)
-    total = {folder: sum(file.stat().st_size for file in folder.iterdir()) for folder in folders}
-    for folder in folders:
+def keep_small(kept: Path) -> None:
+    """Drop what was used longest ago, protocols and recordings alike, until the cache is within its bound."""
+    places = sorted(cache_folder().iterdir(), key=lambda place: place.stat().st_mtime)
+    total = {
+        place: sum(file.stat().st_size for file in (place.iterdir() if place.is_dir() else [place])) for place in places
+    }
+    for place in places:
         if sum(total.values()) <= LARGEST_BYTES:
             return
-        if folder != kept:
-            shutil.rmtree(folder, ignore_errors=True)
-            del total[folder]
+        if place != kept:
+            if place.is_dir():
+                shutil.rmtree(place, ignore_errors=True)
+            else:
+                place.unlink(missing_ok=True)
+            del total[place]

@@ -7,6 +7,7 @@ was learned), `explain` (how large the few likeliest would be), `closure` (what 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -36,13 +37,17 @@ FORETOLD = 0.5
 
 
 def diagnose_recording(
-    runs: Sequence[Run], model: Path, joints: Sequence[str] | None = None, progress: Progress | None = None
+    runs: Sequence[Run],
+    model: Path,
+    joints: Sequence[str] | None = None,
+    progress: Progress | None = None,
+    notes: Sequence[str] = (),
 ) -> Diagnosis:
     """Diagnose the gap between a robot and its model by whatever was recorded.
 
     Args:
         runs: recordings of one robot. joints: default every position servo that all runs command and measure.
-        progress: told a share and words.
+        progress: told a share and words. notes: what else the diagnosis says of itself.
 
     Raises:
         BadInput: too little of them can be simulated.
@@ -74,7 +79,8 @@ def diagnose_recording(
     found = decide(rows, assessment.outside)
     by_name = dict(zip(suspects, closed, strict=True))
     best = by_name.get(found.verdict, plain)
-    return _diagnosis(made, model, runs, assessment, found, by_name, best, windows, before, floor)
+    diagnosis = _diagnosis(made, model, runs, assessment, found, by_name, best, windows, before, floor)
+    return dataclasses.replace(diagnosis, notes=(*diagnosis.notes, *notes))
 
 
 def _size(assessment: Assessment, name: str) -> Mapping[str, float]:
@@ -114,7 +120,7 @@ def _diagnosis(
     judged = list(range(len(made.folds.runs)))
     selected = tuple(name for row in found.selected for name in row.causes)
     refit = best.refit if selected else Refit((), (), best.refit.nuisance)
-    measured = measure([one.run for one in made.folds.runs], model, made.protocol.joints)
+    measured = measure([one.run for one in made.folds.runs], model, made.protocol.joints).as_json()
     effects = tuple(_found(made, assessment, name, closed.get(name)) for name in assessment.ranked())
     notes = [
         str(made.selection),
@@ -137,9 +143,9 @@ def _diagnosis(
             "before": before,
             "after": best.after if selected else before,
             "floor": floor,
-            "signals": measured.as_json()["signals"],
+            "signals": measured["signals"],
         },
-        where=measured.as_json()["where"],
+        where=measured["where"],
         calibration=calibration_of(windows, refit, judged) if selected else {},
         notes=tuple(notes),
         sensors=tuple(

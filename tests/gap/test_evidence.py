@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from openant_tools.gap.assess import layouts_of
 from openant_tools.gap.cloud import robots_at, templates_at, templates_of
 from openant_tools.gap.evidence import COLUMN_NAMES, Layouts, RunLayout, Scale, evidence_of
 from openant_tools.gap.experiment import Experiment
@@ -52,16 +53,6 @@ def pendulum(tmp_path_factory: pytest.TempPathFactory) -> Protocol:
     return _recorded(model, ("hinge",), 4.0)
 
 
-def _layouts(protocol: Protocol) -> Layouts:
-    runs = [
-        RunLayout(
-            str(one.plant.setup), one.run.duration_s, one.layout.groups(), {s: one.layout.joints_of(s) for s in one.layout.groups()}
-        )
-        for one in protocol.runs
-    ]  # fmt: skip
-    return Layouts.of(runs, len(protocol.joints))
-
-
 def _healthy(protocol: Protocol, count: int, first: int = 0) -> list[Case]:
     return [Case({}, seed) for seed in range(first, first + count)]
 
@@ -79,7 +70,7 @@ def _features(parts: list[NDArray[np.float32]]) -> NDArray[np.float32]:
 
 @pytest.mark.slow
 def test_each_cause_is_among_the_first_by_what_it_would_do_to_this_very_recording(pendulum: Protocol) -> None:
-    bank, layouts = templates_of(pendulum), _layouts(pendulum)
+    bank, layouts = templates_of(pendulum), layouts_of(pendulum)
     templates = _features(templates_at(pendulum, bank))
     healthy = _features(robots_at(pendulum, _healthy(pendulum, 60), 1))
     known = np.concatenate([one.layout.known(one.seen) for one in pendulum.runs])
@@ -127,7 +118,7 @@ def test_on_a_stand_legs_that_do_not_move_each_other_are_simulated_side_by_side(
     side_by_side = _features(templates_at(protocol, bank))
     alone = np.concatenate([_features(templates_at(protocol, [case])) for case in bank])
     # The scale of torques is asked of all joints at once.
-    layouts = _layouts(protocol)
+    layouts = layouts_of(protocol)
     means = layouts.mean & np.isin(layouts.signal, ["pos", "vel"])
     np.testing.assert_allclose(side_by_side[:, means], alone[:, means], atol=2e-5)
 

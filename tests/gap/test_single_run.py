@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from openant_tools.effects.catalogue import enter
 from openant_tools.effects.robot import Robot
 from openant_tools.errors import BadInput
+from openant_tools.gap import prepare
 from openant_tools.gap.diagnose import diagnose
 from openant_tools.gap.prepare import CACHE_VARIABLE
 from openant_tools.gap.protocol import Protocol
@@ -81,3 +83,13 @@ def test_one_run_of_a_robot_as_its_model_says_names_nothing(model: Path) -> None
 def test_what_is_too_short_to_hold_anything_out_is_refused_in_one_line(model: Path) -> None:
     with pytest.raises(BadInput, match="too little to hold parts of it out"):
         diagnose([_recorded(model, seconds=2.0)], model)
+
+
+def test_recordings_that_were_looked_at_long_ago_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(prepare, "LARGEST_BYTES", 25)
+    place = prepare.cache_folder()
+    for age, name in enumerate(("recording-new.npz", "recording-used.npz", "recording-old.npz")):
+        (place / name).write_bytes(bytes(10))
+        os.utime(place / name, (1e9 - age, 1e9 - age))
+    prepare.keep_small(place / "recording-new.npz")
+    assert sorted(path.name for path in place.iterdir()) == ["recording-new.npz", "recording-used.npz"]
