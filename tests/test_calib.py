@@ -518,7 +518,7 @@ def test_turns_that_fit_no_sensor_are_asked_for_again_and_not_judged(tmp_path, m
         assert "turn the robot half a turn" in builder.said
         kept = ant.folder.config()
         assert kept.provenance_of("imu.gyro_counts_per_dps") is None
-        assert kept.imu.acc_counts_per_g == pytest.approx(2048, rel=0.01), "what was measured is kept"
+        assert kept.imu.acc_counts_per_g == pytest.approx(512, rel=0.01), "what was measured is kept"
 
 
 @given(
@@ -545,13 +545,13 @@ def test_an_accelerometer_a_little_off_is_measured_and_used(tmp_path):
     with robot(tmp_path / "ant", imu={"acc_scale": [1.04] * 3}) as ant:
         finding, _ = ant.do(imu(ant.bench))
         assert finding.ok
-        assert ant.folder.config().imu.acc_counts_per_g == pytest.approx(1.04 * 2048, rel=0.003)
+        assert ant.folder.config().imu.acc_counts_per_g == pytest.approx(1.04 * 512, rel=0.003)
         with opened_imu(ant.bench) as (driver, _):
             assert driver.info.gravity == pytest.approx(9.807, abs=0.03)
-        ant.folder.update({"imu.acc_counts_per_g": 512.0})
+        ant.folder.update({"imu.acc_counts_per_g": 2048.0})
         with opened_imu(ant.bench) as (driver, _):
-            assert driver.info.acc_lsb_per_g == 2048
-            assert "512 had been measured (other firmware, another board?); gravity decides" in driver.info.notes[0]
+            assert driver.info.acc_lsb_per_g == 512
+            assert "2048 had been measured (other firmware, another board?); gravity decides" in driver.info.notes[0]
 
 
 @given(vector=st.tuples(*[st.floats(-1.8, 1.8)] * 3))

@@ -149,6 +149,22 @@ def test_every_firmware_reads_one_g_at_rest(minor: int, sensor: int, expected: i
     assert sample.yaw_step == (0.0 if minor == 48 else pytest.approx(math.radians(1)))
 
 
+def test_the_platforms_own_scales_read_one_g_from_the_default_board() -> None:
+    """Its releases divide by 512, its later code by what it has for the board's name; any other name it refuses."""
+    by_board = {"KAKUTEH7MINI": 512.0, "TBS_LUCID_FC": 2048.0}
+    bench = Bench()
+
+    def ask(command: msp.Command) -> bytes:
+        bench.fc.receive(msp.encode(msp.Frame(msp.Direction.REQUEST, command)), bench.t)
+        bench.t += 0.1
+        return msp.Parser().feed(bench.fc.transmit(bench.t))[0].payload
+
+    board = msp.BoardInfo.decode(ask(msp.Command.BOARD_INFO)).board
+    z = msp.RawImu.decode(ask(msp.Command.RAW_IMU)).acc[2]
+    assert z / by_board[board] * 9.81 == pytest.approx(9.81, rel=0.02)
+    assert z / 512.0 * 9.81 == pytest.approx(9.81, rel=0.02)
+
+
 def test_a_scale_that_the_firmware_does_not_promise_is_decided_by_gravity_and_said() -> None:
     class Patched(FlightControllerSettings):
         lsb_per_g = 512  # a vendor's build that kept the old division
@@ -163,7 +179,7 @@ def test_a_moving_robot_leaves_the_scale_to_the_firmware_and_says_so() -> None:
     bench = Bench()
     bench.motion = lambda t: Body(rate=np.array([0, 0, 2 * math.sin(9 * t)]))
     info = bench.imu().connect()
-    assert (info.acc_lsb_per_g, info.gravity, info.gyro_bias) == (2048, None, None)
+    assert (info.acc_lsb_per_g, info.gravity, info.gyro_bias) == (512, None, None)
     assert "moved while connecting" in info.notes[0]
 
 

@@ -73,7 +73,8 @@ class FlightControllerSettings:
     """What a scenario may set of the flight controller (`[imu]`).
 
     Attributes:
-        api_minor: 45 (firmware 4.4), 46 (4.5), 47 (2025) or 48 (2026). Until 45 the accelerometer has 512 LSB/g.
+        api_minor: 45 (firmware 4.4), 46 (4.5), 47 (2025) or 48 (2026). Until 45 the accelerometer has 512 LSB/g, which
+            is what the platform's own code divides this board's readings by, whatever firmware it runs.
         acc_lsb_per_g: of the sensor, from API 1.46 on: 2048, 1024 or 4096.
         rate_hz: runs of the serial task a second (`serial_update_rate_hz`, 100 … 2000).
         mount_rpy: rotation of the board in the body, rad about x, then y, then z (body from board).
@@ -85,7 +86,7 @@ class FlightControllerSettings:
         uid: three 32-bit words.
     """
 
-    api_minor: int = 46
+    api_minor: int = 45
     acc_lsb_per_g: int = 2048
     rate_hz: float = 100.0
     mount_rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
