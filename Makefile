@@ -3,6 +3,8 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN     = $(VENV)/bin
+# errors only
+PIP     = $(BIN)/pip -qq --disable-pip-version-check --no-input
 DEMO   ?= demo-robot
 # two workers: what CI has, and any laptop
 PYTEST_ARGS ?= -n 2
@@ -10,7 +12,7 @@ PYTEST_ARGS ?= -n 2
 .PHONY: demo test lint types contracts pytest pictures tour clean
 
 demo: $(VENV)/.all
-	$(BIN)/openant demo --robot $(DEMO)
+	@$(BIN)/openant demo --robot $(DEMO)
 
 test: lint types contracts pytest
 
@@ -29,12 +31,13 @@ pytest: $(VENV)/.dev
 
 # Torch comes first and by name: the constraint names the CPU build's version, which any platform can satisfy.
 $(VENV)/.all: pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all]'
+	@echo "Making an environment in $(VENV), once: a minute or two."
+	@$(PYTHON) -m venv $(VENV)
+	@$(PIP) install --root-user-action=ignore -c constraints.txt -e '.[all]'
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.all
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,dev]'
+	@$(PIP) install --root-user-action=ignore -c constraints.txt -e '.[all,dev]'
 	@touch $@
 
 # docs/tour.md and its pictures: the terminal program itself, walked with a virtual robot.

@@ -215,7 +215,7 @@ class TrueWalk:
         acc = acc + senses.acc_bias + senses.acc_noise * draw(3)
         seen[at["gyro"]] = np.rint(gyro / GYRO_COUNT) * GYRO_COUNT
         seen[at["acc"]] = np.rint(acc / ACC_COUNT) * ACC_COUNT
-        action = np.clip(self.policies[b].act(seen.astype(np.float32)), -1.0, 1.0)
+        action = np.clip(self.policies[b].likeliest(seen.astype(np.float32)), -1.0, 1.0)
         command: np.ndarray = self.centre + self.half * action
         return command
 

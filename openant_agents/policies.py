@@ -24,25 +24,28 @@ class Policy:
     """What plays in an environment.
 
     Attributes:
-        act: action (joints,) from observation, once a step.
+        sample: action (joints,) from observation as in training, drawn by chance; once a step.
+        likeliest: the action that it holds best: SAC's mean, SARSA's greedy primitive; once a step.
         begin: to be called after each reset.
+        seed: begins its chance anew.
         step: environment steps of training that it had when it was saved.
         agent: `sac` or `sarsa`.
     """
 
-    act: Callable[[Array], Array]
+    sample: Callable[[Array], Array]
+    likeliest: Callable[[Array], Array]
     begin: Callable[[], None]
+    seed: Callable[[int], None]
     step: int
     agent: str
 
 
-def load_policy(folder: Path, env: gymnasium.Env[Any, Any], *, explore: bool = False) -> Policy:
+def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> Policy:
     """The policy of a training run.
 
     Args:
         folder: the run's.
         env: that it is to play in.
-        explore: whether it acts as in training, or takes what it holds best.
 
     Raises:
         BadInput: no such run, or one whose observations or actions are not the environment's.
@@ -52,12 +55,14 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any], *, explore: bool = F
         from openant_agents import sac
 
         learner, step = sac.load_policy(folder, env)
-        return Policy(lambda observation: learner.act(observation, explore=explore), _nothing, step, "sac")
+        return Policy(
+            learner.act, lambda seen: learner.act(seen, explore=False), _nothing, learner.begin_chance, step, "sac"
+        )
     if agent == "sarsa":
         from openant_agents import sarsa
 
-        policy, step = sarsa.load_policy(folder, env, explore=explore)
-        return Policy(policy, policy.begin, step, "sarsa")
+        policy, step = sarsa.load_policy(folder, env)
+        return Policy(policy.sample, policy.greedy, policy.begin, policy.seed, step, "sarsa")
     raise BadInput(f"nobody knows how to play an agent called {agent!r}", where=folder, remedy="update openant-tools")
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from openant_agents.evaluate import evaluate
+from openant_agents.evaluate import LIKELIEST, SAMPLED, evaluate
 from openant_agents.exploits import Twitch
 from openant_agents.policies import load_policy
 from openant_agents.runs import read_facts
@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Measured:
-    """What a policy achieved in one place.
+    """What a policy achieved in one place, with actions drawn as in training (`evaluate.SAMPLED`), by which it is ranked.
 
     Attributes:
         average_reward_m_s: m/s, mean over plays.
@@ -50,6 +50,8 @@ class Measured:
         plays: m/s, each.
         reversals_hz: how often the actions of a joint turned back, per second: walking does so once or twice.
         helped: how often the robot had to be set up again.
+        likeliest: its likeliest action beside it: `median`, `low` and `high` in m/s, and `stood_still`, how many plays
+            ended so; None where it was not played.
     """
 
     average_reward_m_s: float
@@ -57,12 +59,24 @@ class Measured:
     plays: tuple[float, ...]
     reversals_hz: float
     helped: int
+    likeliest: Mapping[str, float] | None = None
 
     @classmethod
-    def of(cls, plays: Sequence[float], reversals_hz: float = math.nan, helped: int = 0) -> Measured:
+    def of(
+        cls,
+        plays: Sequence[float],
+        reversals_hz: float = math.nan,
+        helped: int = 0,
+        likeliest: Mapping[str, float] | None = None,
+    ) -> Measured:
         n = len(plays)
         error = float(np.std(plays, ddof=1) / math.sqrt(n)) if n > 1 else 0.0
-        return cls(float(np.mean(plays)), error, tuple(plays), reversals_hz, helped)
+        return cls(float(np.mean(plays)), error, tuple(plays), reversals_hz, helped, likeliest)
+
+    @property
+    def median(self) -> float:
+        """m/s, over plays."""
+        return float(np.median(self.plays))
 
 
 @dataclass(frozen=True)
@@ -191,36 +205,41 @@ def play(
     make_env: Callable[[Mapping[str, Any]], gymnasium.Env[Any, Any]],
     *,
     seconds: float,
-    plays: int,
+    starts: int,
+    likeliest: bool = False,
     report: Callable[[float], None] | None = None,
 ) -> Measured:
-    """Play a policy some times, from other headings each.
+    """Play a policy from some starts, with other headings each.
 
     Args:
         run: the policy's.
         make_env: makes the place from how the policy's own environment was made (its `run.json`).
-        seconds: s of robot time of each play.
-        plays: how many.
+        seconds: s of robot time from each start.
+        starts: how many.
+        likeliest: whether its likeliest action is played beside it.
         report: called with the share done.
 
     Raises:
         BadInput: no such policy, or one that does not fit the place.
     """
+    ways = (SAMPLED, LIKELIEST) if likeliest else (SAMPLED,)
     env = Twitch(make_env(read_facts(run)["env"]))
     try:
         policy = load_policy(run, env)
-        averages: list[float] = []
-        helped = 0
-        for seed in range(plays):
+        done, reversals_hz = [], math.nan
+        for number, way in enumerate(ways):
 
-            def tell(done: float, average: float, seed: int = seed) -> None:
+            def tell(played: float, average: float, number: int = number) -> None:
                 if report is not None:
-                    report((seed + done / seconds) / plays)
+                    report((number + played / (starts * seconds)) / len(ways))
 
-            result, _ = evaluate(env, policy.act, seconds=seconds, seed=seed, begin=policy.begin, report=tell)
-            averages.append(result.average_reward_m_s)
-            helped += sum(result.helped.values())
-        return Measured.of(averages, env.reversals_hz, helped)
+            done.append(evaluate(env, policy, way=way, seconds=seconds, starts=starts, report=tell))
+            if way == SAMPLED:
+                reversals_hz = env.reversals_hz
+        sampled = done[0]
+        return Measured.of(
+            sampled.rewards.tolist(), reversals_hz, sampled.helped.total(), done[1].as_dict() if likeliest else None
+        )
     finally:
         env.close()
 
@@ -249,7 +268,7 @@ def read_measured(file: Path) -> dict[str, Measured]:
             value = float(one["average_reward_m_s"])
             found[name] = Measured(
                 value, float(one.get("standard_error_m_s", 0.0)), tuple(one.get("plays", (value,))),
-                float(one.get("reversals_hz", math.nan)), int(one.get("helped", 0)),
+                float(one.get("reversals_hz", math.nan)), int(one.get("helped", 0)), _likeliest(one.get("likeliest")),
             )  # fmt: skip
     except OSError as error:
         raise BadInput("it cannot be read", where=file, remedy="name what `openant policies play` wrote") from error
@@ -260,3 +279,7 @@ def read_measured(file: Path) -> dict[str, Measured]:
     if not all(math.isfinite(one.average_reward_m_s) for one in found.values()):
         raise BadInput("a reward in it is no number", where=file, remedy="measure that policy again")
     return found
+
+
+def _likeliest(said: Any) -> dict[str, float] | None:
+    return None if said is None else {str(key): float(value) for key, value in dict(said).items()}

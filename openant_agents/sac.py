@@ -315,6 +315,10 @@ class Sac:
         """(actions,), uniform in −1…1."""
         return self.random.uniform(-1.0, 1.0, self.replay.actions).astype(np.float32)
 
+    def begin_chance(self, seed: int) -> None:
+        """Draw exploration noise from its beginning by this seed."""
+        self.noise.manual_seed(seed)
+
     def act(self, observation: Array, *, explore: bool = True) -> Array:
         """(actions,): a sample of the policy, or its mode."""
         if self._think is not None:

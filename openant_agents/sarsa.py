@@ -618,8 +618,8 @@ def _learned(
 class SarsaPolicy:
     """An agent that acts and no longer learns: the action of every environment step."""
 
-    def __init__(self, agent: Sarsa, gait: Gait, *, explore: bool) -> None:
-        self._agent, self._gait, self._explore = agent, gait, explore
+    def __init__(self, agent: Sarsa, gait: Gait) -> None:
+        self._agent, self._gait = agent, gait
         self._commands: deque[Array] = deque()
 
     def begin(self) -> None:
@@ -627,28 +627,38 @@ class SarsaPolicy:
         self._gait.rest()
         self._commands.clear()
 
-    def __call__(self, observation: Array) -> Array:
+    def seed(self, seed: int) -> None:
+        """Begin its chance anew."""
+        self._agent.random = np.random.default_rng(seed)
+
+    def sample(self, observation: Array) -> Array:
+        """(joints,): of a primitive chosen as in training, ε-greedily."""
+        return self._act(observation, self._agent.choose)
+
+    def greedy(self, observation: Array) -> Array:
+        """(joints,): of the primitive of the highest value."""
+        return self._act(observation, self._agent.best)
+
+    def _act(self, observation: Array, choose: Callable[[Rows], int]) -> Array:
         if not self._commands:
-            agent = self._agent
-            rows = agent.coder.rows_of(observation, learn=False)
-            primitive = agent.choose(rows) if self._explore else agent.best(rows)
-            self._commands.extend(self._gait.actions(primitive).astype(np.float32))
+            rows = self._agent.coder.rows_of(observation, learn=False)
+            self._commands.extend(self._gait.actions(choose(rows)).astype(np.float32))
         command = self._commands.popleft()
         self._gait.sent(command)
         return command
 
 
-def load_policy(folder: Path, env: gymnasium.Env[Any, Any], *, explore: bool = False) -> tuple[SarsaPolicy, int]:
+def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[SarsaPolicy, int]:
     """The agent of a run, ready to act in an environment, and the step it was saved at.
 
     Raises:
         BadInput: no such run, or one whose observations or actions are not the environment's.
     """
     with making_sense(folder):
-        return _policy(folder, env, explore)
+        return _policy(folder, env)
 
 
-def _policy(folder: Path, env: gymnasium.Env[Any, Any], explore: bool) -> tuple[SarsaPolicy, int]:
+def _policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[SarsaPolicy, int]:
     facts = read_facts(folder)
     describe = getattr(env.unwrapped, "describe", None)
     here = dict(describe()) if describe is not None else {}
@@ -671,7 +681,7 @@ def _policy(folder: Path, env: gymnasium.Env[Any, Any], explore: bool) -> tuple[
             remedy="train a little longer",
         )
     agent.settle()
-    return SarsaPolicy(agent, gait, explore=explore), int(checkpoint["step"])
+    return SarsaPolicy(agent, gait), int(checkpoint["step"])
 
 
 def _gait(env: gymnasium.Env[Any, Any], described: Mapping[str, Any]) -> Gait:

@@ -36,6 +36,8 @@ __all__ = ["Ant"]
 SETTLE_S = 2.0
 #: m/s and rad/s; a robot that moves faster than this after that time does not stand.
 RESTLESS = 0.5
+#: m, how far beyond its circle a robot may be before the camera follows it; how far that stands from the circle's rim
+ROOM_M, DISTANCE_M = 0.15, 1.0
 #: m, from which the robot is let down onto the floor before it settles (the published simulation's start).
 START_HEIGHT_M = 0.2
 
@@ -334,17 +336,27 @@ class Ant(AntBase):
     def render(self) -> NDArray[np.uint8] | None:
         """The robot, the reward direction, and the circle it turns at, (height, width, 3); None without `rgb_array`.
 
+        The camera stays where the circle is, so that one sees the robot get on, and follows one that leaves it.
+
         Raises:
             NoOpenGL: there is nothing to draw with on this machine.
         """
         if self.render_mode is None:
             return None
         if self._painter is None:
+            # Without a graphics card the finest edges and shadows would take twice the time of a step and its picture.
+            quality = self.model.vis.quality
+            quality.offsamples, quality.shadowsize = min(2, quality.offsamples), min(1024, quality.shadowsize)
             self._painter = Painter(self.model, *self._size)
         x, y, z = self._torso_position.tolist()
         task = self.task
+        more: dict[str, Any] = {}
         circle = (task.ox, task.oy, task.radius_m) if isinstance(task, BackAndForth) else None
-        return self._painter.frame(self.data, look_at=(x, y, z), arrow=(task.ux, task.uy), circle=circle)
+        if circle is not None:
+            ox, oy, radius = circle
+            beyond = max(0.0, 1.0 - (radius + ROOM_M) / max(math.hypot(x - ox, y - oy), 1e-9))
+            more = {"camera_at": (ox + beyond * (x - ox), oy + beyond * (y - oy), z), "distance_m": DISTANCE_M + radius}
+        return self._painter.frame(self.data, look_at=(x, y, z), arrow=(task.ux, task.uy), circle=circle, **more)
 
     def close(self) -> None:
         """Give the OpenGL context back, if there is one."""

@@ -7,6 +7,8 @@ import io
 import itertools
 import os
 import platform
+import shutil
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,12 +20,16 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.files import write_bytes
 
-__all__ = ["NoOpenGL", "Painter", "write_strip"]
+__all__ = ["VIDEO_BYTES", "NoOpenGL", "Painter", "write_mp4", "write_strip", "write_video"]
 
 Image = NDArray[np.uint8]
 ARROW_RGBA = (0.0, 0.447, 0.698, 1.0)  # Okabe–Ito blue
 CIRCLE_RGBA = (0.337, 0.706, 0.914, 1.0)  # Okabe–Ito sky blue
 CIRCLE_SEGMENTS = 48
+#: bytes that a video may have: it goes into reports
+VIDEO_BYTES = 3_000_000
+#: of WebP, from 0 to 100, in the order in which they are tried until a video is small enough
+VIDEO_QUALITIES = (70, 45, 20, 0)
 
 
 class NoOpenGL(BadInput):
@@ -86,6 +92,7 @@ class Painter:
         data: mujoco.MjData,
         *,
         look_at: tuple[float, float, float],
+        camera_at: tuple[float, float, float] | None = None,
         arrow: tuple[float, float] | None = None,
         circle: tuple[float, float, float] | None = None,
         azimuth_deg: float = 90.0,
@@ -96,14 +103,15 @@ class Painter:
 
         Args:
             data: the state; its positions must be up to date (`mj_kinematics`).
-            look_at: m, the point in the middle of the picture.
+            look_at: m, where the robot is.
+            camera_at: m, the point in the middle of the picture; None: where the robot is.
             arrow: a unit vector in the plane, drawn above the robot.
             circle: x, y and radius in m, drawn on the floor.
             azimuth_deg, elevation_deg, distance_m: where the camera stands.
         """
         self._gl.make_current()
         camera = mujoco.MjvCamera()
-        camera.lookat[:] = look_at
+        camera.lookat[:] = look_at if camera_at is None else camera_at
         camera.azimuth, camera.elevation, camera.distance = azimuth_deg, elevation_deg, distance_m
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self._model, data, self._option, None, camera, everything, self._scene)
@@ -165,3 +173,48 @@ def write_strip(pictures: Sequence[Image], file: Path, *, seconds_apart: float, 
     picture = io.BytesIO()
     figure.savefig(picture, format="png", dpi=160)
     write_bytes(file, picture.getvalue())
+
+
+def write_video(pictures: Sequence[Image], file: Path, *, seconds_apart: float) -> None:
+    """Write pictures as an animated WebP of at most `VIDEO_BYTES` that plays in real time, for ever.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    from PIL import Image as Pillow
+
+    whole = [Pillow.fromarray(picture) for picture in pictures]
+    for coarser in range(len(VIDEO_QUALITIES) + 4):
+        # Where the coarsest quality does not do, every second picture, every fourth, … does.
+        skip = 2 ** max(0, coarser - len(VIDEO_QUALITIES) + 1)
+        first, *others = whole[::skip]
+        film = io.BytesIO()
+        first.save(
+            film, format="WEBP", save_all=True, append_images=others, duration=round(1e3 * seconds_apart * skip), loop=0,
+            quality=VIDEO_QUALITIES[min(coarser, len(VIDEO_QUALITIES) - 1)], method=1,
+        )  # fmt: skip
+        if film.tell() <= VIDEO_BYTES:
+            break
+    write_bytes(file, film.getvalue())
+
+
+def write_mp4(pictures: Sequence[Image], file: Path, *, seconds_apart: float) -> bool:
+    """Write pictures as an MP4 by ffmpeg; False where there is none, or one that cannot."""
+    ffmpeg = shutil.which("ffmpeg")
+    if ffmpeg is None:
+        return False
+    height, width, _ = pictures[0].shape
+    file.parent.mkdir(parents=True, exist_ok=True)
+    made = file.with_name(f".{file.name}")
+    command = [
+        ffmpeg, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
+        "-r", f"{1 / seconds_apart:.6f}", "-i", "-", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", str(made),
+    ]  # fmt: skip
+    try:
+        done = subprocess.run(command, input=b"".join(map(bytes, pictures)), capture_output=True, check=False)
+    except OSError:
+        return False
+    if done.returncode == 0:
+        made.replace(file)
+    made.unlink(missing_ok=True)
+    return done.returncode == 0

@@ -6,6 +6,8 @@ a signal, but at the end of the thread that had started the process.)
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import os
 import signal
 import threading
@@ -13,13 +15,16 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-__all__ = ["end_with", "end_with_who_started_us", "environment", "tied"]
+__all__ = ["PROGRESS", "end_with", "end_with_who_started_us", "environment", "pass_on", "tied"]
 
 #: s between two looks, and what a command has to save and to let go in
 LOOK_S = 0.5
 GRACE_S = 20.0
 #: environment variable that names the process with which a command that it started is to end
 ENDS_WITH = "OPENANT_ENDS_WITH"
+
+#: environment variable that names the file descriptor on which whoever started a command wants to be told how far it is
+PROGRESS = "OPENANT_PROGRESS"
 
 _watching = threading.Event()
 
@@ -67,3 +72,18 @@ def end_with_who_started_us() -> None:
     parent = os.environ.pop(ENDS_WITH, "")
     if parent.isdigit():
         end_with(int(parent), orderly=True)
+
+
+def pass_on(words: str, share: float) -> None:
+    """Tell whoever started this command how far it is (share from 0 to 1), where that was asked for (`PROGRESS`)."""
+    fd = _progress_fd()
+    if fd is not None:
+        with contextlib.suppress(OSError):  # nobody listens any more
+            os.write(fd, f"{share:.4f} {words}\n".encode())
+
+
+@functools.cache
+def _progress_fd() -> int | None:
+    # Taken out of the environment: in processes that this one starts the number is another file's.
+    fd = os.environ.pop(PROGRESS, "")
+    return int(fd) if fd.isdigit() else None

@@ -34,7 +34,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 def small(folder: Path) -> Demo:
     """A demo that is over soon: short recordings, hardly any training."""
-    return Demo(folder, steps=150, record_s=8.0, eval_s=2.4)
+    return Demo(folder, steps=150, record_s=8.0, eval_s=2.4, starts=2)
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +44,11 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Demo:
     demo.prepare()
     for stage in demo.stages():
         assert not demo.stands(stage)
-        demo.run(stage, show=lambda line: None)
+        shares: list[float] = []
+        demo.run(stage, lambda words, share, shares=shares: shares.append(share))
         assert demo.stands(stage), stage.name
+        assert shares == sorted(shares)
+        assert stage.name == "robot" or 0.9 < shares[-1] <= 1.0, stage.name
     demo_figures = write_report(demo)
     (demo.folder / "figures.json").write_text(json.dumps(demo_figures))
     return demo
@@ -56,8 +59,14 @@ def test_the_whole_way_leaves_a_calibrated_robot_a_policy_and_a_report(done: Dem
     config = folder.config()
     assert config.model == "calibrated.xml"
     assert folder.check()[1] == []
-    assert json.loads((done.training / "eval.json").read_text())["seconds"] >= 2.4
+    measured = json.loads((done.training / "eval.json").read_text())
+    assert (measured["starts"], len(measured["plays"]["sampled"])) == (2, 2)
     page = done.report.read_text()
+    if done.video.exists():  # there is OpenGL here
+        assert "data:image/webp" in page
+        assert done.video.stat().st_size < rendering.VIDEO_BYTES
+        assert "prefers-reduced-motion" in page
+    assert f"{100 * measured['sampled']['median']:.1f} cm/s" in page
     for words in ("held-out error", "settings recovered", "learned to walk at", "openant sysid fit", "data:image/png"):
         assert words in page
     assert "http://" not in re.sub(r'xmlns(:\w+)?="[^"]+"', "", page), "a report opens offline"
@@ -83,7 +92,7 @@ def test_what_stands_is_not_done_again_and_what_follows_from_a_change_is(done: D
     again = small(done.folder)
     assert all(again.stands(stage) for stage in again.stages())
 
-    longer = Demo(done.folder, steps=200, record_s=8.0, eval_s=2.4)
+    longer = Demo(done.folder, steps=200, record_s=8.0, eval_s=2.4, starts=2)
     assert [stage.name for stage in longer.stages() if not longer.stands(stage)] == ["learn"]
 
     now = time.time() + 5
@@ -139,7 +148,7 @@ def test_without_opengl_the_robot_is_drawn_and_nothing_fails(done: Demo, monkeyp
 def test_fresh_removes_what_the_demo_made_and_nothing_else(tmp_path: Path) -> None:
     demo = small(tmp_path / "ant")
     demo.prepare()
-    demo.run(demo.stages()[0], show=lambda line: None)
+    demo.run(demo.stages()[0])
     mine = demo.folder / "runs" / "mine" / "checkpoint.pt"
     mine.parent.mkdir(parents=True)
     mine.touch()
@@ -159,18 +168,21 @@ def test_a_robot_of_ones_own_is_not_touched(tmp_path: Path) -> None:
     assert folder.config_file.read_bytes() == before
 
 
-def test_a_stage_that_fails_says_how_to_repeat_it(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_stage_that_fails_says_how_to_repeat_it_and_its_last_words(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     demo = small(tmp_path / "ant")
     demo.prepare()
     command = ("config", "show", "--robot", str(tmp_path / "no where"))
-    shown: list[str] = []
     with pytest.raises(StageFailed) as failure:
-        demo.run(Stage("show", "look at it", (command,), (), ()), show=shown.append)
+        demo.run(Stage("show", "look at it", (command,), (), ()))
     assert failure.value.exit_code == 2
     assert "'show' ended with exit code 2" in str(failure.value)
-    assert shown == [f"openant config show --robot '{tmp_path}/no where'"]
-    assert f"repeat `{shown[0]}`" in str(failure.value)
-    assert "there is no robot.toml here" in capfd.readouterr().err
+    typed = f"openant config show --robot '{tmp_path}/no where'"
+    assert f"repeat `{typed}`" in str(failure.value)
+    assert "there is no robot.toml here" in failure.value.said
+    assert demo.log.read_text().startswith(f"$ {typed}\n")
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_finding_that_says_no_is_passed_on(tmp_path: Path) -> None:
@@ -181,7 +193,7 @@ def test_a_finding_that_says_no_is_passed_on(tmp_path: Path) -> None:
     demo.prepare()
     check = ("config", "check", "--robot", str(folder.path))
     with pytest.raises(StageFailed) as failure:
-        demo.run(Stage("check", "read it over", (check,), (), ()), show=lambda line: None)
+        demo.run(Stage("check", "read it over", (check,), (), ()))
     assert failure.value.exit_code == 1
 
 

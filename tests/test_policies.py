@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import re
 
 import gymnasium
 import numpy as np
@@ -241,7 +242,7 @@ def test_policies_are_played_and_ranked_from_the_command_line(runs, tmp_path, ca
         "nominal",
         "--seconds",
         0.4,
-        "--plays",
+        "--starts",
         2,
         "--json",
         played,
@@ -250,6 +251,8 @@ def test_policies_are_played_and_ranked_from_the_command_line(runs, tmp_path, ca
     measured = read_measured(played)
     assert set(measured) == {"one", "two", "three", "bare"}
     assert len(measured["one"].plays) == 2
+    assert set(measured["one"].likeliest) == {"median", "low", "high", "stood_still"}
+    assert re.search(r"one +sampled .* in 2 starts\), likeliest ", capsys.readouterr().out)
     before = played.read_bytes()
     assert run_command(*words) == 0  # nothing left to play
     assert played.read_bytes() == before
@@ -258,7 +261,7 @@ def test_policies_are_played_and_ranked_from_the_command_line(runs, tmp_path, ca
     capsys.readouterr()
     assert run_command(
         "policies", "rank", "--policies", runs, "--real", real, "--sim", f"nominal={played}", "--sim", "lite=nominal:lite",
-        "--seconds", 0.2, "--plays", 1, "--report", tmp_path / "report", "--json", tmp_path / "rank.json",
+        "--seconds", 0.2, "--starts", 1, "--report", tmp_path / "report", "--json", tmp_path / "rank.json",
     ) == 0  # fmt: skip
     printed = capsys.readouterr().out
     assert printed.splitlines()[1].startswith("two ")  # the best on the robot first

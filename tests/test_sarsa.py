@@ -370,10 +370,10 @@ def test_a_policy_plays_what_it_learned_and_only_where_it_fits(tmp_path):
     assert (policy.agent, policy.step) == ("sarsa", 300)
     observation, _ = env.reset(seed=0)
     policy.begin()
-    actions = np.array([policy.act(observation) for _ in range(10)])
+    actions = np.array([policy.likeliest(observation) for _ in range(10)])
     assert (np.abs(np.diff(actions, axis=0)) <= np.sin(np.pi / 10) + 1e-6).all()
     policy.begin()
-    assert np.abs(policy.act(observation)).max() < 0.32  # from rest again, not from where the joints were
+    assert np.abs(policy.likeliest(observation)).max() < 0.32  # from rest again, not from where the joints were
     with pytest.raises(BadInput, match="trained with other dt"):
         load_policy(tmp_path / "run", ant(dt=0.1))
     train(ant(), folder=tmp_path / "young", steps=10, seed=2, settings=QUICK)
@@ -441,7 +441,7 @@ def test_train_and_eval_from_the_command_line(tmp_path, capsys):
     assert result["collisions"] == 0
     assert (out / "learning_curve.png").stat().st_size > 5_000
     assert re.search(r"20 decisions; \d+ tiles seen, 0\.\d % of the table; no collision", capsys.readouterr().out)
-    assert run_command("eval", out, "--seconds", 2, "--json", tmp_path / "eval.json") == 0
+    assert run_command("eval", out, "--seconds", 2, "--starts", 2, "--json", tmp_path / "eval.json") == 0
     assert json.loads((tmp_path / "eval.json").read_text())["step"] == 1400
     refused = [
         ((*arguments, "--epsilon", 0.1), "this folder holds another run: it differs in settings.epsilon"),

@@ -6,24 +6,32 @@ have changed. So an interrupted demo goes on where it stopped, and one whose sce
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
+import os
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from openant_tools.errors import BadInput, OpenAntError
 from openant_tools.files import json_text, read_json, write_text
 from openant_tools.robot.config import CONFIG_NAME
-from openant_tools.workers import environment
+from openant_tools.workers import PROGRESS, environment
 
 __all__ = ["Demo", "Stage", "StageFailed", "openant"]
 
 INTERRUPTED = 130
+#: of what a command said that failed
+LAST_LINES = 15
+#: s for its last words on how far it is
+HEARD_S = 1.0
 #: marks a folder as the demo's own, and remembers the commands that made what stands in it
 STATE = "demo.json"
 
@@ -73,13 +81,18 @@ parameters = { angle_rad = -0.008 }
 
 
 class StageFailed(OpenAntError):
-    """A command of a stage ended with another exit code than 0."""
+    """A command of a stage ended with another exit code than 0.
 
-    def __init__(self, stage: str, command: Sequence[str], code: int) -> None:
+    Attributes:
+        said: the last lines that it said.
+    """
+
+    def __init__(self, stage: str, command: Sequence[str], code: int, said: str) -> None:
         super().__init__(
             f"the stage {stage!r} ended with exit code {code}, for the reason above",
             remedy=f"repeat `{words_of(command)}`; the demo goes on from there",
         )
+        self.said = said
         self.exit_code = code if code in (1, 2, INTERRUPTED) else 2
 
 
@@ -118,14 +131,16 @@ class Demo:
         folder: made where it is missing.
         steps: of training.
         record_s: length of each recording, s; shorter than the protocol's own, because a fit takes as long as its data.
-        eval_s: robot time that the trained agent is measured for, s.
+        eval_s: robot time that the trained agent walks from each start to be measured, s.
+        starts: how many.
         learns: whether torch is there to train with.
     """
 
     folder: Path
-    steps: int = 6000
-    record_s: float = 16.0
-    eval_s: float = 60.0
+    steps: int = 7000
+    record_s: float = 12.0
+    eval_s: float = 20.0
+    starts: int = 15
     learns: bool = importlib.util.find_spec("torch") is not None
 
     @property
@@ -159,6 +174,20 @@ class Demo:
         return self.folder / "pictures"
 
     @property
+    def strip(self) -> Path:
+        """Pictures of the walking robot; missing where there is no OpenGL, like the video."""
+        return self.pictures / "walk.png"
+
+    @property
+    def video(self) -> Path:
+        return self.pictures / "walk.webp"
+
+    @property
+    def log(self) -> Path:
+        """What the commands said."""
+        return self.folder / "demo.log"
+
+    @property
     def report(self) -> Path:
         return self.folder / "report.html"
 
@@ -180,14 +209,14 @@ class Demo:
         stages = [
             Stage(
                 "robot",
-                "a robot's folder with the nominal values of its kit",
+                "a robot's folder with its kit's nominal values",
                 (("config", "new", "--kit", "standard", "--robot", robot),),
                 (),
                 (self.nominal, self.folder / CONFIG_NAME),
             ),
             Stage(
                 "record",
-                "drive the virtual robot on its stand: a motion to fit, and another one twice, to judge by",
+                "move the virtual robot on its stand, and record it",
                 (
                     (*play, "--robot", robot, "--out", str(self.fitted), "--yes"),
                     (*play, "--seed", "1", "--repeat", "2", "--robot", robot, "--out", str(self.held_out[0]), "--yes"),
@@ -198,7 +227,7 @@ class Demo:
             ),
             Stage(
                 "fit",
-                "find what the data sheets do not know, and judge it on the motion that was held out",
+                "find what the data sheets do not know",
                 (
                     (
                         *("sysid", "fit", str(self.fitted)),
@@ -214,11 +243,18 @@ class Demo:
             stages += [
                 Stage(
                     "learn",
-                    "train an agent in the simulation that was just calibrated",
+                    "train an agent in the calibrated simulation",
                     (
                         (
                             *("train", "sac", "--robot", robot, "--env", "sim", "--steps", str(self.steps)),
-                            *("--learning-start", str(min(500, self.steps)), "--entropy-start", "0.1"),
+                            *(
+                                "--learning-start",
+                                str(min(500, self.steps)),
+                                "--entropy-start",
+                                "0.1",
+                                "--batch",
+                                "128",
+                            ),
                             *("--out", str(training), "--json", str(training / "train.json")),
                         ),
                     ),
@@ -228,15 +264,17 @@ class Demo:
                 ),
                 Stage(
                     "measure",
-                    "play what it learned and measure its reward",
+                    f"let it walk from {self.starts} starts, and film it",
                     (
                         (
-                            *("eval", str(training), "--seconds", f"{self.eval_s:g}"),
-                            *("--strip", str(self.pictures / "walk.png"), "--json", str(training / "eval.json")),
+                            *("eval", str(training), "--seconds", f"{self.eval_s:g}", "--starts", str(self.starts)),
+                            *("--strip", str(self.strip), "--video", str(self.video)),
+                            *("--json", str(training / "eval.json")),
                         ),
                     ),
                     (training / "train.json",),
                     (training / "eval.json",),
+                    replaced=(self.strip, self.video, self.video.with_suffix(".mp4")),
                 ),
             ]
         return tuple(stages)
@@ -260,7 +298,16 @@ class Demo:
         if fresh and state.exists():
             made = {path for stage in self.stages() for path in (*stage.results, *stage.replaced, *stage.outdated)}
             kept_by_others = {self.folder / name for name in ("calibrated.xml", "journal.jsonl", "backups", STATE)}
-            for path in {*made, *kept_by_others, self.fit, self.training, self.pictures, self.report, self.scenario}:
+            for path in {
+                *made,
+                *kept_by_others,
+                self.log,
+                self.fit,
+                self.training,
+                self.pictures,
+                self.report,
+                self.scenario,
+            }:
                 _remove(path)
         self.folder.mkdir(parents=True, exist_ok=True)
         if not state.exists():
@@ -274,11 +321,11 @@ class Demo:
             return False
         return all(path.exists() for path in stage.results) and not _older(stage.results, stage.inputs)
 
-    def run(self, stage: Stage, show: Callable[[str], None]) -> None:
-        """Do a stage.
+    def run(self, stage: Stage, progress: Callable[[str, float], None] = lambda words, share: None) -> None:
+        """Do a stage; its commands and what they say go to the log.
 
         Args:
-            show: called with each command before it runs.
+            progress: called in a thread of its own, with what is being done and the share of the stage that is done.
 
         Raises:
             StageFailed: a command ended with another exit code than 0.
@@ -289,11 +336,21 @@ class Demo:
         for path in stage.outdated:
             if path.exists() and _older((path,), stage.inputs):
                 _remove(path)
-        for command in stage.commands:
-            show(words_of(command))
-            code = openant(command)
+        for number, command in enumerate(stage.commands):
+
+            def tell(words: str, share: float, number: int = number) -> None:
+                progress(words, (number + share) / len(stage.commands))
+
+            with self.log.open("a", encoding="utf-8") as log:
+                log.write(f"$ {words_of(command)}\n")
+                log.flush()
+                since = log.tell()
+                code = openant(command, log, tell)
             if code != 0:
-                raise StageFailed(stage.name, command, code)
+                with self.log.open(encoding="utf-8", errors="replace") as lines:
+                    lines.seek(since)
+                    said = "".join(lines.readlines()[-LAST_LINES:]).rstrip()
+                raise StageFailed(stage.name, command, code, said)
         write_text(self.folder / STATE, json_text({**self._done(), stage.name: stage.commands}))
 
     def _done(self) -> dict[str, list[list[str]]]:
@@ -310,18 +367,36 @@ def words_of(command: Sequence[str]) -> str:
     return shlex.join(["openant", *command])
 
 
-def openant(command: Sequence[str]) -> int:
+def openant(
+    command: Sequence[str], log: IO[str] | None = None, progress: Callable[[str, float], None] | None = None
+) -> int:
     """Run `openant` with these arguments and return its exit code.
 
     The command runs in a process group of its own, so that a Ctrl-C reaches it once, by way of this process, which then
     waits until it has ended in its own way (torque off, checkpoint saved) and raises KeyboardInterrupt.
+
+    Args:
+        log: where everything goes that it says; None: where this process' own words go.
+        progress: called in a thread of its own, with what the command is doing and how far it is, from 0 to 1.
     """
-    process = subprocess.Popen(
-        [sys.executable, "-m", "openant_tools.cli", *command],
-        stdin=subprocess.DEVNULL,
-        process_group=0,
-        env=environment(),
-    )
+    told, tells = os.pipe()
+    try:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "openant_tools.cli", *command],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=None if log is None else subprocess.STDOUT,
+            process_group=0,
+            pass_fds=(tells,),
+            env={**environment(), PROGRESS: str(tells)},
+        )
+    except BaseException:
+        os.close(told)
+        raise
+    finally:
+        os.close(tells)
+    hears = threading.Thread(target=_hear, args=(told, progress or (lambda words, share: None)), daemon=True)
+    hears.start()
     interrupted = False
     while True:
         try:
@@ -331,9 +406,19 @@ def openant(command: Sequence[str]) -> int:
             process.send_signal(signal.SIGINT)
         else:
             break
+    hears.join(HEARD_S)
     if interrupted or code in (INTERRUPTED, -signal.SIGINT):
         raise KeyboardInterrupt
     return code
+
+
+def _hear(told: int, progress: Callable[[str, float], None]) -> None:
+    """What `workers.pass_on` says in the command, until it has ended."""
+    with open(told, encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            share, _, words = line.rstrip("\n").partition(" ")
+            with contextlib.suppress(ValueError):
+                progress(words, float(share))
 
 
 def _older(results: Sequence[Path], inputs: Sequence[Path]) -> bool:

@@ -21,7 +21,7 @@ from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
-from openant_tools.report import KeyFigure, Mark, Report, Table, Text, plots
+from openant_tools.report import KeyFigure, Mark, Picture, Report, Table, Text, plots
 from openant_tools.report.parts import Tone
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.registers import PWM_FULL
@@ -30,7 +30,7 @@ from openant_tools.virtual.scenario import load_scenario
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
-__all__ = ["Recovered", "compare", "truth", "write_report"]
+__all__ = ["Recovered", "compare", "speed", "spread", "truth", "write_report"]
 
 Array = NDArray[np.float64]
 
@@ -132,7 +132,7 @@ def write_report(demo: Demo) -> dict[str, Any]:
     run = read_run(demo.held_out[0])
     moment = _worst_moment(run, demo.nominal, demo.fit / "calibrated.xml")
     curve = _curve(demo.training / "learning_curve.csv") if demo.learns else None
-    reward = _reward(demo) if demo.learns else None
+    walking = _walking(demo) if demo.learns else None
     picture, drawn_by = robot_picture(demo.fit / "calibrated.xml")
 
     before, after = fit["held_out"]["before"], fit["held_out"]["after"]
@@ -145,7 +145,10 @@ def write_report(demo: Demo) -> dict[str, Any]:
         "floor_rad": floor,
         "settings_determined": len(claimed),
         "settings_within_interval": inside,
-        "average_reward_m_s": reward,
+        "average_reward_m_s": None if walking is None else walking["average_reward_m_s"],
+        "walking": None
+        if walking is None
+        else {key: walking[key] for key in ("starts", "seconds", "sampled", "likeliest")},
     }
 
     report = Report("A virtual Open Ant, calibrated", _subtitle(demo), made_by=f"openant demo --robot {demo.folder}")
@@ -164,8 +167,8 @@ def write_report(demo: Demo) -> dict[str, Any]:
             "good" if inside >= 0.9 * len(claimed) else "warn",
         ),
     ]
-    if reward is not None:
-        keys.append(KeyFigure("learned to walk at", f"{100 * reward:.1f} cm/s", _minutes(curve)))
+    if walking is not None:
+        keys.append(KeyFigure("learned to walk at", speed(walking), f"{_minutes(curve)}; {spread(walking)}"))
     report.key_figures(*keys)
     if picture is not None:
         report.picture(picture, f"The calibrated model at its home pose, {drawn_by}.", "An Open Ant on its four legs")
@@ -184,14 +187,29 @@ def write_report(demo: Demo) -> dict[str, Any]:
     columns = ["parameter", "data sheet", "true", "found", "from", "to", "unit", "inside"]
     report.details("All values", Table(columns, [_row(row) for row in rows]), Text(_explained(rows)))
     if curve is not None:
-        report.section("Learning").figure(
-            _keep(demo, "learning", _learning_figure(curve)),
-            "Average reward of the last 120 s while it trained, in the simulation that was calibrated.",
+        assert walking is not None
+        report.section("Learning")
+        if demo.video.exists() and demo.strip.exists():
+            report.add(
+                Picture(
+                    demo.video,
+                    "What it learned: the start whose reward was the median, as sampled, in real time. The circle is the task's, "
+                    "the arrow the direction that is rewarded.",
+                    "The robot walking across its circle",
+                    still=demo.strip,
+                )
+            )
+            report.picture(demo.strip, "The same in eight pictures.", "The robot walking, in eight pictures")
+        else:
+            report.text("There are no pictures of the walk: this machine has no OpenGL to draw them with.")
+        report.figure(
+            _keep(demo, "learning", _learning_figure(curve, walking)),
+            "Average reward of the last 120 s while it trained, in the simulation that was calibrated; and what it achieved "
+            f"afterwards from {walking['starts']} starts (median, lowest to highest). The curve looks back two minutes, in which "
+            "it was still learning.",
         )
-        strip = demo.pictures / "walk.png"
-        if strip.exists():
-            report.picture(strip, "What it learned, a picture a step.", "The robot walking")
-    _keep(demo, "overview", _overview_figure(picture, moment, curve))
+        report.text(_stood_still(walking))
+    _keep(demo, "overview", _overview_figure(picture, demo.strip, moment, curve, walking))
     report.section("The same by hand").code("\n".join(line for stage in demo.stages() for line in stage.command_lines))
     report.write(demo.report)
     return figures
@@ -271,17 +289,25 @@ def _draw_gap(above: Any, below: Any, moment: _Moment) -> None:
         below.set_xlabel(plots.axis_label("time in run", "s"))
 
 
-def _learning_figure(curve: Array) -> MatplotlibFigure:
+def _learning_figure(curve: Array, walking: Mapping[str, Any]) -> MatplotlibFigure:
     figure: MatplotlibFigure
     figure, axes = plots.figure(height=2.6)
-    _draw_learning(axes, curve)
+    _draw_learning(axes, curve, walking)
+    plots.legend(axes)
     return figure
 
 
-def _draw_learning(axes: Any, curve: Array) -> None:
+def _draw_learning(axes: Any, curve: Array, walking: Mapping[str, Any]) -> None:
     with plots.style():
         axes.axhline(0, color=plots.INK, linewidth=0.6)
-        axes.plot(curve[:, 1] / 60, 100 * curve[:, 2], color=plots.BLUE)
+        axes.plot(curve[:, 1] / 60, 100 * curve[:, 2], color=plots.BLUE, label="while it trained, sampled")
+        end = curve[-1, 1] / 60 if len(curve) else 0.0
+        for k, (way, colour, marker) in enumerate((("sampled", plots.BLUE, "o"), ("likeliest", plots.VERMILLION, "s"))):
+            median, low, high = (100 * walking[way][key] for key in ("median", "low", "high"))
+            axes.errorbar(
+                [1.02 * end + 0.02 * end * k], [median], [[median - low], [high - median]], color=colour, marker=marker,
+                markersize=5, label=f"afterwards, {way}",
+            )  # fmt: skip
         axes.set_xlabel(plots.axis_label("robot time", "min"))
         axes.set_ylabel(plots.axis_label("average reward", "cm/s"))
 
@@ -316,21 +342,30 @@ def _settings_figure(rows: Sequence[Recovered]) -> MatplotlibFigure:
     return figure
 
 
-def _overview_figure(picture: bytes | None, moment: _Moment, curve: Array | None) -> MatplotlibFigure:
-    """The demo in one picture: the robot, measured against simulated, learning."""
+def _overview_figure(
+    picture: bytes | None, strip: Path, moment: _Moment, curve: Array | None, walking: Mapping[str, Any] | None
+) -> MatplotlibFigure:
+    """The demo in one picture: the robot, measured against simulated, learning and walking."""
     from matplotlib.figure import Figure
     from matplotlib.image import imread
 
-    figure = Figure(figsize=(11.0, 4.2))
+    figure = Figure(figsize=(11.0, 5.0))
     with plots.style():
         figure.set_layout_engine("constrained")
         left, right = np.ravel(np.asarray(figure.subfigures(1, 2, width_ratios=(1.0, 1.35))))
-        if curve is None:
+        if curve is None or walking is None:
             axes = [left.subplots()]
         else:
-            axes = list(left.subplots(2, 1, height_ratios=(1.6, 1.0)))
-            _draw_learning(axes[1], curve)
-            axes[1].set_title("… and learned in its simulation")
+            axes = list(
+                left.subplots(
+                    3 if strip.exists() else 2, 1, height_ratios=(1.2, 1.3, 1.0)[-3 if strip.exists() else -2 :]
+                )
+            )
+            _draw_learning(axes[-1], curve, walking)
+            axes[-1].set_title("… what it learned in its simulation")
+            if strip.exists():
+                axes[1].imshow(imread(strip))
+                axes[1].axis("off")
         axes[0].axis("off")
         if picture is not None:
             axes[0].imshow(imread(io.BytesIO(picture)))
@@ -351,8 +386,37 @@ def _curve(path: Path) -> Array:
     return np.array(rows).reshape(-1, 3)
 
 
-def _reward(demo: Demo) -> float:
-    return float(json.loads((demo.training / "eval.json").read_text(encoding="utf-8"))["average_reward_m_s"])
+def _walking(demo: Demo) -> dict[str, Any]:
+    answer: dict[str, Any] = json.loads((demo.training / "eval.json").read_text(encoding="utf-8"))
+    return answer
+
+
+def speed(walking: Mapping[str, Any]) -> str:
+    """How fast it walks as it trained, in a word; every figure of the demo that says it is this one."""
+    return f"{100 * walking['sampled']['median']:.1f} cm/s"
+
+
+def spread(walking: Mapping[str, Any]) -> str:
+    """Of how many starts that is the median, how far they lie apart, and what its likeliest action does."""
+    sampled, likeliest, starts = walking["sampled"], walking["likeliest"], walking["starts"]
+    words = (
+        f"sampled, median of {starts} starts, {100 * sampled['low']:.1f} to {100 * sampled['high']:.1f}; "
+        f"likeliest action {100 * likeliest['median']:.1f} cm/s"
+    )
+    if likeliest["stood_still"]:
+        words += f", which stood still for good in {likeliest['stood_still']} of {starts}"
+    return words
+
+
+def _stood_still(walking: Mapping[str, Any]) -> str:
+    words = "**Sampled**: actions are drawn by chance as in training. **Likeliest**: the mean of what chance would draw from. "
+    if walking["likeliest"]["stood_still"]:
+        return words + (
+            f"From {walking['likeliest']['stood_still']} of {walking['starts']} starts the likeliest action held a pose whose "
+            "likeliest action is that pose, for ever; chance takes the robot out of there. Longer training brings the gait from "
+            "chance into the mean."
+        )
+    return words + "Neither stood still for good from any start."
 
 
 # ---- the table ----

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from openant_tools.cli.options import json_option
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 __all__ = ["demo"]
 
@@ -24,21 +29,22 @@ __all__ = ["demo"]
     help="The folder for everything it makes.",
 )
 @click.option(
-    "--steps", type=click.IntRange(min=100), default=6000, show_default=True,
-    help="Length of the training; 6,000 steps are 12 minutes of the robot's time.",
+    "--steps", type=click.IntRange(min=100), default=7000, show_default=True,
+    help="Length of the training; 7,000 steps are 14 minutes of the robot's time.",
 )  # fmt: skip
 @click.option("--fresh", is_flag=True, help="Begin anew, instead of going on where an earlier demo stopped.")
 @json_option
 def demo(robot: Path, steps: int, fresh: bool, json_file: Path | None) -> None:
     """The whole way on a virtual robot, in minutes: record, identify, learn, report.
 
-    Each stage is a command that you could type; it is shown before it runs. What stands already is not done again:
-    after Ctrl-C the same command goes on, and after a change of DIR/scenario.toml it does what follows from it.
+    Each step is made of commands that you could type; report.html lists them, and demo.log has what they said. What stands
+    already is not done again: after Ctrl-C the same command goes on, and after a change of DIR/scenario.toml it does what
+    follows from it.
     """
     from rich.console import Console
     from rich.markup import escape
 
-    from openant_tools.bringup.demo import Demo
+    from openant_tools.bringup.demo import Demo, StageFailed
     from openant_tools.bringup.demo_report import write_report
     from openant_tools.files import json_text, write_text
 
@@ -48,30 +54,51 @@ def demo(robot: Path, steps: int, fresh: bool, json_file: Path | None) -> None:
     whole.prepare(fresh=fresh)
     began = time.monotonic()
     stages = whole.stages()
+    say(f"A virtual Open Ant in {escape(str(robot))}: from its first recording to walking, in about three minutes.")
     try:
         for number, stage in enumerate(stages, 1):
-            title = f"[bold]{number}/{len(stages) + 1} {stage.name}[/bold]"
+            line = f"[bold]{number}/{len(stages) + 1} {stage.name:8}[/bold] {escape(stage.words):49}"
             if whole.stands(stage):
-                say(f"{title}: stands already ({escape(str(stage.results[-1]))})")
+                say(f"{line} stands already")
                 continue
-            say(f"{title}: {escape(stage.words)}")
             since = time.monotonic()
-            whole.run(stage, lambda line: say(f"  [dim]$ {escape(line)}[/dim]"))
-            say(f"  [green]done[/green] in {time.monotonic() - since:.0f} s")
+            with _bar(console, line) as tell:
+                whole.run(stage, tell)
+            say(f"{line} [green]done[/green], {time.monotonic() - since:.0f} s")
         if not whole.learns:
             say("learning is left out: it needs torch (pip install 'openant-tools\\[agents]')")
-        with console.status("report"):
+        elif not whole.video.exists():
+            say("no pictures of the walk: there is no OpenGL here (an EGL or OSMesa library would do)")
+        line = f"[bold]{len(stages) + 1}/{len(stages) + 1} {'report':8}[/bold] {'put it all on one page':49}"
+        since = time.monotonic()
+        with _bar(console, line):
             figures = write_report(whole)
+        say(f"{line} [green]done[/green], {time.monotonic() - since:.0f} s; {time.monotonic() - began:.0f} s in all")
+    except StageFailed as failure:
+        say(escape(failure.said))
+        raise
     except KeyboardInterrupt:
         say(f"stopped; the same command goes on from here (in {escape(str(robot))})")
         raise
-    say(
-        f"[bold]{len(stages) + 1}/{len(stages) + 1} report[/bold]: {escape(str(whole.report))}; "
-        f"{time.monotonic() - began:.0f} s in all"
-    )
     _print(whole, figures)
     if json_file is not None:
         write_text(json_file, json_text(figures, indent=2))
+
+
+@contextlib.contextmanager
+def _bar(console: Console, line: str) -> Iterator[Callable[[str, float], None]]:
+    """A step's line with a bar of its own below, which goes when the step is done; yields what is told how far it is."""
+    from rich.console import Group
+    from rich.live import Live
+    from rich.markup import escape
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.text import Text
+
+    columns = (TextColumn("   "), BarColumn(28), TimeElapsedColumn(), TextColumn("{task.description}"))
+    bar = Progress(*columns, console=console)
+    task = bar.add_task("", total=1.0)
+    with Live(Group(Text.from_markup(line), bar), console=console, transient=True):
+        yield lambda words, share: bar.update(task, completed=share, description=escape(words))
 
 
 def _print(whole: Any, figures: dict[str, Any]) -> None:
@@ -81,6 +108,10 @@ def _print(whole: Any, figures: dict[str, Any]) -> None:
         f"(floor {1e3 * figures['floor_rad']:.2f}); {figures['settings_within_interval']} of "
         f"{figures['settings_determined']} settings recovered within their intervals"
     )
+    if figures["walking"] is not None:
+        from openant_tools.bringup.demo_report import speed, spread
+
+        click.echo(f"walks at {speed(figures['walking'])} ({spread(figures['walking'])})")
     rows = [
         (whole.report, "everything at a glance; opens in any browser, offline"),
         (robot / "robot.toml", "the robot, and where each value came from"),
@@ -91,6 +122,8 @@ def _print(whole: Any, figures: dict[str, Any]) -> None:
     ]
     if whole.learns:
         rows.insert(4, (whole.training, "what was learned"))
+        if whole.video.exists():
+            rows.insert(1, (whole.video, "the robot walking; also in the report"))
     width = max(len(str(path)) for path, _ in rows)
     click.echo("\n".join(f"  {path!s:{width}}  {words}" for path, words in rows))
     click.echo("\nnext:")

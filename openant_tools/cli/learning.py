@@ -14,6 +14,7 @@ import click
 from openant_tools.cli.options import robot_folder
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json
+from openant_tools.workers import pass_on
 
 if TYPE_CHECKING:
     from openant_agents.drops import DropWatch
@@ -152,6 +153,7 @@ class LearningBar:
             description=name or ("learning" if progress.learning else "exploring"),
             words="  ".join(words),
         )
+        pass_on(f"{100 * progress.average_reward_m_s:+.1f} cm/s", progress.step / progress.steps)
         drop = self._watch.see(progress) if self._watch is not None else None
         if drop is not None:
             self._bar.console.print(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from openant_tools.cli.eval import STARTS_IN_SIMULATION, STARTS_ON_A_ROBOT
 from openant_tools.cli.hardware import Moving
 from openant_tools.cli.learning import need_agents
 from openant_tools.cli.options import SECONDS, json_option, report_option
@@ -26,9 +27,13 @@ policies_option = click.option(
 play_options = (
     click.option(
         "--seconds", type=SECONDS, default=60.0, show_default=True,
-        help="Robot time of a play.",
+        help="Robot time from each start.",
     ),
-    click.option("--plays", type=click.IntRange(min=1), default=3, show_default=True, help="Of each policy."),
+    click.option(
+        "--starts", "--plays", "starts", type=click.IntRange(min=1), metavar="N",
+        help="How often each policy starts anew.  "
+        f"[default: {STARTS_IN_SIMULATION} in a simulation, {STARTS_ON_A_ROBOT} on a robot]",
+    ),
 )  # fmt: skip
 
 
@@ -55,24 +60,29 @@ def policies() -> None:
 @policies.command(cls=Moving)
 @_playing
 @click.option("--on", "place", required=True, metavar="PLACE", help="Where: see `openant policies --help`.")
+@click.option("--likeliest", is_flag=True, help="On a robot also its likeliest action. In a simulation always.")
 @click.option("--yes", is_flag=True, help="The robot may move: do not ask.")
 @click.option(
     "--json", "json_file", type=click.Path(path_type=Path, dir_okay=False), required=True, metavar="FILE",
     help="What to write. A file that stands there goes on: what it has is not played again.",
 )  # fmt: skip
-def play(folder: Path, seconds: float, plays: int, place: str, yes: bool, json_file: Path) -> None:
-    """Play every policy in one place and write what each achieved."""
+def play(
+    folder: Path, seconds: float, starts: int | None, place: str, likeliest: bool, yes: bool, json_file: Path
+) -> None:
+    """Play every policy in one place and write what each achieved.
+
+    Ranked is what it achieves sampled, with actions drawn as in training; its likeliest action stands beside it.
+    """
     need_agents()
     from openant_agents.ranking import find_policies, read_measured, write_measured
 
     runs = find_policies(folder)
     done = read_measured(json_file) if json_file.is_file() else {}
-    for name, measured in _play(runs, place, seconds, plays, yes, known=done):
+    both = likeliest or not _on_robot(place)
+    for name, measured in _play(runs, place, seconds, starts, yes, known=done, likeliest=both):
         done[name] = measured
         write_measured(json_file, done, place=place, seconds=seconds)
-        click.echo(
-            f"{name:24} {100 * measured.average_reward_m_s:+6.1f} ± {100 * measured.standard_error_m_s:.1f} cm/s"
-        )
+        click.echo(f"{name:24} {_achieved(measured)}")
 
 
 @policies.command(cls=Moving)
@@ -92,7 +102,7 @@ def play(folder: Path, seconds: float, plays: int, place: str, yes: bool, json_f
 def rank(
     folder: Path,
     seconds: float,
-    plays: int,
+    starts: int | None,
     real: str,
     simulations: tuple[str, ...],
     flag_by: str | None,
@@ -117,9 +127,9 @@ def rank(
     if flag_by is not None and flag_by != "none" and flag_by not in places:
         raise BadInput(f"no simulation is called {flag_by}", remedy=f"choose one of {', '.join(places)}, or none")
     runs = find_policies(folder)
-    on_robot = dict(_play(runs, real, seconds, plays, yes))
+    on_robot = dict(_play(runs, real, seconds, starts, yes))
     runs = {name: path for name, path in runs.items() if name in on_robot}
-    simulated = {name: dict(_play(runs, place, seconds, plays, False)) for name, place in places.items()}
+    simulated = {name: dict(_play(runs, place, seconds, starts, False)) for name, place in places.items()}
     names = list(runs)
     for name, measured in simulated.items():
         missing = [policy for policy in names if policy not in measured]
@@ -137,8 +147,9 @@ def rank(
     if chooser != "none":
         worse: dict[str, dict[str, Measured]] = {}
         if not places[chooser].endswith(".json"):
+            few = max(1, (starts or STARTS_IN_SIMULATION) // 5)
             for words, wrapper in DISTURBANCES.items():
-                worse[words] = dict(_play(runs, places[chooser], seconds, 1, False, wrapper=wrapper))
+                worse[words] = dict(_play(runs, places[chooser], seconds, few, False, wrapper=wrapper))
         for policy in names:
             otherwise = {words: measured[policy].average_reward_m_s for words, measured in worse.items()}
             otherwise |= {
@@ -208,10 +219,11 @@ def _play(
     runs: Mapping[str, Path],
     place: str,
     seconds: float,
-    plays: int,
+    starts: int | None,
     yes: bool,
     *,
     known: Mapping[str, Measured] | None = None,
+    likeliest: bool = False,
     wrapper: Callable[[Any], Any] | None = None,
 ) -> Any:
     """(name, what it achieved) of each policy, with progress; from a file where the place is one."""
@@ -226,6 +238,7 @@ def _play(
         yield from ((name, one) for name, one in measured.items() if name in runs)
         return
     make = _maker(place, yes)
+    starts = starts or (STARTS_ON_A_ROBOT if _on_robot(place) else STARTS_IN_SIMULATION)
 
     def made(facts: Mapping[str, Any]) -> Any:
         return make(facts) if wrapper is None else wrapper(make(facts))
@@ -240,7 +253,26 @@ def _play(
             if known and name in known:
                 continue
             bar.update(task, completed=0.0, description=f"{place}: {name} ({number} of {len(runs)})")
-            yield name, play_one(run, made, seconds=seconds, plays=plays, report=tell)
+            yield name, play_one(run, made, seconds=seconds, starts=starts, likeliest=likeliest, report=tell)
+
+
+def _achieved(measured: Measured) -> str:
+    """Both ways of a policy in a line, in cm/s."""
+    plays, starts = measured.plays, len(measured.plays)
+    words = f"sampled {100 * measured.median:+6.1f} cm/s"
+    if starts > 1:
+        words += f" ({100 * min(plays):+.1f} to {100 * max(plays):+.1f} in {starts} starts)"
+    if measured.likeliest is not None:
+        likeliest = measured.likeliest
+        words += f", likeliest {100 * likeliest['median']:+6.1f}"
+        if likeliest["stood_still"]:
+            words += f" (stood still for good in {likeliest['stood_still']:.0f} of {starts})"
+    return words
+
+
+def _on_robot(place: str) -> bool:
+    """Whether a place is a robot behind its ports, which starts where it stands."""
+    return place.partition(":")[0] in ("virtual", "hardware")
 
 
 def _maker(place: str, yes: bool) -> Callable[[Mapping[str, Any]], Any]:

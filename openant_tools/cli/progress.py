@@ -6,6 +6,8 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
+from openant_tools.workers import pass_on
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -31,4 +33,9 @@ def progress_bar(
         columns.append(TimeRemainingColumn())
     with Progress(*columns, console=console or Console(stderr=True), transient=True) as bar:
         task = bar.add_task(words, total=1.0)
-        yield lambda words, share: bar.update(task, description=words, completed=share)
+
+        def tell(words: str, share: float) -> None:
+            bar.update(task, description=words, completed=share)
+            pass_on(words, share)
+
+        yield tell

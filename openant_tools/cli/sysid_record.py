@@ -12,6 +12,7 @@ import click
 from openant_tools.cli.hardware import Moving, anyway_option, engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import Number, rate_option, robot_option, seconds_option
 from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
+from openant_tools.workers import pass_on
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -233,12 +234,17 @@ def _record_here(
     columns = TextColumn("{task.description:18}"), BarColumn(), TextColumn("{task.percentage:3.0f} %")
     bar = stack.enter_context(Progress(*columns, TimeElapsedColumn(), console=console, transient=True))
     task = bar.add_task("connecting", total=1.0)
+
+    def tell(words: str, share: float) -> None:
+        bar.update(task, description=words, completed=share)
+        pass_on(words, share)
+
     try:
         return record_takes(
             config,
             wanted,
             robot_toml=None if folder is None else folder.config_file.read_text(),
-            progress=lambda words, share: bar.update(task, description=words, completed=share),
+            progress=tell,
             journal=None if folder is None else folder.journal,
             notice=lambda text: bar.console.print(text, highlight=False),
         )

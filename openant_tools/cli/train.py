@@ -45,6 +45,10 @@ def train() -> None:
     "--entropy-start", type=Number(min=0.0, min_open=True), metavar="ALPHA",
     help="Weight of the entropy at first; 0.1 explores less and walks sooner.  [default: 1]",
 )  # fmt: skip
+@click.option(
+    "--batch", type=click.IntRange(min=1),
+    help="Transitions in an update; half as many take half the time, for a first look.  [default: 256]",
+)  # fmt: skip
 @settings_option
 @click.option(
     "--learn", "learn", type=click.Choice(["between", "beside"]),
@@ -75,6 +79,7 @@ def sac(
     randomise: bool,
     learning_start: int | None,
     entropy_start: float | None,
+    batch: int | None,
     settings_file: Path | None,
     learn: str | None,
     updates_per_step: float,
@@ -107,7 +112,7 @@ def sac(
     from openant_agents.sac import Settings
     from openant_agents.sac import train as train_sac
 
-    given = {"learning_start": learning_start, "entropy_start": entropy_start}
+    given = {"learning_start": learning_start, "entropy_start": entropy_start, "batch": batch}
     settings = settings_of(Settings, settings_file, "sac", given)
     more: dict[str, Any] = {"updates_per_step": updates_per_step} if learn == "beside" else {}
     with training(name, options, yes=yes, steps=steps, out=out) as (env, bar):

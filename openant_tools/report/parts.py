@@ -219,27 +219,32 @@ class Figure:
 
 @dataclass(frozen=True)
 class Picture:
-    """A photograph or a rendering: a PNG or JPEG file, or the bytes of one."""
+    """A photograph, a rendering or a short video: a PNG, JPEG or (animated) WebP file, or the bytes of one.
+
+    Attributes:
+        still: of a picture that moves, what is shown where motion is unwanted.
+    """
 
     data: bytes | Path
     caption: str
     alt: str = ""
+    still: bytes | Path | None = None
 
     def html(self, key: str) -> str:
         alt = escape(self.alt or self.caption, quote=True)
-        picture = f'<img alt="{alt}" src="{_data_url(self._bytes())}">'
+        picture = f'<img alt="{alt}" src="{_data_url(_bytes_of(self.data))}">'
+        if self.still is not None:
+            still = f'<source media="(prefers-reduced-motion: reduce)" srcset="{_data_url(_bytes_of(self.still))}">'
+            picture = f"<picture>{still}{picture}</picture>"
         return f"<figure>{picture}<figcaption>{_inline(self.caption)}</figcaption></figure>"
 
     def markdown(self, key: str, save: SavePicture) -> str:
-        data = self._bytes()
-        path = save(f"{key}.{'jpg' if _is_jpeg(data) else 'png'}", data)
+        data = _bytes_of(self.data)
+        path = save(f"{key}.{_kind_of(data).replace('jpeg', 'jpg')}", data)
         return f"![{(self.alt or self.caption).replace(']', ')')}]({path})\n\n*{self.caption}*"
 
     def json(self) -> dict[str, Any]:
         return {"kind": "picture", "caption": self.caption}
-
-    def _bytes(self) -> bytes:
-        return self.data if isinstance(self.data, bytes) else self.data.read_bytes()
 
 
 @dataclass(frozen=True)
@@ -301,10 +306,15 @@ def _data(cell: object) -> object:
     return cell if isinstance(cell, bool | int | float | str | None) else str(cell)
 
 
-def _is_jpeg(data: bytes) -> bool:
-    return data[:2] == b"\xff\xd8"
+def _bytes_of(picture: bytes | Path) -> bytes:
+    return picture if isinstance(picture, bytes) else picture.read_bytes()
+
+
+def _kind_of(data: bytes) -> str:
+    if data[:2] == b"\xff\xd8":
+        return "jpeg"
+    return "webp" if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else "png"
 
 
 def _data_url(data: bytes) -> str:
-    kind = "jpeg" if _is_jpeg(data) else "png"
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+    return f"data:image/{_kind_of(data)};base64,{base64.b64encode(data).decode()}"
