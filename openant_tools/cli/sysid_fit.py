@@ -22,7 +22,11 @@ __all__ = ["fit"]
 @model_option
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), required=True, metavar="DIR")
 @click.option(
-    "--hold-out", multiple=True, type=click.Path(path_type=Path), metavar="RUN", help="Judge on this run. Repeatable."
+    "--hold-out",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="RUN",
+    help="Judge by this run, once. Repeatable.",
 )
 @click.option("--joint", "joints", multiple=True, metavar="NAME", help="Fit this joint only. Repeatable.")
 @click.option("--kind", "kinds", multiple=True, metavar="KIND", help="Fit this kind of parameter only. Repeatable.")
@@ -60,7 +64,9 @@ def fit(
 ) -> int:
     """Fit a model to recordings and write calibrated.xml, fit.json and report.html to DIR.
 
-    What does not beat the given model on held-out runs falls back to it. Without --hold-out, runs are left out in turn.
+    The runs are left out of the fit in turn, by motion and by gain; a kind of value that does not serve the one left out falls
+    back to the given model. Runs given with --hold-out have no part in that: they judge the outcome once, and all of it falls
+    back if it is not better. Without, runs left out of fit and choice in turn judge.
     With --robot, calibrated.xml and every value with its provenance go into the robot's folder too; effects that its
     robot.toml has act in the fit as they stand there.
 
@@ -75,7 +81,7 @@ def fit(
     voltage_sag …), which is written to calibrated.effects.toml and into robot.toml, and acts in the environment. Anything
     else in an MJCF with --parameters (docs/identify.md).
 
-    Where what is left is not noise, load_friction is tried by itself; if held-out runs are followed better with it, that model
+    Where what is left is not noise, load_friction is tried by itself; if runs left out are followed better with it, that model
     goes to DIR/with-effects and into the robot's folder, and DIR keeps the best for plain MuJoCo. Exit code 1: nothing beats
     the given model.
     """

@@ -1,7 +1,8 @@
 """What a plain model leaves, tried with the effects that MuJoCo has no feature for.
 
 A fit of what MuJoCo carries comes first, because its model plays anywhere. Where what it leaves is not noise, the same fit
-is done once more with what geared servos are known to do beside it, and kept apart: only if it follows held-out runs better.
+is done once more with what geared servos are known to do beside it, and kept apart: only if it follows what is left out of the
+fit better.
 """
 
 from __future__ import annotations
@@ -10,16 +11,18 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from openant_tools.model.gap import Gap
 from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
 from openant_tools.robot.config import Effect as Entry
+from openant_tools.sysid.choice import pays, pooled
 from openant_tools.sysid.dataset import sensor_floor
 from openant_tools.sysid.declared import Declaration
-from openant_tools.sysid.identify import WORTH, Identification, identify
+from openant_tools.sysid.identify import Identification, identify
 from openant_tools.sysid.kinds import ELECTRICAL_DAMPING, KINDS
 from openant_tools.sysid.weights import WHITE
 
-__all__ = ["TRIED", "better", "brakes_alike", "with_effects"]
+__all__ = ["TRIED", "better", "brakes_alike", "chosen_in_turn", "with_effects"]
 
 Progress = Callable[[str, float], None]
 
@@ -57,8 +60,8 @@ def with_effects(
     Args:
         plain: what `identify` made of the same runs with the same arguments.
         runs, hold_out, also, tie, declared, effects, progress: as `identify` took them.
-        measured_supply: as well; where it was not asked for, gains and torque limits follow what was logged if that explains
-            the fitted runs better. (A plain model has to do without: a simulation knows no voltage.)
+        measured_supply: as well; where it was not asked for, gains and torque limits follow what was logged if runs that are
+            left out are followed better so. (A plain model has to do without: a simulation knows no voltage.)
     """
     acting = {name for name, _ in plain.effects}
     tried = [kind for kind in TRIED if kind not in also and (KINDS[kind].effect or ("",))[0] not in acting]
@@ -80,10 +83,20 @@ def with_effects(
 
 
 def better(richer: Identification, plain: Identification) -> bool:
-    """Whether a fit with effects found some, and follows held-out runs better than the plain one at both horizons."""
+    """Whether a fit with effects found some, and follows what was left out of it better than the plain one at both horizons.
+
+    Held-out runs have no say in it: they judge.
+    """
     found = any(value.accepted and value.name.partition(".")[0] in TRIED for value in richer.values)
-    short, long = richer.after.horizon / plain.after.horizon, richer.after.full / plain.after.full
-    return found and max(short, long) < 1.0 and min(short, long) < 1.0 - WORTH
+    return found and pays(richer.choice.after, plain.choice.after)
+
+
+def chosen_in_turn(richer: Identification, plain: Identification) -> Gap | None:
+    """What the better of both leaves of runs left out in turn, where it is chosen anew without each; None where none were."""
+    best = [
+        one if pays(one.chosen, other.chosen) else other for one, other in zip(richer.turns, plain.turns, strict=True)
+    ]
+    return pooled([turn.after for turn in best], [turn.samples for turn in best]) if best else None
 
 
 def brakes_alike(plain: Identification, richer: Identification) -> bool:

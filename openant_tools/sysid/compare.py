@@ -19,13 +19,12 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from openant_tools.errors import BadInput
+from openant_tools.sysid.intervals import TWO_SIDED_95
 
 __all__ = ["FAMILY_ERROR", "Change", "Comparison", "Estimate", "Snapshot", "compare", "holm"]
 
 #: probability that anything at all is called changed where nothing has
 FAMILY_ERROR = 0.05
-#: half width of a 95 % interval over standard deviation, of a normal distribution
-TWO_SIDED_95 = 1.96
 #: verdicts of fit.json under which a value is no statement of the data
 _SILENT = {
     "not in the data": "the data of {} do not determine it",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from openant_tools.effects.rollout import EffectValues, rollout
 from openant_tools.model.floor import steps
-from openant_tools.model.gap import HORIZON_S, Gap, gap
+from openant_tools.model.gap import HORIZON_S, Gap
 from openant_tools.model.plant import Plant, Setup
 from openant_tools.model.rollout import Rollouts, Trajectories
 from openant_tools.recording.run import Run
@@ -138,13 +138,16 @@ def runs_of(datasets: Sequence[Dataset]) -> Iterator[tuple[Dataset, Run, slice]]
 
 def gaps(datasets: Sequence[Dataset], parameters: Sequence[Parameter], us: Sequence[Array]) -> list[Gap]:
     """The gap of each variant over all datasets together, at the horizon and over full runs."""
-    measured = np.concatenate([data.measured for data in datasets])
-    simulated = []
-    for horizon in (True, False):
-        per_dataset = [data.simulate(parameters, us, data.horizon if horizon else data.full).pos for data in datasets]
-        simulated.append(np.concatenate(per_dataset, axis=1))
-    short, long = simulated
-    return [Gap(gap(measured, short[v]), gap(measured, long[v])) for v in range(len(us))]
+    squares, samples = np.zeros((2, len(us))), np.zeros((2, len(us)))
+    for data in datasets:
+        for which, rollouts in enumerate((data.horizon, data.full)):
+            for rows, pos, _ in data.stream(parameters, us, rollouts):
+                error = (data.measured[rows] - pos) ** 2
+                squares[which] += np.nansum(error, axis=(1, 2))
+                samples[which] += np.isfinite(error).sum(axis=(1, 2))
+    with np.errstate(invalid="ignore"):  # where nothing compares there is no gap
+        short, full = np.sqrt(squares / samples).tolist()
+    return [Gap(*both) for both in zip(short, full, strict=True)]
 
 
 def sensor_floor(runs: Sequence[Run], joints: Sequence[str]) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,8 @@ class Posterior:
         covariance: (parameters, parameters) of u, the prior included.
         centre: (parameters,) the middle of the prior.
         low, high: (parameters,) the physical bounds of u.
+        precision: (parameters, parameters) of u, what the data alone say.
+        prior_precision: (parameters,) of u: 1, or next to nothing where the prior would have held the estimate back.
     """
 
     u: Array
@@ -40,6 +43,18 @@ class Posterior:
     centre: Array
     low: Array
     high: Array
+    precision: Array
+    prior_precision: Array
+
+    @cached_property
+    def narrow(self) -> Array:
+        """(parameters, parameters) covariance of u as the residuals alone have it, the prior included."""
+        return np.asarray(np.linalg.inv(self.precision + np.diag(self.prior_precision)), np.float64)
+
+    @property
+    def information(self) -> Array:
+        """(parameters,) share of each one's precision that the data gave, all others free: 0 prior only, 1 data."""
+        return 1.0 - np.diag(self.narrow) * self.prior_precision
 
     def with_given(self, back: Bools) -> Array:
         """u given that the parameters in `back` are at the given model's values (0), to first order.
@@ -58,9 +73,10 @@ class Posterior:
 
 def posterior(found: Descent, weighing: Weighing, prior: Prior) -> Posterior:
     """To first order, where a descent ended."""
-    precision, _ = found.tangent.normal(found.point, weighing(found.point).each, prior)
-    covariance = np.asarray(np.linalg.inv(precision), np.float64)
-    return Posterior(found.point.u, covariance, prior.centre, prior.low, prior.high)
+    both, _ = found.tangent.normal(found.point, weighing(found.point).each, prior)
+    covariance = np.asarray(np.linalg.inv(both), np.float64)
+    told = both - np.diag(prior.precision)
+    return Posterior(found.point.u, covariance, prior.centre, prior.low, prior.high, told, prior.precision)
 
 
 @dataclass(frozen=True)
@@ -69,13 +85,11 @@ class Estimate(Posterior):
 
     Attributes:
         parameters: what was estimated.
+        found: where the descent ended.
         step_shift: (parameters,) of u, by which a model with an infinitely small time step would be fitted otherwise.
-        precision: (parameters, parameters) of u, what the data alone say.
-        information: (parameters,) share of each parameter's posterior precision that the data gave: 0 prior only, 1 data.
         halves: (2, parameters) of u, what each half of the data alone would say (to first order); NaN where there is one.
         contradictory: (parameters,) whether the two halves differ by more than chance.
         contradicts: (parameters,) whether the estimate lies where the prior says that it cannot.
-        prior_precision: (parameters,) of u: 1, or next to nothing where the prior would have held the estimate back.
         noise: (joints,) rad, standard deviation of the residual per joint, of all datasets.
         correlation_s: (joints,) s, integrated autocorrelation time of the residual.
         stamp_error_s: s, standard deviation by which the rows' time stamps miss the moments of sampling, row by row.
@@ -84,13 +98,11 @@ class Estimate(Posterior):
     """
 
     parameters: tuple[Parameter, ...]
+    found: Descent
     step_shift: Array
-    precision: Array
-    information: Array
     halves: Array
     contradictory: Bools
     contradicts: Bools
-    prior_precision: Array
     noise: Array
     correlation_s: Array
     stamp_error_s: float
@@ -119,6 +131,7 @@ def estimate(found: Descent, model: ForwardModel, weighing: Weighing, prior: Pri
     each, contradictory = halves(model.datasets, weighing, found, prior, free)
     return Estimate(
         parameters=tuple(model.parameters),
+        found=found,
         u=u,
         covariance=np.outer(wider, wider) * covariance + open_ @ open_.T,
         step_shift=step_shift,
@@ -126,8 +139,6 @@ def estimate(found: Descent, model: ForwardModel, weighing: Weighing, prior: Pri
         centre=prior.centre,
         low=prior.low,
         high=prior.high,
-        # What the data, all other parameters free, say about each: 1 − posterior variance over prior variance.
-        information=1.0 - np.diag(covariance) * prior.precision,
         halves=each,
         contradictory=contradictory,
         contradicts=np.abs(u - prior.centre) > CONFLICT,

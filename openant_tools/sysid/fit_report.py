@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,7 +48,7 @@ VERDICTS = """
 - **tied**: the data tell it only together with the other that is named; knowing one would settle both.
 - **conflict**: the data are certain, and contradict what the given model says; the data's value is written.
 - **not in the data**: the data say nothing about it; it stays at its prior.
-- **fell back**: it did not beat the given model on held-out runs; the given value stays.
+- **fell back**: it did not beat the given model on runs that the fit had not seen; the given value stays.
 """
 
 
@@ -98,9 +99,8 @@ def fit_report(result: Identification) -> Report:
     for data in result.held_out:
         report.add(*_joints(result, data))
     report.section("How it was judged").text(
-        f"The gap is the root mean square of measured minus simulated position over all joints and samples. "
-        f"{'Runs were left out in turn, each simulated by a fit to the others' if result.in_turn else 'Held-out runs'}: "
-        f"{', '.join(result.judged_on)}. Simulations start from the measured state and play the run's own commands."
+        "The gap is the root mean square of measured minus simulated position over all joints and samples. Simulations start from "
+        f"the measured state and play the run's own commands. {_judged(result)}"
     )
     report.table(
         ["joint", "residual (mrad)", "it remembers itself for (s)"],
@@ -140,6 +140,18 @@ def _matrix(correlation: Array, names: Sequence[str]) -> MatplotlibFigure:
     return figure
 
 
+def _judged(result: Identification) -> str:
+    folds = "; ".join(", ".join(names) for names in result.folds)
+    chosen = f"What is kept was chosen by folds within the fitted runs, each followed by a fit to the others: {folds}."
+    if not result.in_turn:
+        return f"{chosen} Held-out runs judged it once, and had no part in it: {', '.join(result.judged_on)}."
+    turns = "; ".join(", ".join(turn.runs) for turn in result.turns)
+    return (
+        f"{chosen} Judged was by the same runs in turn, nested: without each the fit was made and what is kept was chosen anew, and "
+        f"that model followed it: {turns}. The figures are of those models, not of the written one, which has seen all."
+    )
+
+
 def _names(result: Identification) -> list[str]:
     return [run.name for data in result.datasets for run in data.runs]
 
@@ -175,6 +187,7 @@ def _error_against_horizon(result: Identification) -> MatplotlibFigure:
     given, calibrated = [], []
     sheets = [data_sheet_model(data.plant, data.runs) for data in result.held_out]
     by_sheet: list[float] = []
+    none = np.zeros(0)
     longest = max(run.duration_s for data in result.held_out for run in data.runs)
     horizons = [horizon for horizon in HORIZONS_S if horizon < longest / 2]
     for horizon in [*horizons, None]:
@@ -186,7 +199,9 @@ def _error_against_horizon(result: Identification) -> MatplotlibFigure:
             before.append(pos[0])
             after.append(pos[1])
             if (model := sheets[k]) is not None:
-                sheet.append(rollouts([model]).pos[0])
+                # As the others: what robot.toml knows acts, and where the fit followed the logged supply, so does this.
+                sold = replace(data, plant=replace(data.plant, model=model))
+                sheet.append(sold.simulate((), [none], Rollouts(sold.plant, data.runs, horizon)).pos[0])
         truth = np.concatenate(measured)
         given.append(1e3 * gap(truth, np.concatenate(before)))
         calibrated.append(1e3 * gap(truth, np.concatenate(after)))

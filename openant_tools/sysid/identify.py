@@ -1,21 +1,22 @@
 """Identification from end to end: runs and a model in; values with intervals and verdicts, judged on held-out runs, out.
 
-What is reported as better was measured on runs that the fit did not see. A parameter that the data cannot determine stays at
-its prior; whatever does not beat the given model on held-out runs, at the short horizon and over full runs, goes back.
+What is reported as better was measured on runs that neither the fit nor any choice saw. A parameter that the data cannot
+determine stays at its prior; what does not beat the given model on runs that are left out of the fit in turn, at the short horizon
+and over full runs, goes back (`choice.py`). Runs that were held out judge once, and may only send all of it back.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from openant_tools.effects.catalogue import acting
 from openant_tools.effects.entries import check_pair, entries_of, values_of
@@ -28,9 +29,11 @@ from openant_tools.model.of_run import own_model, plants_of
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.recording.run import Run
 from openant_tools.robot.config import Effect as Entry
+from openant_tools.sysid.choice import Choice, Fold, Settled, by_gain, by_motion, pays, pooled, settle
 from openant_tools.sysid.dataset import Dataset, gaps, sensor_floor
 from openant_tools.sysid.declared import Declaration, declared_parameters
-from openant_tools.sysid.estimate import Estimate, Posterior
+from openant_tools.sysid.estimate import Estimate
+from openant_tools.sysid.intervals import TWO_SIDED_95
 from openant_tools.sysid.kinds import ACTUATOR_LAG, LOAD_FRICTION, SPEED_LIMIT
 from openant_tools.sysid.parameter import (
     ACTION_DELAY,
@@ -82,12 +85,6 @@ DEFAULT_KINDS = (
 #: and with them, where a robot stood on the floor
 ON_FLOOR = ("floor_friction", "contact_softness")
 
-#: going back must pay this much on held-out runs (relative, over both horizons): less is luck
-WORTH = 0.01
-#: and, where two or three motions are left out in turn, must pay with this probability
-CERTAIN = 0.95
-#: times that runs are left out in turn, at most: each is another fit
-MOST_FOLDS = 4
 #: share of a run's samples that may be missing without a word
 MISSING = 0.01
 #: what is said where gains and torque limits follow it
@@ -95,12 +92,15 @@ FOLLOWED = (
     "Gains and torque limits follow the logged supply, in the given model and in the fitted one: at the nominal supply, as "
     "`openant gap measure` plays them, both leave other errors than are told here."
 )
+#: and where held-out runs sent back what was chosen
+SENT_BACK = (
+    "Held-out runs are not followed better by what was chosen ({:.1f} → {:.1f} mrad over full runs, {:.1f} → {:.1f} mrad at "
+    + f"{HORIZON_S:g} s), so all of it goes back: they differ from the fitted runs in what these do not tell."
+)
 #: share by which a supply falls before it is worth a word: a servo measures it in steps of 0.1 V
 SAG = 0.03
 #: s; a row's time stamp may be off by this much without a word
 STAMP_ERROR_S = 0.5e-3
-#: 95 % of a normal distribution
-TWO_SIDED_95 = 1.96
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class Value:
         prior_low, prior_high: 95 % interval of the prior.
         verdict: `identified`, `weak` (between data and prior), `tied` (the data tell it only together with another),
             `conflict` (the data's, which contradict the prior), `not in the data` (left at its prior) or `fell back` (it
-            did not beat the given model on held-out runs).
+            did not beat the given model on runs that the fit had not seen).
         information: share of the precision that the data gave, 0…1.
         tied_to: the other parameter's name, where it is tied.
         record_next: what to record so that it becomes identified; empty where it is, or where nothing is known.
@@ -157,6 +157,24 @@ class Value:
 
 
 @dataclass(frozen=True)
+class Turn:
+    """Runs that were left out of everything, choices included, and judged what came of the others.
+
+    Attributes:
+        runs: their names.
+        samples: how many positions they have.
+        chosen: what the choice leaves of the folds within the others.
+        before, after: the gap on the runs, of the given model and of what was chosen.
+    """
+
+    runs: tuple[str, ...]
+    samples: int
+    chosen: Gap
+    before: Gap
+    after: Gap
+
+
+@dataclass(frozen=True)
 class Identification:
     """The result of a fit.
 
@@ -168,7 +186,9 @@ class Identification:
         floor: rad, what no model could beat on these runs, from repeats or the encoder's resolution.
         doubt: why that floor is none; "" where it holds.
         judged_on: names of the held-out runs; where none were given, of the runs left out in turn.
-        in_turn: whether runs were left out in turn, each judged by a fit to the others.
+        turns: where runs were left out in turn, each judged by a fit to the others and a choice made anew without it.
+        folds: names of the runs, or parts of them, that were left out together for `choice`.
+        choice: what of the fit to all runs beats the given model on the folds.
         noise: joint → rad, residual deviation of the fit.
         correlation_s: joint → s, how long a residual remembers itself; far above the sample time it is model error.
         stamp_error_s: s, standard deviation by which time stamps miss the moments of sampling, row by row.
@@ -185,7 +205,9 @@ class Identification:
     after: Gap
     floor: float
     judged_on: tuple[str, ...]
-    in_turn: bool
+    turns: tuple[Turn, ...]
+    folds: tuple[tuple[str, ...], ...]
+    choice: Choice
     noise: Mapping[str, float]
     correlation_s: Mapping[str, float]
     stamp_error_s: float
@@ -199,6 +221,10 @@ class Identification:
     doubt: str = ""
     checked: tuple[str, ...] = ()
     with_effects: Identification | None = None
+
+    @property
+    def in_turn(self) -> bool:
+        return bool(self.turns)
 
     @property
     def models(self) -> tuple[Path, ...]:
@@ -250,11 +276,18 @@ class Identification:
             "held_out": {
                 "runs": list(self.judged_on),
                 "in_turn": self.in_turn,
+                "nested": self.in_turn,
                 "before": figures(self.before),
                 "after": figures(self.after),
                 "floor_rad": self.floor,
                 "doubt": self.doubt,
                 "share_closed": share_closed(self.before.full, self.after.full, self.floor),
+            },
+            "chosen": {
+                "folds": [list(names) for names in self.folds],
+                "before": figures(self.choice.before),
+                "after": figures(self.choice.after),
+                "measured_supply": self.datasets[0].measured_supply,
             },
             "accepted": list(self.accepted),
             "acting": [
@@ -283,19 +316,20 @@ def identify(
     checked: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Identification:
-    """Fit `model` to `runs` and judge the result on `hold_out`, or by leaving out runs in turn.
+    """Fit `model` to `runs`, choose what of it is kept by folds within them, and judge that once on `hold_out`; without those by
+    leaving out runs in turn, each judged by a fit and a choice that had no part of it.
 
     Args:
         runs: what to fit; each may name its own model of the same joints (formats, section 1).
         model: the MJCF whose values are the priors and into which the result goes.
-        hold_out: runs that the fit must not see.
+        hold_out: runs that fit and choice must not see; if what was chosen does not beat the given model on them, all goes back.
         joints: which joints to fit; default every position-controlled joint that all runs command and measure.
         kinds: keys of KINDS; default what `declared` asks for, else DEFAULT_KINDS as far as they apply.
         also: keys of KINDS besides the default ones.
         tie: `joint` (each its own values), `servo` (one value for all joints of a servo model) or `all`.
         declared: parameters that a user declared, fitted besides.
-        measured_supply: gains and torque limits follow the voltage that the runs logged, in the given model too; None: if that
-            explains the fitted runs better.
+        measured_supply: gains and torque limits follow the voltage that the runs logged, in the given model too; None: if what
+            is left out of the fit is followed better so.
         effects: `[[effect]]` entries that the robot has: those that act between steps act in every simulation as they are,
             unless they are fitted themselves.
         checked: what `check_runs` noted of all these runs, where they have gone through it before; default they do now.
@@ -336,12 +370,11 @@ def identify(
     played = _played(effects, wanted)
     acting = values_of(played, joints)
 
-    supply = bool(measured_supply)
-
     def datasets(of: Sequence[Run], supply: bool) -> list[Dataset]:
         return _datasets(of, model, joints, wanted, supply, acting)
 
-    data, judged = datasets(runs, supply), datasets(hold_out, supply)
+    supplies = (False, True) if measured_supply is None and logged else (bool(measured_supply),)
+    data, judged = datasets(runs, supplies[0]), datasets(hold_out, supplies[0])
     for one in (*data, *judged):
         beside = check_pair(played, one.plant.model, one.plant.path)
         # An effect that is fitted makes a pair of its own.
@@ -358,38 +391,47 @@ def identify(
     chosen += declared_parameters(plant, declared) if declared else []
     floor = np.maximum(sensor_floor(runs, joints), 1e-6)
 
-    tried = 2 if measured_supply is None and logged else 1
-    total = tried + 2  # the fits, those with runs left out, and judging
+    motions = by_motion(runs, joints)
+    gains = by_gain(runs, lambda run: own_model(run) or model)
+    turns = () if hold_out else motions
+    total = 2 * len(supplies) + 1  # each a fit and its folds; and judging
 
     def share(part: int) -> Progress | None:
         return progress and (lambda what, done: progress(what, (part + done) / total))
 
-    problem = Problem(data, chosen, floor)
-    estimate = problem.solve(progress=share(0))
-    if tried == 2:
-        following = Problem(datasets(runs, True), chosen, floor)
-        other = following.solve(estimate.u, progress=share(1))
-        supply = other.score < estimate.score
-        if supply:
-            problem, estimate = following, other
-            data, judged = list(following.datasets), datasets(hold_out, True)
-    trials: list[tuple[Posterior, list[Dataset]]] = [(estimate, judged)]
-    tests: list[Run] = []
-    if not hold_out:
-        parts, folds = _folds(runs)
-        whole = (
-            problem if len(parts) == len(runs) else Problem(datasets(parts, supply), chosen, floor, freed=problem.freed)
+    ways = list[tuple[Problem, Estimate, list[Settled]]]()
+    for supply in supplies:
+        problem = Problem(data if supply == supplies[0] else datasets(runs, supply), chosen, floor)
+        start = ways[0][1].u if ways else None
+        estimate = problem.solve(start, share(2 * len(ways)))
+        prepare = partial(datasets, supply=supply)
+        ways.append(
+            (problem, estimate, settle(problem, estimate, motions, gains, turns, prepare, share(2 * len(ways) + 1)))
         )
-        # Where all runs lead is near where most of them do; that it is only the start says nothing of the run left out.
-        posteriors = whole.solve_without(folds, estimate.u, share(tried))
-        trials = [(one, datasets(test, supply)) for one, test in zip(posteriors, folds, strict=True)]
-        tests = [run for test in folds for run in test]
-
-    untied = verdicts(estimate, np.ones(len(chosen), bool))
-    undetermined = np.array([verdict.word == "not in the data" for verdict in untied], bool)
-    kept, before, after = _judge(trials, chosen, undetermined, share(tried + 1))
-    u = np.where(kept, estimate.with_given(~kept), 0.0)
-    u[undetermined & kept] = problem.centre[undetermined & kept]
+    # What is chosen of all runs comes first, then what is chosen anew without each turn.
+    best, *anew = (
+        1 if len(each) > 1 and pays(each[1].choice.after, each[0].choice.after) else 0
+        for each in zip(*(settled for *_, settled in ways), strict=True)
+    )
+    problem, estimate, (settled, *_) = ways[best]
+    data, kept, u = list(problem.datasets), settled.choice.kept, settled.u
+    if progress:
+        progress("judging what was chosen", (total - 1) / total)
+    sent_back = list[str]()
+    told = [_turn(ways[way][2][1 + k], fold, chosen) for k, (way, fold) in enumerate(zip(anew, turns, strict=True))]
+    if told:
+        samples = [turn.samples for turn in told]
+        before, after = (pooled([getattr(turn, end) for turn in told], samples) for end in ("before", "after"))
+        if not kept.any():
+            after = before  # it is the given model that is written, whatever came of fewer runs
+    else:
+        judged = judged if data[0].measured_supply == supplies[0] else datasets(hold_out, True)
+        before, after = gaps(judged, chosen, [np.zeros(len(chosen)), u])
+        if not (after.horizon < before.horizon and after.full < before.full):
+            sent_back.append(
+                SENT_BACK.format(1e3 * before.full, 1e3 * after.full, 1e3 * before.horizon, 1e3 * after.horizon)
+            )
+            kept, u, after = np.zeros(len(chosen), bool), np.zeros(len(chosen)), before
     found = verdicts(estimate, kept)
     values = tuple(
         _value(p, next(one.plant for one in data if p.belongs(one.plant)), estimate, k, found[k], float(u[k]))
@@ -403,8 +445,10 @@ def identify(
         after=after,
         floor=float(np.sqrt(np.mean(floors([*runs, *hold_out], joints)[0] ** 2))),
         doubt=(doubt := disagreement([*runs, *hold_out], joints)),
-        judged_on=tuple(run.name for run in (hold_out or tests)),
-        in_turn=not hold_out,
+        judged_on=tuple(run.name for run in hold_out) or tuple(name for turn in told for name in turn.runs),
+        turns=tuple(told),
+        folds=tuple(tuple(run.name for run in fold.runs) for fold in (*motions, *gains)),
+        choice=settled.choice,
         noise=dict(zip(joints, estimate.noise.tolist(), strict=True)),
         correlation_s=dict(zip(joints, estimate.correlation_s.tolist(), strict=True)),
         stamp_error_s=estimate.stamp_error_s,
@@ -418,12 +462,18 @@ def identify(
         notes=(
             *dict.fromkeys(said),
             *([doubt] if doubt else []),
+            *sent_back,
             *_telemetry_notes(everything, telemetry),
             *_acting_notes(acting),
-            *([FOLLOWED] if supply else _supply_notes(everything, joints)),
+            *([FOLLOWED] if data[0].measured_supply else _supply_notes(everything, joints)),
             *_notes(estimate, joints, runs, values),
         ),
     )
+
+
+def _turn(settled: Settled, fold: Fold, parameters: Sequence[Parameter]) -> Turn:
+    before, after = gaps(settled.unseen, parameters, [np.zeros(len(parameters)), settled.u])
+    return Turn(tuple(run.name for run in fold.runs), settled.samples, settled.choice.after, before, after)
 
 
 def joints_in_common(runs: Sequence[Run], model: Path, wanted: Sequence[str] | None) -> list[str]:
@@ -539,119 +589,6 @@ def _by_default(plant: Plant, *, limp: bool, on_floor: bool) -> list[str]:
     if plant.free_joint is not None and on_floor:
         out += ON_FLOOR
     return out
-
-
-def _folds(runs: Sequence[Run]) -> tuple[list[Run], list[list[Run]]]:
-    """What to leave out in turn: each motion with its repeats, or where there are many a share of them; a single motion is cut
-    in three and loses a third at a time.
-
-    Returns:
-        all runs, or the parts that they were cut into; and those to leave out, turn by turn.
-    """
-    names = {run.name: run.facts.repeat_of or run.name for run in runs}
-    motions = list(dict.fromkeys(names.values()))
-    if len(motions) > 1:
-        fold = {motion: k % MOST_FOLDS for k, motion in enumerate(motions)}
-        turns = range(min(MOST_FOLDS, len(motions)))
-        return list(runs), [[run for run in runs if fold[names[run.name]] == k] for k in turns]
-    folds: list[list[Run]] = [[], [], []]
-    for run in runs:
-        edges = np.linspace(run.t[0], run.t[-1] + 1e-9, 4)
-        for k, fold_k in enumerate(folds):
-            fold_k.append(replace(run.between(edges[k], edges[k + 1]), name=f"{run.name}[{k + 1}/3]"))
-    return [run for fold_k in folds for run in fold_k], folds
-
-
-def _judge(
-    trials: Sequence[tuple[Posterior, Sequence[Dataset]]],
-    parameters: Sequence[Parameter],
-    undetermined: NDArray[np.bool_],
-    progress: Progress | None = None,
-) -> tuple[NDArray[np.bool_], Gap, Gap]:
-    """Which parameters keep their estimates: the rule of formats, section 6.
-
-    Starting from all, the kind or joint whose return to the given model helps most on held-out runs goes back, as long as
-    one does, by more than chance; and on, while what is left does not beat the given model at both horizons.
-    """
-    told = 0.0
-
-    def tell() -> None:
-        # How many go back nobody knows beforehand, mostly none or few.
-        nonlocal told
-        if progress:
-            progress("judging on held-out runs", told)
-        told += (1.0 - told) / 3
-
-    tell()
-    before = _left(trials, parameters, [np.zeros(len(parameters), bool)], undetermined)[0]
-    kept = np.ones(len(parameters), bool)
-    after = _left(trials, parameters, [kept], undetermined)[0]
-    while kept.any():
-        tell()
-        # What is kept must pay too. Where physics knows better than the given model, its value is no safer one.
-        short, full, pays = after[0].horizon, after[0].full, _score(after[0], before[0])
-        beats = short < before[0].horizon and full < before[0].full and pays < -WORTH
-        groups = [
-            np.array([bool(kept[k]) and p.kind == kind for k, p in enumerate(parameters)])
-            for kind in dict.fromkeys(p.kind for p in parameters if not beats or p.centre == 0)
-        ]
-        labels = list(dict.fromkeys(p.label for p in parameters))
-        if len(labels) > 1:
-            groups += [
-                np.array([bool(kept[k]) and p.label == label for k, p in enumerate(parameters)]) for label in labels
-            ]
-        options = [kept & ~group for group in groups if group.any()]
-        results = _left(trials, parameters, options, undetermined)
-        if beats:
-            # What helps on one motion and hardly on another is luck, and two or three motions have much of it.
-            helps = [_helps(result, after, before) for result in results]
-            options = [option for option, one in zip(options, helps, strict=True) if one]
-            results = [result for result, one in zip(results, helps, strict=True) if one]
-            if not options:
-                break
-        best = min(range(len(options)), key=lambda k: _score(results[k][0], before[0]))
-        if beats and _score(results[best][0], before[0]) > pays - WORTH:
-            break
-        kept, after = options[best], results[best]
-    return kept, before[0], after[0]
-
-
-def _helps(one: Sequence[Gap], other: Sequence[Gap], before: Sequence[Gap]) -> bool:
-    """Whether one choice of parameters follows what was left out better than another, where trials are few by more than they
-    differ (Student)."""
-    gains = [_score(b, given) - _score(a, given) for a, b, given in zip(one[1:], other[1:], before[1:], strict=True)]
-    n = len(gains)
-    if n in (1, MOST_FOLDS):
-        return True
-    error = float(np.std(gains, ddof=1)) / math.sqrt(n)
-    return float(np.mean(gains)) > float(student.ppf(CERTAIN, n - 1)) * error
-
-
-def _score(figure: Gap, before: Gap) -> float:
-    """Mean log ratio to the given model over both horizons; a horizon that is worse than given counts thrice."""
-    ratios = np.log([figure.horizon / before.horizon, figure.full / before.full])
-    return float(np.mean(np.where(ratios > 0, 3 * ratios, ratios)))
-
-
-def _left(
-    trials: Sequence[tuple[Posterior, Sequence[Dataset]]],
-    parameters: Sequence[Parameter],
-    options: Sequence[NDArray[np.bool_]],
-    undetermined: NDArray[np.bool_],
-) -> list[list[Gap]]:
-    """For each option of kept parameters the gap over all held-out rows, and then that of each trial."""
-    squares = np.zeros((len(options), len(trials), 2))
-    count = np.zeros((len(trials), 1))
-    for t, (posterior, test) in enumerate(trials):
-        us = []
-        for kept in options:
-            us.append(np.where(undetermined & kept, posterior.centre, posterior.with_given(~kept)))
-        count[t] = sum(int(np.isfinite(data.measured).sum()) for data in test)
-        for k, figure in enumerate(gaps(test, parameters, us)):
-            squares[k, t] = count[t] * np.array([figure.horizon, figure.full]) ** 2
-    return [
-        [Gap(*np.sqrt(one.sum(axis=0) / count.sum())), *(Gap(*row) for row in np.sqrt(one / count))] for one in squares
-    ]
 
 
 def _value(parameter: Parameter, plant: Plant, estimate: Estimate, k: int, verdict: Verdict, u: float) -> Value:

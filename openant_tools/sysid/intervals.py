@@ -16,12 +16,14 @@ from openant_tools.sysid.forward import ForwardModel
 from openant_tools.sysid.solve import Descent, Point, Prior
 from openant_tools.sysid.weights import Weighing, Weights
 
-__all__ = ["TIMING_STD_S", "halves", "left_open", "wider_by_blocks"]
+__all__ = ["TIMING_STD_S", "TWO_SIDED_95", "halves", "left_open", "wider_by_blocks"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+#: 95 % of a normal distribution
+TWO_SIDED_95 = 1.96
 #: half of the ±2 ms within which delays count as calibrated (effects.md)
 TIMING_STD_S = 1e-3
 #: models about the estimate that are looked at for how contacts chatter

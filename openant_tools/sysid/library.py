@@ -126,12 +126,14 @@ def fit(
     """Fit a model to runs, and judge it on runs that the fit has not seen.
 
     The result has `values` (each with interval and verdict), `before` and `after` (the gap on held-out runs, rad), `floor` (rad,
-    what no model could beat) and `notes`. What does not beat the given model on held-out runs goes back to it.
+    what no model could beat) and `notes`. What does not beat the given model on folds that are left out of the fit, by motion and
+    by gain, goes back to it.
 
     Args:
         runs: what to fit. Where they name models of their own that differ in their gains, they are of one servo.
         model: the MJCF of all runs, whose values are the priors; default of each run its own, else the robot's.
-        hold_out: runs to judge by; without, the fitted ones are left out in turn, each judged by a fit to the others.
+        hold_out: runs to judge by, once: no choice sees them, and if what was chosen does not beat the given model there, all of
+            it goes back. Without, the fitted ones are left out in turn, each judged by a fit and choices made without it.
         robot: a robot's folder: its model where a run names none, and the effects in its robot.toml, which act as they are.
         joints: those to fit; default every position-controlled joint that all runs command and measure.
         kinds: nothing but these kinds of parameters (docs/identify.md); default what applies.
@@ -139,8 +141,8 @@ def fit(
         tie: `joint` (each its own values), `servo` (one for all joints of a servo model) or `all`.
         declared: other numbers of the MJCF, as `sysid.declared.read_declarations` reads them.
         measured_supply: gains and torque limits follow the voltage that the runs logged, in the given model too.
-        beyond_mujoco: try, too, what MuJoCo has no feature for, unless kinds were named: where that follows held-out runs
-            better, it is `result.with_effects`. If not, the robot's effects of another model do not act, either.
+        beyond_mujoco: try, too, what MuJoCo has no feature for, unless kinds were named: where that follows runs left out of the
+            fit better, it is `result.with_effects`. If not, the robot's effects of another model do not act, either.
         tell: called before the fit begins with each note of the rules, which `notes` have as well.
         progress: called with what is being done and the share that is done, 0…1.
 
@@ -363,7 +365,7 @@ def summary(found: Identification) -> str:
         f"{value.name:{width}}  {value.value:10.5g}  {value.interval:{wide}}  {value.unit:10} {value.words}"
         for value in found.values
     ]
-    judged = "runs left out in turn" if found.in_turn else "held-out runs"
+    judged = "runs left out in turn, each with all choices made anew" if found.in_turn else "held-out runs"
     lines.append(
         f"error on {judged}, full run: {1e3 * found.before.full:.2f} → {1e3 * found.after.full:.2f} mrad; "
         f"{HORIZON_S:g} s: {1e3 * found.before.horizon:.2f} → {1e3 * found.after.horizon:.2f} mrad; "

@@ -24,12 +24,13 @@ from openant_tools.sysid.dataset import Dataset
 from openant_tools.sysid.excitation import CommandSpace
 from openant_tools.sysid.forecast import Forecast, forecast
 from openant_tools.sysid.forward import STEP
-from openant_tools.sysid.identify import IDENTIFIED, NOT_IN_THE_DATA, TWO_SIDED_95, applicable
-from openant_tools.sysid.intervals import TIMING_STD_S
+from openant_tools.sysid.identify import applicable
+from openant_tools.sysid.intervals import TIMING_STD_S, TWO_SIDED_95
 from openant_tools.sysid.kinds import ELECTRICAL_DAMPING
 from openant_tools.sysid.parameter import Parameter, apply, choose, colours
 from openant_tools.sysid.plan_file import as_table
 from openant_tools.sysid.protocols import Protocol
+from openant_tools.sysid.verdict import TIED, told
 
 __all__ = ["Expectation", "Plan", "Planned", "Residual", "information", "make_plan", "marginal", "parameters_of"]
 
@@ -40,8 +41,6 @@ Progress = Callable[[str, float], None]
 FLOOR_STEP = 1.0
 #: s, what is unknown of when a servo samples: its own period, and where in a round trip of 3 ms (eight servos) its turn is
 SAMPLING_STD_S = math.hypot(TIMING_STD_S, 3e-3 / math.sqrt(3))
-#: |correlation| from which two parameters count as tied
-TIED = 0.7
 
 
 @dataclass(frozen=True)
@@ -318,21 +317,12 @@ def _expectations(
     deviation = np.sqrt(np.diag(posterior))
     correlation = posterior / np.outer(deviation, deviation)
     np.fill_diagonal(correlation, 0.0)
-    precision = np.linalg.inv(posterior)
+    words = told(posterior, 1.0 - deviation**2)
     out = []
     for k, parameter in enumerate(parameters):
         nominal = parameter.definition.read(plant.model, plant, parameter.joints[0])
-        known = 1.0 - float(deviation[k] ** 2)
-        # Alone: if all others were known.
-        alone = 1.0 - 1.0 / float(precision[k, k])
         other = int(np.argmax(np.abs(correlation[k])))
-        tied = abs(correlation[k, other]) >= TIED
-        if known >= IDENTIFIED:
-            verdict = "identified"
-        elif alone >= IDENTIFIED and tied:
-            verdict = "tied"
-        else:
-            verdict = "weak" if known >= NOT_IN_THE_DATA else "not in the data"
+        close = abs(correlation[k, other]) >= TIED
 
         def between(
             spread: float, k: int = k, parameter: Parameter = parameter, nominal: float = nominal
@@ -351,9 +341,9 @@ def _expectations(
                 parameter.value(nominal, float(centre[k])),
                 *ends,
                 *prior,
-                known,
-                verdict,
-                parameters[other].name if tied else None,
+                1.0 - float(deviation[k] ** 2),
+                words[k][0],
+                parameters[other].name if close else None,
                 float(correlation[k, other]),
             )
         )

@@ -12,6 +12,7 @@ from openant_tools.report import KeyFigure, Mark, Report, plots
 from openant_tools.report.parts import Tone
 from openant_tools.sysid.forecast import NEAR_M, Forecast
 from openant_tools.sysid.plan import Expectation, Plan
+from openant_tools.sysid.verdict import TIED
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -74,7 +75,7 @@ def plan_report(plan: Plan) -> Report:
         VERDICTS
         + f"\nExpected if a fit leaves {1e3 * residual.rad:g} mrad that last for {residual.memory_s:g} s on the stand, and "
         f"{1e3 * residual.floor_rad:g} mrad for {residual.floor_memory_s:g} s on the floor. **tied to** names the parameter of the "
-        "largest correlation, where that is 0.7 or more."
+        f"largest correlation, where that is {TIED:g} or more."
     )
     for note in plan.notes:
         report.text(note)

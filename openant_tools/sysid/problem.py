@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.recording.run import Run
 from openant_tools.sysid.dataset import Dataset
 from openant_tools.sysid.estimate import CONFLICT, Estimate, Posterior, estimate, posterior
 from openant_tools.sysid.forward import ForwardModel
@@ -35,6 +34,7 @@ from openant_tools.sysid.solve import (
     Point,
     Prior,
     Steps,
+    Tangent,
     descend,
     side_by_side,
 )
@@ -75,7 +75,7 @@ class Problem:
             of which are wrong by the error that they leave. Trusting each stretch as far as the model can follow it, as is
             done otherwise, lets a wrong model choose what it is judged by.
         freed: (parameters,) whose priors the data contradict, so that they count for next to nothing; found by `solve`.
-        left_out: runs of the datasets that nothing is fitted to: they are simulated, and count for nothing.
+        left_out: (rows,) of all datasets that nothing is fitted to: they are simulated, and count for nothing; None: no row.
     """
 
     datasets: Sequence[Dataset]
@@ -83,7 +83,7 @@ class Problem:
     floor: Array
     tempered: bool = False
     freed: Bools = field(default_factory=lambda: np.zeros(0, bool))
-    left_out: Sequence[Run] = ()
+    left_out: Bools | None = None
 
     def __post_init__(self) -> None:
         # Laws that are compared shall differ in nothing but themselves.
@@ -118,18 +118,21 @@ class Problem:
         return estimate(found, self._model, self._weighing, self.prior, self._score(found.point))
 
     def solve_without(
-        self, left_out: Sequence[Sequence[Run]], start: Array, progress: Progress | None = None
+        self, left_out: Sequence[Bools], found: Descent, progress: Progress | None = None
     ) -> list[Posterior]:
-        """What the others say, where some runs are left out: for each choice of them, all choices side by side.
+        """What the other rows say, where some are left out: for each choice of them, all choices side by side.
+
+        Where all rows lead is near where most of them do; that it is only the start says nothing of those left out. Derivatives
+        taken there serve as long as they keep what they promise, so that most of these fits take a few simulations.
 
         Args:
-            left_out: for each fit, the runs of the datasets that it does not see.
-            start: (parameters,) where each begins.
+            left_out: for each fit, (rows,) of all datasets, what it does not see.
+            found: where the fit to all of them ended.
             progress: as `solve` calls it.
         """
-        others = [replace(self, left_out=runs, freed=self.freed.copy()) for runs in left_out]
-        found = self._following(progress)("leaving runs out in turn", *(other._from(start) for other in others))
-        return [posterior(one, other._weighing, other.prior) for one, other in zip(found, others, strict=True)]
+        others = [replace(self, left_out=rows, freed=self.freed.copy()) for rows in left_out]
+        ends = self._following(progress)("leaving runs out in turn", *(other._from(found) for other in others))
+        return [posterior(one, other._weighing, other.prior) for one, other in zip(ends, others, strict=True)]
 
     def _following(self, progress: Progress | None) -> Callable[..., list[Descent]]:
         left = 1.0
@@ -150,10 +153,9 @@ class Problem:
 
         return follow
 
-    def _from(self, start: Array) -> Steps:
-        prior = self.prior
-        found = yield from self._descend(np.clip(start, prior.low, prior.high))
-        return (yield from self._further(found))
+    def _from(self, found: Descent) -> Steps:
+        tangent = replace(found.tangent, change=found.tangent.change.copy())  # a descent changes it
+        return self._approach(found.point, enough=NEAR_TEMPERED, tangent=tangent)
 
     def _further(self, found: Descent) -> Steps:
         """Once more from where the data lead alone, if what is left may have something in it that the priors kept from view."""
@@ -228,6 +230,7 @@ class Problem:
         central: bool = False,
         driven_only: bool = False,
         held: Bools | None = None,
+        tangent: Tangent | None = None,
     ) -> Steps:
         # On the floor contacts chatter otherwise in long steps: these are good for a direction only.
         coarse = self._model.coarse and not (central and self._model.on_floor)
@@ -242,6 +245,7 @@ class Problem:
             thorough=self.tempered,
             least=self._model.differences,
             held=held,
+            tangent=tangent,
         )
 
     def _by_data_alone(self, found: Descent) -> Generator[Look | Derive, Any, Array | None]:

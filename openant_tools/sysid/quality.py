@@ -13,7 +13,7 @@ from openant_tools.model.floor import resolution
 from openant_tools.model.plant import Plant
 from openant_tools.recording.run import Run
 
-__all__ = ["Telemetry", "check_model", "without_errors"]
+__all__ = ["Telemetry", "check_model", "span", "without_errors"]
 
 Array = NDArray[np.float64]
 
@@ -110,7 +110,7 @@ def check_model(run: Run, plant: Plant, simulated: Array) -> None:
                 remedy="check the model: its time step may be too long for its stiffness",
             )
         on = told & (run.signal("torque", [joint], default=1.0)[:, 0] != 0)
-        if not on.any() or _span(cmd[on, j]) < TELLING_RAD or _span(pos[on, j]) < TELLING_RAD:
+        if not on.any() or span(cmd[on, j]) < TELLING_RAD or span(pos[on, j]) < TELLING_RAD:
             continue
         varies, left = float(np.std(pos[on, j])), float(np.std(pos[on, j] - simulated[on, j]))
         if left > UNLIKE * varies:
@@ -123,6 +123,7 @@ def check_model(run: Run, plant: Plant, simulated: Array) -> None:
             )
 
 
-def _span(values: Array) -> float:
+def span(values: Array) -> float:
+    """How far values go, those that are finite."""
     values = values[np.isfinite(values)]
     return float(np.ptp(values)) if len(values) else 0.0

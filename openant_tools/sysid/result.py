@@ -24,7 +24,7 @@ from openant_tools.model.mjcf import write_model
 from openant_tools.robot.config import Effect, Provenance
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.pair import PLAIN, mark_of
-from openant_tools.sysid.beyond import TRIED, better
+from openant_tools.sysid.beyond import TRIED, better, chosen_in_turn
 from openant_tools.sysid.fit_report import fit_report
 from openant_tools.sysid.identify import Identification, calibrated, restated
 from openant_tools.sysid.kinds import KINDS
@@ -86,12 +86,15 @@ def write_fit(result: Identification, out: Path) -> list[Path]:
 
 
 def stating_both(plain: Identification, tried: Identification) -> Identification:
-    """The plain fit with a note of what it and one with effects leave on held-out runs; and with that one, if it is better."""
+    """The plain fit with a note of what it and one with effects leave of what they are judged by; and with that one, if it wins."""
     full, short = (
         f"plain {_rad(one)} rad, with effects {_rad(other)} rad"
         for one, other in ((plain.after.full, tried.after.full), (plain.after.horizon, tried.after.horizon))
     )
-    errors = f"Error on held-out runs: {full} over full runs; {short} at {HORIZON_S:g} s."
+    judged = "runs left out in turn" if plain.in_turn else "held-out runs"
+    errors = f"Error on {judged}: {full} over full runs; {short} at {HORIZON_S:g} s."
+    if both := chosen_in_turn(tried, plain):
+        errors += f" Chosen between the two anew without each: {_rad(both.full)} and {_rad(both.horizon)} rad."
     found = [
         f"{value.name} = {value.value:.3g} {value.unit}"
         for value in tried.values
@@ -127,15 +130,17 @@ def pair_of(result: Identification) -> str | None:
 
 
 def pairs(plain: Identification, richer: Identification) -> dict[str, Any]:
-    """Both pairs for `fit.json`: their files, what they leave on held-out runs, and which wins."""
+    """Both pairs for `fit.json`: their files, what they leave of what they are judged by, and which wins by the folds."""
 
     def one(result: Identification, folder: str) -> dict[str, Any]:
         figures = result.as_json()["held_out"]["after"]
         effects = {"effects": f"{folder}{EFFECTS}"} if result.effects else {}
         return {"model": f"{folder}{_models(result)[0]}", **effects, **figures}
 
+    both = chosen_in_turn(richer, plain)
     return {
         "wins": "with_effects",
+        "chosen_in_turn": both and {f"gap_{HORIZON_S:g}_s_rad": both.horizon, "gap_full_rad": both.full},
         "plain": one(plain, ""),
         "with_effects": one(richer, f"{WITH_EFFECTS}/"),
     }

@@ -24,7 +24,7 @@ from openant_tools.model.servo import read_stiffness, torque_limit
 from openant_tools.model.stability import NUDGE, growth
 from openant_tools.recording.run import Run
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE, RAD_S_PER_COUNT
-from openant_tools.sysid.quality import without_errors
+from openant_tools.sysid.quality import span, without_errors
 
 __all__ = ["RULES", "Finding", "Rule", "Verdict", "check_runs", "findings", "with_rows", "without_turns"]
 
@@ -110,7 +110,7 @@ class Case:
 
     @cached_property
     def moves(self) -> list[bool]:
-        return [_span(self.pos[:, j]) > MOVES_QUANTA * step for j, step in enumerate(self.steps)]
+        return [span(self.pos[:, j]) > MOVES_QUANTA * step for j, step in enumerate(self.steps)]
 
     @cached_property
     def row_s(self) -> float:
@@ -118,7 +118,7 @@ class Case:
 
     def commanded(self, j: int) -> float:
         """rad over which a joint is commanded while it has torque."""
-        return _span(self.cmd[self.on[:, j], j])
+        return span(self.cmd[self.on[:, j], j])
 
 
 @dataclass(frozen=True)
@@ -249,7 +249,7 @@ def _time_unit(case: Case) -> Found:
         # Of three neighbours the one in the middle: an error of telemetry is no motion.
         x = np.median(np.stack([x[:-2], x[1:-1], x[2:]]), axis=0)
         fastest = max(fastest, float(np.max(np.abs(np.diff(x)) / np.diff(t[1:-1]))))
-        furthest = max(furthest, _span(x))
+        furthest = max(furthest, span(x))
     if furthest > WENT_RAD and fastest < CREEPS_RAD_S:
         unit, factor = ("ms", "0.001") if case.row_s < 500.0 else ("µs", "1e-6") if case.row_s < 5e5 else ("ns", "1e-9")
         yield (
@@ -398,8 +398,8 @@ def _exchanged(case: Case) -> Found:
     Only where the commands can be told apart: joints that are always commanded alike say nothing about it.
     """
     names = case.joints
-    live = [j for j in range(len(names)) if case.moves[j] or _span(case.cmd[:, j]) > 0]
-    held = [j for j in live if _span(case.cmd[:, j]) <= MOVES_QUANTA * case.steps[j]]
+    live = [j for j in range(len(names)) if case.moves[j] or span(case.cmd[:, j]) > 0]
+    held = [j for j in live if span(case.cmd[:, j]) <= MOVES_QUANTA * case.steps[j]]
     whose: dict[int, int] = {}
     for j in live:
         own = _followed(case, j, j)
@@ -682,11 +682,6 @@ def _falls_apart(case: Case, played: Rollouts) -> bool:
 # --- numbers -------------------------------------------------------------------------------------------------------------
 
 
-def _span(values: Array) -> float:
-    values = values[np.isfinite(values)]
-    return float(np.ptp(values)) if len(values) else 0.0
-
-
 def _furthest(values: Array) -> float:
     return float(np.nanmax(np.abs(values), initial=0.0, where=np.isfinite(values)))
 
@@ -739,7 +734,7 @@ def _is_wrapped(case: Case, j: int) -> bool:
     if not len(jumps):
         return False
     pos = _unwrap(case.run.t, case.pos[:, j])
-    went = [_span(pos[(case.run.t >= case.run.t[row]) & (case.run.t <= case.run.t[row] + 1.0)]) for row in jumps]
+    went = [span(pos[(case.run.t >= case.run.t[row]) & (case.run.t <= case.run.t[row] + 1.0)]) for row in jumps]
     return float(np.median(went)) < math.pi
 
 

@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.sysid.estimate import Estimate
+from openant_tools.sysid.estimate import Estimate, Posterior
 from openant_tools.sysid.kinds import KINDS
 
-__all__ = ["SILENT", "Verdict", "Word", "experiment", "verdicts"]
+__all__ = ["SILENT", "TIED", "Verdict", "Word", "experiment", "told", "undetermined", "verdicts"]
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -45,23 +45,40 @@ class Verdict:
 
 def verdicts(estimate: Estimate, kept: Bools) -> list[Verdict]:
     """A verdict for each parameter; `kept` are those that stood up to held-out runs."""
-    covariance = np.linalg.inv(estimate.precision + np.diag(estimate.prior_precision))
-    deviation = np.sqrt(np.diag(covariance))
-    correlation = covariance / np.outer(deviation, deviation)
     out = []
-    for k, information in enumerate(estimate.information):
-        other = _partner(correlation[k], k, deviation[k])
-        word: Word
+    for k, (word, other) in enumerate(told(estimate.narrow, estimate.information)):
         if not kept[k]:
             word, other = "fell back", None
-        elif information >= IDENTIFIED:
-            word, other = "conflict" if estimate.contradicts[k] else "identified", None
-        elif other is not None:
-            word = "tied"
-        else:
-            word = "weak" if information >= NOT_IN_THE_DATA else "not in the data"
+        elif word == "identified" and estimate.contradicts[k]:
+            word = "conflict"
         out.append(Verdict(word, other, bool(estimate.contradictory[k])))
     return out
+
+
+def told(covariance: Array, information: Array) -> list[tuple[Word, int | None]]:
+    """Of each parameter whether the data tell it, and what it is tied to.
+
+    Args:
+        covariance: (parameters, parameters) in prior deviations.
+        information: (parameters,) share of the precision that the data give.
+    """
+    deviation = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(deviation, deviation)
+    out: list[tuple[Word, int | None]] = []
+    for k, share in enumerate(information):
+        other = None if share >= IDENTIFIED else _partner(correlation[k], k, deviation[k])
+        if share >= IDENTIFIED:
+            out.append(("identified", None))
+        elif other is not None:
+            out.append(("tied", other))
+        else:
+            out.append(("weak" if share >= NOT_IN_THE_DATA else "not in the data", None))
+    return out
+
+
+def undetermined(posterior: Posterior) -> Bools:
+    """(parameters,) of which the data say nothing."""
+    return np.array([word == "not in the data" for word, _ in told(posterior.narrow, posterior.information)], bool)
 
 
 def _partner(correlation: Array, k: int, deviation: float) -> int | None:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from openant_tools.recording.run import Run
 from openant_tools.sysid.dataset import Dataset, runs_of
 from openant_tools.sysid.solve import Point
 
@@ -38,14 +37,14 @@ class Stretch:
     period: float
 
 
-def stretches(datasets: Sequence[Dataset], left_out: Sequence[Run] = ()) -> tuple[Stretch, ...]:
-    """Those of all runs but the ones left out."""
+def stretches(datasets: Sequence[Dataset], left_out: NDArray[np.bool_] | None = None) -> tuple[Stretch, ...]:
+    """Those of all runs, without the rows (of all datasets) that are left out."""
     out = []
     for data, run, part in runs_of(datasets):
-        if any(run is one for one in left_out):
-            continue
         rows = np.arange(part.start, part.stop)
         on = run.signal("torque", data.plant.joints, default=1.0) != 0
+        if left_out is not None:
+            rows, on = rows[~left_out[rows]], on[~left_out[rows]]
         period = float(np.median(np.diff(run.t)))
         for driven, state in ((True, on), (False, ~on)):
             if state.any():
