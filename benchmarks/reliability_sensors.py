@@ -14,7 +14,8 @@ from openant_tools.calib.gyro_scale import KNOWN, by_hand
 from openant_tools.comms.tag_family import load_family
 from openant_tools.comms.tags import BodyPose, BodyTracker, TagSetup
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.virtual.overhead_camera import OverheadCamera, OverheadCameraSettings, Scene, TagOnFloor
+from openant_tools.virtual.camera_scene import OverheadCameraSettings, Scene, TagOnFloor
+from openant_tools.virtual.overhead_camera import OverheadCamera
 
 __all__ = ["campaigns"]
 

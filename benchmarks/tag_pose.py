@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 
 from openant_tools.comms.tags import BodyPose, BodyTracker, TagSetup
-from openant_tools.virtual.overhead_camera import OverheadCamera, OverheadCameraSettings, Scene, TagOnFloor, TagOnRobot
+from openant_tools.virtual.camera_scene import OverheadCameraSettings, Scene, TagOnFloor, TagOnRobot
+from openant_tools.virtual.overhead_camera import OverheadCamera
 
 FAMILIES = ("tagCircle21h7", "tag36h11", "tag25h9", "tag16h5")
 DISTANCES = (1.0, 1.5, 2.0, 2.5, 3.0)

@@ -29,14 +29,9 @@ from openant_tools.comms.tags import BodyLost, BodyPose, BodyTracker, TagDetecto
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.robot.config import parse_config
 from openant_tools.robot.folder import create_robot
+from openant_tools.virtual.camera_scene import OverheadCameraSettings, Scene, TagOnFloor, TagOnRobot
 from openant_tools.virtual.camera_stream import VirtualCamera
-from openant_tools.virtual.overhead_camera import (
-    OverheadCamera,
-    OverheadCameraSettings,
-    Scene,
-    TagOnFloor,
-    TagOnRobot,
-)
+from openant_tools.virtual.overhead_camera import OverheadCamera
 
 #: A small picture from near by: as many pixels on the tags as the real one has, at a quarter of the work.
 MIDDLE = TagOnFloor(x=0.0, y=0.0)

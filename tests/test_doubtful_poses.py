@@ -21,7 +21,8 @@ from openant_tools.comms.clock import RealClock
 from openant_tools.comms.tag_family import load_family
 from openant_tools.comms.tags import BodyLost, BodyPose, BodyTracker, TagSetup
 from openant_tools.errors import HardwareFault
-from openant_tools.virtual.overhead_camera import OverheadCamera, TagOnRobot
+from openant_tools.virtual.camera_scene import TagOnRobot
+from openant_tools.virtual.overhead_camera import OverheadCamera
 
 CAMERA = OverheadCamera(SMALL, seed=2)
 AWAY = scene(x=9.0)

@@ -13,7 +13,6 @@ from collections.abc import Generator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,6 +31,7 @@ from openant_tools.comms.setup import camera_of_robot
 from openant_tools.comms.tags import TagDetector, tag_pose
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.files import write_bytes
+from openant_tools.optional import cv2
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Answer, Ask, Bench, Event, Hands, Intent, Look, Procedure, Progress, Say
 from openant_tools.recording.reader import Recording, read_recording

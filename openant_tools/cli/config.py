@@ -50,9 +50,10 @@ def new(robot: Path | None, kit: str, name: str | None) -> None:
 def check(robot: Path | None, json_file: Path | None) -> int:
     """Read the configuration over and list, a line each, what cannot be. Exit code 1 if there is anything.
 
-    Notes (a key that looks like a slip) are listed too, but do not fail the check.
+    Notes (a key that looks like a slip, two OpenCV that lie over each other) are listed too, but do not fail the check.
     """
     from openant_tools.files import json_text, write_text
+    from openant_tools.optional import opencv
     from openant_tools.robot.folder import RobotFolder
 
     folder = RobotFolder.at(robot_folder(robot))
@@ -60,6 +61,7 @@ def check(robot: Path | None, json_file: Path | None) -> int:
     errors = [entry for entry in located if entry.problem.severity == "error"]
     for entry in located:
         click.echo(str(entry) if entry.problem.severity == "error" else f"note: {entry}")
+    click.echo(f"note: {opencv().words}", err=True)
     if json_file:
         problems = [{"line": entry.line, **dataclasses.asdict(entry.problem)} for entry in located]
         write_text(json_file, json_text({"consistent": not errors, "problems": problems}, indent=2))

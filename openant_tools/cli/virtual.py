@@ -65,6 +65,7 @@ def start(
       openant virtual start --ready-file ant.json
       openant comms scan --port $(jq -r .bus ant.json)
     """
+    from openant_tools.optional import installed
     from openant_tools.virtual.start import serve
 
     # Interrupting is how one ends it (formats, section 6): no failure. A flag, since an exception that is raised
@@ -72,6 +73,8 @@ def start(
     ended = threading.Event()
     if until_eof:
         threading.Thread(target=_await_eof, args=(ended,), daemon=True).start()
+    if not no_camera and not installed("cv2"):
+        click.echo("no camera: OpenCV is not installed → pip install 'openant-tools[camera]'", err=True)
     with serve(scenario, clock=clock, tcp=tcp, key_file=key_file, camera=False if no_camera else None) as server:
         for name, value in server.addresses.items():
             if value is not None:

@@ -27,13 +27,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.comms.clock import Clock
 from openant_tools.comms.mjpeg import MjpegStream
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.optional import cv2
 
 __all__ = ["Camera", "CameraInfo", "CameraSettings", "CameraStatistics", "DropCounter", "Frame", "Setting"]
 

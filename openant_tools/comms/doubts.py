@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.comms.tag_family import load_family
+from openant_tools.optional import cv2
 
 __all__ = ["View", "other_reading"]
 

@@ -138,7 +138,7 @@ class CharucoBoard:
     dictionary: str = "DICT_5X5_100"
 
     def _board(self) -> Any:
-        import cv2
+        from openant_tools.optional import cv2
 
         table = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, table)
@@ -150,7 +150,7 @@ class CharucoBoard:
 
     def corners(self, gray: NDArray[np.uint8]) -> tuple[Array, Array] | None:
         """Board points (n, 3) in m and their pixels (n, 2), or None where too few are seen."""
-        import cv2
+        from openant_tools.optional import cv2
 
         board = self._board()
         found, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(gray)
@@ -166,7 +166,7 @@ def calibrate(pictures: Sequence[NDArray[np.uint8]], board: CharucoBoard) -> Int
     Raises:
         BadInput: too few usable views, all from one direction, or a reprojection error above a pixel; it says which.
     """
-    import cv2
+    from openant_tools.optional import cv2
 
     views = [view for view in (board.corners(picture) for picture in pictures) if view is not None]
     if len(views) < MIN_VIEWS:

@@ -11,8 +11,9 @@ import http.client
 import urllib.parse
 from typing import Any
 
-import cv2
 import numpy as np
+
+from openant_tools.optional import cv2
 
 __all__ = ["MjpegStream"]
 

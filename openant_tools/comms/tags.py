@@ -28,7 +28,6 @@ import time
 from collections import deque
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,6 +35,7 @@ from openant_tools.comms.doubts import View, other_reading
 from openant_tools.comms.intrinsics import Intrinsics
 from openant_tools.comms.tag_family import load_family
 from openant_tools.errors import BadInput
+from openant_tools.optional import cv2
 
 __all__ = ["BodyLost", "BodyPose", "BodyTracker", "Sighting", "TagDetector", "TagSetup", "tag_pose"]
 

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json, reading
+from openant_tools.optional import pa
 from openant_tools.recording.plausibility import check_time
 from openant_tools.recording.run import Array
 from openant_tools.recording.tables import parquet_table

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.csv as pa_csv
-import pyarrow.parquet as pq
 from numpy.typing import ArrayLike, NDArray
 
 from openant_tools.errors import BadInput
@@ -21,14 +17,23 @@ from openant_tools.recording.facts import facts_from_json, facts_to_json
 from openant_tools.recording.plausibility import check_names, check_run, check_time, need_signals
 from openant_tools.recording.run import BODY_COLUMNS, JOINT_SIGNALS, Facts, Run
 
+if TYPE_CHECKING:
+    import pyarrow
+
 __all__ = ["find_run", "parquet_table", "read_run", "read_table", "run_of_columns", "write_table"]
 
 #: bytes of a CSV, and of its first line: an Open Ant's has 1,500
 LARGEST_CSV, LONGEST_HEADER = 2**30, 64 * 1024
 #: numbers of a table: an hour of an Open Ant at 300 Hz has 80 million
 LARGEST_TABLE = 400_000_000
-_MISSING = ("", "nan", "NaN", "NAN", "null", "NULL", "None", "NA", "N/A")
-_TRUE, _FALSE = pa.array(["true", "True", "TRUE"]), pa.array(["false", "False", "FALSE"])
+#: rows of a CSV that are words at a time: the words of all would take ten times the memory of the numbers
+CSV_ROWS = 20_000
+#: words that stand for a number in tables of other software
+_WORDS = (
+    dict.fromkeys(("", "nan", "NaN", "NAN", "null", "NULL", "None", "NA", "N/A"), np.nan)
+    | dict.fromkeys(("true", "True", "TRUE"), 1.0)
+    | dict.fromkeys(("false", "False", "FALSE"), 0.0)
+)
 
 
 def read_run(path: str | Path, *, need: Sequence[str] = ("cmd", "pos"), plausible: bool = True) -> Run:
@@ -84,8 +89,8 @@ def run_of_columns(columns: Mapping[str, ArrayLike], *, name: str = "run", need:
     read: dict[str, NDArray[Any]] = {}
     for column, values in named.items():
         try:
-            read[column] = _numbers(column, pa.array(np.asarray(values), from_pandas=True), name)
-        except (pa.ArrowException, ValueError) as error:
+            read[column] = _numbers(column, _one_a_row(values), name)
+        except ValueError as error:
             raise BadInput(
                 f"the values are no column of numbers: {error}",
                 where=f"{name}, column {column}",
@@ -135,19 +140,13 @@ def write_table(run: Run, path: str | Path) -> None:
     path = Path(path)
     if path.suffix not in (".parquet", ".csv"):
         raise BadInput("a table is .parquet or .csv", where=path, remedy="name it NAME.parquet")
-    arrays = {"t": pa.array(run.t)}
-    for name in _in_order(run):
-        values = run.columns[name]
-        if values.dtype.kind == "f":
-            arrays[name] = pa.array(values, mask=np.isnan(values))
-        else:
-            arrays[name] = pa.array(values.tolist() if values.dtype.kind in "OU" else values)
-    table = pa.table(arrays)
+    columns = {"t": run.t} | {name: run.columns[name] for name in _in_order(run)}
+    parquet = path.suffix == ".parquet" and _parquet(columns)
     with atomic_writer(path) as stream, atomic_writer(path.with_suffix(".json")) as facts_stream:
-        if path.suffix == ".parquet":
-            pq.write_table(table, stream, compression="zstd", write_page_checksum=True)
+        if parquet:
+            parquet(stream)
         else:
-            _write_csv(table, stream)
+            _write_csv(columns, stream)
         facts_stream.write(facts_to_json(run.facts_at(path.parent)).encode())
         # What is left in the buffers goes to the disk before either file takes its place: a full disk makes neither.
         stream.flush()
@@ -199,10 +198,10 @@ def _joints_of(names: Sequence[str], where: str) -> tuple[str, ...]:
 def _read_parquet(path: Path) -> dict[str, NDArray[Any]]:
     table = parquet_table(path)
     check_names(table.column_names, str(path))
-    return {name: _numbers(name, table[name].combine_chunks(), path) for name in table.column_names}
+    return {name: _numbers(name, _of_arrow(name, table[name], path), path) for name in table.column_names}
 
 
-def parquet_table(path: Path, columns: Sequence[str] | None = None, width: int = 1) -> pa.Table:
+def parquet_table(path: Path, columns: Sequence[str] | None = None, width: int = 1) -> pyarrow.Table:
     """What a parquet file holds of `columns` (default: of all), by its checksums whole.
 
     Args:
@@ -212,6 +211,8 @@ def parquet_table(path: Path, columns: Sequence[str] | None = None, width: int =
         BadInput: it is cut, damaged or no such file, or holds more numbers than a run can have.
         OSError: it cannot be opened.
     """
+    from openant_tools.optional import pa, pq
+
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             size = file.metadata
@@ -260,95 +261,166 @@ def _read_csv(path: Path) -> dict[str, NDArray[Any]]:
     check_names([name for name in names if name], f"{path}, line 1")
     # A column without a name is an index, or a comma at the end of every line: it holds nothing of ours.
     names = [name or f"unnamed {k}" for k, name in enumerate(names)]
-    bad: list[pa_csv.InvalidRow] = []
+    words: list[list[Any]] = [[] for _ in names]
+    plain = text.find("_", len(first)) < 0  # Python reads 1_0 as ten
+    for rows in _csv_rows(text, len(names), path):
+        for column, cells in zip(words, zip(*rows, strict=True), strict=True):
+            column.append(_floats(cells, plain))
+    named = {name: parts for name, head, parts in zip(names, header, words, strict=True) if head.strip()}
+    return {name: _numbers(name, _joined(parts), path) for name, parts in named.items()}
 
-    def remember(row: pa_csv.InvalidRow) -> str:
-        bad.append(row)
-        return "skip"
 
+def _csv_rows(text: str, width: int, path: Path) -> Iterator[list[list[str]]]:
+    """The rows below the header, some thousands at a time; each has a cell for each column."""
+    reader = csv.reader(_lines(text), strict=True)
+    rows: list[list[str]] = []
     try:
-        table = pa_csv.read_csv(
-            io.BytesIO(text.encode()),
-            # One thread: only so does Arrow count the rows that it finds wrong.
-            read_options=pa_csv.ReadOptions(column_names=names, skip_rows=1, use_threads=False),
-            parse_options=pa_csv.ParseOptions(invalid_row_handler=remember),
-            convert_options=pa_csv.ConvertOptions(
-                column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False
-            ),
-        )
-    except pa.ArrowException as error:
-        raise BadInput(f"this is not a whole CSV file: {error}", where=path, remedy="export it again") from error
-    if bad:
-        where = f"{path}, line {bad[0].number}" if bad[0].number is not None else path
+        next(reader, None)
+        for row in reader:
+            if len(row) != width:
+                if not row:
+                    continue
+                raise BadInput(
+                    f"a row has {len(row)} values where the header names {width} columns",
+                    where=f"{path}, line {reader.line_num}",
+                    remedy="the file was cut or edited: complete that row or delete it",
+                )
+            rows.append(row)
+            if len(rows) == CSV_ROWS:
+                yield rows
+                rows = []
+    except csv.Error as error:
         raise BadInput(
-            f"a row has {bad[0].actual_columns} values where the header names {bad[0].expected_columns} columns",
-            where=where,
-            remedy="the file was cut or edited: complete that row or delete it",
-        )
-    named = [name for name, head in zip(names, header, strict=True) if head.strip()]
-    return {name: _numbers(name, table[name].combine_chunks(), path) for name in named}
+            f"this is not a whole CSV file: {error}", where=f"{path}, line {reader.line_num}", remedy="export it again"
+        ) from error
+    if rows:
+        yield rows
 
 
-def _numbers(name: str, column: pa.Array, path: Path | str) -> NDArray[Any]:
-    """One column as float64 with NaN where a sample is missing; words where the format holds words or knows nothing."""
-    signal = name.partition(".")[0]
-    ours = name == "t" or name in BODY_COLUMNS or (signal in JOINT_SIGNALS and "." in name)
-    if isinstance(column, pa.ChunkedArray):
-        column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
+def _lines(text: str) -> Iterator[str]:
+    """The lines of a text with their ends, without a copy of it all."""
+    at = 0
+    while at < len(text):
+        end = text.find("\n", at) + 1 or len(text)
+        yield text[at:end]
+        at = end
+
+
+def _floats(cells: Sequence[str], plain: bool) -> NDArray[Any]:
+    """Cells as float64 where all are numbers, empty or true or false; else as the words that they are."""
+    if plain:
+        try:
+            return np.array([float(cell or "nan") for cell in cells])
+        except ValueError:
+            pass
+    try:
+        return np.array([_number(cell) for cell in cells])
+    except ValueError:
+        return np.array(cells, dtype=object)
+
+
+def _number(cell: str) -> float:
+    """What a cell says; raises ValueError where it is no number and no word for one."""
+    cell = cell.strip()
+    known = _WORDS.get(cell)
+    if "_" in cell:
+        raise ValueError(cell)
+    return float(cell) if known is None else known
+
+
+def _joined(parts: list[NDArray[Any]]) -> NDArray[Any]:
+    """The pieces of one column: numbers where all are, else words."""
+    if not parts:
+        return np.array([])
+    if all(part.dtype.kind == "f" for part in parts):
+        return np.concatenate(parts)
+    return np.concatenate([part if part.dtype == object else _as_words(part) for part in parts])
+
+
+def _as_words(numbers: NDArray[Any]) -> NDArray[Any]:
+    return np.array([str(value) for value in _cells(numbers)], dtype=object)
+
+
+def _one_a_row(values: ArrayLike) -> NDArray[Any]:
+    """The values of one column in memory, (n,); raises ValueError where they are no such thing."""
+    array = np.asarray(values)
+    if array.ndim != 1:
+        raise ValueError(f"they have the shape {array.shape}")
+    return array
+
+
+def _of_arrow(name: str, column: pyarrow.ChunkedArray, path: Path | str) -> NDArray[Any]:
+    """One column of a parquet file as numbers with NaN where one is missing, or as words, or as objects."""
+    from openant_tools.optional import pa, pc
+
+    column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
     if pa.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
-    if signal == "err" and "." in name:
-        if pa.types.is_null(column.type):
-            return np.full(len(column), "", dtype=object)
-        words = column.cast(pa.string()).fill_null("").to_pylist()
-        return np.array([word.strip() for word in words], dtype=object)
-    if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
-        return _parsed(name, column, path, ours)
+    kind = column.type
+    if pa.types.is_null(kind):
+        return np.full(len(column), np.nan)
     if (
-        pa.types.is_floating(column.type)
-        or pa.types.is_integer(column.type)
-        or pa.types.is_boolean(column.type)
-        or pa.types.is_null(column.type)
-        or pa.types.is_decimal(column.type)
+        pa.types.is_floating(kind)
+        or pa.types.is_integer(kind)
+        or pa.types.is_boolean(kind)
+        or pa.types.is_decimal(kind)
     ):
         values = pc.fill_null(column.cast(pa.float64(), safe=False), np.nan)
         return np.array(values.to_numpy(zero_copy_only=False), dtype=float)
-    if ours:
-        raise BadInput(
-            f"the values are {column.type}, not numbers", where=f"{path}, column {name}", remedy="store float64"
-        )
-    if pa.types.is_temporal(column.type):
+    if _is_ours(name) and not (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+        raise BadInput(f"the values are {kind}, not numbers", where=f"{path}, column {name}", remedy="store float64")
+    if pa.types.is_temporal(kind):
         column = column.cast(pa.string())
     out = np.empty(len(column), dtype=object)
     out[:] = column.to_pylist()
     return out
 
 
-def _parsed(name: str, column: pa.Array, path: Path | str, ours: bool) -> NDArray[Any]:
-    texts = pc.utf8_trim_whitespace(column.cast(pa.string()))
-    missing = pc.or_kleene(pc.is_null(texts), pc.is_in(texts, value_set=pa.array(_MISSING)))
-    numbers = pc.if_else(missing, pa.scalar(None, pa.string()), texts)
-    for words, digit in ((_TRUE, "1"), (_FALSE, "0")):
-        numbers = pc.if_else(pc.is_in(texts, value_set=words), digit, numbers)
+def _is_ours(name: str) -> bool:
+    signal = name.partition(".")[0]
+    return name == "t" or name in BODY_COLUMNS or (signal in JOINT_SIGNALS and "." in name)
+
+
+def _numbers(name: str, column: NDArray[Any], path: Path | str) -> NDArray[Any]:
+    """One column as float64 with NaN where a sample is missing; words where the format holds words or knows nothing."""
+    if name.startswith("err."):
+        if column.dtype.kind in "fiub":
+            column = _as_words(column)
+        return np.array(
+            [str(word).strip() if word is not None and word == word else "" for word in column], dtype=object
+        )
+    if column.dtype.kind in "fiub":
+        return column.astype(float)
+    if column.dtype.kind in "mM":
+        column = column.astype(str)
+    known = [None if value is None or value != value else value for value in column.tolist()]
     try:
-        values = pc.fill_null(numbers.cast(pa.float64()), np.nan)
-    except pa.ArrowInvalid:
-        if not ours:
-            return np.array([text or "" for text in texts.to_pylist()], dtype=object)
-        row, word = next((row, word) for row, word in enumerate(numbers.to_pylist()) if not _is_number(word))
-        remedy = "leave a missing sample empty" if "," not in word else "write numbers with a point, not a comma"
+        return np.array([np.nan if value is None else _of_cell(value) for value in known])
+    except (ValueError, TypeError):
+        if not _is_ours(name):
+            return _words_of(known)
+        row, word = next((row, value) for row, value in enumerate(known) if not _is_number(value))
+        remedy = "leave a missing sample empty" if "," not in str(word) else "write numbers with a point, not a comma"
         raise BadInput(
-            f"{word[:40]!r} is not a number", where=f"{path}, column {name}, row {row + 1}", remedy=remedy
+            f"{str(word).strip()[:40]!r} is not a number", where=f"{path}, column {name}, row {row + 1}", remedy=remedy
         ) from None
-    return np.array(values.to_numpy(zero_copy_only=False), dtype=float)
 
 
-def _is_number(word: str | None) -> bool:
+def _of_cell(value: Any) -> float:
+    return _number(value) if isinstance(value, str) else float(value)
+
+
+def _is_number(value: Any) -> bool:
     try:
-        pa.scalar(word, pa.string()).cast(pa.float64())
-    except pa.ArrowInvalid:
+        return value is None or _of_cell(value) == 0.0 or True
+    except (ValueError, TypeError):
         return False
-    return True
+
+
+def _words_of(values: Sequence[Any]) -> NDArray[Any]:
+    out = np.empty(len(values), dtype=object)
+    out[:] = ["" if v is None else v.strip() if isinstance(v, str) else v for v in values]
+    return out
 
 
 def _in_order(run: Run) -> list[str]:
@@ -358,10 +430,33 @@ def _in_order(run: Run) -> list[str]:
     return first + [name for name in run.columns if name not in set(first)]
 
 
-def _write_csv(table: pa.Table, stream: Any) -> None:
-    try:
-        pa_csv.write_csv(table, stream, pa_csv.WriteOptions(quoting_style="none"))
-    except pa.ArrowInvalid:  # a text with a comma or a quote in it
-        stream.seek(0)
-        stream.truncate()
-        pa_csv.write_csv(table, stream, pa_csv.WriteOptions(quoting_style="needed"))
+def _parquet(columns: Mapping[str, NDArray[Any]]) -> Callable[[IO[bytes]], None]:
+    """What writes columns as a parquet file; made before any file is begun, for pyarrow may be missing."""
+    from openant_tools.optional import pa, pq
+
+    arrays = {}
+    for name, values in columns.items():
+        if values.dtype.kind == "f":
+            arrays[name] = pa.array(values, mask=np.isnan(values))
+        else:
+            arrays[name] = pa.array(values.tolist() if values.dtype.kind in "OU" else values)
+    table = pa.table(arrays)
+    return lambda stream: pq.write_table(table, stream, compression="zstd", write_page_checksum=True)
+
+
+def _write_csv(columns: Mapping[str, NDArray[Any]], stream: IO[bytes]) -> None:
+    text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    rows = len(next(iter(columns.values())))
+    for first in range(0, rows, CSV_ROWS):
+        cells = [_cells(values[first : first + CSV_ROWS]) for values in columns.values()]
+        writer.writerows(zip(*cells, strict=True))
+    text.detach()
+
+
+def _cells(values: NDArray[Any]) -> list[Any]:
+    """Values as they stand in a CSV: the shortest words that read back the same, nothing where one is missing."""
+    if values.dtype.kind == "f":
+        return ["" if v != v else int(v) if abs(v) < 1e15 and v == int(v) else v for v in values.tolist()]
+    return ["" if value is None else value for value in values.tolist()]

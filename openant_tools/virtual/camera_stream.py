@@ -31,10 +31,9 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
-import cv2
 import numpy as np
 
-from openant_tools.virtual.overhead_camera import OverheadCamera, OverheadCameraSettings, Scene
+from openant_tools.virtual.camera_scene import OverheadCameraSettings, Scene
 
 __all__ = ["CAMERA_FAULTS", "VirtualCamera"]
 
@@ -135,8 +134,6 @@ class VirtualCamera:
 def _serve(settings: OverheadCameraSettings, seed: int, stepped: bool, pipe: Connection) -> None:
     """The camera's process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the robot's process decides when to end
-    # One thread a picture: the machine's other cores have the robot to compute.
-    cv2.setNumThreads(1)
     feed = _Feed(settings, seed, stepped)
     server = _Server(("127.0.0.1", 0), _Handler)
     server.feed = feed
@@ -183,6 +180,12 @@ class _Feed:
         self.time = 0.0
         self.watchers = 0
         self.published: tuple[int, _Picture | None] = (0, None)
+        from openant_tools.optional import cv2
+        from openant_tools.virtual.overhead_camera import OverheadCamera
+
+        # One thread a picture: the machine's other cores have the robot to compute.
+        cv2.setNumThreads(1)
+        self._jpeg = (cv2.imencode, cv2.IMWRITE_JPEG_QUALITY)
         self._camera = OverheadCamera(settings, seed)
         self._seed = seed
         self._queue: deque[_Exposure] = deque()
@@ -249,8 +252,8 @@ class _Feed:
             known = self._rendered.get(exposure.index)
             if known is None:
                 image = self._camera.picture(exposure.index, exposure.t, exposure.scene)
-                quality = [cv2.IMWRITE_JPEG_QUALITY, self.settings.jpeg_quality]
-                known = _Picture(exposure, cv2.imencode(".jpg", image, quality)[1].tobytes())
+                encode, quality = self._jpeg
+                known = _Picture(exposure, encode(".jpg", image, [quality, self.settings.jpeg_quality])[1].tobytes())
                 self._rendered[exposure.index] = known
                 if len(self._rendered) > 2 * QUEUE:
                     self._rendered.popitem(last=False)

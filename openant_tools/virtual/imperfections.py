@@ -15,8 +15,8 @@ from typing import Any
 
 from openant_tools.errors import BadInput
 from openant_tools.virtual.body import Cable, Payload
+from openant_tools.virtual.camera_scene import OverheadCameraSettings
 from openant_tools.virtual.motor import MotorSettings
-from openant_tools.virtual.overhead_camera import OverheadCameraSettings
 from openant_tools.virtual.world import WorldSettings
 
 __all__ = ["CATALOGUE", "Entry", "apply_entry", "nearest"]

@@ -15,11 +15,11 @@ from openant_tools.files import LARGEST_TOML, parse_toml, read_text, reading
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.kit import KITS, home_angles
 from openant_tools.robot.servo import baud_code, servo_model
+from openant_tools.virtual.camera_scene import OverheadCameraSettings, TagOnFloor, TagOnRobot
 from openant_tools.virtual.faults import Fault
 from openant_tools.virtual.flight_controller import FlightControllerSettings
 from openant_tools.virtual.imperfections import Entry, apply_entry, nearest
 from openant_tools.virtual.motor import MotorSettings
-from openant_tools.virtual.overhead_camera import OverheadCameraSettings, TagOnFloor, TagOnRobot
 from openant_tools.virtual.seal import KEY_VARIABLE, is_sealed, open_sealed, read_key, seal
 from openant_tools.virtual.world import ServoSetup, WorldSettings, standard_servos
 

@@ -54,8 +54,8 @@ from typing import Any, Protocol
 
 from openant_tools.errors import OpenAntError
 from openant_tools.files import write_text
+from openant_tools.virtual.camera_scene import Scene
 from openant_tools.virtual.lateness import HOP_S, Lateness
-from openant_tools.virtual.overhead_camera import Scene
 from openant_tools.virtual.ports import Port, PtyPort, TcpPort
 from openant_tools.virtual.world import World
 

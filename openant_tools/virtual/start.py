@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.optional import installed
 from openant_tools.virtual.body import Body
+from openant_tools.virtual.camera_scene import OverheadCameraSettings
 from openant_tools.virtual.camera_stream import VirtualCamera
 from openant_tools.virtual.eeprom import EepromFile
 from openant_tools.virtual.faults import Faults
 from openant_tools.virtual.flight_controller import FlightController, FlightControllerSettings
-from openant_tools.virtual.overhead_camera import OverheadCameraSettings
 from openant_tools.virtual.scenario import Scenario, load_scenario
 from openant_tools.virtual.server import Server
 from openant_tools.virtual.world import NAP_S, World
@@ -60,12 +61,12 @@ def assemble(script: Scenario, *, clock: str | None = None, tcp: bool = False, c
     Args:
         clock: "real" or "stepped"; None for what the scenario says.
         tcp: put the bus on a TCP port.
-        camera: whether to start the camera's process; None for what the scenario says.
+        camera: whether to start the camera's process; None for what the scenario says. Without OpenCV there is none.
     """
     stepped = script.stepped if clock is None else clock == "stepped"
     seed = script.world.seed
     eye = None
-    if script.camera if camera is None else camera:
+    if (script.camera if camera is None else camera) and installed("cv2"):
         # Started first: its process gets ready while this one builds the robot.
         eye = VirtualCamera(OverheadCameraSettings(**script.world.camera), seed + 3, stepped=stepped)
     try:
