@@ -91,9 +91,9 @@ class Drives:
         #: joints that somebody has in hand
         self.grips: dict[int, Grip] = {}
         # what the sensors show
-        self.duty, self.current, self.shaft_velocity = np.zeros(n), np.zeros(n), np.zeros(n)
-        self.motor_torque = np.zeros(n)
-        self._filtered_velocity = np.zeros(n)
+        self.duty, self.current = np.zeros(n), np.zeros(n)
+        #: rad/s at the joint, as the firmware's filter gives it
+        self._filtered_velocity, self._velocity_change = np.zeros(n), np.zeros(n)
         self.voltage = 12.0
         # the supply
         self.supply_v, self.supply_ohm, self.supply_a = 12.0, 0.0, 0.0
@@ -101,7 +101,7 @@ class Drives:
         #: 1 where the supply reaches a servo, 0 behind an open connector
         self.path: Array | None = None
         #: s below each servo's reset voltage, without a break
-        self.starved_s = np.zeros(n)
+        self.starved_s, self.starving = np.zeros(n), False
         self.powered = np.ones(n)
         # heat, of winding and case
         self.ambient = 25.0
@@ -124,6 +124,7 @@ class Drives:
             return np.array([float(getattr(motor, name)) for motor in m])
 
         self.kt, self.ke, self._r_cold = column("kt"), column("ke"), column("resistance")
+        self._back_per_v = self.ke * self.sign
         self.resistance = self._r_cold.copy()
         self.strength = column("strength")
         self._armature = column("armature")
@@ -145,6 +146,7 @@ class Drives:
         self._velocity_share = 1 - np.exp(-self.dt / np.maximum(column("velocity_filter_s"), 1e-9))
         self._standby = column("standby_a")
         self._reset_v = column("reset_v")
+        self._highest_reset_v = float(self._reset_v.max(initial=0.0))
         self._copper, self._magnet = column("copper_per_k"), column("magnet_per_k")
         self._winding_j_k, self._case_j_k = column("winding_j_k"), column("case_j_k")
         self._winding_case, self._case_air = column("winding_case_k_w"), column("case_air_k_w")
@@ -165,13 +167,14 @@ class Drives:
         self._noise = column("encoder_noise_rad") * PULSES_PER_RAD
         self._current_noise = column("current_noise_a")
         self._noisy = bool(self._noise.any())
+        self._shaft_gain = self.sign * PULSES_PER_RAD
+        self._shaft_zero = self.mount * PULSES_PER_RAD
         self._fill_noise()
         self._varying_friction = bool(self._load_friction.any() or (self._static > self._coulomb).any())
         self._extra_torque = bool(self._bias.any() or self._quadratic.any() or self._cogging.any())
         self._limited = bool(np.isfinite(self._torque_limit).any())
         self._filtered_goal = bool((self._lag_share < 1).any() or np.isfinite(self._slew).any())
-        self._shaft_gain = self.sign * PULSES_PER_RAD
-        self._shaft_zero = self.mount * PULSES_PER_RAD
+        self._derated = bool(self._derating_per_k.any())
         self._sensor_delay = column("sensor_delay_s")
         # Positions and velocities of the recent past, the newest last, where any answer is old.
         keep = round(float(self._sensor_delay.max(initial=0.0)) / self.dt) + 1
@@ -208,7 +211,7 @@ class Drives:
         self.body.armature[:] = np.maximum(inertia, self._armature / 2)
 
     def _fill_noise(self) -> None:
-        self._noise_rows = self._random.standard_normal((_NOISE_BLOCK, self.n)) * self._noise
+        self._noise_rows = list(self._random.standard_normal((_NOISE_BLOCK, self.n)) * self._noise)
         self._noise_row = 0
 
     # ---- what the firmware does to its loop ----
@@ -231,6 +234,10 @@ class Drives:
         self.d_gain[k] = loop.d_gain / self._d_divisor[k]
         self.pwm_limit[k] = loop.pwm_limit
         self._has_i, self._has_d = bool(self.i_gain.any()), bool(self.d_gain.any())
+        # What a step needs of all this, multiplied out.
+        self._duty_per_count = self.torque_on * self.direction / PWM_FULL
+        self._lowest_pwm = -self.pwm_limit
+        self._turned = bool((self.direction != 1).any() or self.offset.any())
         plain = loop.mode in (POSITION_MODE, EXTENDED_MODE)
         feeds = loop.feedforward_velocity or loop.feedforward_acceleration
         self._special = [i for i in self._special if i != k]
@@ -317,41 +324,44 @@ class Drives:
             goal = self.effective_goal
         else:
             goal = self.goal
-        shaft_velocity = self.sign * (self.rotor_velocity if self.elastic else body.v)
+        velocity = self.rotor_velocity if self.elastic else body.v
         if count % self._every == 0:
             self._control(goal)
-        d = self._pwm * self.torque_on
-        d *= 1.0 / PWM_FULL
-        d *= self.direction
-        conducting = self.torque_on
-        back = self.ke * shaft_velocity
-        over_r = d / self.resistance
-        draw, push = float(over_r @ d), float(over_r @ back)
-        volts = (self.supply_v - self.supply_ohm * (self.supply_a - push)) / (1 + self.supply_ohm * draw)
+        self.duty = d = self._pwm * self._duty_per_count
+        back = self._back_per_v * velocity
+        volts = self.supply_v
+        if self.supply_ohm:
+            over_r = d / self.resistance
+            draw, push = float(over_r @ d), float(over_r @ back)
+            volts = (volts - self.supply_ohm * (self.supply_a - push)) / (1 + self.supply_ohm * draw)
         self.voltage = volts
         if volts < self.lowest_voltage:
             self.lowest_voltage = volts
-        driven = d * volts if self.path is None else d * volts * self.path
-        current = (driven - back) / self.resistance * conducting
-        torque = self.kt_warm * current
-        torque *= self._pull
+        current = d * volts
+        if self.path is not None:
+            current *= self.path
+        current -= back
+        current /= self.resistance
+        current *= self.torque_on
+        self.current = current
+        change = np.subtract(velocity, self._filtered_velocity, out=self._velocity_change)
+        change *= self._velocity_share
+        self._filtered_velocity += change
+        torque = self._joint_nm_per_a * current
         if self._limited:
             torque = np.minimum(np.maximum(torque, -self._torque_limit), self._torque_limit)
-        self.duty, self.current, self.motor_torque, self.shaft_velocity = d, current, torque, shaft_velocity
-        self._filtered_velocity += (shaft_velocity - self._filtered_velocity) * self._velocity_share
-        joint_torque = torque * self.sign
         if self._extra_torque:
-            joint_torque = joint_torque + self._extra()
+            torque += self._extra()
         if self.elastic:
-            self._step_rotors(joint_torque)
+            self._step_rotors(torque)
         else:
             if self._varying_friction:
-                body.frictionloss[:] = self._friction(body.v, joint_torque)
-            body.torque[:] = joint_torque
+                body.frictionloss[:] = self._friction(body.v, torque)
+            body.torque[:] = torque
         if self.grips:
             body.torque += grip_torque(self.grips, body.q, body.v, self.time)
         if self._past is not None:
-            self._past.append((body.q.copy(), self._filtered_velocity.copy()))
+            self._past.append((body.q.copy(), self._filtered_velocity * self.sign))
         body.step()
         self.time += self.dt
 
@@ -364,9 +374,10 @@ class Drives:
             pulses += self._noise_rows[self._noise_row]
             self._noise_row += 1
         np.rint(pulses, out=pulses)
-        pulses *= self.direction
-        pulses += self.offset
-        error = goal - pulses
+        if self._turned:
+            pulses *= self.direction
+            pulses += self.offset
+        error = np.subtract(goal, pulses, out=pulses)
         if self._has_dead_zone:
             error = np.sign(error) * np.maximum(np.abs(error) - self._dead_zone, 0.0)
         pwm = self.p_gain * error
@@ -381,7 +392,9 @@ class Drives:
         self._error = error
         for k in self._special:
             self._control_specially(k, pwm)
-        self._pwm = np.trunc(np.minimum(np.maximum(pwm, -self.pwm_limit), self.pwm_limit))
+        np.maximum(pwm, self._lowest_pwm, out=pwm)
+        np.minimum(pwm, self.pwm_limit, out=pwm)
+        self._pwm = np.trunc(pwm, out=pwm)
 
     def _control_specially(self, k: int, pwm: Array) -> None:
         """Feed-forward, and the modes that are not position control."""
@@ -393,14 +406,15 @@ class Drives:
         if loop.mode == PWM_MODE:
             pwm[k] = loop.goal_pwm
         elif loop.mode == VELOCITY_MODE:
-            velocity = self.direction[k] * self._filtered_velocity[k] / RAD_S_PER_COUNT
+            velocity = self.direction[k] * self.sign[k] * self._filtered_velocity[k] / RAD_S_PER_COUNT
             error = loop.goal_velocity - velocity
             self._velocity_sum[k] += error
             pwm[k] = loop.velocity_p_gain / 128 * error + loop.velocity_i_gain / 65536 * self._velocity_sum[k]
         elif loop.mode in (CURRENT_MODE, CURRENT_POSITION_MODE):
             # The bridge gives what drives this current against back-EMF.
             wanted = abs(loop.goal_current) * AMPERE_PER_COUNT
-            back = self.direction[k] * self.ke[k] * self.shaft_velocity[k]
+            shaft = self.sign[k] * (self.rotor_velocity if self.elastic else self.body.v)[k]
+            back = self.direction[k] * self.ke[k] * shaft
             volts = max(self.voltage, 1.0)
             if loop.mode == CURRENT_MODE:
                 drive = math.copysign(wanted, loop.goal_current)
@@ -465,9 +479,18 @@ class Drives:
         rise = self.winding - 25.0
         self.resistance = self._r_cold * (1 + self._copper * rise)
         self.kt_warm = self.kt * (1 - self._magnet * rise)
-        share = np.where(self._derating_s > 0, 1 - np.exp(-dt / np.maximum(self._derating_s, 1e-9)), 1.0)
-        self._derating += (self._derating_per_k * (self.case - 25.0) - self._derating) * share
-        self._pull = self.strength * np.clip(1 - self._derating, 0.0, 1.0)
+        pull = self.kt_warm * self.strength
+        if self._derated:
+            share = np.where(self._derating_s > 0, 1 - np.exp(-dt / np.maximum(self._derating_s, 1e-9)), 1.0)
+            self._derating += (self._derating_per_k * (self.case - 25.0) - self._derating) * share
+            pull *= np.clip(1 - self._derating, 0.0, 1.0)
+        self._joint_nm_per_a = pull * self.sign
+
+    @property
+    def joint_torque(self) -> Array:
+        """(n,) N·m of the motors, at the joints."""
+        torque: Array = np.clip(self._joint_nm_per_a * self.current, -self._torque_limit, self._torque_limit)
+        return torque
 
     def set_path(self, path: Array) -> None:
         """Which servos the supply reaches, (n,) of 0 and 1."""
@@ -482,15 +505,19 @@ class Drives:
     def watch_supply(self, dt: float) -> None:
         """Note how long each servo has been below its reset voltage, by the lowest since the last call."""
         self.supply_a = float(self._standby @ self.powered)
-        low = self.lowest_voltage * (1.0 if self.path is None else self.path) < self._reset_v
-        self.starved_s = np.where(low, self.starved_s + dt, 0.0)
+        if self.path is not None or self.lowest_voltage < self._highest_reset_v:
+            low = self.lowest_voltage * (1.0 if self.path is None else self.path) < self._reset_v
+            self.starved_s = np.where(low, self.starved_s + dt, 0.0)
+            self.starving = bool(low.any())
+        elif self.starving:
+            self.starved_s, self.starving = np.zeros(self.n), False
         self.lowest_voltage = self.voltage
 
     def sense(self, k: int, time: float) -> Sensed:
         """What servo k's electronics measure at `time` (s), at most a step after the last one done."""
         ahead = time - self.time
         q, v = float(self.body.q[k]), float(self.body.v[k])
-        velocity = float(self._filtered_velocity[k])
+        velocity = float(self._filtered_velocity[k] * self.sign[k])
         if self._past and self._sensor_delay[k] > 0:
             old = max(0, len(self._past) - round(float(self._sensor_delay[k]) / self.dt))
             if old < len(self._past):
@@ -498,7 +525,7 @@ class Drives:
                 v = velocity * float(self.sign[k])
         pulses = float(self._shaft_gain[k]) * (q + v * ahead) + float(self._shaft_zero[k])
         if self._noisy:
-            pulses += float(self._noise_rows[self._noise_row - 1, k])
+            pulses += float(self._noise_rows[self._noise_row - 1][k])
         current = float(self.current[k]) + float(self._current_noise[k]) * float(self._random.standard_normal())
         move = self._moves.get(k)
         return Sensed(

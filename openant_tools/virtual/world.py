@@ -153,7 +153,7 @@ class World:
         self.drives.touching = self._touching(motors)
         self.drives.winding[:] = self.drives.case[:] = settings.ambient_c
         self.set_supply(settings.supply.volts, settings.supply.resistance_ohm)
-        self._stall_current = settings.supply.volts / self.drives.resistance
+        self._heavy_a = OVERLOAD_SHARE * settings.supply.volts / self.drives.resistance
 
     def _touching(self, motors: Sequence[MotorSettings]) -> np.ndarray[Any, Any] | None:
         """W/K between the cases of servos that are screwed to each other: hip and knee of one leg."""
@@ -267,7 +267,7 @@ class World:
         drives = self.drives
         drives.watch_supply(elapsed)
         for k, servo in enumerate(self.servos):
-            if drives.starved_s[k] > drives.motors[k].reset_s:
+            if drives.starving and drives.starved_s[k] > drives.motors[k].reset_s:
                 if servo.powered:
                     servo.power_off()
                     drives.powered[k] = 0.0
@@ -278,11 +278,13 @@ class World:
                 servo.watch_bus(now)
                 if protect:
                     servo.protect(drives.voltage_at(k), float(drives.case[k]))
-        heavy = np.abs(drives.current) > OVERLOAD_SHARE * self._stall_current
-        self._overloaded_s = np.where(heavy, self._overloaded_s + elapsed, 0.0)
+        heavy = np.abs(drives.current) > self._heavy_a
         if heavy.any():
+            self._overloaded_s = np.where(heavy, self._overloaded_s + elapsed, 0.0)
             for k in map(int, np.flatnonzero(self._overloaded_s > OVERLOAD_S)):
                 self.servos[k].raise_hardware_error(OVERLOAD_ERROR)
+        else:
+            self._overloaded_s[:] = 0.0
 
     def plug(self, k: int, plugged: bool) -> None:
         """Put servo k on the cable, which powers it, or take it off."""
@@ -335,8 +337,6 @@ class World:
     def state(self) -> dict[str, Any]:
         """The truth behind the sensors, for tests and people: rad, rad/s, N·m, A, V, °C, m."""
         drives, body = self.drives, self.body
-        torque = drives.sign * drives.motor_torque
-
         def per_joint(values: Sequence[Any] | np.ndarray[Any, Any]) -> dict[str, Any]:
             return {joint: _plain(value) for joint, value in zip(self.joints, values, strict=True)}
 
@@ -345,7 +345,7 @@ class World:
             "setup": self.settings.body.setup,
             "angle": per_joint(body.q),
             "velocity": per_joint(body.v),
-            "torque": per_joint(torque),
+            "torque": per_joint(drives.joint_torque),
             "current": per_joint(drives.current),
             "duty": per_joint(drives.duty),
             "temperature": per_joint(drives.case),
