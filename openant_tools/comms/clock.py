@@ -206,8 +206,8 @@ class SteppedClock:
 
     def sleep_until(self, t: float) -> None:
         if any(line.written != self._settled[name] for name, line in self._lines.items()):
-            self._ask("settle")
-        if t > self._t:
+            self._ask("advance", to=t)  # once what was written has had its effect
+        elif t > self._t:
             self._take(self._control.ask("advance", to=t))
 
     def wait_readable(self, line: Line, deadline: float) -> bool:

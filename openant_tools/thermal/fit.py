@@ -495,11 +495,35 @@ class _Points:
         share = (self.t - run.edges[cell]) / (run.edges[cell + 1] - run.edges[cell])
         return np.asarray(whole[:, cell, self.joint] * (1 - share) + whole[:, cell + 1, self.joint] * share)
 
-    def covariance(self, deviation: float, tau: float) -> Array:
-        """(n, n) K²: the thermometers' own errors and a slow disturbance at each joint."""
-        same = self.joint[:, None] == self.joint[None, :]
-        apart = np.abs(self.t[:, None] - self.t[None, :])
-        return np.asarray(np.diag(self.sd**2) + deviation**2 * np.exp(-apart / tau) * same)
+    def noise(self, deviation: float, tau: float) -> _Noise:
+        """The thermometers' own errors (K) and a slow disturbance at each joint: a deviation (K) that lasts for τ (s)."""
+        rows = [np.flatnonzero(self.joint == k) for k in np.unique(self.joint)]
+        roots = []
+        for mine in rows:
+            apart = np.abs(self.t[mine, None] - self.t[None, mine])
+            covariance = np.diag(self.sd[mine] ** 2) + deviation**2 * np.exp(-apart / tau)
+            roots.append(linalg.cholesky(covariance, lower=True))
+        return _Noise(rows, roots)
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """What disturbs the points, each joint's by itself: its rows and the lower root of its covariance, K."""
+
+    rows: Sequence[NDArray[np.intp]]
+    roots: Sequence[Array]
+
+    def whitened(self, values: Array) -> Array:
+        """(n, …) values at the points, so weighed that their errors are independent and of size 1."""
+        out = np.empty_like(values)
+        for rows, root in zip(self.rows, self.roots, strict=True):
+            out[rows] = linalg.solve_triangular(root, values[rows], lower=True)
+        return out
+
+    @property
+    def log_size(self) -> float:
+        """Half the logarithm of the covariance's determinant."""
+        return sum(float(np.log(np.diag(root)).sum()) for root in self.roots)
 
 
 def _fit_one(run: Inputs, before: Known | None) -> Fit:
@@ -511,11 +535,11 @@ def _fit_one(run: Inputs, before: Known | None) -> Fit:
     deviation, tau = math.exp(_DISTURBANCE_PRIOR[0]), DISTURBANCE_S[1]
     residual, jacobian = _linearised(run, layout, points, theta)
     for round_ in range(3):
-        root = linalg.cholesky(points.covariance(deviation, tau), lower=True)
-        theta, residual, jacobian = _gauss_newton(run, layout, points, theta, prior, root, residual, jacobian)
+        noise = points.noise(deviation, tau)
+        theta, residual, jacobian = _gauss_newton(run, layout, points, theta, prior, noise, residual, jacobian)
         if round_ < 2:
             deviation, tau = _evidence(points, layout, theta, residual, jacobian)
-    weighted = linalg.solve_triangular(root, jacobian, lower=True)
+    weighted = noise.whitened(jacobian)
     covariance = linalg.inv(weighted.T @ weighted + prior)
     rms = np.array(
         [np.sqrt(np.mean(residual[points.joint == k] ** 2)) if (points.joint == k).any() else np.nan
@@ -528,11 +552,39 @@ def _linearised(run: Inputs, layout: _Layout, points: _Points, theta: Array) -> 
     """(n,) residuals in K and their (n, p) derivatives of the model by its parameters."""
     steps = np.full(len(theta), 1e-3)
     steps[~layout.log] = 1e-2
-    batch = np.vstack([theta, theta + np.diag(steps)])
+    row, reached = _apart(run, layout)
+    batch = np.tile(theta, (row.max() + 1, 1))
+    batch[row, np.arange(len(theta))] += steps
     servos, start = _servos(run, layout, batch)
     case, _ = _simulated(run, layout, batch, servos, start)
     seen = points.seen_in(run, start.case, case)
-    return points.temperature - seen[0], ((seen[1:] - seen[0]) / steps[:, None]).T
+    change = np.where(reached[:, points.joint], seen[row] - seen[0], 0.0)
+    return points.temperature - seen[0], (change / steps[:, None]).T
+
+
+def _apart(run: Inputs, layout: _Layout) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Which parameters may be changed in one and the same simulation, since no joint feels two of them.
+
+    Heat goes from a servo to its neighbour in the leg and no farther.
+
+    Returns:
+        (p,) the simulation in which each is changed, from 1 (0 changes nothing); (p, joints) whom each reaches.
+    """
+    reached = np.ones((len(layout.names), len(run.joints)), bool)
+    for place, (_, joint) in enumerate(layout.names):
+        if joint:
+            k = run.joints.index(joint)
+            reached[place] = False
+            reached[place, [k, run.partner[k] if run.partner[k] >= 0 else k]] = True
+    row, taken = np.zeros(len(reached), np.intp), list[NDArray[np.bool_]]()
+    for place, mine in enumerate(reached):
+        free = next((n for n, others in enumerate(taken) if not (others & mine).any()), len(taken))
+        if free == len(taken):
+            taken.append(mine.copy())
+        else:
+            taken[free] |= mine
+        row[place] = free + 1
+    return row, reached
 
 
 def _gauss_newton(
@@ -541,21 +593,21 @@ def _gauss_newton(
     points: _Points,
     theta: Array,
     prior: Array,
-    root: Array,
+    noise: _Noise,
     residual: Array,
     jacobian: Array,
 ) -> tuple[Array, Array, Array]:
     """The best parameters for this noise, with residuals and derivatives there; steps are shortened until they help."""
 
     def cost(residual: Array, theta: Array) -> float:
-        whitened = linalg.solve_triangular(root, residual, lower=True)
+        whitened = noise.whitened(residual)
         away = theta - layout.mean
         return float(whitened @ whitened + away @ prior @ away)
 
     best, damping = cost(residual, theta), 1e-3
     for _ in range(ITERATIONS):
-        weighted = linalg.solve_triangular(root, jacobian, lower=True)
-        gradient = weighted.T @ linalg.solve_triangular(root, residual, lower=True) - prior @ (theta - layout.mean)
+        weighted = noise.whitened(jacobian)
+        gradient = weighted.T @ noise.whitened(residual) - prior @ (theta - layout.mean)
         curvature = weighted.T @ weighted + prior
         step = linalg.solve(curvature + damping * np.diag(np.diag(curvature)), gradient, assume_a="pos")
         step = (
@@ -582,15 +634,21 @@ def _gauss_newton(
 def _evidence(points: _Points, layout: _Layout, theta: Array, residual: Array, jacobian: Array) -> tuple[float, float]:
     """The disturbance (K, s) under which these points are most probable, the parameters integrated out."""
     z = residual + jacobian @ (theta - layout.mean)
-    explained = jacobian @ layout.covariance @ jacobian.T
+    # (n, p): with the parameters, the points' covariance is that of the noise and this times its transpose. So few
+    # parameters are taken out by themselves (Woodbury), and the noise is one joint's at a time.
+    shown = jacobian @ _root(layout.covariance)
+    one = np.eye(len(theta))
     best = (-math.inf, DISTURBANCE_K[0], DISTURBANCE_S[0])
     for deviation in DISTURBANCE_K:
         centre, spread = _DISTURBANCE_PRIOR
         prior = -0.5 * ((math.log(deviation) - centre) / spread) ** 2
         for tau in DISTURBANCE_S:
-            root = linalg.cholesky(points.covariance(deviation, tau) + explained, lower=True)
-            whitened = linalg.solve_triangular(root, z, lower=True)
-            value = -0.5 * float(whitened @ whitened) - float(np.log(np.diag(root)).sum()) + prior
+            noise = points.noise(deviation, tau)
+            whitened, weighted = noise.whitened(z), noise.whitened(shown)
+            root = linalg.cholesky(one + weighted.T @ weighted, lower=True)
+            explained = linalg.solve_triangular(root, weighted.T @ whitened, lower=True)
+            away = float(whitened @ whitened) - float(explained @ explained)
+            value = -0.5 * away - noise.log_size - float(np.log(np.diag(root)).sum()) + prior
             best = max(best, (value, deviation, tau))
     return best[1], best[2]
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +59,16 @@ class Servos:
     by_duty: NDArray[np.bool_]
     partner: NDArray[np.intp]
 
+    @cached_property
+    def winding_tau_s(self) -> Array:
+        """Cw / Gw."""
+        return self.winding_j_k / self.winding_w_k
+
+    @cached_property
+    def leg(self) -> Array:
+        """(b, joints) W/K to the neighbour, 0 where there is none."""
+        return np.asarray(self.leg_w_k * (self.partner >= 0))
+
 
 @dataclass(frozen=True)
 class State:
@@ -88,22 +99,23 @@ def advance(
     """
     room = servos.room_c if room is None else room
     power = winding_heat(servos, state.winding, drive)
-    tau = servos.winding_j_k / servos.winding_w_k
+    tau = servos.winding_tau_s
     fade = np.exp(-seconds / tau)
     goal = state.case + power / servos.winding_w_k
-    winding = goal + (state.winding - goal) * fade
-    mean = goal + (state.winding - goal) * (1 - fade) * tau / seconds
+    away, faded = state.winding - goal, 1 - fade
+    winding = goal + away * fade
+    mean = goal + away * faded * tau / seconds
     flow = servos.winding_w_k * (mean - state.case)
     rise = np.maximum(np.abs(state.case - room), _LEAST_RISE_K)
     air = servos.air_w_k * (rise / AIR_RISE_K) ** servos.exponent
-    has = servos.partner >= 0
-    leg = servos.leg_w_k * has
-    neighbour = state.case[:, servos.partner] * has
+    # Who has no neighbour gives it nothing, whatever place -1 means.
+    leg = servos.leg
+    neighbour = state.case[:, servos.partner]
     out = air + leg
     gain = flow + servos.idle * idle + servos.gear * gear + air * room + leg * neighbour
     goal = gain / out
     case = goal + (state.case - goal) * np.exp(-seconds * out / servos.case_j_k)
-    return State(winding + (case - state.case) * (1 - fade), case)
+    return State(winding + (case - state.case) * faded, case)
 
 
 def steady_drive(servos: Servos, case: Array, idle: Array, others: Array) -> Array:
@@ -113,7 +125,7 @@ def steady_drive(servos: Servos, case: Array, idle: Array, others: Array) -> Arr
     """
     rise = np.maximum(case - servos.room_c, 0.0)
     air = servos.air_w_k * rise * (np.maximum(rise, _LEAST_RISE_K) / AIR_RISE_K) ** servos.exponent
-    leg = servos.leg_w_k * (servos.partner >= 0) * (case - others[:, servos.partner])
+    leg = servos.leg * (case - others[:, servos.partner])
     power = np.maximum(air + leg - servos.idle * idle, 0.0)
     winding = case + power / servos.winding_w_k
     resistance = servos.resistance * (1 + COPPER_PER_K * (winding - 25.0))

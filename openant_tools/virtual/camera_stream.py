@@ -11,6 +11,9 @@ Every picture says in its header when it was exposed (`X-Timestamp`, s: robot ti
 when it was delivered (`X-Delivered`), which exposure it is (`X-Frame`) and how many were delivered before it
 (`X-Ordinal`).
 
+A stepped robot's time goes on some hundred times for each picture, so it stands in memory that both processes share, with how
+much the robot has told so far: who asks for a picture waits until all of that has been heard.
+
 The camera delivers frame k, exposed around k/fps, after its latency and jitter, unless it is dropped. What is random is
 a function of the seed and k.
 """
@@ -46,6 +49,10 @@ MEMORY = 256
 #: As many pictures as a driver's queue holds; what comes while it is full is lost.
 QUEUE = 4
 SNAPSHOT_TIMEOUT_S = 20.0
+#: s between two looks at a stepped robot's time while a picture waits for it
+LOOK_S = 2e-3
+#: places in the memory shared by both processes: robot time, s; messages told
+TIME, TOLD = 0, 1
 
 
 @dataclass(frozen=True)
@@ -67,12 +74,13 @@ class VirtualCamera:
 
     def __init__(self, settings: OverheadCameraSettings, seed: int, *, stepped: bool = False) -> None:
         self.settings = settings
-        self._stepped = stepped
         self._next = 0
         context = multiprocessing.get_context("spawn")
         self._pipe, far = context.Pipe()
+        self._shared: Any = context.RawArray("d", 2)
+        shared = self._shared if stepped else None
         self._process = context.Process(
-            target=_serve, args=(settings, seed, stepped, far), name="openant-camera", daemon=True
+            target=_serve, args=(settings, seed, shared, far), name="openant-camera", daemon=True
         )
         self._process.start()
         far.close()
@@ -106,9 +114,8 @@ class VirtualCamera:
         self._tell(("expose", index, due, time.monotonic() - (t - due), scene))
 
     def advance(self, t: float) -> None:
-        """Tell a stepped camera the time, after the exposures up to then."""
-        if self._stepped:
-            self._tell(("time", t))
+        """The time of a stepped robot, after the exposures up to then."""
+        self._shared[TIME] = t
 
     def fault(self, name: str | None) -> None:
         """Begin a fault of `CAMERA_FAULTS`, or end it."""
@@ -129,12 +136,13 @@ class VirtualCamera:
         # The robot goes on without its camera.
         with contextlib.suppress(OSError):
             self._pipe.send(message)
+            self._shared[TOLD] += 1
 
 
-def _serve(settings: OverheadCameraSettings, seed: int, stepped: bool, pipe: Connection) -> None:
+def _serve(settings: OverheadCameraSettings, seed: int, shared: Any, pipe: Connection) -> None:
     """The camera's process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the robot's process decides when to end
-    feed = _Feed(settings, seed, stepped)
+    feed = _Feed(settings, seed, shared)
     server = _Server(("127.0.0.1", 0), _Handler)
     server.feed = feed
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -145,10 +153,9 @@ def _serve(settings: OverheadCameraSettings, seed: int, stepped: bool, pipe: Con
             message = pipe.recv()
             if message[0] == "expose":
                 feed.expose(*message[1:])
-            elif message[0] == "time":
-                feed.advance(message[1])
             else:
                 feed.set_fault(message[1])
+            feed.has_heard()
     except (EOFError, OSError):
         # The robot is gone. Threads in the midst of OpenCV do not survive an orderly end of the interpreter.
         os._exit(0)
@@ -170,14 +177,19 @@ class _Picture:
 
 
 class _Feed:
-    """Exposures in, pictures out."""
+    """Exposures in, pictures out.
 
-    def __init__(self, settings: OverheadCameraSettings, seed: int, stepped: bool) -> None:
+    Args:
+        shared: a stepped robot's time and how much it has told; None in real time.
+    """
+
+    def __init__(self, settings: OverheadCameraSettings, seed: int, shared: Any) -> None:
         self.settings = settings
-        self.stepped = stepped
+        self.stepped = shared is not None
+        self._shared = shared
+        self._heard = 0
         self.changed = threading.Condition()
         self.fault: str | None = None
-        self.time = 0.0
         self.watchers = 0
         self.published: tuple[int, _Picture | None] = (0, None)
         from openant_tools.optional import cv2
@@ -212,10 +224,20 @@ class _Feed:
                 self._queue.append(exposure)
             self.changed.notify_all()
 
-    def advance(self, t: float) -> None:
+    def has_heard(self) -> None:
         with self.changed:
-            self.time = t
+            self._heard += 1
             self.changed.notify_all()
+
+    def catch_up(self, at: float | None) -> None:
+        """Return once a stepped robot's time is `at` (s), and all is here that it has told until then."""
+        if not self.stepped:
+            return
+        give_up = time.monotonic() + SNAPSHOT_TIMEOUT_S
+        while at is not None and self.now() < at - 1e-9 and time.monotonic() < give_up:
+            time.sleep(LOOK_S)
+        with self.changed:
+            self.changed.wait_for(lambda: self._heard >= self._shared[TOLD], SNAPSHOT_TIMEOUT_S)
 
     def set_fault(self, fault: str | None) -> None:
         with self.changed:
@@ -224,7 +246,7 @@ class _Feed:
             self.changed.notify_all()
 
     def now(self) -> float:
-        return self.time if self.stepped else time.monotonic()
+        return float(self._shared[TIME]) if self.stepped else time.monotonic()
 
     def render(self) -> None:
         """Publish queued pictures, each at its time."""
@@ -236,7 +258,7 @@ class _Feed:
             picture = self._frozen(self.picture(exposure))
             with self.changed:
                 while self.now() < exposure.due:
-                    self.changed.wait(None if self.stepped else max(1e-4, exposure.due - self.now()))
+                    self.changed.wait(LOOK_S if self.stepped else max(1e-4, exposure.due - self.now()))
                 self._queue.popleft()
                 self.published = (self.published[0] + 1, picture)
                 self.changed.notify_all()
@@ -270,8 +292,6 @@ class _Feed:
     def snapshot(self, at: float | None) -> _Picture | None:
         """The last picture delivered by `at` (default now)."""
         with self.changed:
-            if at is not None and self.stepped:
-                self.changed.wait_for(lambda: self.time >= at - 1e-9, SNAPSHOT_TIMEOUT_S)
             now = self.now() if at is None else at
             dues = [exposure.due for exposure in self._history]
             found = bisect_right(dues, now + 1e-9)
@@ -299,15 +319,16 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         feed = self.server.feed
+        url = urllib.parse.urlparse(self.path)
+        at = [float(one) for one in urllib.parse.parse_qs(url.query).get("at", ())]
+        feed.catch_up(at[0] if at else None)
         self.close_connection = feed.fault == "gone"
         if self.close_connection:
             return
-        url = urllib.parse.urlparse(self.path)
         if url.path == "/stream.mjpg":
             self._stream(feed)
         elif url.path == "/snapshot.jpg":
-            at = urllib.parse.parse_qs(url.query).get("at")
-            picture = feed.snapshot(float(at[0]) if at else None)
+            picture = feed.snapshot(at[0] if at else None)
             if picture is None:
                 self.send_response(204)
                 self.send_header("Content-Length", "0")

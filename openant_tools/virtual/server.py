@@ -11,7 +11,8 @@ The control socket (Unix stream, one JSON object a line, one line of answer each
 |---|---|
 | `{"do": "now"}` | `{"t": s, "stepped": bool}` |
 | `{"do": "open"}` | counts of bytes start anew, for a client that has just opened its ports; `{"t": s}` |
-| `{"do": "advance", "to": s}` | runs the world to that time (stepped only); `{"t": s}` |
+| `{"do": "advance", "to": s}` | runs the world to that time (stepped only); `{"t": s}`. With `bus_written` and |
+| | `imu_written` it does what `settle` does first, and answers so |
 | `{"do": "settle", "bus_written": n, "imu_written": m}` | waits for so many bytes in all and lets them act; |
 | | `{"t": s, "bus_sent": n, "imu_sent": m}`: when the last answer reached the host (or the wire fell silent), and |
 | | how many bytes were sent in all; `"bus_arrivals": [[n, t], …]` (and `imu_…`): when each portion since the last |
@@ -477,11 +478,7 @@ class Server:
             self._restart_counts(control)
             return {"t": self.now}
         if do == "advance":
-            if not self.stepped:
-                raise _Failed("time runs by itself: the robot was not started with --clock stepped")
-            self.advance(_number(request, "to"))
-            stood = self._sleep_through()
-            return {"t": self.now, **stood}
+            return self._advance(control, request)
         if do == "settle":
             return self._settle(control, request)
         if do == "wait":
@@ -550,6 +547,23 @@ class Server:
             control.arrivals[name] = []
         return answer
 
+    def _advance(self, control: _Control, request: dict[str, Any]) -> dict[str, Any]:
+        if not self.stepped:
+            raise _Failed("time runs by itself: the robot was not started with --clock stepped")
+        to, stood, writes = _number(request, "to"), dict[str, Any](), "bus_written" in request
+        if writes:
+            self._arrive(control, request)
+            stood = self._let_act()
+        if to > self.now or not writes:
+            self.advance(to)
+            stood |= self._sleep_through()
+        return (self._counts(control) if writes else {"t": self.now}) | stood
+
+    def _let_act(self) -> dict[str, Any]:
+        """Stepped: run until the last answer has reached the host, or the wire has fallen silent."""
+        self.advance(max(self._act(), self.now))
+        return self._sleep_through()
+
     def _wait(self, control: _Control, request: dict[str, Any]) -> dict[str, Any]:
         if not self.stepped:
             raise _Failed("time runs by itself: the robot was not started with --clock stepped")
@@ -566,9 +580,7 @@ class Server:
         self._arrive(control, request)
         stood: dict[str, Any] = {}
         if self.stepped:
-            reached = max(self._act(), self.now)
-            self.advance(reached)
-            stood = self._sleep_through()
+            stood = self._let_act()
         else:
             while self._outbox:
                 time.sleep(max(0.0, self._outbox[0][0] - self.now))
@@ -586,11 +598,8 @@ class Server:
         """Wait for more bytes at one port, the pseudo-terminal's delivery being asynchronous."""
         files = self.ports[name].files
         left = deadline - time.monotonic()
-        with selectors.DefaultSelector() as waiting:
-            for file in files:
-                waiting.register(file, selectors.EVENT_READ)
-            if not files or left <= 0 or not waiting.select(left):
-                raise _Failed(f"the bytes announced for {name} did not arrive")
+        if not files or left <= 0 or not select.select(files, (), (), left)[0]:
+            raise _Failed(f"the bytes announced for {name} did not arrive")
         self._read(name)
 
     def set_plugged(self, device: str, plugged: bool) -> None:
