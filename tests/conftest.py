@@ -14,8 +14,9 @@ if _WORKERS > 1:
     for _limit in ("OMP_NUM_THREADS", "LOKY_MAX_CPU_COUNT"):
         os.environ.setdefault(_limit, str(max(1, (os.cpu_count() or 1) // _WORKERS)))
 
-# What the tests start by the hundred compiles our modules once, not each time.
+# What the tests start by the hundred compiles our modules once, not each time; and MuJoCo loads no window library.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+os.environ.setdefault("MUJOCO_GL", "disable")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

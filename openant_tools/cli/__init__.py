@@ -154,6 +154,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line; exits with 0, 1, 2 or 130 (formats, section 6), never a traceback for bad input."""
     heed_signals()
     end_with_who_started_us()
+    # MuJoCo loads a window library as it is imported, for a renderer that no command of ours uses (`openant_env.rendering`
+    # chooses its own): a third of its time to load, and a process started besides.
+    os.environ.setdefault("MUJOCO_GL", "disable")
     try:
         code = openant.main(args=argv, prog_name="openant", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)

@@ -570,12 +570,13 @@ def _apart(run: Inputs, layout: _Layout) -> tuple[NDArray[np.intp], NDArray[np.b
     Returns:
         (p,) the simulation in which each is changed, from 1 (0 changes nothing); (p, joints) whom each reaches.
     """
+    partner = np.where(run.partner >= 0, run.partner, np.arange(len(run.joints)))
     reached = np.ones((len(layout.names), len(run.joints)), bool)
     for place, (_, joint) in enumerate(layout.names):
         if joint:
             k = run.joints.index(joint)
             reached[place] = False
-            reached[place, [k, run.partner[k] if run.partner[k] >= 0 else k]] = True
+            reached[place, [k, partner[k]]] = True
     row, taken = np.zeros(len(reached), np.intp), list[NDArray[np.bool_]]()
     for place, mine in enumerate(reached):
         free = next((n for n, others in enumerate(taken) if not (others & mine).any()), len(taken))

@@ -337,6 +337,7 @@ class World:
     def state(self) -> dict[str, Any]:
         """The truth behind the sensors, for tests and people: rad, rad/s, N·m, A, V, °C, m."""
         drives, body = self.drives, self.body
+
         def per_joint(values: Sequence[Any] | np.ndarray[Any, Any]) -> dict[str, Any]:
             return {joint: _plain(value) for joint, value in zip(self.joints, values, strict=True)}
 
