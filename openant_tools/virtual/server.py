@@ -11,8 +11,8 @@ The control socket (Unix stream, one JSON object a line, one line of answer each
 |---|---|
 | `{"do": "now"}` | `{"t": s, "stepped": bool}` |
 | `{"do": "open"}` | counts of bytes start anew, for a client that has just opened its ports; `{"t": s}` |
-| `{"do": "advance", "to": s}` | runs the world to that time (stepped only); `{"t": s}`. With `bus_written` and |
-| | `imu_written` it does what `settle` does first, and answers so |
+| `{"do": "advance", "to": s}` | runs the world to that time (stepped only); `{"t": s}`. With `bus_written` or |
+| | `imu_written` it does first what `settle` does, and answers so |
 | `{"do": "settle", "bus_written": n, "imu_written": m}` | waits for so many bytes in all and lets them act; |
 | | `{"t": s, "bus_sent": n, "imu_sent": m}`: when the last answer reached the host (or the wire fell silent), and |
 | | how many bytes were sent in all; `"bus_arrivals": [[n, t], …]` (and `imu_…`): when each portion since the last |
@@ -550,7 +550,8 @@ class Server:
     def _advance(self, control: _Control, request: dict[str, Any]) -> dict[str, Any]:
         if not self.stepped:
             raise _Failed("time runs by itself: the robot was not started with --clock stepped")
-        to, stood, writes = _number(request, "to"), dict[str, Any](), "bus_written" in request
+        to, stood = _number(request, "to"), dict[str, Any]()
+        writes = any(f"{name}_written" in request for name in self.sent)
         if writes:
             self._arrive(control, request)
             stood = self._let_act()
