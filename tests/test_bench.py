@@ -221,7 +221,7 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
         '[[effect]]\neffect = "floor_tilt"\nparameters = { angle_rad = 0.2 }\n'
         '[[effect]]\neffect = "blocked_joint"\njoints = ["knee_fl"]\nparameters = { angle_rad = -0.87 }\n'
     )
-    with virtual_robot(str(scenario), clock="stepped") as robot:
+    with virtual_robot(str(scenario), clock="stepped", camera=False) as robot:
         ready = folder / "ready.json"
         ready.write_text(json.dumps(robot))
         yield {**{key: str(value) for key, value in robot.items()}, "ready": str(ready)}

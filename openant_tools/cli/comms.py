@@ -110,7 +110,7 @@ def scan(
         control = None
         if virtual_source is not None:
             clock = "real" if driver == "sdk" else clock_of_its_own(virtual_source)
-            robot = stack.enter_context(virtual_robot(virtual_source, clock=clock))
+            robot = stack.enter_context(virtual_robot(virtual_source, clock=clock, camera=False))
             paths, control = (*paths, str(robot["bus"])), robot["control"]
         buses = list(paths) or [port.stable_path for port in Host().ports() if port.kind == "bus"]
         if not buses:

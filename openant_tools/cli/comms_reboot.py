@@ -41,7 +41,8 @@ def reboot(
     with contextlib.ExitStack() as stack:
         control = None
         if virtual_source is not None:
-            found = stack.enter_context(virtual_robot(virtual_source, clock=clock_of_its_own(virtual_source)))
+            clock = clock_of_its_own(virtual_source)
+            found = stack.enter_context(virtual_robot(virtual_source, clock=clock, camera=False))
             port, control = port or str(found["bus"]), found["control"]
         rate = baud or (config.bus.baud if config is not None else 1_000_000)
         bus = open_bus(find_bus(port, config), rate, control)

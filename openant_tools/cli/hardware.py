@@ -96,7 +96,7 @@ def engine_config(
         found: Mapping[str, str | None] = {}
         if virtual_source is not None:
             clock = clock or clock_of_its_own(virtual_source)
-            found = stack.enter_context(virtual_robot(virtual_source, clock=clock))
+            found = stack.enter_context(virtual_robot(virtual_source, clock=clock, camera=camera))
         more.setdefault("still", not _moving())
         port, control = port or found.get("bus"), found.get("control")
         described = None if folder is None else folder.config()
