@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Progress = Callable[[str, float], None]
 #: asks for what options of kept parameters leave, is answered with that over all folds and over each, ends with a choice
-Choosing = Generator[Sequence[Bools], Sequence[Sequence[Gap]], "Choice"]
+Choosing = Generator["_Ask", Sequence[Sequence[Gap]], "Choice"]
 
 #: going back must pay this much on what was left out (relative, over both horizons): less is luck
 WORTH = 0.01
@@ -112,10 +112,19 @@ def _folds(motions: Sequence[Fold], gains: Sequence[Fold], without: Fold | None,
 
 @dataclass(frozen=True)
 class _Trial:
-    """A fit without a fold, and the fold's runs."""
+    """A fit without a fold, the rows that it has not seen, and the fold's runs."""
 
     posterior: Posterior
+    gone: Bools
     unseen: Sequence[Dataset]
+
+
+@dataclass(frozen=True)
+class _Ask:
+    """For what is left with each option of kept parameters; `fitted`: with the kept ones fitted anew, else to first order."""
+
+    options: Sequence[Bools]
+    fitted: bool = False
 
 
 @dataclass(frozen=True)
@@ -132,13 +141,11 @@ class Settled:
     """A fit to all runs, or without some, and what was chosen of it.
 
     Attributes:
-        posterior: of the fit.
         choice: by folds within its runs.
         u: (parameters,) of the model that this gives.
         unseen: the runs without which all of it was found; none where it was all.
     """
 
-    posterior: Posterior
     choice: Choice
     u: Array
     unseen: Sequence[Dataset]
@@ -179,17 +186,34 @@ def settle(
         masks |= {mask.tobytes(): mask for mask in (gone, *(mask for _, mask in sets[-1]))}
     del masks[nothing.tobytes()]
     found = problem.solve_without(
-        list(masks.values()), estimate.found, progress and (lambda what, done: progress(what, done / 2))
+        list(masks.values()), estimate.found, progress=progress and (lambda what, done: progress(what, done / 2))
     )
     without: dict[bytes, Posterior] = dict(zip(masks, found, strict=True))
     unseen = {id(fold): prepare(fold.runs) for each in sets for fold, _ in each}
     fits = [estimate, *(without[turn.rows(datasets).tobytes()] for turn in turns)]
-    trials = [[_Trial(without[mask.tobytes()], unseen[id(fold)]) for fold, mask in each] for each in sets]
-    choices = choose(fits, trials, parameters, progress and (lambda what, done: progress(what, (1 + done) / 2)))
+    trials = [
+        [
+            _Trial(one, nothing if turn is None else turn.rows(datasets), ()),
+            *(_Trial(without[mask.tobytes()], mask, unseen[id(fold)]) for fold, mask in each),
+        ]
+        for one, turn, each in zip(fits, (None, *turns), sets, strict=True)
+    ]
+
+    def refit(asked: Sequence[tuple[_Trial, Bools]]) -> list[_Trial]:
+        """Those kept from where they are likeliest while the others are as given."""
+        ends = problem.solve_without(
+            [trial.gone for trial, _ in asked],
+            estimate.found,
+            [trial.posterior.with_given(~kept) for trial, kept in asked],
+            [~kept for _, kept in asked],
+        )
+        return [replace(trial, posterior=end) for (trial, _), end in zip(asked, ends, strict=True)]
+
+    choices = choose(trials, parameters, refit, progress and (lambda what, done: progress(what, (1 + done) / 2)))
     shown = [list[Dataset](), *(unseen[id(turn)] for turn in turns)]
     return [
-        Settled(one, choice, _at(one, choice.kept), runs)
-        for one, choice, runs in zip(fits, choices, shown, strict=True)
+        Settled(choice, _at(posterior, choice.kept), runs)
+        for (choice, posterior), runs in zip(choices, shown, strict=True)
     ]
 
 
@@ -208,41 +232,57 @@ def _shown(fit: Posterior, trial: Posterior, kept: Bools) -> Array:
 
 
 def choose(
-    fits: Sequence[Posterior],
     trials: Sequence[Sequence[_Trial]],
     parameters: Sequence[Parameter],
+    refit: Callable[[Sequence[tuple[_Trial, Bools]]], list[_Trial]],
     progress: Progress | None = None,
-) -> list[Choice]:
-    """Of each fit, by the trials within its runs, which parameters keep their estimates."""
-    choosing = [_choose(parameters, len(each)) for each in trials]
-    ended: dict[int, Choice] = {}
+) -> list[tuple[Choice, Posterior]]:
+    """Which parameters keep their estimates, and where those of the fit are then; all fits side by side.
+
+    Args:
+        trials: for each fit the fit itself, and then those without a fold of its runs.
+        refit: trials and what each keeps → the same with that fitted anew, and the rest as given.
+    """
+    choosing = [_choose(parameters, len(each) - 1) for each in trials]
+    now = {k: list(each) for k, each in enumerate(trials)}
+    tried: dict[int, tuple[Bools, list[_Trial]]] = {}
+    ended: dict[int, tuple[Choice, Posterior]] = {}
     answers: dict[int, Sequence[Sequence[Gap]] | None] = dict.fromkeys(range(len(trials)))
     told = 0.0
     while answers:
         if progress:
             progress("choosing what is kept", told)
         told += (1.0 - told) / 3  # how many rounds there are nobody knows beforehand
-        asked: dict[int, Sequence[Bools]] = {}
+        asked: dict[int, _Ask] = {}
         for k, answer in answers.items():
+            kept, there = tried.pop(k, (None, now[k]))
             try:
                 asked[k] = next(choosing[k]) if answer is None else choosing[k].send(answer)
+                now[k] = there
             except StopIteration as end:
-                ended[k] = end.value
-        answers = {**_left(fits, trials, parameters, asked)}
+                choice: Choice = end.value
+                taken = there if kept is not None and np.array_equal(kept, choice.kept) else now[k]
+                ended[k] = choice, taken[0].posterior
+        places = [(k, trial, ask.options[0]) for k, ask in asked.items() if ask.fitted for trial in now[k]]
+        anew = iter(refit([(trial, kept) for _, trial, kept in places]) if places else ())
+        for k, ask in asked.items():
+            if ask.fitted:
+                tried[k] = ask.options[0], [next(anew) for _ in now[k]]
+        shown = {k: tried[k][1] if k in tried else now[k] for k in asked}
+        answers = {**_left(shown, parameters, {k: ask.options for k, ask in asked.items()})}
     return [ended[k] for k in range(len(trials))]
 
 
-def _choose(parameters: Sequence[Parameter], trials: int) -> Choosing:
+def _choose(parameters: Sequence[Parameter], folds: int) -> Choosing:
     """The rule of formats, section 6.
 
     Starting from all, the kind or joint whose return to the given model helps most on what was left out goes back, as long as
-    one does, by more than chance; and on, while what is left does not beat the given model at both horizons.
+    one does, by more than chance; and on, while what is left does not beat the given model at both horizons. Which one it is is
+    seen to first order, whether it helps with the rest fitted anew.
     """
     kept = np.ones(len(parameters), bool)
-    before, after = yield [~kept, kept]
-    if not trials:
-        return Choice(kept, before[0], after[0])
-    while kept.any():
+    before, after = yield _Ask([~kept, kept])
+    while folds and kept.any():
         # What is kept must pay too. Where physics knows better than the given model, its value is no safer one.
         short, full, gain = after[0].horizon, after[0].full, _score(after[0], before[0])
         beats = short < before[0].horizon and full < before[0].full and gain < -WORTH
@@ -255,19 +295,21 @@ def _choose(parameters: Sequence[Parameter], trials: int) -> Choosing:
             groups += [
                 np.array([bool(kept[k]) and p.label == label for k, p in enumerate(parameters)]) for label in labels
             ]
-        options = [kept & ~group for group in groups if group.any()]
-        results = (yield options) if options else []
-        if beats:
+
+        def better(one: Sequence[Gap], other: Sequence[Gap] = after, gain: float = gain) -> bool:
             # What helps on one motion and hardly on another is luck, and two or three motions have much of it.
-            helps = [_helps(result, after, before) for result in results]
-            options = [option for option, one in zip(options, helps, strict=True) if one]
-            results = [result for result, one in zip(results, helps, strict=True) if one]
-            if not options:
-                break
-        best = min(range(len(options)), key=lambda k: _score(results[k][0], before[0]))
-        if beats and _score(results[best][0], before[0]) > gain - WORTH:
+            return _score(one[0], before[0]) <= gain - WORTH and _helps(one, other, before)
+
+        options = [kept & ~group for group in groups if group.any()]
+        results = (yield _Ask(options)) if options else []
+        found = [(option, one) for option, one in zip(options, results, strict=True) if not beats or better(one)]
+        if not found:
             break
-        kept, after = options[best], results[best]
+        option, _ = min(found, key=lambda each: _score(each[1][0], before[0]))
+        (there,) = (yield _Ask([option], fitted=True)) if option.any() else [before]
+        if beats and not better(there):
+            break
+        kept, after = option, there
     return Choice(kept, before[0], after[0])
 
 
@@ -305,31 +347,26 @@ def _samples(datasets: Sequence[Dataset]) -> int:
 
 
 def _left(
-    fits: Sequence[Posterior],
-    trials: Sequence[Sequence[_Trial]],
-    parameters: Sequence[Parameter],
-    asked: Mapping[int, Sequence[Bools]],
+    trials: Mapping[int, Sequence[_Trial]], parameters: Sequence[Parameter], asked: Mapping[int, Sequence[Bools]]
 ) -> dict[int, list[list[Gap]]]:
-    """For each set and option of kept parameters the gap over all folds, and then over each.
+    """For each fit and option of kept parameters the gap over all folds, and then over each.
 
     What different fits would have done on the same fold is simulated together.
     """
     shown: dict[int, list[tuple[int, int]]] = {}
     for k in asked:
-        for t, trial in enumerate(trials[k]):
+        for t, trial in enumerate(trials[k][1:], 1):
             shown.setdefault(id(trial.unseen), []).append((k, t))
     found: dict[tuple[int, int], list[Gap]] = {}
     for places in shown.values():
-        us = list[Array]()
-        for k, t in places:
-            us += [_shown(fits[k], trials[k][t].posterior, kept) for kept in asked[k]]
+        us = [_shown(trials[k][0].posterior, trials[k][t].posterior, kept) for k, t in places for kept in asked[k]]
         first_k, first_t = places[0]
         figures = gaps(trials[first_k][first_t].unseen, parameters, us)
         for k, t in places:
             found[k, t], figures = figures[: len(asked[k])], figures[len(asked[k]) :]
     out = {}
     for k, options in asked.items():
-        counts = [_samples(trial.unseen) for trial in trials[k]]
-        each = [[found[k, t][o] for t in range(len(counts))] for o in range(len(options))]
+        counts = [_samples(trial.unseen) for trial in trials[k][1:]]
+        each = [[found[k, t][o] for t in range(1, 1 + len(counts))] for o in range(len(options))]
         out[k] = [[pooled(one, counts), *one] if one else [Gap(math.nan, math.nan)] for one in each]
     return out

@@ -118,7 +118,12 @@ class Problem:
         return estimate(found, self._model, self._weighing, self.prior, self._score(found.point))
 
     def solve_without(
-        self, left_out: Sequence[Bools], found: Descent, progress: Progress | None = None
+        self,
+        left_out: Sequence[Bools],
+        found: Descent,
+        starts: Sequence[Array] = (),
+        held: Sequence[Bools] = (),
+        progress: Progress | None = None,
     ) -> list[Posterior]:
         """What the other rows say, where some are left out: for each choice of them, all choices side by side.
 
@@ -128,10 +133,16 @@ class Problem:
         Args:
             left_out: for each fit, (rows,) of all datasets, what it does not see.
             found: where the fit to all of them ended.
+            starts: for each fit, (parameters,) u where it begins; default where that one ended.
+            held: for each fit, (parameters,) what stays where it begins; default nothing.
             progress: as `solve` calls it.
         """
         others = [replace(self, left_out=rows, freed=self.freed.copy()) for rows in left_out]
-        ends = self._following(progress)("leaving runs out in turn", *(other._from(found) for other in others))
+        begun = [
+            other._from(found, starts[k] if starts else None, held[k] if held else None)
+            for k, other in enumerate(others)
+        ]
+        ends = self._following(progress)("leaving runs out in turn", *begun)
         return [posterior(one, other._weighing, other.prior) for one, other in zip(ends, others, strict=True)]
 
     def _following(self, progress: Progress | None) -> Callable[..., list[Descent]]:
@@ -153,9 +164,10 @@ class Problem:
 
         return follow
 
-    def _from(self, found: Descent) -> Steps:
+    def _from(self, found: Descent, start: Array | None, held: Bools | None) -> Steps:
         tangent = replace(found.tangent, change=found.tangent.change.copy())  # a descent changes it
-        return self._approach(found.point, enough=NEAR_TEMPERED, tangent=tangent)
+        point = found.point if start is None else (yield Look(start))
+        return (yield from self._approach(point, enough=NEAR_TEMPERED, held=held, tangent=tangent))
 
     def _further(self, found: Descent) -> Steps:
         """Once more from where the data lead alone, if what is left may have something in it that the priors kept from view."""
