@@ -30,7 +30,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
@@ -233,6 +232,8 @@ def save_checkpoint(folder: Path, state: Mapping[str, Any], transitions: int, wi
     whole = {
         **state, "schema": SCHEMA, "transitions": transitions, "transition_bytes": width * 4, "curve_bytes": curve_bytes
     }  # fmt: skip
+    import torch  # seconds to load, and who reads curves or facts needs none of it
+
     buffer = io.BytesIO()
     torch.save(_plain(whole), buffer)
     write_bytes(folder / "checkpoint.pt", buffer.getvalue())
@@ -261,6 +262,8 @@ def load_checkpoint(folder: Path) -> dict[str, Any]:
     Raises:
         BadInput: there is none, or it cannot be read.
     """
+    import torch
+
     path = folder / "checkpoint.pt"
     if not path.is_file():
         raise BadInput("there is no checkpoint yet", where=folder, remedy="train a little longer (`openant train sac`)")
@@ -353,6 +356,8 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     if isinstance(value, np.ndarray):
+        import torch
+
         return torch.from_numpy(value.copy())
     if isinstance(value, np.generic):
         return value.item()
