@@ -26,6 +26,9 @@ __all__ = ["READS", "Loop", "Motor", "Sensed", "ServoDevice", "Snapshot", "read_
 #: Instructions that Status Return Level 1 still answers.
 READS = frozenset({Inst.READ, Inst.SYNC_READ, Inst.FAST_SYNC_READ, Inst.BULK_READ, Inst.FAST_BULK_READ, Inst.PING})
 FAST_READ_FIRMWARE = 45
+_FAST_READS = (Inst.FAST_SYNC_READ, Inst.FAST_BULK_READ)
+_GROUP_READS = (Inst.SYNC_READ, Inst.BULK_READ, *_FAST_READS)
+_GROUP_WRITES = (Inst.SYNC_WRITE, Inst.BULK_WRITE)
 CLEAR_KEY = b"\x01DXL\x22"
 BACKUP_STORE = b"\x01CTRL"
 BACKUP_RESTORE = b"\x02CTRL"
@@ -36,6 +39,8 @@ REVERSED, TIME_BASED, TORQUE_BY_GOAL = 0x01, 0x04, 0x08
 POSITION_MODE, EXTENDED_MODE, CURRENT_POSITION_MODE, PWM_MODE, VELOCITY_MODE, CURRENT_MODE = 3, 4, 5, 16, 1, 0
 PULSES_S_PER_COUNT = RAD_S_PER_COUNT * PULSES_PER_TURN / (2 * math.pi)
 WATCHDOG_UNIT_S = 0.02
+#: from here on the Bus Watchdog's one byte is below zero: it has stopped the motion
+TRIPPED = 128
 TICK_WRAP = 32768
 #: In position mode an offset beyond a quarter of a turn is ignored (e-manual, Homing Offset).
 HOMING_LIMIT_POSITION = 1024
@@ -206,6 +211,8 @@ class ServoDevice:
 
     def __post_init__(self) -> None:
         self.registers = {r.name: r for r in self.model.registers.values() if r.min_firmware <= self.firmware}
+        #: name → (first byte, byte behind the last, whether it may be below zero)
+        self._places = {name: (r.address, r.end, r.signed) for name, r in self.registers.items()}
         self._owner: list[Register | None] = [None] * _MEMORY
         for register in self.registers.values():
             for address in range(register.address, register.end):
@@ -234,14 +241,14 @@ class ServoDevice:
 
     def get(self, name: str) -> int:
         """A register's count as it stands in memory (dynamic ones as of the last `refresh`)."""
-        register = self.registers[name]
-        return int.from_bytes(self.memory[register.address : register.end], "little", signed=register.signed)
+        start, end, signed = self._places[name]
+        return int.from_bytes(self.memory[start:end], "little", signed=signed)
 
     def set(self, name: str, counts: int) -> None:
         """Set a register without any rule: what a scenario or the firmware itself does."""
-        register = self.registers[name]
-        mask = (1 << 8 * register.size) - 1
-        self.memory[register.address : register.end] = (counts & mask).to_bytes(register.size, "little")
+        start, end, _ = self._places[name]
+        size = end - start
+        self.memory[start:end] = (counts & ((1 << 8 * size) - 1)).to_bytes(size, "little")
 
     @property
     def id(self) -> int:
@@ -437,10 +444,11 @@ class ServoDevice:
 
     def watch_bus(self, now: float) -> None:
         """The Bus Watchdog: counts while torque is on. Called every few milliseconds."""
-        if self.memory[98] and self.memory[64] and "bus_watchdog" in self.registers:
-            watchdog = self.get("bus_watchdog")
-            if watchdog > 0 and now - self._heard_at > watchdog * WATCHDOG_UNIT_S:
-                self._trip_watchdog()
+        watchdog = self.memory[98]
+        if not (0 < watchdog < TRIPPED and self.memory[64]):
+            return
+        if "bus_watchdog" in self.registers and now - self._heard_at > watchdog * WATCHDOG_UNIT_S:
+            self._trip_watchdog()
 
     def protect(self, voltage: float, temperature: float) -> None:
         """Compare supply (V) and temperature (°C) with their limits."""
@@ -471,7 +479,7 @@ class ServoDevice:
 
     @property
     def watchdog_tripped(self) -> bool:
-        return "bus_watchdog" in self.registers and self.get("bus_watchdog") < 0
+        return self.memory[98] >= TRIPPED and "bus_watchdog" in self.registers
 
     # ---- instructions ----
 
@@ -511,11 +519,31 @@ class ServoDevice:
             self.boot(now)
         elif self._pending.baud:
             self._baud = BAUD_CODES[self.memory[8]]
+        else:
+            return
         self._pending = _Pending()
 
     def _do(self, instruction: Instruction, now: float, *, shadow: bool) -> bytes | None:
         """Parameters of the reply; None where the instruction is not for this servo. Raises _Refused."""
         code, params, broadcast = instruction.code, instruction.params, instruction.id == BROADCAST
+        if code in _GROUP_READS:
+            if not broadcast:
+                raise _Refused(Error.INSTRUCTION)
+            if code in _FAST_READS and self.firmware < FAST_READ_FIRMWARE:
+                return None
+            wanted = _wanted(code, params).get(self.memory[7])
+            return None if wanted is None else self.read(*wanted, now=now)
+        if code in _GROUP_WRITES:
+            if not broadcast:
+                raise _Refused(Error.INSTRUCTION)
+            writes, own, shadow_id = _group_writes(code, params), self.memory[7], self.memory[12]
+            for address, data in writes.get(own, ()):
+                self._apply(self._check(address, data))
+            # A group write reaches a shadow ID too, as any write does.
+            if shadow_id <= MAX_ID and shadow_id != own:
+                for address, data in writes.get(shadow_id, ()):
+                    self._apply(self._check(address, data, ram_only=True))
+            return None
         if code == Inst.PING:
             return bytes(self.memory[0:2]) + bytes(self.memory[6:7])
         if code == Inst.READ:
@@ -553,25 +581,6 @@ class ServoDevice:
         if code == Inst.CONTROL_TABLE_BACKUP:
             self._back_up(params)
             return b""
-        if code in (Inst.SYNC_READ, Inst.BULK_READ, Inst.FAST_SYNC_READ, Inst.FAST_BULK_READ):
-            fast = code in (Inst.FAST_SYNC_READ, Inst.FAST_BULK_READ)
-            if not broadcast:
-                raise _Refused(Error.INSTRUCTION)
-            if fast and self.firmware < FAST_READ_FIRMWARE:
-                return None
-            wanted = _wanted(code, params).get(self.memory[7])
-            return None if wanted is None else self.read(*wanted, now=now)
-        if code in (Inst.SYNC_WRITE, Inst.BULK_WRITE):
-            if not broadcast:
-                raise _Refused(Error.INSTRUCTION)
-            writes, own, shadow_id = _group_writes(code, params), self.memory[7], self.memory[12]
-            for address, data in writes.get(own, ()):
-                self._apply(self._check(address, data))
-            # A group write reaches a shadow ID too, as any write does.
-            if shadow_id <= MAX_ID and shadow_id != own:
-                for address, data in writes.get(shadow_id, ()):
-                    self._apply(self._check(address, data, ram_only=True))
-            return None
         raise _Refused(Error.INSTRUCTION)
 
     # ---- reading and writing ----
