@@ -223,9 +223,10 @@ def reads_of_settings() -> dict[str, set[str]]:
     found: dict[str, set[str]] = {section: set() for section in classes.values()}
     for root in ("openant_tools", "openant_env", "openant_agents"):
         for path in (Path(__file__).parents[1] / root).rglob("*.py"):
-            tree = ast.parse(path.read_text())
+            text = path.read_text()
+            nodes = list(ast.walk(ast.parse(text)))
             stands: dict[str, str] = {"motor": "motors", "m": "motors"}
-            for node in ast.walk(tree):
+            for node in nodes:
                 pairs: list[tuple[ast.expr, ast.expr]] = []
                 if isinstance(node, ast.Assign):
                     for target in node.targets:
@@ -238,16 +239,16 @@ def reads_of_settings() -> dict[str, set[str]]:
                 for target, value in pairs:
                     if isinstance(target, ast.Name) and isinstance(value, ast.Attribute) and value.attr in sections:
                         stands[target.id] = value.attr
-            for kind in [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and node.name in classes]:
+            for kind in [node for node in nodes if isinstance(node, ast.ClassDef) and node.name in classes]:
                 found[classes[kind.name]] |= {n.attr for n in ast.walk(kind) if isinstance(n, ast.Attribute)}
-            for node in ast.walk(tree):
+            for node in nodes:
                 if not isinstance(node, ast.Attribute):
                     continue
                 of = node.value
                 section = (
                     of.attr if isinstance(of, ast.Attribute) and of.attr in sections
                     else stands.get(of.id) if isinstance(of, ast.Name)
-                    else "motors" if "motors" in ast.unparse(of) else None
+                    else "motors" if "motors" in text and "motors" in ast.unparse(of) else None
                 )  # fmt: skip
                 if section in found:
                     found[section].add(node.attr)
