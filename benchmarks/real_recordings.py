@@ -1,6 +1,6 @@
 """Identification on real recordings of other people's servos: each motion in turn, by what was fitted to the others.
 
-    python benchmarks/real_recordings.py [--shared ../shared/realdata] [--only bam-xl330|sage-so101] [--cache FILE]
+    python benchmarks/real_recordings.py [--shared ../shared/realdata] [--only bam-xl330|sage-so101] [--no-effects] [--cache FILE]
 
 Prints Markdown: the error of the model as given on a motion that no fit saw, root mean square of position over the full run,
 and what share of it a fit leaves. `plain` is our best model for plain MuJoCo and `with effects` the best that we find (the plain
@@ -139,9 +139,11 @@ def table(
     joints: Sequence[str] | None = None,
     also: Sequence[str] = (),
     peer: bool = False,
+    effects: bool = True,
 ) -> None:
     kept = json.loads(cache.read_text()) if cache.exists() else {}
-    columns = [*(["quick fit", "plain", "with effects"] if peer else ["plain"]), "--hold-out", "foretold"]
+    columns = ["plain", *(["with effects"] if peer and effects else []), "--hold-out", "foretold"]
+    columns = [*(["quick fit"] if peer else []), *columns]
     print(f"\n### {title}\n\n| held out | given, rad | {' | '.join(columns)} | accepted |")
     print(f"|---|---|{'---|' * len(columns)}---|")
 
@@ -173,6 +175,7 @@ def main() -> None:
     parser.add_argument("--shared", type=Path, default=Path(__file__).resolve().parents[2] / "shared" / "realdata")
     parser.add_argument("--only", choices=["bam-xl330", "sage-so101"])
     parser.add_argument("--joint", action="append", choices=list(TURNED_KG_M2), help="of sage-so101; default both")
+    parser.add_argument("--no-effects", action="store_true", help="plain MuJoCo alone: a quarter of a minute a cell")
     parser.add_argument("--work", type=Path, default=Path("/tmp/real_recordings"))
     parser.add_argument("--cache", type=Path, default=Path("real_recordings.json"))
     options = parser.parse_args()
@@ -184,7 +187,8 @@ def main() -> None:
             run = sysid.load(path)
             assert run.model_path is not None
             groups[run.model_path].append(run)
-        table("bam-xl330", groups, options.cache, peer=True)
+        title = "bam-xl330, plain" if options.no_effects else "bam-xl330"
+        table(title, groups, options.cache, peer=True, effects=not options.no_effects)
     if options.only != "bam-xl330":
         recorded = [sysid.load(path) for path in sorted((options.shared / "sage-so101").glob("*.parquet"))]
         for words, also in (("delay", []), ("delay and lag", ["actuator_lag"])):

@@ -23,8 +23,8 @@ from readers import READERS, SCENARIO, Reader, mutations
 
 from openant_tools.cli import main
 from openant_tools.errors import BadInput, OpenAntError
+from openant_tools.model.of_run import own_model
 from openant_tools.recording.tables import read_run
-from openant_tools.sysid.identify import own_model
 
 #: s, far beyond what any of these files takes on a busy computer
 BOUND_S = 20.0

@@ -113,10 +113,10 @@ class Estimate(Posterior):
 
 def estimate(found: Descent, model: ForwardModel, weighing: Weighing, prior: Prior, score: float) -> Estimate:
     """What is known where a descent ended."""
-    point, tangent, u = found.point, found.tangent, found.point.u
+    point, u = found.point, found.point.u
     weights = weighing(point)
-    precision, _ = tangent.normal(point, weights.each, prior)
-    covariance = np.linalg.inv(precision)
+    first = posterior(found, weighing, prior)
+    precision = first.precision + np.diag(prior.precision)
     # A parameter at its bound cannot give way to what is left open; the others must hold all of it.
     free = (u > prior.low + 1e-6) & (u < prior.high - 1e-6)
     inside = np.ix_(free, free)
@@ -133,9 +133,9 @@ def estimate(found: Descent, model: ForwardModel, weighing: Weighing, prior: Pri
         parameters=tuple(model.parameters),
         found=found,
         u=u,
-        covariance=np.outer(wider, wider) * covariance + open_ @ open_.T,
+        covariance=np.outer(wider, wider) * first.covariance + open_ @ open_.T,
         step_shift=step_shift,
-        precision=precision - np.diag(prior.precision),
+        precision=first.precision,
         centre=prior.centre,
         low=prior.low,
         high=prior.high,

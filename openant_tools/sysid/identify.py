@@ -51,12 +51,10 @@ from openant_tools.sysid.parameter import (
 from openant_tools.sysid.problem import Problem
 from openant_tools.sysid.quality import Telemetry, check_model, without_errors
 from openant_tools.sysid.rules import check_runs, without_turns
-from openant_tools.sysid.verdict import IDENTIFIED, NOT_IN_THE_DATA, SILENT, Verdict, Word, experiment, verdicts
+from openant_tools.sysid.verdict import SILENT, Verdict, Word, experiment, verdicts
 
 __all__ = [
     "DEFAULT_KINDS",
-    "IDENTIFIED",
-    "NOT_IN_THE_DATA",
     "Identification",
     "Value",
     "applicable",
@@ -64,7 +62,6 @@ __all__ = [
     "dataset_of",
     "identify",
     "joints_in_common",
-    "own_model",
     "restated",
 ]
 
