@@ -351,13 +351,13 @@ def identify(
     wanted = applicable(
         declared.kinds if kinds is None and declared else kinds,
         floored,
-        limp=any((run.signal("torque", joints, default=1.0) == 0).any() for run in everything)
+        limp=any((run.signal("torque", joints, default=1.0) == 0).any() for run in runs)
         # What brakes in the motor never reaches the gears, so that a friction that follows their load tells it apart.
         or LOAD_FRICTION in also,
-        on_floor=any(setup_of(run.facts.setup) is Setup.FLOOR for run in everything),
+        on_floor=any(setup_of(run.facts.setup) is Setup.FLOOR for run in runs),
         also=also,
     )
-    logged = any(run.facts.supply_v and run.has("volt", [joints[0]]) for run in everything)
+    logged = any(run.facts.supply_v and run.has("volt", [joints[0]]) for run in runs)
     if measured_supply and not logged:
         raise BadInput(
             "no run has both a logged voltage (volt.*) and its nominal supply (supply_v)",
