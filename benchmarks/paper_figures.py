@@ -80,7 +80,7 @@ def train_one(agent: str, folder: Path, steps: int, seed: int, changed: Mapping[
     options: dict[str, Any] = {"kit": "standard", "task": "back-and-forth"}
     if agent == "sarsa":
         options |= {"dt": 0.05, "action_range": "sarsa"}
-    env = gymnasium.make("openant/Ant-v0", **options)
+    env = gymnasium.make("openant/AntContinuing-v0", **options)
     facts = {"id": "openant/Ant-v0", "options": options}
     if agent == "sac":
         sac.train(env, folder=folder, steps=steps, seed=seed, settings=sac.Settings(**changed), env_facts=facts)

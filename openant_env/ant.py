@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from openant_env.base import AntBase, Observation, OnFall, unit
 from openant_env.randomise import Randomiser, intervals_of
-from openant_env.rendering import Painter
+from openant_env.rendering import Painter, Window
 from openant_env.robots import DT_S, simulated_robot
 from openant_env.tasks import BackAndForth
 from openant_tools.effects.acting import Acting
@@ -70,14 +70,14 @@ class Ant(AntBase):
             (`openant_env.randomise`).
         on_fall: what lying on the back means: `"truncate"`, `"terminate"`, or `"ignore"`.
         time_limit_s: s after which to truncate; None: never.
-        render_mode: None or `"rgb_array"`.
+        render_mode: None, `"rgb_array"`, or `"human"`: MuJoCo's viewer, which shows each step in its own time.
         width, height: pixels of a rendered picture.
 
     Raises:
         BadInput: in one line, what of the robot's folder or of the arguments cannot be used.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": round(1.0 / DT_S)}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": round(1.0 / DT_S)}  # noqa: RUF012
 
     def __init__(
         self,
@@ -103,8 +103,8 @@ class Ant(AntBase):
             "randomise": randomise, "on_fall": on_fall, "time_limit_s": time_limit_s, "render_mode": render_mode, "width": width,
             "height": height,
         }  # fmt: skip
-        if render_mode not in (None, "rgb_array"):
-            raise BadInput(f"render mode {render_mode!r} does not exist", remedy="use 'rgb_array' or None")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise BadInput(f"render mode {render_mode!r} does not exist", remedy="use 'human', 'rgb_array' or None")
         super().__init__(
             simulated_robot(robot, kit=kit, effects=effects),
             task=task, task_options=task_options, dt=dt, action_range=action_range, observation_order=observation_order,
@@ -131,6 +131,7 @@ class Ant(AntBase):
         self._painter: Painter | None = None
         self._bind()
         self._settled = self._settle()
+        self._window = Window(self.model, self.data, self.dt) if render_mode == "human" else None
 
     def _bind(self) -> None:
         """Look every name up once, and keep views into the simulation's memory, which never moves."""
@@ -249,6 +250,8 @@ class Ant(AntBase):
         self.average_reward.clear()
         self._seconds = 0.0
         observation = self._observe(hx, hy)
+        if self._window is not None:
+            self._window.show()
         return observation, self._info(x, y, hx, hy, self._observation)
 
     def _advance_imperfectly(self) -> None:
@@ -312,6 +315,8 @@ class Ant(AntBase):
         self.average_reward.add(reward, self.dt)
         observation = self._observe(hx, hy)
         info = self._info(x, y, hx, hy, self._observation)
+        if self._window is not None:
+            self._window.show()
         terminated = truncated = False
         if up_z < 0.0 and self._on_fall != "ignore":
             terminated, truncated = self._on_fall == "terminate", self._on_fall == "truncate"
@@ -334,14 +339,15 @@ class Ant(AntBase):
     # --------------------------------------------------------------------------------------------------- pictures
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The robot, the reward direction, and the circle it turns at, (height, width, 3); None without `rgb_array`.
+        """The robot, the reward direction, and the circle it turns at, (height, width, 3); None without `rgb_array`:
+        the window of `human` is drawn by each step.
 
         The camera stays where the circle is, so that one sees the robot get on, and follows one that leaves it.
 
         Raises:
             NoOpenGL: there is nothing to draw with on this machine.
         """
-        if self.render_mode is None:
+        if self.render_mode != "rgb_array":
             return None
         if self._painter is None:
             # Without a graphics card the finest edges and shadows would take twice the time of a step and its picture.
@@ -359,7 +365,10 @@ class Ant(AntBase):
         return self._painter.frame(self.data, look_at=(x, y, z), arrow=(task.ux, task.uy), circle=circle, **more)
 
     def close(self) -> None:
-        """Give the OpenGL context back, if there is one."""
+        """Give the OpenGL context back, and the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
         if self._painter is not None:
             self._painter.close()
             self._painter = None

@@ -90,12 +90,13 @@ class AntHardware(AntBase):
         attended: somebody is there who calls `resume` (as the space bar of our commands does): where motion has ended for
             good, `reset` waits for that instead of raising.
         notice: called with what the user should know; default: the log.
+        render_mode: None, or `"rgb_array"`: what the overhead camera sees.
 
     Raises:
         BadInput, HardwareFault: in one line, what is missing.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
     def __init__(
         self,
@@ -118,7 +119,7 @@ class AntHardware(AntBase):
         patience_s: float | None = None,
         attended: bool = False,
         notice: Callable[[str], None] | None = None,
-        render_mode: None = None,
+        render_mode: str | None = None,
     ) -> None:
         if robot is None and virtual is None:
             raise BadInput("no robot is named", remedy="give robot=DIR, or virtual='default' for a virtual one")
@@ -127,7 +128,9 @@ class AntHardware(AntBase):
             task=task, task_options=task_options, dt=dt, action_range=action_range, observation_order=observation_order,
             on_fall=on_fall, time_limit_s=time_limit_s,
         )  # fmt: skip
-        self.render_mode = None
+        if render_mode not in (None, "rgb_array"):
+            raise BadInput(f"render mode {render_mode!r} does not exist here", remedy="use 'rgb_array' or None")
+        self.render_mode = render_mode
         centre = self.robot.arena.centre_m
         self._chosen_origin = "origin" in (task_options or {})
         if isinstance(self.task, BackAndForth) and centre is not None and not self._chosen_origin:
@@ -323,6 +326,19 @@ class AntHardware(AntBase):
         if terminated or truncated:
             self._reason, self._ready = info["reason"], False
         return observation, reward, terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """The overhead camera's newest picture, (height, width, 3), at most 640 wide; None without `rgb_array`.
+
+        Raises:
+            HardwareFault: the camera has not sent one.
+        """
+        if self.render_mode is None:
+            return None
+        picture = self.link.picture()
+        if picture is None:
+            raise HardwareFault("the overhead camera has not sent a picture yet", remedy="reset the environment first")
+        return picture
 
     def _derate(self) -> None:
         """Let a servo that is warm go less far from its rest, so that it cools instead of shutting down."""

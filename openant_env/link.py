@@ -289,6 +289,11 @@ class RobotLink:
         self.wait(seconds)
         return None
 
+    def picture(self) -> NDArray[np.uint8] | None:
+        """The overhead camera's newest picture, (height, width, 3) in RGB; None where there is none."""
+        found: NDArray[np.uint8] | None = self._need_engine().ask(messages.Picture())
+        return found
+
     def wait(self, seconds: float) -> None:
         """Let time pass while there is no engine."""
         if self.stepped and self._control is not None:

@@ -9,6 +9,7 @@ import os
 import platform
 import shutil
 import subprocess
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,7 @@ def _gl_context(width: int, height: int) -> Any:
             return context
     raise NoOpenGL(
         f"no picture of the robot can be drawn, there is no OpenGL here ({'; '.join(reasons)})",
-        remedy="install an EGL or OSMesa library, or go on without pictures",
+        remedy="pip install 'openant-tools[view]' and an EGL or OSMesa library, or go on without pictures",
     )
 
 
@@ -147,6 +148,47 @@ class Painter:
         """Give the OpenGL context back."""
         self._context.free()
         self._gl.free()
+
+
+class Window:
+    """MuJoCo's own viewer on a simulation that somebody else steps; closing it does not stop that.
+
+    Args:
+        model, data: what is shown.
+        dt: s, the time between two pictures.
+
+    Raises:
+        NoOpenGL: there is no screen, or what opens windows is not installed.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, dt: float) -> None:
+        instead = "use render_mode='rgb_array', or run it under `xvfb-run`"
+        if platform.system() == "Linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            raise NoOpenGL("there is no screen here to open a window on", remedy=instead)
+        try:
+            viewer = importlib.import_module("mujoco.viewer")
+            self._viewer: Any = viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
+        except ImportError as error:
+            raise NoOpenGL(
+                f"no window can be opened: {error}", remedy="pip install 'openant-tools[view]', or " + instead
+            ) from error
+        except RuntimeError as error:  # macOS wants its own launcher
+            raise NoOpenGL(f"no window can be opened: {error}", remedy=instead) from error
+        self._dt = dt
+        self._next = time.monotonic()
+
+    def show(self) -> None:
+        """Draw the state as it is, no sooner than `dt` after the last one."""
+        if not self._viewer.is_running():
+            return
+        self._viewer.sync()
+        now = time.monotonic()
+        self._next = max(self._next + self._dt, now)
+        time.sleep(self._next - now)
+
+    def close(self) -> None:
+        """Close the window."""
+        self._viewer.close()
 
 
 def write_strip(pictures: Sequence[Image], file: Path, *, seconds_apart: float, columns: int = 4) -> None:

@@ -165,6 +165,16 @@ def test_it_has_the_spaces_and_words_of_the_simulation(walker: Walker, folder: R
     simulated.close()
 
 
+def test_its_picture_is_what_the_overhead_camera_sees(walker: Walker, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert walker.env.render() is None
+    monkeypatch.setattr(walker.env, "render_mode", "rgb_array")
+    picture = walker.env.render()
+    assert picture.dtype == np.uint8
+    assert picture.shape[1] <= 640
+    assert picture.shape[2] == 3
+    assert picture.std() > 10, "a floor with a robot on it is not one colour"
+
+
 @pytest.mark.filterwarnings("ignore:.*Box observation space.*:UserWarning")
 def test_gymnasium_finds_nothing_wrong(walker: Walker) -> None:
     check_env(walker.env, skip_render_check=True, skip_close_check=True)

@@ -304,6 +304,6 @@ def _maker(place: str, yes: bool) -> Callable[[Mapping[str, Any]], Any]:
 
     def make(facts: Mapping[str, Any]) -> Any:
         kept = {key: facts["options"][key] for key in ("task", "dt", "action_range") if key in facts["options"]}
-        return gymnasium.make(name, **kept, **chosen)
+        return gymnasium.make(name, max_episode_steps=-1, **kept, **chosen)
 
     return make

@@ -71,7 +71,9 @@ def tune(
     defaults, hour = DEFAULTS[agent]
     length = steps or hour
     options = {**robot_argument(robot, kit), **defaults}
-    first = gymnasium.make("openant/Ant-v0", **options)  # what is wrong with the robot shows before the study is made
+    first = gymnasium.make(
+        "openant/Ant-v0", max_episode_steps=-1, **options
+    )  # what is wrong with the robot shows before the study is made
     facts = {
         "agent": agent, "seeds": seeds, "steps": length, "model_sha256": first.unwrapped.describe()["model_sha256"],
         "options": {key: value for key, value in options.items() if key != "robot"},
@@ -93,7 +95,7 @@ def tune(
         search(
             study,
             agent,
-            lambda: gymnasium.make("openant/Ant-v0", **options),
+            lambda: gymnasium.make("openant/Ant-v0", max_episode_steps=-1, **options),
             trials=trials,
             steps=length,
             seeds=range(seeds),

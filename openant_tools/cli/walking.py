@@ -86,7 +86,7 @@ def environment(name: str, options: Mapping[str, Any], recordings: Path, **more:
     import openant_env  # noqa: F401  (registers the environments)
 
     if name != HARDWARE_ID:
-        env = gymnasium.make(name, **options, **more)
+        env = gymnasium.make(name, max_episode_steps=-1, **options, **more)
         if not env.unwrapped.robot.identified:
             _notice(
                 f"{options['robot']} was never identified: this is the kit's nominal model, not that robot "

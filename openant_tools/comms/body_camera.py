@@ -13,6 +13,7 @@ from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from openant_tools.comms.camera import Camera, CameraInfo, CameraSettings, CameraStatistics
 from openant_tools.comms.clock import Clock
@@ -76,6 +77,7 @@ class BodyCamera:
         self._leans: deque[tuple[float, float, float]] = deque(maxlen=LEANS)
         self._results: deque[BodyPose | BodyLost] = deque(maxlen=QUEUE)
         self._pose: BodyPose | None = None
+        self._image: NDArray[np.uint8] | None = None
         self._seen_at = clock.now()
         self._lost = ""
         self._said: tuple[str, float] = ("", -np.inf)
@@ -110,6 +112,18 @@ class BodyCamera:
         if out:
             self._pose = out[-1] if isinstance(out[-1], BodyPose) else None
         return out
+
+    def picture(self, width: int) -> NDArray[np.uint8] | None:
+        """The newest picture, (height, width or less, 3) in RGB, or None before the first.
+
+        Pixels are left out to fit, not averaged: this is called between two cycles of the bus.
+        """
+        image = self._image
+        if image is None:
+            return None
+        every = -(-image.shape[1] // width)
+        few = image[::every, ::every]
+        return np.ascontiguousarray(few[..., ::-1] if few.ndim == 3 else np.repeat(few[..., None], 3, axis=2))
 
     @property
     def taken_at(self) -> float:
@@ -164,6 +178,7 @@ class BodyCamera:
         frame = self._camera.newest()
         if frame is None:
             return
+        self._image = frame.image
         result = self._tracker.track(frame.image, frame.t, self._lean_at(frame.t))
         if isinstance(result, BodyPose):
             self._seen_at, self._lost = self._clock.now(), ""

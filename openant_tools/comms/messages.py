@@ -30,6 +30,7 @@ __all__ = [
     "ImuConfig",
     "Look",
     "Notice",
+    "Picture",
     "Play",
     "Ramp",
     "ReadRegister",
@@ -244,6 +245,13 @@ class Statistics:
     """The reply is `BusStatistics.as_dict`, with the loop's own figures."""
 
 
+@dataclass(frozen=True)
+class Picture:
+    """The overhead camera's newest picture, (height, width, 3) of uint8 in RGB and at most `width` wide; None without one."""
+
+    width: int = 640
+
+
 Command = (
     Torque
     | Ramp
@@ -257,6 +265,7 @@ Command = (
     | ReadRegister
     | WriteRegister
     | Statistics
+    | Picture
 )
 
 
