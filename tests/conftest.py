@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 
 import pytest
 
@@ -13,6 +14,9 @@ _WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if _WORKERS > 1:
     for _limit in ("OMP_NUM_THREADS", "LOKY_MAX_CPU_COUNT"):
         os.environ.setdefault(_limit, str(max(1, (os.cpu_count() or 1) // _WORKERS)))
+
+# The log of what the tests run is none of the user's.
+os.environ.setdefault("XDG_STATE_HOME", tempfile.mkdtemp(prefix="openant-state-"))
 
 # What the tests start by the hundred compiles our modules once, not each time; and MuJoCo loads no window library.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

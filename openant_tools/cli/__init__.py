@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import errno
 import importlib
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -13,6 +15,7 @@ from pathlib import Path
 import click
 
 from openant_tools.cli.leaving import heed_signals
+from openant_tools.cli.log import begin, log_options
 from openant_tools.errors import OpenAntError
 from openant_tools.trust import TRUST, trusted
 from openant_tools.workers import end_with_who_started_us
@@ -40,9 +43,12 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "plot": ("plot", "Learning", "Learning curves of several runs in one picture."),
     "policies": ("policies", "Learning", "Which simulation ranks policies as the robot does, and which fool it."),
     "tune": ("tune", "Learning", "Search for settings of an agent, on as many machines as you like."),
+    "support": ("support", "Help", "One bundle for a bug report: versions, ports, config, findings, log."),
 }
 
 INTERRUPTED = 130
+
+_log = logging.getLogger(__name__)
 
 _MAKE_ROOM = "make room there, or choose another place, and repeat the command"
 _OTHER_PLACE = "choose a place that you may write to"
@@ -57,13 +63,16 @@ REMEDIES = {
 }
 
 
-def trust_option(command: click.Command) -> click.Command:
-    """Give a command, or each of a group's, `--trust-paths` where it reads files that may name others."""
+def common_options(command: click.Command) -> click.Command:
+    """Give a command, or each of a group's, `-v`, `-q`, and `--trust-paths` where it reads files that may name others."""
     names = {parameter.name for parameter in command.params}
     if isinstance(command, click.Group):
         for one in command.commands.values():
-            trust_option(one)
-    elif "trust_paths" not in names and names & {"model", "robot", "run", "runs"}:
+            common_options(one)
+        return command
+    if "verbose" not in names:
+        command.params.extend(log_options())
+    if "trust_paths" not in names and names & {"model", "robot", "run", "runs"}:
         words = "Follow absolute paths and links in files, wherever they lead."
         option = ["--trust-paths"]
         command.params.append(
@@ -90,7 +99,16 @@ class Manual(click.Group):
         module = importlib.import_module(f"openant_tools.cli.{COMMANDS[cmd_name][0]}")
         command = getattr(module, "eval_" if cmd_name == "eval" else cmd_name)
         assert isinstance(command, click.Command)
-        return trust_option(command)
+        return common_options(command)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args[0] not in COMMANDS and not args[0].startswith("-") and not ctx.resilient_parsing:
+            near = difflib.get_close_matches(args[0], COMMANDS, n=3)
+            meant = f". Did you mean {' or '.join(map(repr, near))}?" if near else ""
+            raise click.UsageError(f"No such command {args[0]!r}{meant}", ctx)
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         sections: dict[str, list[tuple[str, str]]] = {}
@@ -154,6 +172,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line; exits with 0, 1, 2 or 130 (formats, section 6), never a traceback for bad input."""
     heed_signals()
     end_with_who_started_us()
+    begin(list(sys.argv[1:] if argv is None else map(str, argv)))
     # MuJoCo loads a window library as it is imported, for a renderer that no command of ours uses (`openant_env.rendering`
     # chooses its own): a third of its time to load, and a process started besides.
     os.environ.setdefault("MUJOCO_GL", "disable")
@@ -162,6 +181,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.exit(code if isinstance(code, int) else 0)
     except OpenAntError as error:
         click.echo(f"openant: {error}", err=True)
+        _log.info("ended: %s", error)
         sys.exit(error.exit_code)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
@@ -182,3 +202,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         with contextlib.suppress(OSError):  # the terminal may be what has gone
             click.echo("openant: interrupted", err=True)
         sys.exit(INTERRUPTED)
+    except (
+        Exception
+    ):  # a fault of the program: its traceback goes to stderr as ever, and where `openant support` finds it
+        _log.debug("a fault of the program", exc_info=True)
+        raise
+
+
+openant.params.extend(log_options())

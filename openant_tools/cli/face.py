@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.prompt import Confirm, FloatPrompt, Prompt
 
 from openant_tools.cli.hardware import need_moving, need_terminal
+from openant_tools.cli.log import is_quiet
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.step import Answer, Ask, Event, Hands, Intent, Live, Look, Progress, Say
@@ -70,6 +71,8 @@ class CommandFace:
 
     def _progress(self, share: float | None, words: str) -> None:
         """One line where something new begins, and one a quarter of the way: lines stay, unlike a bar."""
+        if is_quiet():
+            return
         before, at = self._said
         if words != before or (share or 0.0) - at > 0.25:
             self._said = (words, share or 0.0)

@@ -23,6 +23,8 @@ from openant_tools.errors import HardwareFault, OpenAntError
 
 __all__ = ["BodyCamera", "CameraConfig"]
 
+#: px of a picture that is shown to somebody; a larger one would keep the bus waiting while it is handed over
+WIDEST = 640
 #: What is wrong is said again after so long, if it is still wrong.
 REPEAT_S = 10.0
 #: A lost tag is normal for a picture or two (a leg above it, a blurred one).
@@ -113,15 +115,15 @@ class BodyCamera:
             self._pose = out[-1] if isinstance(out[-1], BodyPose) else None
         return out
 
-    def picture(self, width: int) -> NDArray[np.uint8] | None:
-        """The newest picture, (height, width or less, 3) in RGB, or None before the first.
+    def picture(self) -> NDArray[np.uint8] | None:
+        """The newest picture, (height, width, 3) in RGB, at most `WIDEST` wide; None before the first.
 
         Pixels are left out to fit, not averaged: this is called between two cycles of the bus.
         """
         image = self._image
         if image is None:
             return None
-        every = -(-image.shape[1] // width)
+        every = -(-image.shape[1] // WIDEST)
         few = image[::every, ::every]
         return np.ascontiguousarray(few[..., ::-1] if few.ndim == 3 else np.repeat(few[..., None], 3, axis=2))
 

@@ -162,6 +162,7 @@ _CHECKS: Mapping[type, Callable[[Any, Servos, Any], Any]] = {
     messages.StopRecording: _as_it_is,
     messages.Stop: _as_it_is,
     messages.Statistics: _as_it_is,
+    messages.Picture: _as_it_is,
 }
 
 

@@ -1013,12 +1013,11 @@ class Engine:
             messages.ReadRegister: self._do_read,
             messages.WriteRegister: self._do_write,
             messages.Statistics: lambda number, _: messages.Reply(number, value=self._statistics()),
-            messages.Picture: self._do_picture,
+            messages.Picture: lambda number, _: messages.Reply(
+                number, value=None if self._camera is None else self._camera.picture()
+            ),
         }
         return handlers[type(command)](number, command)
-
-    def _do_picture(self, number: int, command: messages.Picture) -> messages.Reply:
-        return messages.Reply(number, value=None if self._camera is None else self._camera.picture(command.width))
 
     def _do_torque(self, number: int, command: messages.Torque) -> messages.Reply:
         if not command.on:

@@ -247,9 +247,7 @@ class Statistics:
 
 @dataclass(frozen=True)
 class Picture:
-    """The overhead camera's newest picture, (height, width, 3) of uint8 in RGB and at most `width` wide; None without one."""
-
-    width: int = 640
+    """The reply is the overhead camera's newest picture, (height, width, 3) of uint8 in RGB, at most 640 wide; None without one."""
 
 
 Command = (
