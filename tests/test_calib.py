@@ -38,6 +38,7 @@ from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.procedure.step import Ask, Bench, Declined, Event, Hands, Intent, Progress, drive
+from openant_tools.procedure.unfinished import unfinished
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
 from openant_tools.robot.config import Camera
@@ -217,6 +218,47 @@ def test_horns_go_on_at_half_a_turn_and_the_drawing_says_which_way(tmp_path):
         assert "turn hip_rr slowly from 209° to 180°" in builder.said
         assert not any(ant.torque())
         assert abs(ant.server.world.body.q[0]) < 0.03
+
+
+def leave_at(kind: type[Event], words: str):
+    """A builder who leaves once an event of this kind says so."""
+
+    def leave(event: Event) -> None:
+        said = event.question if isinstance(event, Ask) else getattr(event, "words", "")
+        if isinstance(event, kind) and words in said:
+            raise KeyboardInterrupt
+
+    return leave
+
+
+def test_ids_that_were_left_go_on_with_the_next_servo(tmp_path):
+    with robot(tmp_path / "ant", **LOOSE) as ant:
+        for left_at in ("(knee_rr)", "(hip_fr)"):
+            builder = ant.builder(before=leave_at(Hands, left_at))
+            with pytest.raises(KeyboardInterrupt):
+                ant.do(ids(ant.bench), builder)
+        assert "it goes on at 2 of 8: hip_rr was done before" in builder.said
+        plugged = [event.joint for event in builder.events if isinstance(event, Hands) and event.task == "plug"]
+        assert plugged == ["knee_rr", "hip_fr"]
+        ant.do(undo(ant.bench))  # what is taken back is to be done again
+        assert unfinished(ant.folder, "ids") is None
+
+
+def test_centring_that_was_left_goes_on_where_it_was_and_reads_again_what_was_done(tmp_path):
+    with robot(tmp_path / "ant", **set_up()) as ant:
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(centre(ant.bench), ant.builder(before=leave_at(Ask, "hip_fr holds")))
+        assert not any(ant.torque())
+        assert unfinished(ant.folder, "centre").words == "2 of 8"
+        mode = ant.server.world.servos[1].model.register("operating_mode")
+        ant.server.world.servos[1].memory[mode.address] = 4  # somebody has played with knee_rr meanwhile
+        builder = ant.builder(before=leave_at(Ask, "knee_fr holds"))
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(centre(ant.bench), builder)
+        assert "it goes on at 3 of 8: hip_rr, knee_rr were done before" in builder.said
+        assert "knee_rr is not as it was left: its operating mode is 4, not 3; it is done again" in builder.said
+        asked = [event.question.split()[0] for event in builder.events if isinstance(event, Ask)]
+        assert asked == ["knee_rr", "hip_fr", "knee_fr"]
 
 
 def test_legs_are_proven_one_by_one_and_a_bad_cable_is_named(tmp_path):

@@ -126,7 +126,7 @@ def test_twins_in_markdown_and_json(tmp_path: Path) -> None:
     a_report().write_folder(tmp_path)
     text = (tmp_path / "report.md").read_text()
     assert text.startswith("# Fit of ant12 & friends\n")
-    assert "| a\\|b | 1.5 |" in text
+    assert "| a\\|b | 1.50 |" in text
     pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text)
     assert len(pictures) == 3
     assert all((tmp_path / picture).read_bytes().startswith(b"\x89PNG") for picture in pictures)
@@ -151,7 +151,7 @@ def test_links_go_where_they_say_and_nothing_else_runs() -> None:
 
 def test_numbers_stand_to_the_right_and_missing_ones_are_a_dash() -> None:
     html = Table(["n", "word"], [[np.float64(-0.123456), "a"], [float("nan"), "b"], [12, True]]).html("t")
-    assert "<td class=num>−0.1235</td>" in html
+    assert "<td class=num>−0.123</td>" in html
     assert "<td class=num>–</td>" in html
     assert "<td>yes</td>" in html
 

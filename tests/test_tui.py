@@ -401,8 +401,8 @@ def test_an_observation_outside_its_bounds_is_shown_and_stays_until_seen(robot: 
     assert condition(history, "knee_fl").word == "ok"
     faults.watch(history)
     assert [str(fault) for fault in faults.unseen] == [
-        "hip_fl: pos.hip_fl is 0.6, outside its bounds -0.5 ... 0.5",
-        "gyro.z: gyro.z is -1.5, outside its bounds -1 ... 1",
+        "hip_fl: pos.hip_fl is 34.4°, outside its bounds −28.6 to 28.6°",
+        "gyro.z: gyro.z is −85.9 °/s, outside its bounds −57.3 to 57.3 °/s",
     ]
 
 

@@ -19,6 +19,7 @@ from openant_tools.bringup.robot_picture import robot_picture
 from openant_tools.files import write_bytes
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
+from openant_tools.numbers import number
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
 from openant_tools.report import KeyFigure, Mark, Picture, Report, Table, Text, plots
@@ -30,7 +31,7 @@ from openant_tools.virtual.scenario import load_scenario
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
-__all__ = ["Recovered", "compare", "speed", "spread", "truth", "write_report"]
+__all__ = ["Recovered", "compare", "gap_words", "speed", "spread", "truth", "write_report"]
 
 Array = NDArray[np.float64]
 
@@ -155,11 +156,11 @@ def write_report(demo: Demo) -> dict[str, Any]:
     keys = [
         KeyFigure(
             "held-out error",
-            f"{1e3 * before['gap_full_rad']:.1f} → {1e3 * after['gap_full_rad']:.2f} mrad",
-            f"data sheets → calibrated, over a motion of {run.duration_s:.0f} s that the fit did not see",
+            f"{gap_words(before['gap_full_rad'])} → {gap_words(after['gap_full_rad'])}",
+            f"data sheets → calibrated, over a motion of {number(run.duration_s, decimals=0)} s that the fit did not see",
             "good" if after["gap_full_rad"] < before["gap_full_rad"] else "bad",
         ),
-        KeyFigure("floor", f"{1e3 * floor:.2f} mrad", "what no model could beat: two plays of one motion differ by it"),
+        KeyFigure("floor", gap_words(floor), "what no model could beat: two plays of one motion differ by it"),
         KeyFigure(
             "settings recovered",
             f"{inside} of {len(claimed)}",
@@ -229,7 +230,9 @@ def _subtitle(demo: Demo) -> str:
 
 
 def _minutes(curve: Array | None) -> str:
-    return "" if curve is None or not len(curve) else f"after {curve[-1, 1] / 60:.0f} minutes of its time"
+    return (
+        "" if curve is None or not len(curve) else f"after {number(curve[-1, 1] / 60, decimals=0)} minutes of its time"
+    )
 
 
 # ---- figures ----
@@ -393,15 +396,24 @@ def _walking(demo: Demo) -> dict[str, Any]:
 
 def speed(walking: Mapping[str, Any]) -> str:
     """How fast it walks as it trained, in a word; every figure of the demo that says it is this one."""
-    return f"{100 * walking['sampled']['median']:.1f} cm/s"
+    return f"{_cm_s(walking['sampled']['median'])} cm/s"
+
+
+def _cm_s(reward_m_s: float) -> str:
+    return number(100 * reward_m_s, decimals=1)
+
+
+def gap_words(gap_rad: float) -> str:
+    """An error of position as every page of the demo says it."""
+    return number(gap_rad, "rad", name="gap")
 
 
 def spread(walking: Mapping[str, Any]) -> str:
     """Of how many starts that is the median, how far they lie apart, and what its likeliest action does."""
     sampled, likeliest, starts = walking["sampled"], walking["likeliest"], walking["starts"]
     words = (
-        f"sampled, median of {starts} starts, {100 * sampled['low']:.1f} to {100 * sampled['high']:.1f}; "
-        f"likeliest action {100 * likeliest['median']:.1f} cm/s"
+        f"sampled, median of {starts} starts, {_cm_s(sampled['low'])} to {_cm_s(sampled['high'])}; "
+        f"likeliest action {_cm_s(likeliest['median'])} cm/s"
     )
     if likeliest["stood_still"]:
         words += f", which stood still for good in {likeliest['stood_still']} of {starts}"
@@ -426,7 +438,7 @@ def _row(row: Recovered) -> Sequence[object]:
     tone: Tone = "good" if row.inside else "bad"
     mark = Mark("yes" if row.inside else "no", tone) if row.determined else Mark(row.verdict)
     numbers = (row.given, row.truth, row.value, row.low, row.high)
-    return [row.name, *("" if number is None else f"{number:.4g}" for number in numbers), row.unit, mark]
+    return [row.name, *("" if value is None else number(value) for value in numbers), row.unit, mark]
 
 
 def _explained(rows: Sequence[Recovered]) -> str:

@@ -10,6 +10,7 @@ from openant_tools.comms.restart import RULES, MotionStopped, StopCause
 from openant_tools.errors import BadInput, OpenAntError, StorageFault
 from openant_tools.procedure.finding import Finding, keep, latest
 from openant_tools.procedure.step import Bench, Declined, Face, Say, Step, drive
+from openant_tools.procedure.unfinished import Unfinished, unfinished
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
@@ -197,12 +198,14 @@ class Standing:
         finding: its newest; None where it has not been done.
         state: `stale` where a step that it needs has been done again since.
         waits_for: steps that it needs and that have not said yes yet.
+        left: how far it was when it was left in the middle; None where it was not.
     """
 
     step: Step
     finding: Finding | None
     state: State
     waits_for: tuple[str, ...]
+    left: Unfinished | None = None
 
 
 def standing(folder: RobotFolder) -> dict[str, Standing]:
@@ -221,7 +224,7 @@ def standing(folder: RobotFolder) -> dict[str, Standing]:
             if not finding.ok:
                 state = "unsure" if finding.ok is None else "failed"
         waits = tuple(other for other, seen in zip(step.needs, needed, strict=True) if seen is None or not seen.ok)
-        out[name] = Standing(step, finding, state, waits)
+        out[name] = Standing(step, finding, state, waits, unfinished(folder, name))
     return out
 
 

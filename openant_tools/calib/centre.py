@@ -12,7 +12,7 @@ from openant_tools.calib.wires import BOOT_S, bare_config, journalled, opened_bu
 from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.motion import ramp
-from openant_tools.comms.servos import Servo
+from openant_tools.comms.servos import Servo, Servos
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import (
@@ -28,6 +28,7 @@ from openant_tools.procedure.step import (
     RegisterChange,
     Say,
 )  # fmt: skip
+from openant_tools.procedure.unfinished import Parts
 from openant_tools.robot.config import Motor
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import NOMINAL_ZERO_RAD
@@ -74,8 +75,22 @@ def centre(bench: Bench) -> Procedure:
         yield Hands("Connect the servos, still without horns, one behind the other; 12 V on.", "plug")
         with opened_bus(bench) as bus:
             wait(bus.clock, BOOT_S)
+    parts = Parts(bench.folder, "centre", [motor.joint for motor in motors], bench.joints)
+    if parts.before:
+        yield Say(parts.words)
     for k, motor in enumerate(motors):
         joint = motor.joint
+        if joint in parts.before:
+            differs = _differs(bench, motor)
+            if not differs:
+                centred.append(joint)
+                evidence.append(
+                    Evidence(
+                        f"{joint} off its mounting angle", parts.before[joint].get("off_rad"), "rad", "encoder, holding"
+                    )
+                )
+                continue
+            yield Say(f"{joint} is not as it was left: {differs}; it is done again", "warn")
         yield Progress(k / len(motors), f"{joint} ({k + 1} of {len(motors)})")
         with opened_bus(bench) as bus:
             if bus.ping(motor.id, insist=True) is None:
@@ -104,6 +119,7 @@ def centre(bench: Bench) -> Procedure:
             problems.append(trouble)
         else:
             centred.append(joint)
+            parts.done(joint, off_rad=off)
     if not motors:
         raise BadInput("no joint is named", remedy="leave out --joint")
     return Finding(
@@ -116,6 +132,19 @@ def centre(bench: Bench) -> Procedure:
         data={"centred": centred},
         problems=tuple(problems),
     )
+
+
+def _differs(bench: Bench, motor: Motor) -> str:
+    """What of a servo whose horn is on does not read as it was left; "" where all does."""
+    with opened_bus(bench) as bus:
+        found = bus.ping(motor.id, insist=True)
+        if found is None:
+            return f"nothing answers under id {motor.id}"
+        if found.model_number != motor.servo.number:
+            return f"its model number is {found.model_number}, not {motor.servo.number}"
+        servos = robot_servos(bench.folder.config(), [motor.joint])
+        mode = Servos(bus, servos).read_counts("operating_mode", motor.joint)
+    return "" if mode == POSITION_MODE else f"its operating mode is {mode}, not {POSITION_MODE}"
 
 
 def _one(bench: Bench, motor: Motor) -> Generator[Event, Answer, tuple[float, str]]:

@@ -30,6 +30,7 @@ from openant_tools.procedure.step import (
     RegisterChange,
     Say,
 )  # fmt: skip
+from openant_tools.procedure.unfinished import Parts
 from openant_tools.robot.config import Motor, RobotConfig
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE
@@ -79,13 +80,20 @@ def ids(bench: Bench) -> Procedure:
                 found = scan(bus)
             named = [m.joint for m in motors if any((o.id, o.baud) == (m.id, config.bus.baud) for o in found.servos)]
             return _finding(named, motors, problems)
+    parts = Parts(bench.folder, "ids", [motor.joint for motor in motors], bench.joints)
+    if parts.before:
+        yield Say(parts.words)
     if found.servos or found.garbled:
         yield Hands("Take every servo off the cable; they are set up one at a time.", "unplug")
     for k, motor in enumerate(motors):
+        if motor.joint in parts.before:
+            named.append(motor.joint)
+            continue
         yield Progress(k / len(motors), f"{motor.joint} ({k + 1} of {len(motors)})")
         trouble = yield from _one(bench, motor, motors, config)
         if trouble is None:
             named.append(motor.joint)
+            parts.done(motor.joint, id=motor.id)
         else:
             problems.append(trouble.words)
         yield Hands(f"Take it off the cable, and write {motor.joint} on it.", "unplug", motor.joint)

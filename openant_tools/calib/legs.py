@@ -17,6 +17,7 @@ from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servo, Servos
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Answer, Ask, Bench, Event, Hands, Intent, Live, Procedure, Progress, Say
+from openant_tools.procedure.unfinished import Parts
 from openant_tools.robot.config import RobotConfig
 from openant_tools.robot.joints import JOINTS, LEGS, Leg
 from openant_tools.robot.kit import ANGLE_LIMIT_RAD
@@ -37,13 +38,23 @@ def legs(bench: Bench) -> Procedure:
     config = bench.folder.config()
     wanted = [leg for leg in LEGS if not bench.joints or any(joint.endswith(leg.name) for joint in bench.joints)]
     problems, evidence, proven = list[str](), list[Evidence](), list[str]()
-    yield Hands(
-        "Build the legs one after the other; the torso stands on its stand, cables out.", "assemble", setup="stand"
-    )
-    yield Hands("Take every leg off the cable.", "unplug")
+    parts = Parts(bench.folder, "legs", [leg.name for leg in wanted], bench.joints)
+    if parts.before:
+        yield Say(parts.words)
+        words = "Go on with the next leg; those that are proven stay as they are, the torso on its stand."
+        yield Hands(words, "assemble", setup="stand")
+    else:
+        yield Hands(
+            "Build the legs one after the other; the torso stands on its stand, cables out.", "assemble", setup="stand"
+        )
+        yield Hands("Take every leg off the cable.", "unplug")
     with opened_bus(bench) as bus:
         wait(bus.clock, 0.2)
     for k, leg in enumerate(wanted):
+        if leg.name in parts.before:
+            proven.append(leg.name)
+            evidence += [Evidence(**one) for one in parts.before[leg.name].get("evidence", ())]
+            continue
         while True:
             yield Progress(k / len(wanted), f"{leg.words} leg ({k + 1} of {len(wanted)})")
             try:
@@ -54,6 +65,7 @@ def legs(bench: Bench) -> Procedure:
             if not trouble:
                 evidence += found
                 proven.append(leg.name)
+                parts.done(leg.name, evidence=[vars(one) for one in found])
                 yield Say(f"{leg.words} leg: cable, range and nudge are good", "ok")
                 break
             yield Say(trouble, "fail")
@@ -139,9 +151,7 @@ def _by_hand(bus: Bus, joints: list[str], config: RobotConfig) -> Generator[Even
         seen = float(np.ptp(tracks[joint][1])) if tracks[joint][1] else 0.0
         whole = 2 * ANGLE_LIMIT_RAD[JOINTS[joint].kind]
         evidence.append(Evidence(f"range of {joint}", seen, "rad", "by hand"))
-        evidence.append(
-            Evidence(f"answers lost at {joint}", lost / max(1, asked), "1", f"{asked} reads while it moved")
-        )
+        evidence.append(Evidence(f"answers lost at {joint}", float(lost), f"of {asked}", "while it moved by hand"))
         if seen < RANGE_SHARE * whole:
             raise HardwareFault(
                 f"{joint} turned by {math.degrees(seen):.0f}° of {math.degrees(whole):.0f}°",

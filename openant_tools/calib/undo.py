@@ -9,6 +9,7 @@ from openant_tools.comms.servos import Servo, Servos
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.journal import EepromWrite, Entry, Journal
 from openant_tools.procedure.step import Bench, Intent, Procedure, Progress, RegisterChange, Say
+from openant_tools.procedure.unfinished import forget
 from openant_tools.robot.registers import EEPROM_END
 from openant_tools.robot.servo import BAUD_CODES, ServoModel
 
@@ -60,6 +61,9 @@ def undo(bench: Bench, *, everything: bool = False) -> Procedure:
                 yield Say(trouble, "fail")
             else:
                 done += 1
+    # What a step had done of its parts is not so any more.
+    for command in {entry.command for entry in backwards}:
+        forget(bench.folder, command.rpartition(" ")[2])
     ok = not problems
     return Finding(
         "undo",

@@ -103,14 +103,14 @@ def _bar(console: Console, line: str) -> Iterator[Callable[[str, float], None]]:
 
 def _print(whole: Any, figures: dict[str, Any]) -> None:
     robot = whole.folder
+    from openant_tools.bringup.demo_report import gap_words, speed, spread
+
+    before, after, floor = (gap_words(figures[name]) for name in ("gap_before_rad", "gap_after_rad", "floor_rad"))
     click.echo(
-        f"\nheld-out error {1e3 * figures['gap_before_rad']:.1f} → {1e3 * figures['gap_after_rad']:.2f} mrad "
-        f"(floor {1e3 * figures['floor_rad']:.2f}); {figures['settings_within_interval']} of "
+        f"\nheld-out error {before} → {after} (floor {floor}); {figures['settings_within_interval']} of "
         f"{figures['settings_determined']} settings recovered within their intervals"
     )
     if figures["walking"] is not None:
-        from openant_tools.bringup.demo_report import speed, spread
-
         click.echo(f"walks at {speed(figures['walking'])} ({spread(figures['walking'])})")
     rows = [
         (whole.report, "everything at a glance; opens in any browser, offline"),

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from openant_tools.errors import BadInput
 from openant_tools.files import json_text, known, read_json, write_text
+from openant_tools.numbers import number
+from openant_tools.procedure.unfinished import forget
 
 if TYPE_CHECKING:  # a manual that lists the steps opens without NumPy
     from openant_tools.robot.config import Provenance
@@ -49,6 +51,11 @@ class Evidence:
             number = getattr(self, name)
             if number is not None and not math.isfinite(number):
                 object.__setattr__(self, name, None)
+
+    @property
+    def words(self) -> str:
+        """The number as it is read, with unit and interval."""
+        return number(self.value, self.unit, self.low, self.high, name=self.name)
 
 
 @dataclass(frozen=True)
@@ -165,7 +172,7 @@ class Finding:
         lines = [f"# {self.step}: {_SIGNS[self.verdict]} {self.verdict}", "", self.what, ""]
         lines += [f"- {words}" for words in self.lines] + [""] * bool(self.lines)
         if self.evidence:
-            lines += ["| what | value | interval | unit | source |", "|---|---|---|---|---|"]
+            lines += ["| what | value | source |", "|---|---|---|"]
             lines += [_row(evidence) for evidence in self.evidence] + [""]
         lines += [f"Next: {self.next_action}", ""] if self.next_action else []
         return "\n".join([*lines, f"{self.date:%Y-%m-%d %H:%M} UTC, `{self.command}`", ""])
@@ -180,9 +187,7 @@ def together(*verdicts: bool | None) -> bool | None:
 
 
 def _row(evidence: Evidence) -> str:
-    value = "–" if evidence.value is None else f"{evidence.value:.5g}"
-    interval = "" if evidence.low is None or evidence.high is None else f"{evidence.low:.4g} … {evidence.high:.4g}"
-    return f"| {evidence.name} | {value} | {interval} | {evidence.unit} | {evidence.source} |"
+    return f"| {evidence.name} | {evidence.words} | {evidence.source} |"
 
 
 def latest(folder: RobotFolder, step: str) -> Finding | None:
@@ -213,6 +218,8 @@ def keep(finding: Finding, folder: RobotFolder, recording: str | None = None) ->
     from openant_tools.robot.config import Provenance
 
     folder.refuse_if_held()
+    if finding.ok:
+        forget(folder, finding.step)
     stamp = finding.date.strftime("%Y%m%dT%H%M%SZ")
     path = folder.findings / f"{finding.step}-{stamp}.json"
     write_text(path, json_text(finding.as_json()))
@@ -238,4 +245,4 @@ def keep(finding: Finding, folder: RobotFolder, recording: str | None = None) ->
 
 
 def _short(value: float) -> float:
-    return float(f"{value:.6g}")
+    return float(f"{value:.6g}")  # for a file

@@ -11,6 +11,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
+from openant_tools.numbers import number
 from openant_tools.report import plots
 
 if TYPE_CHECKING:
@@ -143,7 +144,7 @@ class Table:
 
     Attributes:
         columns: headings, with the unit where there is one.
-        rows: cells: text, a number (printed with four significant digits; write text for more), a `Mark` or None.
+        rows: cells: text, a number (printed by `openant_tools.numbers`; write text for more digits), a `Mark` or None.
         caption: what it shows.
     """
 
@@ -288,7 +289,7 @@ def _shown(cell: object) -> str:
         return "yes" if cell else "no"
     if isinstance(cell, float) or hasattr(cell, "dtype"):
         value = float(cell)  # type: ignore[arg-type]
-        return f"{value:.4g}".replace("-", "−") if math.isfinite(value) else "–"
+        return number(value) if math.isfinite(value) else "–"
     return str(cell)
 
 

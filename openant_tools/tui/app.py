@@ -21,13 +21,13 @@ from textual.widgets import Input
 from openant_tools.bringup.walk import WALK
 from openant_tools.errors import OpenAntError
 from openant_tools.procedure.step import Step
-from openant_tools.robot.config import CONFIG_NAME
+from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.kit import KITS
 from openant_tools.tui.dialogs import Help, Question
 from openant_tools.tui.feeds import ReplayFeed
 from openant_tools.tui.jump import Jump
 from openant_tools.tui.marks import BLUE, GREEN, ORANGE, VERMILION, plain
-from openant_tools.tui.page import Page
+from openant_tools.tui.page import Page, help_of
 from openant_tools.tui.screens.findings import FindingsScreen
 from openant_tools.tui.screens.gap import GapScreen
 from openant_tools.tui.screens.learn import LearnScreen
@@ -35,7 +35,7 @@ from openant_tools.tui.screens.live import LiveScreen
 from openant_tools.tui.screens.recordings import RecordingsScreen
 from openant_tools.tui.screens.settings import SettingsScreen
 from openant_tools.tui.screens.step import StepScreen
-from openant_tools.tui.screens.walk import WalkScreen
+from openant_tools.tui.screens.walk import WalkScreen, continues
 from openant_tools.tui.session import Session
 from openant_tools.virtual.process import VIRTUAL_DEFAULT
 
@@ -96,8 +96,13 @@ VIRTUAL_ROBOTS: tuple[tuple[str, str | None], ...] = (
     ("A healthy robot on the floor, under its camera", str(SCENARIOS / "floor.toml")),
 )
 
+#: number of a step, as typed → its name
+_NUMBERS: Mapping[str, str] = {str(k): name for k, name in enumerate(WALK, 1)}
+#: s that a typed number waits for Enter
+TYPED_S = 4.0
+
 GENERAL_HELP = """\
-# Open Ant
+# Everywhere
 
 | key | |
 |---|---|
@@ -107,7 +112,8 @@ GENERAL_HELP = """\
 | `Ctrl-O` | jump mode: a letter on everything that can be gone to |
 | `Tab`, arrows, `Enter` | move, choose |
 | `Esc` | back; on the first screen: quit |
-| `F1` | help on what has the focus |
+| `F1` | help on the step, or on what has the focus |
+| a step's number, `Enter` | that step |
 """
 
 
@@ -130,6 +136,8 @@ class OpenAnt(App[int]):
         # tmux makes alt+f1 of an Esc and an F1 that come soon after each other.
         Binding("f1,alt+f1", "help", "Help", key_display="F1"),
         Binding("ctrl+o", "jump", "Jump", show=False),
+        # Of a number that was typed; any other Enter goes to what has the focus.
+        Binding("enter", "open_typed", show=False, priority=True),
         Binding("ctrl+p", "command_palette", "All", key_display="^P"),
         Binding("f8,alt+f8", "see", "Seen", show=False),
         Binding("p", "pause", "Pause", show=False),
@@ -147,9 +155,14 @@ class OpenAnt(App[int]):
     ) -> None:
         super().__init__()
         self.session = Session(path)
+        # With the one robot whose folder lies here it goes on; of several the builder is asked which.
+        robots = self.session.robots_here() if self.session.folder is None else []
+        if len(robots) == 1:
+            self.session.open(robots[0])
         self._virtual = virtual
         self._clock = clock
         self._ticking = ticking
+        self._typed = ""
         self.register_theme(THEME)
         self.theme = THEME.name
         self.set_class(plain(), "-ascii")
@@ -161,6 +174,8 @@ class OpenAnt(App[int]):
         if self._ticking:
             self.set_interval(TICK_S, self.tick)
         self._stop_before_suspension()
+        if self.session.folder is None and self.session.robots_here():
+            self.call_after_refresh(self.need_folder, lambda: None)
         if self._virtual is not None:
             self.start_virtual(self._virtual)
 
@@ -217,14 +232,21 @@ class OpenAnt(App[int]):
         self.action_leave()
 
     def action_leave(self) -> None:
-        """Quit; asks first where something is going on."""
-        if self._running_step is None and not self.session.learning and not self.session.computing:
+        """Quit; asks first where something is going on, or a robot is held."""
+        if self._running_step is not None or self.session.learning or self.session.computing:
+            words = (
+                "Something is still running. Quit all the same? Torque goes off; training and what a diagnosis simulated are "
+                "saved and can go on later."
+            )
+        elif self.session.watching:
+            words = "This program holds the robot. Quit all the same? Torque goes off, and its bus is given free."
+        elif self.session.virtual is not None:
+            words = (
+                "A virtual robot runs in this program. Quit all the same? It ends; what its servos remember is kept."
+            )
+        else:
             self._quit(0)
             return
-        words = (
-            "Something is still running. Quit all the same? Torque goes off; training and what a diagnosis simulated are "
-            "saved and can go on later."
-        )
         self.push_screen(Question(words, "Quit", "Stay"), self._answered_quit)
 
     def _answered_quit(self, choice: int | None) -> None:
@@ -268,28 +290,32 @@ class OpenAnt(App[int]):
         if self.session.folder is not None:
             then()
             return
-        place = self.session.path / NEW_ROBOT
-        kits = list(KITS.values())
+        robots, place, kits = self.session.robots_here(), self.session.new_place(NEW_ROBOT), list(KITS.values())
 
         def answered(choice: int | None) -> None:
             if choice is None:
                 return
-            if choice == len(kits):
+            if choice == len(robots) + len(kits):
                 self.action_go("settings")
                 return
             try:
-                if (place / CONFIG_NAME).is_file():
-                    self.session.open(place)
+                if choice < len(robots):
+                    self.session.open(robots[choice])
                 else:
-                    self.session.create(place, kits[choice].name)
+                    self.session.create(place, kits[choice - len(robots)].name)
             except OpenAntError as error:
                 self.notify(str(error), severity="error")
                 return
             self.refresh_walk()
             then()
 
-        words = f"All that is found out about a robot is kept in a folder. There is none here yet: make {place}?"
-        offers = [f"Yes: {kit.words}" for kit in kits]
+        if robots:
+            words = "Which robot?"
+            offers = [continues(RobotFolder(path)) for path in robots]
+            offers += [f"A new one in {place.name}: {kit.words}" for kit in kits]
+        else:
+            words = f"All that is found out about a robot is kept in a folder. There is none here yet: make {place}?"
+            offers = [f"Yes: {kit.words}" for kit in kits]
         self.push_screen(Question(words, *offers, "Another place, or one that is there already: Settings"), answered)
 
     def open_step(self, name: str, *, instead: bool = False) -> None:
@@ -318,8 +344,9 @@ class OpenAnt(App[int]):
         """Help on the focused widget, else on the screen, and the keys that hold everywhere."""
         if isinstance(self.screen, Help):
             return
-        own = next((words for widget in self._focus_path() if (words := getattr(widget, "HELP", None))), "")
-        self.push_screen(Help(f"{own}\n{GENERAL_HELP}"))
+        own = next((words for widget in self._focus_path() if (words := help_of(widget))), "")
+        about = self.screen.about if isinstance(self.screen, Page) else ""
+        self.push_screen(Help(f"{about}\n{own}\n{GENERAL_HELP}"))
 
     def _focus_path(self) -> Iterable[Widget]:
         widget: Widget | None = self.focused
@@ -416,7 +443,37 @@ class OpenAnt(App[int]):
         self.session.play(feed)
         self.action_go("live")
 
+    # ---- a step by its number ------------------------------------------------------------------------------------
+
+    def typed(self, digit: str) -> None:
+        """A digit of a step's number, which Enter opens."""
+        number = self._typed + digit if f"{self._typed}{digit}" in _NUMBERS else digit
+        if number not in _NUMBERS:
+            self._typed = ""
+            return
+        self._typed = number
+        for screen in self.screen_stack:
+            if isinstance(screen, WalkScreen):
+                screen.go_to(_NUMBERS[number])
+        if not isinstance(self.screen, WalkScreen):
+            self.notify(f"{number} {WALK[_NUMBERS[number]].title}: Enter opens it", timeout=TYPED_S)
+        self.set_timer(TYPED_S, partial(self._forget_typed, number))
+
+    def _forget_typed(self, number: str) -> None:
+        if self._typed == number:
+            self._typed = ""
+
+    def action_open_typed(self) -> None:
+        name, self._typed = _NUMBERS[self._typed], ""
+        running = self._running_step
+        if running is None and isinstance(self.screen, StepScreen):
+            self.open_step(name, instead=True)
+        else:
+            self.open_step(name)
+
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        if action == "open_typed":
+            return bool(self._typed) and not isinstance(self.focused, Input) and isinstance(self.screen, Page)
         if action in ("pause", "seek", "speed", "end_replay"):
             return self.session.replay is not None
         return True

@@ -6,6 +6,7 @@ import math
 
 from rich.text import Text
 
+from openant_tools.numbers import number, readable
 from openant_tools.procedure.step import Live
 from openant_tools.tui.marks import BLUE, plain, spelled
 
@@ -22,12 +23,19 @@ def bars(live: Live, width: int) -> Text:
     full, empty, here = ("=", "-", "|") if plain() else ("━", "─", "●")
     for joint, value in live.values.items():
         low, high = live.low.get(joint), live.high.get(joint)
-        text.append(f"{joint:9}{value:+8.3f} {spelled(live.unit):5}", "bold")
+        shown = number(value, live.unit, sign=True, decimals=1 if live.unit in ("rad", "rad/s") else 3)
+        text.append(f"{joint:9}{spelled(shown):>12} ", "bold")
         if low is not None and high is not None and math.isfinite(value) and high > low:
             at = min(max(round((value - low) / (high - low) * (across - 1)), 0), across - 1)
-            text.append(f"{low:+7.2f} ")
+            text.append(f"{spelled(_end(low, live.unit)):>7} ")
             text.append(full * at + here + empty * (across - 1 - at), BLUE)
-            text.append(f" {high:+6.2f}")
+            text.append(f" {spelled(_end(high, live.unit)):>6}")
         text.append(f" {spelled(live.marks.get(joint, ''))}\n")
     text.rstrip()
     return text
+
+
+def _end(value: float, unit: str) -> str:
+    """An end of a bar, without its unit."""
+    factor, read = readable(value, unit)
+    return number(factor * value, sign=True, decimals=0 if read in ("°", "°/s") else 2)

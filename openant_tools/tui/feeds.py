@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.ring import COMMON, ERR_CODES, SIGNALS, columns
+from openant_tools.numbers import number, span
 from openant_tools.recording.run import Run
 
 __all__ = ["WINDOW_S", "Feed", "History", "LiveFeed", "ReplayFeed"]
@@ -21,6 +22,10 @@ Array = NDArray[np.float64]
 WINDOW_S = 10.0
 #: of the width of its bounds: what a value must be beyond them, so that noise at an end is no news
 OUTSIDE_SHARE = 0.02
+
+
+#: first part of a column's name → its unit, of those whose bounds are measured
+UNITS = {"pos": "rad", "vel": "rad/s", "gyro": "rad/s", "acc": "m/s²"}
 
 
 class Feed(Protocol):
@@ -161,7 +166,8 @@ class History:
         value = self.newest(name) if name in self._index else np.nan
         if not (value < low - slack or value > high + slack):
             return ""
-        return f"{name} is {value:.3g}, outside its bounds {low:.3g} ... {high:.3g}"
+        unit = UNITS.get(name.partition(".")[0], "")
+        return f"{name} is {number(value, unit)}, outside its bounds {span(low, high, unit)}"
 
     def last_known(self, name: str) -> float:
         """The last value that is a number, of those in the window; NaN where there is none."""

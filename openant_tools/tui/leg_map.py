@@ -15,12 +15,13 @@ from textual.reactive import reactive
 from textual.timer import Timer
 from textual.widget import Widget
 
+from openant_tools.numbers import number
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS, LEGS
 from openant_tools.robot.mjcf import SEGMENT, TORSO_RADIUS
 from openant_tools.tui.braille import canvas_lines
 from openant_tools.tui.faults import Condition, condition
 from openant_tools.tui.feeds import History
-from openant_tools.tui.marks import MARKS, mark, plain
+from openant_tools.tui.marks import MARKS, mark, plain, spelled
 
 __all__ = ["JointChosen", "LegMap"]
 
@@ -173,9 +174,7 @@ Arrow keys choose a joint, here and among the strips.
         if self.chosen in self._history.joints:
             angle = self._history.last_known(f"pos.{self.chosen}")
             if np.isfinite(angle):
-                text.append(
-                    f"  {angle:+.2f} rad ({math.degrees(angle):+.0f}°)" if not plain() else f"  {angle:+.2f} rad"
-                )
+                text.append(f"  {spelled(number(angle, 'rad', sign=True, decimals=1))}")
         else:
             text.append(f"  id {JOINTS[self.chosen].id}")
         return text

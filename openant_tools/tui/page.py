@@ -5,20 +5,25 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 from rich.text import Text
+from textual import events
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.screen import Screen
-from textual.widgets import Footer, Static
+from textual.widget import Widget
+from textual.widgets import Footer, Input, Static
 
+from openant_tools.numbers import number
 from openant_tools.tui.leg_map import JointChosen, LegMap
-from openant_tools.tui.marks import MARKS, mark, marked, spelled
+from openant_tools.tui.marks import MARKS, mark, marked, plain, spelled
 from openant_tools.tui.session import Session
 from openant_tools.tui.strips import JointStrips
 
 if TYPE_CHECKING:
     from openant_tools.tui.app import OpenAnt
 
-__all__ = ["Page"]
+__all__ = ["Page", "help_of"]
+
+STOP_STYLE = "bold #000000 on #FFE14D"
 
 
 class Page(Screen[None]):
@@ -50,6 +55,11 @@ class Page(Screen[None]):
     @property
     def session(self) -> Session:
         return self.ant.session
+
+    @property
+    def about(self) -> str:
+        """What F1 says first, of what is at hand now; Markdown."""
+        return ""
 
     def compose(self) -> ComposeResult:
         yield Static(id="top")
@@ -93,7 +103,10 @@ class Page(Screen[None]):
         if replay is not None:
             words = "playing" if replay.playing else "paused"
             keys = "p pause  , . step  [ ] 5 s  < > speed  x end"
-            line.update(f"{words} {replay.position_s:.1f} of {replay.duration_s:.1f} s, x{replay.speed:g}   {keys}")
+            line.update(
+                f"{words} {number(replay.position_s, decimals=1)} of {number(replay.duration_s, decimals=1)} s, "
+                f"x{number(replay.speed)}   {keys}"
+            )
         for map_ in self.query(LegMap):
             map_.chosen = session.selected
             map_.draw(session.history)
@@ -117,11 +130,23 @@ class Page(Screen[None]):
             on = session.history.newest("torque") > 0
             text.append("  ")
             text.append_text(marked("on" if on else "off", "torque ON" if on else "torque off"))
-        stop = "SPACE: STOP"
+        stop = "[SPACE: STOP]" if plain() else " SPACE: STOP "
         room = max(self.size.width - 2 - len(stop) - 1, 20)
         text.truncate(room, overflow="ellipsis", pad=True)
-        return text.append(f" {stop}", f"bold {MARKS['fail'].colour}")
+        # The brightest thing of every screen, by its brightness alone where there are no colours.
+        return text.append(" ").append(stop, STOP_STYLE)
+
+    def on_key(self, event: events.Key) -> None:
+        """A digit that nothing else wants is one of a step's number."""
+        if event.character is not None and event.character in "0123456789" and not isinstance(self.focused, Input):
+            event.stop()
+            self.ant.typed(event.character)
 
     def on_joint_chosen(self, message: JointChosen) -> None:
         self.session.selected = message.joint
         self.draw()
+
+
+def help_of(widget: Widget) -> str:
+    """What a widget says of itself on F1; "" where it has nothing of its own to say."""
+    return str(getattr(widget, "HELP", None) or "")

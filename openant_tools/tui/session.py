@@ -70,6 +70,20 @@ class Session:
     def name(self) -> str:
         return self.path.resolve().name
 
+    def robots_here(self) -> list[Path]:
+        """The robots' folders in `path`, where that is none itself: in order of their names."""
+        if not self.path.is_dir():
+            return []
+        try:
+            return sorted(file.parent for file in self.path.glob(f"*/{CONFIG_NAME}"))
+        except OSError:
+            return []
+
+    def new_place(self, name: str) -> Path:
+        """Where a new robot's folder may be made: this name in `path`, with a number where something stands there."""
+        tries = (self.path / (name if k == 1 else f"{name}-{k}") for k in range(1, 1000))
+        return next(place for place in tries if not place.exists() or (place.is_dir() and not any(place.iterdir())))
+
     def open(self, path: Path) -> None:
         """Work on another robot's folder."""
         self.disconnect()

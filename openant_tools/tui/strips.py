@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -15,6 +16,7 @@ from textual.reactive import reactive
 from textual.strip import Strip
 from textual.widget import Widget
 
+from openant_tools.numbers import number, readable, span
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.braille import trace
 from openant_tools.tui.faults import condition
@@ -32,7 +34,7 @@ class Signal:
     Attributes:
         columns: of the rows; the first that has values counts.
         low, high: what the strip spans at least.
-        form: of the number beside it.
+        decimals: of the number beside it, which has a sign unless it cannot be negative.
     """
 
     title: str
@@ -40,20 +42,20 @@ class Signal:
     unit: str
     low: float
     high: float
-    form: str
+    decimals: int
 
 
 SIGNALS: tuple[Signal, ...] = (
-    Signal("angle", ("pos",), "rad", -0.5, 0.5, "+6.2f"),
-    Signal("velocity", ("vel",), "rad/s", -1.0, 1.0, "+6.2f"),
-    Signal("effort (A, or share of full load)", ("cur", "load"), "", -0.2, 0.2, "+6.2f"),
-    Signal("duty", ("pwm",), "of 1", -0.2, 0.2, "+6.2f"),
-    Signal("supply", ("volt",), "V", 9.0, 13.0, "6.1f"),
-    Signal("temperature", ("temp",), "°C", 20.0, 60.0, "6.0f"),
-    Signal("round trip", ("rtt",), "ms", 0.0, 5.0, "6.2f"),
+    Signal("angle", ("pos",), "°", -30.0, 30.0, 1),
+    Signal("velocity", ("vel",), "°/s", -60.0, 60.0, 0),
+    Signal("effort (A, or share of full load)", ("cur", "load"), "", -0.2, 0.2, 2),
+    Signal("duty", ("pwm",), "of 1", -0.2, 0.2, 2),
+    Signal("supply", ("volt",), "V", 9.0, 13.0, 1),
+    Signal("temperature", ("temp",), "°C", 20.0, 60.0, 0),
+    Signal("round trip", ("rtt",), "ms", 0.0, 5.0, 2),
 )
 #: columns → factor from the row's unit to the one shown
-_FACTOR: Mapping[str, float] = {"rtt": 1e3}
+_FACTOR: Mapping[str, float] = {"rtt": 1e3, "pos": math.degrees(1), "vel": math.degrees(1)}
 #: columns of text before and after the trace
 _BEFORE, _AFTER = 25, 17
 #: of one joint: each line costs time ten times a second
@@ -136,7 +138,7 @@ All strips of a signal share one scale, which stands in the top line; it grows w
         grey = Style(color="#A8A8A8")
         unit = spelled(chosen.unit)
         title = f"{chosen.title} {unit}"
-        scale = f"{low:.3g} ... {high:.3g} {unit}, {WINDOW_S:.0f} s"
+        scale = f"{spelled(span(low, high))} {unit}, {number(WINDOW_S)} s"
         head = f"{'joint':9}{'servo':9}{title}"
         room = width - len(head) - after - 1
         head += scale.rjust(room) if room > len(scale) else ""
@@ -169,13 +171,17 @@ All strips of a signal share one scale, which stands in the top line; it grows w
         name = Style(bold=here, reverse=here)
         state = Style(color=MARKS[found.mark].colour, bold=found.mark == "fail")
         newest = values[-1] if len(values) else np.nan
-        number = f"{newest:{chosen.form}}" if np.isfinite(newest) else f"{'-':>6}"
+        shown = (
+            spelled(number(float(newest), sign=chosen.low <= 0.0 and chosen.unit != "ms", decimals=chosen.decimals))
+            if np.isfinite(newest)
+            else "-"
+        )
         blue = Style(color=BLUE)
         lines = [
             [
                 Segment(f"{joint:8}", name),
                 Segment(f" {mark(found.mark)} {found.word:7.7}", state),
-                Segment(f"{number:>6} "),
+                Segment(f"{shown:>6} "),
                 Segment(drawn[0], blue),
             ]
         ]
@@ -197,12 +203,14 @@ All strips of a signal share one scale, which stands in the top line; it grows w
     def _body(self, width: int) -> str:
         """One line on the torso: turn rate, specific force, place; empty where nobody measures them."""
         newest = self._history.last_known
-        groups = (("gyro", "xyz", "rad/s"), ("acc", "xyz", "m/s2"), ("base", "xy", "m"))
+        groups = (("gyro", "xyz", "rad/s", 0), ("acc", "xyz", "m/s²", 1), ("base", "xy", "m", 2))
         words = []
-        for name, axes, unit in groups:
+        for name, axes, unit, decimals in groups:
             values = [newest(f"{name}.{axis}") for axis in axes]
             if all(np.isfinite(values)):
-                words.append(f"{name} " + " ".join(f"{value:+.2f}" for value in values) + f" {unit}")
+                factor, read = readable(1.0, unit)
+                row = " ".join(spelled(number(factor * value, sign=True, decimals=decimals)) for value in values)
+                words.append(f"{name} {row} {spelled(read)}")
         return "   ".join(words)[:width].ljust(width)
 
 
@@ -215,8 +223,7 @@ def _scale(chosen: Signal, values: Mapping[str, np.ndarray]) -> tuple[float, flo
 
 
 def _after(volts: float, celsius: float, rtt_s: float) -> str:
-    shown = (f"{volts:7.1f}", f"{celsius:5.0f}", f"{rtt_s * 1e3:5.1f}")
     return "".join(
-        text if np.isfinite(value) else " " * len(text)
-        for text, value in zip(shown, (volts, celsius, rtt_s), strict=True)
+        (number(value, decimals=decimals) if np.isfinite(value) else "").rjust(width)
+        for value, decimals, width in ((volts, 1, 7), (celsius, 0, 5), (1e3 * rtt_s, 1, 5))
     )

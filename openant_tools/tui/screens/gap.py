@@ -14,6 +14,7 @@ from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
 
 from openant_tools.errors import OpenAntError
+from openant_tools.numbers import number, percent
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.choices import Choices
@@ -83,8 +84,8 @@ improved model, which `w` writes beside the robot's own. The full report with pi
         self._was_running = self.session.computing
         self._runs = runs_of(self.session.folder)
         runs = self.query_one("#runs", Choices)
-        for number, path in enumerate(self._runs):
-            runs.add_option(Option(self._line(path), id=str(number)))
+        for index, path in enumerate(self._runs):
+            runs.add_option(Option(self._line(path), id=str(index)))
         self._list()
         (self.query_one("#diagnoses", Choices) if self._files else runs).focus()
         if self._runs:
@@ -120,8 +121,8 @@ improved model, which `w` writes beside the robot's own. The full report with pi
     def _choose(self, chosen: set[Path]) -> None:
         self._chosen = chosen
         runs = self.query_one("#runs", Choices)
-        for number, path in enumerate(self._runs):
-            runs.replace_option_prompt_at_index(number, self._line(path))
+        for index, path in enumerate(self._runs):
+            runs.replace_option_prompt_at_index(index, self._line(path))
         self.draw_process()
 
     def action_all(self) -> None:
@@ -221,16 +222,16 @@ def _page(found: Diagnosis) -> Text:
     for place in found.where[:PLACES]:
         share = float(place["share"])
         text.append(f" {place['signal']:6.6}{place['joint']:9.9}{place['regime']:10.10}")
-        text.append_text(_bar(share, ORANGE)).append(f" {100 * share:3.0f} %\n")
+        text.append_text(_bar(share, ORANGE)).append(f" {percent(share):>5}\n")
     text.append_text(_by_leg(found))
     text.append("\nWhich, and how likely\n", "bold")
     for one in found.effects[:CANDIDATES]:
         text.append_text(_candidate(found, one))
     gap, share = found.gap, closed(found)
     text.append("\nHow far\n", "bold")
-    before, after, floor = (1e3 * float(gap[name]) for name in ("before", "after", "floor"))
-    text.append(f" {before:.2f} {spelled('→')} {after:.2f} mrad of position, floor {floor:.2f}\n closed ")
-    text.append_text(_bar(share, GREEN)).append(f" {100 * share:3.0f} % on runs left out\n")
+    before, after, floor = (number(float(gap[name]), "rad", name="gap") for name in ("before", "after", "floor"))
+    text.append(f" {before} {spelled('→')} {after} of position, floor {floor}\n closed ")
+    text.append_text(_bar(share, GREEN)).append(f" {percent(share):>5} on runs left out\n")
     text.append("\nNext\n", "bold")
     text.append(f" {spelled(what_next(found))}\n")
     for note in found.notes:
@@ -244,9 +245,9 @@ def _candidate(found: Diagnosis, one: Found) -> Text:
     unsure = any(one.effect in group for group in found.ambiguous_with)
     state: Name = "ok" if one.effect in found.selected else "warn" if unsure else "todo"
     text = Text.assemble(" ", marked(state, one.effect, 21))
-    text.append_text(_bar(one.probability, BLUE)).append(f" {100 * one.probability:3.0f} %\n")
-    values = ", ".join(f"{name} {span.value:.3g}" for name, span in one.parameters.items())
-    alone = "" if one.gap_closed is None else f"closes {100 * one.gap_closed:.0f} % alone; "
+    text.append_text(_bar(one.probability, BLUE)).append(f" {percent(one.probability):>5}\n")
+    values = ", ".join(f"{name} {number(span.value)}" for name, span in one.parameters.items())
+    alone = "" if one.gap_closed is None else f"closes {percent(one.gap_closed)} alone; "
     text.append(
         spelled(f"   {where_words(one.joints)}{': ' if values else ''}{values}\n   {alone}{standing(found, one)}\n")
     )
@@ -270,7 +271,7 @@ def _by_leg(found: Diagnosis) -> Text:
         text.append(" position by leg, front above: hip, knee\n")
         for left, right in (("fl", "fr"), ("rl", "rr")):
             both = (
-                f"{leg} {100 * share[f'hip_{leg}']:3.0f} {100 * share[f'knee_{leg}']:3.0f} %" for leg in (left, right)
+                f"{leg} {percent(share[f'hip_{leg}']):>5} {percent(share[f'knee_{leg}']):>5}" for leg in (left, right)
             )
             text.append(f"   {'      '.join(both)}\n")
     return text

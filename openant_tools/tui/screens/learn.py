@@ -12,10 +12,11 @@ from textual.containers import Horizontal, Vertical
 from textual.widgets import Input, Label, OptionList, Static
 from textual.widgets.option_list import Option
 
+from openant_tools.numbers import number, percent, span
 from openant_tools.tui.braille import trace
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.dialogs import Question
-from openant_tools.tui.marks import BLUE, marked, plain
+from openant_tools.tui.marks import BLUE, marked, plain, spelled
 from openant_tools.tui.page import Page
 from openant_tools.tui.training import AGENTS, Training, read_curve
 
@@ -148,13 +149,14 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
         step = np.array([point.step for point in points], float)
         reward = 100 * np.array([point.average_reward_m_s for point in points])
         width = max(20, self.size.width - 4)
-        share = "" if steps is None else f" of {steps} ({step[-1] / steps:.0%})"
+        share = "" if steps is None else f" of {steps} ({percent(step[-1] / steps)})"
         text.append(
-            f"  step {step[-1]:.0f}{share}, {points[-1].seconds / 60:.0f} min of robot time: {reward[-1]:+.2f} cm/s\n"
+            f"  step {number(step[-1])}{share}, {number(points[-1].seconds / 60, decimals=0)} min of robot time: "
+            f"{spelled(number(reward[-1], sign=True, decimals=1))} cm/s\n"
         )
         low, high = min(0.0, float(reward.min())), max(1.0, float(reward.max()))
         stop = max(float(step[-1]), float(steps or 0.0))
         lines = trace(step, reward, 0.0, stop, low, high, width, 4, plain=plain())
         for line in lines:
             text.append(f"  {line}\n", BLUE)
-        text.append(f"  {low:+.1f} ... {high:+.1f} cm/s over 0 ... {stop:.0f} steps\n")
+        text.append(f"  {spelled(span(low, high))} cm/s over {span(0.0, stop)} steps\n")

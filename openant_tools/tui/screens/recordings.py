@@ -15,6 +15,7 @@ from textual.widgets import Input, OptionList, Static
 from textual.widgets.option_list import Option
 
 from openant_tools.errors import OpenAntError
+from openant_tools.numbers import number
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.feeds import ReplayFeed
@@ -58,10 +59,12 @@ that has the columns of docs/recordings.md.
         super().on_mount()
         self._files = runs_of(self.session.folder)
         chooser = self.query_one("#list", Choices)
-        for number, path in enumerate(self._files):
+        for index, path in enumerate(self._files):
             stat = path.stat()
             when = datetime.datetime.fromtimestamp(stat.st_mtime).strftime("%d.%m.%Y %H:%M")
-            chooser.add_option(Option(Text(f"{path.name:40.40} {stat.st_size / 1e6:7.1f} MB  {when}"), id=str(number)))
+            chooser.add_option(
+                Option(Text(f"{path.name:40.40} {number(stat.st_size / 1e6, decimals=1):>7} MB  {when}"), id=str(index))
+            )
         if self._files:
             chooser.highlighted = 0
         else:

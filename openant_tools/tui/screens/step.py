@@ -15,17 +15,20 @@ from textual.widgets.option_list import Option
 
 from openant_tools.bringup.walk import WALK, standing
 from openant_tools.errors import OpenAntError
+from openant_tools.numbers import number, percent, span
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.journal import Journal
 from openant_tools.procedure.step import Answer, Ask, Event, Hands, Intent, Live, Look, Progress, Say, Step
+from openant_tools.procedure.unfinished import forget, unfinished
 from openant_tools.tui.bars import bars
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.dialogs import Question
-from openant_tools.tui.found import finding_lines
+from openant_tools.tui.found import finding_lines, verdict
 from openant_tools.tui.leg_map import LegMap
 from openant_tools.tui.marks import MARKS, Name, mark, marked, plain, spelled
 from openant_tools.tui.page import Page
 from openant_tools.tui.screens.walk import standing_mark
+from openant_tools.tui.step_help import step_help
 from openant_tools.tui.step_run import BY_VIRTUAL_HANDS, StepRun
 
 __all__ = ["StepScreen"]
@@ -44,7 +47,8 @@ class Choice:
 
 
 class StepScreen(Page):
-    """A log above, what is asked below; beside it the robot, where there is room."""
+    """Three fixed places: above what to do now and what was found, below what is asked and what comes next. Between them the
+    log; beside it the robot, where there is room."""
 
     HELP = """\
 # A step of the walk
@@ -71,9 +75,18 @@ and can be begun again: what it found or wrote before stays, and every write to 
         self._live: Live | None = None
         self._drawn_live: Live | None = None
         self._granted_all = False
+        self._now = ""
+        self._found: Finding | None = None
+        self._found_before = ""
+
+    @property
+    def about(self) -> str:
+        return step_help(self.step)
 
     def body(self) -> ComposeResult:
         yield Static(id="head")
+        yield Static(id="now")
+        yield Static(id="found")
         with Horizontal(id="work"):
             yield VerticalScroll(id="log", can_focus=True)
             yield LegMap(self.session.history)
@@ -95,6 +108,11 @@ and can be begun again: what it found or wrote before stays, and every write to 
     def draw(self) -> None:
         super().draw()
         self.query_one("#head", Static).update(self._head())
+        now, found = self.query_one("#now", Static), self.query_one("#found", Static)
+        now.display, found.display = bool(self._now), self._found is not None
+        now.update(Text(spelled(self._now), style="bold"))
+        if self._found is not None:
+            found.update(verdict(self._found, self._found_before))
         if self._live is not self._drawn_live:
             self._drawn_live = self._live
             line = self.query_one("#bars", Static)
@@ -109,7 +127,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
         text = Text(no_wrap=True, overflow="ellipsis")
         if self.running:
             progress = self._progress
-            share = "" if progress is None or progress.share is None else f" {progress.share:.0%}"
+            share = "" if progress is None or progress.share is None else f" {percent(progress.share)}"
             text.append_text(marked("wait", f"running{share}  "))
             if self._pending is not None:
                 text.append_text(marked("warn", "your turn"))
@@ -125,11 +143,11 @@ and can be begun again: what it found or wrote before stays, and every write to 
     def introduce(self) -> None:
         """What the step is about, and the offer to begin."""
         step, folder = self.step, self.session.folder
-        self.say(Text(step.does, style="bold"))
+        self._now = step.does
         if step.table:
             self.say(Text(f"You need {step.table}."))
         moves = "The robot moves; you are asked before it does." if step.moves else "Nothing moves."
-        self.say(Text(f"It changes {step.changes or 'nothing'}. {moves} About {step.minutes:g} min."))
+        self.say(Text(f"It changes {step.changes or 'nothing'}. {moves} About {number(step.minutes)} min."))
         if folder is None:
             self.say(
                 marked("warn", f"there is no robot's folder at {self.session.path.resolve()}: make one in Settings (s)")
@@ -142,7 +160,29 @@ and can be begun again: what it found or wrote before stays, and every write to 
             self.say(marked("warn", f"before this one should come: {names}"))
         if one is not None and one.finding is not None:
             self.show_finding(one.finding, "the last time: ")
-        self.offer("", [Choice("Begin", self.begin), self._back()])
+        self.offer("", [*self._beginnings("Begin"), self._back()])
+        self.draw()
+
+    def _beginnings(self, words: str) -> list[Choice]:
+        """To begin; where it was left in the middle, first of all to go on there."""
+        folder = self.session.folder
+        left = None if folder is None else unfinished(folder, self.step.name)
+        if left is None:
+            return [Choice(words, self.begin)]
+        self.say(
+            marked(
+                "warn",
+                f"it was left at {left.words}: {', '.join(left.done)} {'is' if len(left.done) == 1 else 'are'} done",
+            )
+        )
+        onwards = Choice(f"Go on at {len(left.done) + 1} of {len(left.of)}: {left.next}", self.begin)
+        return [onwards, Choice(f"{words} from the first", self.begin_anew)]
+
+    def begin_anew(self) -> None:
+        """Run it from its start, whatever of it was done before."""
+        if self.session.folder is not None:
+            forget(self.session.folder, self.step.name)
+        self.begin()
 
     def begin(self) -> None:
         """Run the procedure from its start."""
@@ -155,7 +195,8 @@ and can be begun again: what it found or wrote before stays, and every write to 
         self.offer("", [])
         self.say(marked("wait", f"{self.step.title} begins"))
         self._granted_all = False
-        self._progress = self._live = None
+        self._progress = self._live = self._found = None
+        self._now = self.step.does
         if session.replay is not None:
             session.play(None)
         run = self._run = StepRun(
@@ -167,22 +208,24 @@ and can be begun again: what it found or wrote before stays, and every write to 
     def ended(self, finding: Finding | None, why: str) -> None:
         """The procedure is through: draw what it found, or why it did not."""
         self._run = self._pending = self._progress = self._live = None
-        again = Choice("Begin again", self.begin)
         if finding is None:
             self.say(marked("fail", why))
-            self.offer("It ended without a finding.", [again, self._back()])
+            self._now = why
+            self.offer("It ended without a finding.", [*self._beginnings("Begin again"), self._back()])
         else:
             self.show_finding(finding)
+            self._now = finding.next_action or "Nothing is left to do here."
+            [*ahead, again] = self._beginnings("Begin again")
             names = list(WALK)
             after = names.index(self.step.name) + 1 if self.step.name in names else len(names)
             following = names[after] if after < len(names) else None
-            choices = [again, self._back()]
+            choices = [*ahead, again, self._back()]
             if following is not None:
                 forward = Choice(f"Next: {WALK[following].title}", lambda: self.ant.open_step(following, instead=True))
-                choices = [forward, *choices] if finding.ok else [again, forward, self._back()]
+                choices = [forward, *choices] if finding.ok else [*ahead, again, forward, self._back()]
             if self._wrote():
                 choices.append(Choice("Undo what was written last", lambda: self.ant.open_step("undo", instead=True)))
-            self.offer(finding.next_action, choices)
+            self.offer("", choices)
         self.draw()
 
     def _wrote(self) -> bool:
@@ -194,7 +237,10 @@ and can be begun again: what it found or wrote before stays, and every write to 
         return bool(left) and left[-1].command.endswith(f" {self.step.name}")
 
     def show_finding(self, finding: Finding, before: str = "") -> None:
-        for line in finding_lines(finding, before):
+        self._found, self._found_before = finding, before
+        for line in finding_lines(
+            finding, not before, max(40, (self.query_one("#log").size.width or self.size.width) - 4)
+        ):
             self.say(line)
 
     # ---- from the procedure --------------------------------------------------------------------------------------
@@ -232,6 +278,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
             self._hands(event)
 
     def _intend(self, event: Intent) -> None:
+        self._now = f"It will {event.words}."
         self.say(Text(f"{mark('info')} It will {event.words}.", style="bold"))
         for change in event.registers:
             self.say(Text(f"    {change}"))
@@ -256,14 +303,19 @@ and can be begun again: what it found or wrote before stays, and every write to 
         self.reply(True, "granted, with all further writes of this step")
 
     def _ask(self, event: Ask) -> None:
+        self._now = event.question
         if event.choices:
             choices = [Choice(word, lambda word=word: self.reply(word, word)) for word in event.choices]  # type: ignore[misc]
             default = event.choices.index(str(event.default)) if event.default in event.choices else 0
             self.ask(event, event.question, choices, default)
             return
-        span = f" ({event.low:g} ... {event.high:g})" if event.low is not None and event.high is not None else ""
+        allowed = (
+            f" ({number(event.low)} to {number(event.high)})"
+            if event.low is not None and event.high is not None
+            else ""
+        )
         unit = "" if event.unit == "text" else event.unit
-        self.ask(event, f"{event.question} {unit}{span}", [])
+        self.ask(event, f"{event.question} {unit}{allowed}", [])
         field = self.query_one("#value", Input)
         field.display = True
         field.value = "" if event.default is None else str(event.default)
@@ -281,11 +333,12 @@ and can be begun again: what it found or wrote before stays, and every write to 
                 self.say(marked("warn", f"{value!r} is no number"))
                 return
             if not (event.low is None or value >= event.low) or not (event.high is None or value <= event.high):
-                self.say(marked("warn", f"{value:g} is outside {event.low} ... {event.high}"))
+                self.say(marked("warn", f"{number(value)} is outside {span(event.low, event.high)}"))
                 return
         self.reply(value, str(value))
 
     def _hands(self, event: Hands) -> None:
+        self._now = event.words
         self.say(Text(f"{mark('info')} {event.words}", style="bold"))
         if event.while_watching:
             return

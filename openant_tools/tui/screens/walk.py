@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import ClassVar
 
 from rich.text import Text
@@ -12,22 +13,39 @@ from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
 
 from openant_tools.bringup.walk import WALK, Standing, standing
+from openant_tools.numbers import number
 from openant_tools.procedure.step import Step
+from openant_tools.robot.folder import RobotFolder
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.found import sign
 from openant_tools.tui.leg_map import LegMap
 from openant_tools.tui.marks import Name, mark, marked, plain, spelled
 from openant_tools.tui.page import Page
+from openant_tools.tui.step_help import step_help
 
-__all__ = ["WalkScreen", "standing_mark"]
+__all__ = ["WalkScreen", "continues", "standing_mark"]
 
 _MARKS: dict[str, Name] = {"todo": "todo", "ok": "ok", "failed": "fail", "unsure": "unsure", "stale": "stale"}
 CHECK, VIRTUAL = "check", "virtual"
 
 
 def standing_mark(one: Standing) -> Text:
-    """A step's state, with what it waits for where it cannot be begun."""
+    """A step's state; of one that was left in the middle how far it was."""
+    if one.left is not None and one.state != "ok":
+        return marked("warn", f"{one.left.words} done")
     return marked(_MARKS[one.state])
+
+
+def continues(folder: RobotFolder) -> str:
+    """How far a robot's walk is, and what is next: `Continue my-ant · 3 of 15 · next: Motor IDs`."""
+    states = standing(folder)
+    done = sum(one.state == "ok" for one in states.values())
+    following = next((one for one in states.values() if one.state != "ok"), None)
+    words = f"Continue {folder.path.resolve().name} · {done} of {len(states)}"
+    if following is None:
+        return f"{words} · all done"
+    at = "" if following.left is None else f", at {len(following.left.done) + 1} of {len(following.left.of)}"
+    return f"{words} · next: {following.step.title}{at}"
 
 
 class WalkList(Choices):
@@ -68,7 +86,12 @@ class WalkScreen(Page):
         Binding("escape,q", "app.leave", "Quit", key_display="q"),
     ]
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._shown: Path | None = None
+
     def body(self) -> ComposeResult:
+        yield Static(id="continue")
         with Horizontal():
             yield WalkList(id="walk")
             with Vertical(id="beside"):
@@ -90,6 +113,10 @@ class WalkScreen(Page):
         chosen = walk.highlighted
         folder = self.session.folder
         self._standing = standing(folder) if folder is not None else {}
+        words = "No robot yet: Enter on a step makes its folder" if folder is None else continues(folder)
+        self.query_one("#continue", Static).update(Text(spelled(words), style="bold"))
+        if folder is not None and folder.path != self._shown:
+            chosen, self._shown = None, folder.path
         walk.clear_options()
         for n, (name, step) in enumerate(WALK.items(), 1):
             state = standing_mark(self._standing[name]) if name in self._standing else marked("todo")
@@ -99,6 +126,16 @@ class WalkScreen(Page):
         walk.add_option(Option(Text(f" v {offer}", style="bold"), id=VIRTUAL))
         first = next((k for k, name in enumerate(WALK) if self._state(name) != "ok"), 0)
         walk.highlighted = first if chosen is None else min(chosen, walk.option_count - 1)
+
+    def go_to(self, name: str) -> None:
+        """Put the cursor on a step."""
+        self.query_one(WalkList).highlighted = list(WALK).index(name)
+
+    @property
+    def about(self) -> str:
+        option = self.query_one(WalkList).highlighted_option
+        name = None if option is None else option.id
+        return step_help(WALK[name]) if name is not None and name in WALK else ""
 
     def _state(self, name: str) -> str:
         return self._standing[name].state if name in self._standing else "todo"
@@ -132,7 +169,9 @@ _ABOUT_VIRTUAL = Text.assemble(
 
 
 def _about(step: Step, one: Standing | None) -> Text:
-    text = Text.assemble((f"{step.title}", "bold"), f"  about {step.minutes:g} min\n{step.does}\n")
+    text = Text.assemble((f"{step.title}", "bold"), f"  about {number(step.minutes)} min\n{step.does}\n")
+    if one is not None and one.left is not None:
+        text.append(f"{mark('warn')} left at {one.left.words}; next: {one.left.next}\n", "bold")
     if one is not None and one.finding is not None:
         text.append(f"{mark(sign(one.finding))} {one.finding.what}\n", "bold")
     if one is not None and one.waits_for:

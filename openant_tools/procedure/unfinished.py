@@ -1,0 +1,103 @@
+"""What a step had done when it was left in the middle, part by part (a joint, a leg): it goes on with the next part.
+
+A part is noted once nothing of it is left to do, in the robot's folder, and the notes go when the step says yes. What of a part
+can be read again, a procedure reads again before it trusts the note.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from openant_tools.errors import BadInput
+from openant_tools.files import json_text, read_json, write_text
+
+if TYPE_CHECKING:
+    from openant_tools.robot.folder import RobotFolder
+
+__all__ = ["Parts", "Unfinished", "forget", "unfinished"]
+
+SCHEMA = "openant.unfinished/1"
+
+
+@dataclass(frozen=True)
+class Unfinished:
+    """How far a step was when it was left.
+
+    Attributes:
+        of: every part, in order.
+        done: part → what is known of it.
+        date: when the last one was done, UTC.
+    """
+
+    of: tuple[str, ...]
+    done: Mapping[str, Mapping[str, Any]]
+    date: datetime.datetime
+
+    @property
+    def next(self) -> str:
+        """The first part that is left to do."""
+        return next(part for part in self.of if part not in self.done)
+
+    @property
+    def words(self) -> str:
+        """`4 of 8`."""
+        return f"{len(self.done)} of {len(self.of)}"
+
+
+def unfinished(folder: RobotFolder, step: str) -> Unfinished | None:
+    """What a step has done of its parts, where some and not all are done; None otherwise, and where the note is none."""
+    try:
+        said = read_json(_file(folder, step))
+        if said["schema"] != SCHEMA:
+            return None
+        of = tuple(map(str, said["of"]))
+        done = {str(part): dict(facts) for part, facts in said["done"].items() if part in of}
+        date = datetime.datetime.fromisoformat(str(said["date"]))
+    except (OSError, BadInput, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return Unfinished(of, done, date) if 0 < len(done) < len(of) else None
+
+
+def forget(folder: RobotFolder, step: str) -> None:
+    """The step begins with its first part the next time."""
+    _file(folder, step).unlink(missing_ok=True)
+
+
+class Parts:
+    """The parts of a step that runs.
+
+    Args:
+        folder: the robot's. step: its name. of: all its parts, in order.
+        named: joints that the builder has named: who names them wants them done anew, and nothing is noted.
+    """
+
+    def __init__(self, folder: RobotFolder, step: str, of: Sequence[str], named: Sequence[str] = ()) -> None:
+        self._folder, self._step, self._of = folder, step, tuple(of)
+        left = None if named else unfinished(folder, step)
+        #: part → what is known of it, of those that were done before
+        self.before: Mapping[str, Mapping[str, Any]] = {} if left is None or left.of != self._of else left.done
+        self._done = dict(self.before)
+        self._kept = not named
+
+    def done(self, part: str, **facts: Any) -> None:
+        """Note that nothing of a part is left to do, and what the next run must know of it."""
+        self._done[part] = facts
+        if self._kept:
+            date = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+            note = {"schema": SCHEMA, "date": date.isoformat(), "of": list(self._of), "done": self._done}
+            write_text(_file(self._folder, self._step), json_text(note))
+
+    @property
+    def words(self) -> str:
+        """That it goes on where it was left, in a sentence."""
+        names = ", ".join(self.before)
+        verb = "was" if len(self.before) == 1 else "were"
+        return f"it goes on at {len(self.before) + 1} of {len(self._of)}: {names} {verb} done before"
+
+
+def _file(folder: RobotFolder, step: str) -> Path:
+    return folder.path / "unfinished" / f"{step}.json"

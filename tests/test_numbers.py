@@ -1,0 +1,73 @@
+"""Every number that people read comes from one place, with the digits that it deserves."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from openant_tools.numbers import number, percent, span
+
+HOUSE = Path(__file__).resolve().parent.parent / "openant_tools"
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "low", "high", "name", "shown"),
+    [
+        (0.000487, "rad", None, None, "error after", "0.49 mrad"),
+        (1.776e-15, "rad", None, None, "residual of hip_rr", "0.00 mrad"),
+        (0.7853981634, "rad", None, None, "mounting", "45.0°"),
+        (0.21, "rad", 0.2, 0.22, "nudge", "12.0° (11.5 to 12.6)"),
+        (0.00063, "s", None, None, "round trip", "0.630 ms"),
+        (12.03, "s", 11.0, 13.0, "to its limit", "12.0 s (11.0 to 13.0)"),
+        (4.7213, "N·m/rad", 4.61, 4.84, "stiffness", "4.72 N·m/rad (4.61 to 4.84)"),
+        (0.0, "1", None, None, "telemetry errors", "0"),
+        (1780.0, "", None, None, "answers asked for", "1780"),
+        (0.93812, "1", None, None, "scale", "0.938"),
+        (-0.04, "V", None, None, "", "−0.0400 V"),
+        (None, "rad", None, None, "", "unknown"),
+        (math.nan, "V", 1.0, 2.0, "", "unknown"),
+        (1.5, "K", None, 3.0, "", "1.50 K"),
+    ],
+)
+def test_a_number_is_read_in_the_unit_and_with_the_digits_that_it_deserves(value, unit, low, high, name, shown):
+    assert number(value, unit, low, high, name=name) == shown
+
+
+def test_columns_signs_and_shares():
+    assert number(0.1, "rad", sign=True, decimals=1) == "+5.7°"
+    assert number(-1e-9, "rad", sign=True, decimals=1) == "+0.0°"
+    assert span(-math.pi / 4, math.pi / 4, "rad") == "−45 to 45°"
+    assert span(5, 60, "s") == "5 to 60 s"
+    assert [percent(share) for share in (0.0, 0.0004, 0.06, 1.0, None)] == [
+        "0 %",
+        "below 1 %",
+        "6 %",
+        "100 %",
+        "unknown",
+    ]
+
+
+#: a number formatted by hand: f"{value:.3g}", f"{share:.0%}", f"{value:+8.3f}"
+FORMATTED = re.compile(r"\{[^{}\n]*:[-+ <>^=]*[0-9]*(?:\.[0-9]+)?[gfe%]\}")
+#: where it is left to be done, and how often: none may be added
+LEFT = {
+    "blind/score_report.py": 3, "comms/dropouts/report.py": 5, "gap/measure_report.py": 8, "gap/report.py": 10,
+    "sysid/bench/report.py": 3, "sysid/compare_report.py": 2, "sysid/fit_report.py": 11, "sysid/plan_report.py": 13,
+    "thermal/report.py": 10,
+}  # fmt: skip
+
+
+def test_screens_and_reports_format_no_number_themselves():
+    """The one exception is a number that a computer reads, such as a coordinate in an SVG or a value in a file."""
+    found = {}
+    for path in sorted([*HOUSE.glob("tui/**/*.py"), *HOUSE.glob("**/*report*.py"), *HOUSE.glob("report/*.py"),
+                        *HOUSE.glob("procedure/*.py")]):  # fmt: skip
+        lines = [line for line in path.read_text().splitlines() if FORMATTED.search(line)]
+        lines = [line for line in lines if "# for a file" not in line]
+        if lines:
+            found[path.relative_to(HOUSE).as_posix()] = len(lines)
+    worse = {name: count for name, count in found.items() if count > LEFT.get(name, 0)}
+    assert not worse, f"print with openant_tools.numbers: {worse}"
