@@ -469,7 +469,7 @@ def test_a_wrong_scale_of_the_accelerometer_is_said(tmp_path):
 
 
 def test_a_scale_that_the_firmware_does_not_promise_is_named(tmp_path):
-    with robot(tmp_path / "ant", imu={"acc_scale": [0.25, 0.25, 0.25], "acc_noise": 0.005}) as ant:
+    with robot(tmp_path / "ant", imu={"api_minor": 46, "acc_scale": [0.25] * 3, "acc_noise": 0.005}) as ant:
         finding, _ = ant.do(imu(ant.bench))
         assert "Gravity says 512 LSB/g where API 1.46 promises" in "\n".join(finding.problems)
 
