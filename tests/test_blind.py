@@ -244,24 +244,6 @@ def test_a_robot_done_is_not_done_again_and_one_refused_is_tried_again(sealed_se
     assert asked == ["robot-000", "robot-001", "robot-002", "robot-002"]
 
 
-@pytest.mark.parametrize("prepares", [True, False])
-def test_a_robot_is_timed_as_the_first_only_where_it_prepared_its_protocol(
-    prepares: bool, sealed_set: tuple[Path, Path, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("OPENANT_CACHE", str(tmp_path / "cache"))
-    kept = tmp_path / "cache" / "gap" / "v1-protocol-0"
-    kept.mkdir(parents=True)
-
-    def judge(robot: Path, model: Path) -> dict[str, Any]:
-        if prepares:
-            (kept / "closed").touch()
-        return says(robot, model)
-
-    run_set(sealed_set[0], diagnose=judge)
-    told = [json.loads(verdict_path(sealed_set[0], f"robot-00{k}").read_text())["blind"]["first"] for k in range(3)]
-    assert told == [prepares, False, False]
-
-
 def test_a_robot_that_is_not_wholly_made_yet_is_not_judged(sealed_set: tuple[Path, Path, bytes]) -> None:
     folder = sealed_set[0]
     for path in (folder / "robot-001").glob("stand-1.*"):

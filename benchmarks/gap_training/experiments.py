@@ -77,7 +77,7 @@ def experiment(seed: int, folder: Path) -> Experiment:
     for k, one in enumerate(played.runs):
         found = simulate(Rollouts(one.plant, [one.run], nthread=1), [robot], seed * 64 + k, one.signals).signals
         runs.append(_logged(one.run, logged_by([robot], found, steps, rng, one.layout.t), joints, has))
-    cut = recorded.Experiment.of(runs, model, joints, [None] * len(runs))
+    cut = recorded.Experiment.of(runs, model, joints)
     return Experiment(cut.protocol.coarse(), truth)
 
 

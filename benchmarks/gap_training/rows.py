@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from openant_tools.arrays import read_arrays
 from openant_tools.effects.robot import Reference
 from openant_tools.gap.evidence import Evidence, Layouts, RunLayout, Scale, evidence_of
-from openant_tools.gap.features import ARRIVAL, FOLLOWING, LATENESS
+from openant_tools.gap.features import ARRIVAL, IMU_DELAY, LATENESS
 from openant_tools.gap.population import Case
 
 __all__ = ["Shard", "read_shard"]
@@ -20,7 +20,7 @@ __all__ = ["Shard", "read_shard"]
 Bools = NDArray[np.bool_]
 
 #: signal → what its absence takes with it
-WITH = {"gyro": ("gyro", FOLLOWING), "pos": ("pos", LATENESS, ARRIVAL)}
+WITH = {"gyro": ("gyro", IMU_DELAY), "pos": ("pos", LATENESS, ARRIVAL)}
 #: signals that a log may lack
 MAY_LACK = ("vel", "torque", "volt", "gyro", "acc", "base", "yaw")
 
@@ -70,9 +70,16 @@ class Shard:
                     known &= self.layouts.signal != gone
         return known
 
+    def shorter(self, rng: np.random.Generator) -> Bools:
+        """(features,) what a log of some of the runs would have, with fewer sensors or with all; of a single run all."""
+        runs = np.unique(self.layouts.run)
+        some = rng.choice(runs, int(rng.integers(1, max(len(runs), 2))), replace=False)
+        known = self.lacking(rng) if rng.random() < 0.5 else self.known
+        return known & np.isin(self.layouts.run, some)
+
 
 def read_shard(folder: Path, seed: int) -> Shard:
-    facts = json.loads((folder / f"{seed:05d}.json").read_text())
+    facts = json.loads((folder / f"{seed:05d}.json").read_text().replace('"following"', '"imu_delay"'))
     arrays = read_arrays(folder / f"{seed:05d}.npz")
     runs = range(len(facts["runs"]))
 

@@ -22,8 +22,9 @@ import numpy as np
 
 from benchmarks.gap_training.experiments import Experiment, experiment
 from openant_tools.arrays import write_arrays
+from openant_tools.errors import BadInput
 from openant_tools.files import json_text, write_text
-from openant_tools.gap.cloud import robots_at, templates_at, templates_of
+from openant_tools.gap.ensemble import robots_at, templates_at, templates_of
 from openant_tools.gap.population import Case, applicable, draw
 
 #: robots of a shard: healthy ones that make the measure, and others that are learned from
@@ -33,12 +34,15 @@ BATCH = 53
 
 
 def shard(seed: int, folder: Path) -> float:
-    """Make one; how many seconds it took, 0 where it was there."""
+    """Make one; how many seconds it took, 0 where it was there or where too little of its motion can be used."""
     place = folder / f"{seed:05d}.npz"
     if place.exists():
         return 0.0
     begun = time.monotonic()
-    made = experiment(seed, folder)
+    try:
+        made = experiment(seed, folder)
+    except BadInput:
+        return 0.0
     write_shard(place, made, _cases(made, seed, MEASURE + HEALTHY, ILL), MEASURE)
     return time.monotonic() - begun
 

@@ -2,7 +2,7 @@
 
     python -m benchmarks.gap_training.train FOLDER [--out openant_tools/gap]
 
-Every experiment is described twice: with the sensors that its log had, and with fewer. Then once more for some causes as if no
+Every experiment is described with the sensors that its log had, with fewer, and by some of its runs alone. Then once more for some causes as if no
 catalogue had them: that is what an outsider looks like. First the classifier learns; then, on judgements of experiments that it had
 not seen, the weights of the posterior. Figures are of folds over experiments.
 """
@@ -37,6 +37,8 @@ Floats = NDArray[np.float32]
 TREES, LEAVES, RATE = 300, 24, 0.06
 #: causes of an experiment that are left out in turn, and how large one has to be to be looked for (0 just beyond tolerance, 1 clearly ill)
 LEFT_OUT, LOOKED_FOR = 6, 0.25
+#: descriptions of an experiment of several runs by some of them
+SHORTER = 2
 #: weights this large cost as much as one robot's surprise
 FAR = 3.0
 
@@ -60,7 +62,9 @@ def described(folder: Path, seed: int) -> list[Described]:
     """Of one experiment: as it was recorded, with fewer sensors, and without some causes."""
     shard, rng = read_shard(folder, seed), np.random.default_rng((9, seed))
     out = []
-    for known in (shard.known, shard.lacking(rng)):
+    several = len(np.unique(shard.layouts.run)) > 1
+    shorter = [shard.shorter(rng) for _ in range(SHORTER if several else 0)]
+    for known in (shard.known, shard.lacking(rng), *shorter):
         found = shard.evidence(known)
         true = np.array([[cause in case.causes for cause in found.causes] for case in shard.learned])
         out.append(

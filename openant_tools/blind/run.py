@@ -1,8 +1,7 @@
 """Let the diagnosis judge every robot of a set: one JSON file a robot, and nothing done twice.
 
 Robots fan out over cores, or over machines, through joblib: `loky` for processes of this machine, `dask` for a cluster (with its
-address, or a local one), `ray`. The first robot goes alone, since what has to be prepared for a model and a protocol is prepared
-by it and found by all others. Every machine of a cluster must see the set's folder under the same path.
+address, or a local one), `ray`. Every machine of a cluster must see the set's folder under the same path.
 """
 
 from __future__ import annotations
@@ -83,16 +82,12 @@ def run_set(
     todo = [robot for robot in _whole(folder) if not _judged(verdict_path(folder, robot.name))]
     if not todo:
         return 0
-    # Who is to help is asked for first: the first robot may take half an hour.
     with _fan_out(backend, jobs, scheduler), warnings.catch_warnings():
         # That a process which has grown is replaced is no one's concern.
         warnings.filterwarnings("ignore", "A worker stopped", UserWarning)
-        progress(todo[0].name, 0.0)
-        _judge(folder, todo[0], diagnose, True)
-        progress(todo[0].name, 1 / len(todo))
         judge = tied(_judge) if backend == "loky" else _judge  # the others' workers may be on other machines
-        work = (delayed(judge)(folder, robot, diagnose, False) for robot in todo[1:])
-        for done, name in enumerate(Parallel(return_as="generator_unordered")(work), 2):
+        work = (delayed(judge)(folder, robot, diagnose) for robot in todo)
+        for done, name in enumerate(Parallel(return_as="generator_unordered")(work), 1):
             progress(name, done / len(todo))
     return len(todo)
 
@@ -113,19 +108,14 @@ def _judged(path: Path) -> bool:
         return False
 
 
-def _judge(folder: Path, robot: Path, diagnose: Diagnose, first: bool) -> str:
-    """Diagnose one robot, and say how long it took; first: before all others, by itself."""
-    from openant_tools.gap.prepare import finished_since
-
-    # Whole seconds: file systems' clocks are behind this one by a tick, or by as much as a second.
-    began, clock = time.monotonic(), int(time.time())
+def _judge(folder: Path, robot: Path, diagnose: Diagnose) -> str:
+    """Diagnose one robot, and say how long it took."""
+    began = time.monotonic()
     try:
         found = diagnose(robot, folder / "model.xml")
     except OpenAntError as error:
         found = {"verdict": None, "error": str(error)}
-    # Only what had to prepare its protocol is timed as such: the first of a set may find it prepared.
-    alone = first and finished_since(clock)
-    found["blind"] = {"robot": robot.name, "seconds": round(time.monotonic() - began, 2), "first": alone}
+    found["blind"] = {"robot": robot.name, "seconds": round(time.monotonic() - began, 2)}
     write_text(verdict_path(folder, robot.name), json.dumps(found, indent=1) + "\n")
     return robot.name
 

@@ -31,12 +31,6 @@ model_option = click.option(
     metavar="M.xml",
     help="Default: each run's own model, else that of the robot's folder.",
 )
-robots_option = click.option(
-    "--robots",
-    type=click.IntRange(min=64),
-    metavar="N",
-    help="How many robots to simulate for a protocol never seen. Default: by the number of joints.",
-)
 
 
 @click.command()
@@ -48,7 +42,7 @@ robots_option = click.option(
     multiple=True,
     type=click.Path(path_type=Path),
     metavar="RUN",
-    help="Judge on this run. Repeatable. Default: each run is left out in turn.",
+    help="Judge on this run. Repeatable. Default: parts of RUNs are left out in turn.",
 )
 @click.option(
     "--prior",
@@ -57,7 +51,6 @@ robots_option = click.option(
     help="An effect that you know or expect of this robot: it decides where the runs cannot. Repeatable.",
 )
 @joint_option
-@robots_option
 @robot_option
 @json_option
 @report_option
@@ -67,7 +60,6 @@ def diagnose(
     hold_out: tuple[Path, ...],
     prior: tuple[str, ...],
     joints: tuple[str, ...],
-    robots: int | None,
     robot: Path | None,
     json_file: Path | None,
     report: Path | None,
@@ -75,11 +67,11 @@ def diagnose(
     """Say where the gap between RUNs and a model lies, which unmodelled effect causes it, and how far it closes.
 
     \b
-      openant gap diagnose stand.mcap walk.mcap --robot my-ant --json gap.json --report gap
+      openant gap diagnose walk.mcap --robot my-ant --json gap.json --report gap
       openant gap diagnose a.parquet b.parquet --hold-out c.parquet --model pendulum.xml
 
-    Where the protocol was never seen, robots are simulated first (`openant gap prepare` does that ahead of time). Exit code
-    0 whatever the verdict.
+    Any recording will do, also a single one of a policy: robots with every cause are simulated for it, which takes about a minute,
+    and seconds where the same recording was diagnosed before. Exit code 0 whatever the verdict.
     """
     from openant_tools.files import json_text, write_text
     from openant_tools.gap.diagnose import diagnose as diagnosed
@@ -90,9 +82,7 @@ def diagnose(
     everything = checked(everything, given, joints)
     recordings, held_out = everything[: len(fitted)], everything[len(fitted) :]
     with progress() as tell:
-        found = diagnosed(
-            recordings, given, hold_out=held_out, joints=joints or None, robots=robots, prior=prior, progress=tell
-        )
+        found = diagnosed(recordings, given, hold_out=held_out, joints=joints or None, prior=prior, progress=tell)
         if json_file:
             write_text(json_file, json_text(found.as_json()))
         written = None
@@ -108,28 +98,16 @@ def diagnose(
 @runs_argument
 @model_option
 @joint_option
-@robots_option
 @robot_option
-def prepare(
-    runs: tuple[Path, ...], model: Path | None, joints: tuple[str, ...], robots: int | None, robot: Path | None
-) -> None:
-    """Simulate the robots that diagnoses of what RUNs played will be judged by, so that each takes a minute or two.
-
-    What is done is kept: interrupt it and start it again as you like. The same commands count as the same protocol
-    whatever their time stamps.
-    """
-    from openant_tools.gap.prepare import prepare as prepared
-    from openant_tools.gap.protocol import Protocol
-    from openant_tools.model.of_run import own_model
-    from openant_tools.sysid.identify import joints_in_common
+def prepare(runs: tuple[Path, ...], model: Path | None, joints: tuple[str, ...], robot: Path | None) -> None:
+    """Simulate the robots that a diagnosis of RUNs will be judged by, so that it takes seconds. No verdict depends on it."""
+    from openant_tools.gap.diagnose import prepare as prepared
 
     recordings, given = model_of(read_runs(runs), model, robot)
     recordings = checked(recordings, given, joints)
-    wanted = joints_in_common(recordings, given, joints or None)
-    protocol = Protocol.of(recordings, given, wanted, [own_model(run) for run in recordings])
     with progress() as tell:
-        made = prepared(protocol, robots, progress=tell)
-    click.echo(f"ready: {len(made.cases)} simulated robots of {len(wanted)} joints in {made.folder}")
+        made = prepared(recordings, given, joints or None, tell)
+    click.echo(f"ready: {made} simulated robots")
 
 
 @click.command()

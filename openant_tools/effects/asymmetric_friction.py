@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from openant_tools.effects.effect import Effect, Ints, Parameter, Scope, Table, Values, amount, usual_torque
@@ -19,12 +17,6 @@ AT_REST_RAD_S = 0.01
 def _enter(robot: Robot, joints: Ints, values: Values) -> None:
     for name in ("positive_nm", "negative_nm"):
         robot.law("asymmetric_friction", name)[joints] += values[name]
-
-
-def _simpler(x: Mapping[str, float]) -> str | None:
-    """Friction that is nearly alike either way is plain dry friction."""
-    high, low = max(x.values()), min(x.values())
-    return "coulomb_friction" if low > 0.75 * high else None
 
 
 def _law(values: Table) -> Law:
@@ -53,5 +45,4 @@ effect = Effect(
     order=30,
     parameters=(Parameter("positive_nm", "N·m", 0.1), Parameter("negative_nm", "N·m", 0.1)),
     vector=True,
-    simpler=_simpler,
 )

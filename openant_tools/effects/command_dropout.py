@@ -28,5 +28,4 @@ effect = Effect(
     acts_on="commands",
     random=True,
     # A command that is lost is late, too, while a clock that jitters loses none.
-    shows_as=("clock_jitter",),
 )

@@ -207,12 +207,8 @@ class Effect:
         nuisance: whether a template of it says how robots within its tolerance differ, so that this much of it is no evidence.
         shows: whether it can show on what was recorded.
         signal: the signal of the log that it acts on, where that is not the motion itself.
-        witness: a signal that shows it beside the motion, and nothing else does.
         silent: whether command and encoder shift alike, so that joint positions hardly show it.
         unseen: names of quantities that joint positions do not show.
-        alike: effects that a log as a whole hardly tells from it, while windows of it, each begun anew, do.
-        shows_as: effects that a log of it shows, too, while a log of theirs does not show it.
-        simpler: the effect that it is no more than at coordinates like these, if it is.
         random: whether it acts at random times: no simulation repeats what happened, and what one closes says little.
         stated: from the quantities to the catalogue's parameters, where those are not the same.
         restored: from a diagnosis' parameters back to the quantities, with what its coordinates were.
@@ -237,12 +233,8 @@ class Effect:
     nuisance: bool = False
     shows: Callable[[Reference], bool] = everywhere
     signal: str | None = None
-    witness: str | None = None
     silent: bool = False
     unseen: frozenset[str] = frozenset()
-    alike: tuple[str, ...] = ()
-    shows_as: tuple[str, ...] = ()
-    simpler: Callable[[Mapping[str, float]], str | None] = lambda x: None
     random: bool = False
     stated: Callable[[Values, Reference, Ints], dict[str, float]] = lambda values, reference, joints: dict(values)
     restored: Callable[[Values, Values, Reference, Ints], dict[str, float]] = lambda given, x, reference, joints: dict(
@@ -278,6 +270,10 @@ class Effect:
         """Whether joint positions say little of it at these coordinates: what they would show is within tolerance there."""
         beyond = {q.name for q in self.quantities if not q.shape and abs(x[q.name]) >= q.small}
         return self.unseen_in_joints or (bool(beyond) and beyond <= self.unseen)
+
+    def of_sensors_at(self, x: Mapping[str, float]) -> bool:
+        """Whether it acts on what sensors tell, and not on what moves, at these coordinates."""
+        return self.signal is not None or (not self.of_body and not self.silent and self.unseen_in_joints_at(x))
 
     def values(self, x: Mapping[str, float], reference: Reference, joints: Ints) -> dict[str, float]:
         """The parameters at a point of the coordinates."""

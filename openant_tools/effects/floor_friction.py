@@ -38,6 +38,5 @@ effect = Effect(
         ),
     ),
     nuisance=True,
-    alike=("foot_adhesion",),
     shows=lambda reference: reference.floor,
 )

@@ -24,6 +24,5 @@ effect = Effect(
     quantities=(amount("force_n", "N", 0.05, 0.9, scale=_weight),),
     enter=_enter,
     native=True,
-    alike=("floor_friction",),
     shows=lambda reference: reference.floor,
 )

@@ -53,7 +53,6 @@ effect = Effect(
     order=10,
     parameters=(Parameter("resistance_ohm", "Ω", 0.5, high=20.0),),
     shared=True,
-    witness="volt",
     told_from={
         "load_friction": Action(
             "one joint alone, then all",

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, hstack
 
-from openant_tools.gap.neighbours import beside_neighbours
+from openant_tools.gap.neighbours import against_neighbours
 from openant_tools.model.plant import Plant
 from openant_tools.model.servo import read_damping, read_stiffness, read_velocity_gain
 from openant_tools.recording.run import Run
@@ -90,7 +90,7 @@ class Arrivals:
             (robots, joints + 1) logarithm of their scatter, s, for each joint and for all together; as many of their skewness,
             towards late; (robots, 1) how much more alike joints are in that than by chance, as a share of what they scatter.
         """
-        off = beside_neighbours(x, self.t) * self.counts[:, None]
+        off = against_neighbours(x, self.t) * self.counts[:, None]
         model = np.gradient(simulated.astype(np.float64), self.t, axis=0)
         said = []
         for j, answers in enumerate(self.late):
@@ -122,7 +122,7 @@ class Arrivals:
             speed, acceleration, np.gradient(acceleration, self.t), error, np.roll(error, 1), np.roll(error, -1),
             turn, np.roll(turn, 1), position, speed * np.abs(speed), error * np.abs(error),
         ]  # fmt: skip
-        beside = beside_neighbours(np.stack(every, axis=1)[None].astype(np.float32), self.t)[0] * self.counts[:, None]
+        beside = against_neighbours(np.stack(every, axis=1)[None].astype(np.float32), self.t)[0] * self.counts[:, None]
         size = np.linalg.norm(beside, axis=0)
         out: Array = np.linalg.qr(beside[:, size > 1e-9] / size[size > 1e-9])[0]
         return out
@@ -151,7 +151,7 @@ def _answers(t: Array, times: Array, steps: Array, natural: float, damped: float
         since = t[:, None] - times[at : at + PORTION]
         behind = np.interp(since - LATE_S, grid, position, left=0.0) - np.interp(since, grid, position, left=0.0)
         behind = np.where(since < ANSWERS_S, behind / LATE_S * steps[at : at + PORTION], 0.0)
-        found.append(csr_array(beside_neighbours(behind[None].astype(np.float32), t)[0] * counts[:, None]))
+        found.append(csr_array(against_neighbours(behind[None].astype(np.float32), t)[0] * counts[:, None]))
     return csr_array(hstack(found))
 
 

@@ -17,23 +17,24 @@ from numpy.typing import NDArray
 
 from openant_tools.arrays import read_arrays, write_arrays
 from openant_tools.errors import BadInput
+from openant_tools.gap.cache import cache_folder, keep_small
 from openant_tools.gap.classifier import classifier, weights
-from openant_tools.gap.cloud import robots_at, templates_at, templates_of
-from openant_tools.gap.evidence import Evidence, Layouts, RunLayout, Scale, evidence_of, unknown_signals
+from openant_tools.gap.ensemble import robots_at, templates_at, templates_of
+from openant_tools.gap.evidence import Evidence, Layouts, RunLayout, Scale, anomalies, evidence_of, unknown_signals
 from openant_tools.gap.features import Floats
 from openant_tools.gap.population import Case
 from openant_tools.gap.posterior import NONE, OUTSIDE, features_of, log_posterior
-from openant_tools.gap.prepare import cache_folder, keep_small
 from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.templates import Template
 
 __all__ = ["Assessment", "assess", "layouts_of"]
 
 Bools = NDArray[np.bool_]
 
 #: healthy robots that make the measure, and others that say how far one may be outside it; robots of one batch
-MEASURE, OTHERS, BATCH = 96, 32, 32
+MEASURE, OTHERS, BATCH = 72, 24, 32
 #: of simulated robots: raise it where the same recording gives others
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Assessment:
     Attributes:
         none, outside: probabilities. leads: cause → that it leads the gap. present: cause → that it is there, whatever leads.
         set_aside: signal → times the farthest healthy robot by which it behaves as none that is known: it had no part in this.
+        anomalies: signal → how far it is from the model's, in what healthy robots are off by: above 1 beyond nearly all of them.
         evidence: the rows, of one robot.
     """
 
@@ -51,15 +53,28 @@ class Assessment:
     leads: Mapping[str, float]
     present: Mapping[str, float]
     set_aside: Mapping[str, float]
+    anomalies: Mapping[str, float]
     evidence: Evidence
 
     def ranked(self) -> list[str]:
         """Causes, the likeliest to lead first."""
         return sorted(self.leads, key=lambda name: -self.leads[name])
 
+    @property
+    def robots(self) -> int:
+        """How many were simulated for it."""
+        return len(self.evidence.bank) + MEASURE + OTHERS
+
     def place(self, cause: str) -> tuple[int, ...]:
         """Where its best template sits: indices of joints."""
-        return self.evidence.bank[int(self.evidence.places[0, self.evidence.causes.index(cause)])][1]
+        return self._best(cause)[1]
+
+    def template(self, cause: str) -> Mapping[str, float]:
+        """Coordinates of its best template."""
+        return self._best(cause)[2]
+
+    def _best(self, cause: str) -> Template:
+        return self.evidence.bank[int(self.evidence.places[0, self.evidence.causes.index(cause)])]
 
 
 def assess(
@@ -96,6 +111,7 @@ def assess(
         dict(zip(evidence.causes, p[2:].tolist(), strict=True)),
         dict(zip(evidence.causes, (1 / (1 + np.exp(-odds[0].astype(np.float64)))).tolist(), strict=True)),
         set_aside,
+        anomalies(scale, healthy[MEASURE:], seen),
         evidence,
     )
 

@@ -7,19 +7,19 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
+from scipy.stats import t as student
 
 from openant_tools.effects.catalogue import enter
 from openant_tools.effects.effect import Quantity
 from openant_tools.effects.robot import Robot
-from openant_tools.gap.explain import Hypothesis, Part, bounds_of
 from openant_tools.gap.features import Floats, around_switching
+from openant_tools.gap.hypothesis import Hypothesis, Part, bounds_of
 from openant_tools.gap.protocol import Played, Protocol
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.tolerance import FACTORS, FLOOR, tolerance_of, torso_kg
@@ -29,7 +29,7 @@ from openant_tools.model.plant import Setup
 from openant_tools.model.rollout import Rollouts
 
 __all__ = [
-    "BODY", "Closure", "ClosureByJoint", "Refit", "Windows", "adjust", "calibration_of", "closures", "heat_loss_of", "nothing", "unmoved",
+    "BODY", "Closure", "Refit", "Windows", "adjust", "calibration_of", "closures", "heat_loss_of", "nothing", "unmoved",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -37,42 +37,34 @@ Array = NDArray[np.float64]
 #: standard deviation of a prior, as a share of the tolerance; and where it ends: a re-fit within tolerance is no effect
 SPREAD, END = 0.6, 1.0
 #: rows (of some tens of milliseconds each) of one window say about as much as one: errors within it go together
-INDEPENDENT_S = 0.5
+INDEPENDENT_S = 0.1
 #: standard deviation that sizes of causes keep from where they were found, as a share
 POLISH = 0.3
 #: times what it was found to be that a size may become
 FARTHEST = 2.5
-#: and how often slopes are followed; while contacts are found, so often with one base, and how often it is led anew
-ITERATIONS, SETTLES, LED = 3, 2, 2
+#: and how often slopes are followed
+ITERATIONS = 4
+#: how often errors are taken to be as large as a step leaves them: no model of a real servo is true, and one that trusts its sensors
+#: follows what no parameter explains, to the ends of all of them
+INFLATIONS = 4
 #: times what slopes foretold that may be left: beyond, they are looked at anew
 FORETOLD = 1.3
-#: of so many windows fits follow one, on the stand and on the floor, where each takes long and all joints move each; and of so
-#: many a first look takes one
+#: of so many windows fits follow one, on the stand and on the floor, where each takes long and all joints move each
 FOLLOWED = {Setup.STAND: 1, Setup.FLOOR: 2}
-GLANCE = {Setup.STAND: 3, Setup.FLOOR: 4}
 #: of a tolerance by which it is varied to learn its slope
 NEARBY = 0.3
-#: times what a re-fit leaves of a servo's other joints that it leaves of a joint which is strained
-STRAINED = 1.5
 #: by which bounds are wider than what lies on them
 TINY = 1e-12
 #: rad: no joint is farther off than in a simulation that fell apart
 LOST_RAD = 10.0
-#: how the kinds of friction cone are called, and the impratio about which it is sought with each: a pyramid needs none of the
-#: stiffness that keeps feet in an elliptic cone from creeping
-CONES = {
-    "pyramidal_cones": int(mujoco.mjtCone.mjCONE_PYRAMIDAL), "elliptic_cones": int(mujoco.mjtCone.mjCONE_ELLIPTIC),
-}  # fmt: skip
-USUAL_IMPRATIO = {CONES["pyramidal_cones"]: 2.0, CONES["elliptic_cones"]: 5.0}
-#: squares of tolerances by which a floor has to be bent before another cone is looked at, and times what is left that it may
-#: leave at first sight; squares of what a position is known to beyond which what is left of a joint and window is seldom a foot's
-BENT, ANSWERS, MUCH = 4.0, 2.5, 40.0
 #: what tilts a floor along its x and y, rad
 TILTS = ("tilt_x", "tilt_y")
 #: what a warm motor loses, and °C between runs from which it is asked how much; what of a servo is less by it
 HEAT_LOSS, WARMED_C, LESS = "heat_loss", 2.0, ("stiffness", "torque_limit")
 #: whose calibration it is that belongs to no joint
 BODY = "body"
+#: standard deviations that 95 % lie within
+TWO_SIDED_95 = 1.96
 #: rad, the least that a position is known to
 LEAST_SIGMA_RAD = 2e-4
 
@@ -92,40 +84,50 @@ class Refit:
 
 @dataclass(frozen=True)
 class Closure:
-    """What a hypothesis leaves of the gap on runs that its fit had not seen.
+    """What a hypothesis leaves of the gap on folds that its fit had not seen.
 
     Attributes:
-        after: rad. closed: share of the excess that is gone; low, high: over the runs, 95 %.
-        worst: the least closed of any run that had a gap.
+        after, floor: rad. closed: share of the excess that is gone; low, high: over the folds, 95 %. fitted: the same on what it was
+            fitted to.
+        squares: (2, folds) rad², summed over rows and joints, of the given model and of this one. counts: (folds,) of how many.
         refit: on all training runs together.
+        std: of the coordinates of its causes, in order: by curvature with errors as large as the fit leaves them, or by how much folds
+            differ (jackknife), whichever is more.
     """
 
     after: float
+    floor: float
     closed: float
     low: float
     high: float
-    worst: float
+    fitted: float
+    squares: Array
+    counts: Array
     refit: Refit
+    std: tuple[Mapping[str, float], ...]
 
+    @property
+    def before(self) -> float:
+        """rad, the gap of the given model."""
+        return float(np.sqrt(self.squares[0].sum() / self.counts.sum()))
 
-@dataclass(frozen=True)
-class ClosureByJoint(Closure):
-    """The same where it is known of each joint.
+    def beyond(self, other: Closure) -> tuple[float, float]:
+        """How much more of the excess it closes than another on the same folds, and the standard error of that.
 
-    Attributes:
-        joints: (2, joints) rad², mean squares before and after. floor: rad.
-    """
+        By the jackknife over folds, widened as Student's t is for so few.
+        """
+        n = len(self.counts)
+        whole = self.closed - other.closed
+        if n < 2:
+            return whole, np.inf
+        without = [~(np.arange(n) == f) for f in range(n)]
+        each = np.array([self._share(some) - other._share(some) for some in without])
+        error = float(np.sqrt((n - 1) / n * np.square(each - each.mean()).sum()))
+        return whole, error * float(student.ppf(0.975, n - 1)) / TWO_SIDED_95
 
-    joints: Array
-    floor: float
-
-    def outlier(self, groups: Iterable[Sequence[int]], times: float) -> int | None:
-        """The joint of which it leaves most beside others with the same servo, if that is so many times what it leaves of them."""
-        return _outlier(np.sqrt(self.joints[1]), groups, times)
-
-    def closed_at(self, joints: Sequence[int]) -> float:
-        """The share that is gone of the excess of some joints."""
-        before, after = np.sqrt(self.joints[:, list(joints)].mean(axis=1))
+    def _share(self, folds: NDArray[np.bool_]) -> float:
+        total = self.counts[folds].sum()
+        before, after = np.sqrt(self.squares[:, folds].sum(axis=1) / total)
         return _closed(float(before), float(after), self.floor)
 
 
@@ -166,8 +168,6 @@ def adjust(robot: Robot, kind: str, joints: Sequence[int], value: float) -> None
         setattr(robot, kind, getattr(robot, kind) * value)
     elif kind == "torso_kg":
         robot.torso_kg += value
-    elif kind in CONES:
-        robot.cone = CONES[kind]
     elif kind in TILTS:
         robot.tilt = robot.tilt + value * np.eye(2)[TILTS.index(kind)]
     else:
@@ -183,6 +183,7 @@ class _Descent:
         at, least, blocks: where it was best, what it cost there, and of each run cost, normal matrix and gradient there.
         seen: the same where it is now.
         slopes: of each run, weighted, (coordinates, rows). bends: which of them are other ones wherever it comes to.
+        counts: of each run, of how many independent errors what it costs is.
     """
 
     start: Refit
@@ -194,12 +195,13 @@ class _Descent:
     slopes: dict[int, Floats]
     at: Array
     bends: NDArray[np.bool_]
+    counts: Mapping[int, float]
     least: float = np.inf
     blocks: dict[int, tuple[float, Array, Array]] = dataclasses.field(default_factory=dict)
     seen: dict[int, tuple[float, Array, Array]] = dataclasses.field(default_factory=dict)
 
     @classmethod
-    def of(cls, start: Refit, tolerances: int, learnt: Mapping[int, Floats]) -> _Descent:
+    def of(cls, start: Refit, tolerances: int, learnt: Mapping[int, Floats], counts: Mapping[int, float]) -> _Descent:
         """From a start, with what slopes are known of the tolerances alone."""
         centre = _vector(start)
         shares = np.array([q.share for q in _quantities(start)], bool)
@@ -220,6 +222,7 @@ class _Descent:
             slopes,
             u,
             np.array([True] * len(centre) + [False] * tolerances),
+            counts,
         )
 
     def moved(self, members: Iterable[tuple[int, NDArray[np.bool_]]]) -> Array:
@@ -231,9 +234,16 @@ class _Descent:
 
     @property
     def cost(self) -> float:
-        """What it costs where it is now: its prior, and what runs leave."""
+        """Minus twice the logarithm of how likely it is where it is now, with errors as large as it leaves them, if not smaller
+        than sensors'."""
         own = float(np.sum(np.square((self.u - self.prior) / self.scale)))
-        return own + sum(cost for cost, _, _ in self.seen.values())
+        left, count = sum(cost for cost, _, _ in self.seen.values()), sum(self.counts[k] for k in self.seen)
+        return own + (count * (1 + np.log(left / count)) if left > count else left)
+
+    @property
+    def inflation(self) -> float:
+        """How many times the sensors' variance it leaves where it was best."""
+        return max(1.0, sum(cost for cost, _, _ in self.blocks.values()) / max(sum(self.counts.values()), 1.0))
 
     def failed(self, k: int) -> bool:
         """Whether a run leaves clearly more than its slopes foretold where it was best, though all together have gained."""
@@ -253,20 +263,16 @@ class Windows:
 
     Attributes:
         measured: of each run, (rows, joints) rad; NaN where nobody knows what a servo had in mind (`around_switching`).
-        found: where `settle` came to, before that a re-fit of `nothing`, in tolerances as `names`; 0 before either.
-        cone: mjtCone by which feet were found to slip, None as given.
+        found: where a re-fit of `nothing` came to, in tolerances as `names`; 0 before.
     """
 
     def __init__(self, protocol: Protocol) -> None:
         self.protocol = protocol
         self.names = _nuisances(protocol)
-        self._coarse = protocol.coarse()
         self._before: dict[int, Array] = {}
-        self._given = [_restarted(one) for one in protocol.runs]
-        self._rollouts = self._given.copy()
-        whole = [_restarted(one) for one in self._coarse.runs]
-        self._quick = [one.thinned(FOLLOWED[one.plant.setup]) for one in whole]
-        self._glance = [one.thinned(GLANCE[one.plant.setup]) for one in whole]
+        self._rollouts = [_restarted(one) for one in protocol.runs]
+        coarse = protocol.coarse().runs
+        self._quick = [_restarted(one).thinned(FOLLOWED[one.plant.setup]) for one in coarse]
         unsure = [around_switching(one.run, protocol.joints) for one in protocol.runs]
         self.measured = [
             np.where(there, np.nan, one.run.signal("pos", protocol.joints))
@@ -274,12 +280,12 @@ class Windows:
         ]
         self.floor = floors([one.run for one in protocol.runs], protocol.joints)[0]
         self._sigma = np.maximum(self.floor, LEAST_SIGMA_RAD)
+        self._followed = [
+            np.isin(np.arange(len(one.run.t)), [row for piece in quick.segments for row in piece.row])
+            for one, quick in zip(protocol.runs, self._quick, strict=True)
+        ]
         self._learnt: dict[int, Floats] = {}
-        self._plain: dict[int, Array] = {}
         self.found = np.zeros(len(self.names))
-        self.cone: int | None = None
-        self._settled_once = False
-        self._of_floor = np.array([not one.joints for one in self.names])
 
     def robot(self, refit: Refit | None, k: int, warm_c: Array | None = None) -> Robot:
         """As it is on run k; None: the model as it was given.
@@ -291,9 +297,6 @@ class Windows:
         robot = Robot(len(self.protocol.joints), reference.low, reference.high)
         if refit is None:
             return robot
-        if self.cone is not None:
-            robot.cone = self.cone
-            robot.impratio = self.usual_ratio()
         enter(robot, reference, [(p.cause, p.joints, x) for p, x in zip(refit.hypothesis, refit.x, strict=True)])
         for one, u in zip(self.names, refit.nuisance, strict=True):
             if one.name == HEAT_LOSS:
@@ -318,25 +321,10 @@ class Windows:
         return {name: values[0].astype(np.float64) for name, values in found.items()}
 
     def before(self, k: int) -> Array:
-        """(rows, joints) rad, the same of the model as it was given, with a base that it led itself."""
+        """(rows, joints) rad, the same of the model as it was given."""
         if k not in self._before:
-            self._before[k] = self._errors(k, [self.robot(None, k)], self._given[k])[0]
+            self._before[k] = self._errors(k, [self.robot(None, k)], self._rollouts[k])[0]
         return self._before[k]
-
-    def _lead(self, refit: Refit, *, quick: bool) -> None:
-        """Let a base that nobody measured come, at the beginning of each window, to where a re-fitted model takes it.
-
-        Args:
-            quick: where simulations take larger steps; else where they do not.
-        """
-        for k, one in enumerate((self._coarse if quick else self.protocol).runs):
-            if one.plant.setup is not Setup.FLOOR:
-                continue
-            led = _restarted(one, self.robot(refit, k).model(one.plant))
-            if quick:
-                self._quick[k], self._glance[k] = led.thinned(FOLLOWED[Setup.FLOOR]), led.thinned(GLANCE[Setup.FLOOR])
-            else:
-                self._rollouts[k] = led
 
     def written(self, refit: Refit, judged: Sequence[int]) -> float:
         """The gap, rad, on these runs of the one model that can be written: its servos are always as warm as on average there."""
@@ -361,38 +349,42 @@ class Windows:
         return out
 
     def refit(
-        self, starts: Sequence[Refit], training: Sequence[int], leave_out: Sequence[int], *, anew: bool = False
-    ) -> list[tuple[Refit, list[Refit]]]:
-        """Fit within tolerance, and polish sizes: each on all the runs to train on, and without each of some of them.
+        self, starts: Sequence[Refit], training: Sequence[int], leave_out: Sequence[Collection[int]]
+    ) -> list[tuple[Refit, list[Refit], tuple[Mapping[str, float], ...]]]:
+        """Fit within tolerance, and polish sizes: each on all the runs to train on, and without each group of some of them.
 
         All share one linearisation each, at what is found on all of the training runs; and are simulated side by side.
-
-        Args:
-            anew: learn there what tolerances do, whatever was learnt without causes.
         """
-        fitted = list(training)
-        descents = self._descend(starts, fitted, anew=anew)
+        descents = self._descend(starts, list(training))
         for one in descents:
-            if not one.causes and not self._settled_once:
+            if not one.causes:
                 self._keep(one)
         out = []
         for one in descents:
-            folds = [[block for k, (_, *block) in one.blocks.items() if k != left] for left in leave_out]
-            whole = _from(one.start, one.u)
-            out.append((whole, [_from(one.start, self._solve(one, fold)) for fold in folds]))
+            folds = [[k for k in one.blocks if k not in left] for left in leave_out]
+            whole, parts = _from(one.start, one.u), [_from(one.start, self._solve(one, fold)) for fold in folds]
+            out.append((whole, parts, _from(one.start, self._deviations(one, parts)).x))
         return out
 
-    def _descend(
-        self, starts: Sequence[Refit], fitted: Sequence[int], turns: int = ITERATIONS, *,
-        settles: bool = False, anew: bool = False,
-    ) -> list[_Descent]:  # fmt: skip
-        """Follow each start to where it leaves least on these runs; `settles`: contacts bend on their way."""
+    def _deviations(self, descent: _Descent, folds: Sequence[Refit]) -> Array:
+        """Standard deviations of a fit's coordinates."""
+        normal = np.diag(1 / descent.scale**2)
+        normal += sum(more for _, more, _ in descent.blocks.values()) / descent.inflation
+        curvature: Array = np.sqrt(np.diag(np.linalg.inv(normal)))
+        if len(folds) < 2:
+            return curvature
+        each = np.array([np.concatenate([_vector(fold), fold.nuisance]) for fold in folds])
+        spread = np.sqrt((len(each) - 1) / len(each) * np.square(each - each.mean(axis=0)).sum(axis=0))
+        out: Array = np.maximum(curvature, spread)
+        return out
+
+    def _descend(self, starts: Sequence[Refit], fitted: Sequence[int]) -> list[_Descent]:
+        """Follow each start to where it leaves least on these runs."""
         # Slopes cost the most: what was learnt without causes does until it fails.
-        learnt = {k: known for k, known in self._learnt.items() if k in fitted and not anew}
-        descents = [_Descent.of(start, len(self.names), learnt) for start in starts]
-        for one in descents:
-            one.bends[one.causes :] = settles & self._of_floor
-        for _ in range(turns):
+        learnt = {k: known for k, known in self._learnt.items() if k in fitted}
+        counts = {k: self._count(k) for k in fitted}
+        descents = [_Descent.of(start, len(self.names), learnt, counts) for start in starts]
+        for _ in range(ITERATIONS):
             self._linearize(descents, fitted)
             for k in fitted:
                 if poor := [one for one in descents if one.failed(k)]:
@@ -405,121 +397,13 @@ class Windows:
                     one.u = (one.at + one.u) / 2
                     continue
                 one.at, one.least, one.blocks = one.u, one.cost, dict(one.seen)
-                one.u = self._solve(one, [block for _, *block in one.blocks.values()])
+                one.u = self._solve(one, list(one.blocks))
         return descents
 
     def _keep(self, found: _Descent) -> None:
         """Remember what was learnt of tolerances."""
         self._learnt = {k: slopes[found.causes :] for k, slopes in found.slopes.items()}
         self.found = found.u[found.causes :]
-
-    @property
-    def contacts(self) -> Array:
-        """(names,) where floor and body were found to be; 0 of joints."""
-        out: Array = np.where(self._of_floor, self.found, 0.0)
-        return out
-
-    def usual_ratio(self) -> float:
-        """The factor on the given impratio that belongs to the cones which were found."""
-        if self.cone is None:
-            return 1.0
-        given = next(one.plant.model.opt.impratio for one in self.protocol.runs if one.plant.setup is Setup.FLOOR)
-        return USUAL_IMPRATIO[self.cone] / float(given)
-
-    def look(self, training: Sequence[int]) -> None:
-        """Learn what tolerances do on these runs, as first looks (`left`) need to know it."""
-        (found,) = self._descend([nothing(self)], training, SETTLES)
-        self._keep(found)
-
-    def settle(self, best: Refit, training: Sequence[int], in_time: Callable[[], bool] = lambda: True) -> None:
-        """Find how feet meet the floor: everything else starts from there, and bases are led by it.
-
-        Feet may slip by the other of MuJoCo's friction cones, too, whatever the given model has.
-
-        Args:
-            best: what leaves least so far; contacts that had to do for a cause would be none of this floor's.
-            in_time: whether there is time to try other cones, asked where they might do better.
-        """
-        floor = [k for k in training if self.protocol.runs[k].plant.setup is Setup.FLOOR]
-        if not floor:
-            return
-        self._settled_once = True
-        found = self._settled(best, training)
-        (own,) = self.left([found], floor)
-        if float(np.square(found.nuisance[self._of_floor]).sum()) < BENT:
-            self._lead(found, quick=False)
-            return
-        looked = FOLLOWED[Setup.FLOOR] * sum(len(self._glance[k].segments) for k in floor)
-        much = own > MUCH * len(self.protocol.joints) * looked
-        given = int(self.protocol.runs[floor[0]].plant.model.opt.cone)
-        before = self._learnt, self._plain.copy(), self.found
-        self.cone = next(cone for cone in CONES.values() if cone != given)
-        start = dataclasses.replace(found, nuisance=np.where(self._of_floor, 0.0, found.nuisance))
-        self._lead(start, quick=True)
-        if self.left([start], floor)[0] < (1 if much else ANSWERS) * own and in_time():
-            self._learnt = {k: known for k, known in self._learnt.items() if k not in floor}
-            other = self._settled(start, training)
-            (others,) = self.left([other], floor)
-            if others < own:
-                self._lead(other, quick=False)
-                return
-        self.cone = None
-        self._learnt, self._plain, self.found = before
-        self._lead(found, quick=True)
-        self._lead(found, quick=False)
-
-    def _settled(self, start: Refit, training: Sequence[int]) -> Refit:
-        """Where contacts are found to be, with a base that is led by what was found."""
-        for _ in range(LED):
-            (descent,) = self._descend([start], list(training), SETTLES, settles=True)
-            self._keep(descent)
-            start = _from(start, descent.u)
-            self._lead(start, quick=True)
-        return start
-
-    def left(self, refits: Sequence[Refit], seen: Sequence[int], joints: Sequence[int] | None = None) -> Array:
-        """(refits,) the cost that each would leave, re-fitted within tolerance by the slopes that were learnt without causes.
-
-        A first look at many causes, at some of the windows, after a re-fit of `nothing` on these runs.
-
-        Args:
-            joints: of which it counts what is left; default all.
-        """
-        others = np.ones(len(self.protocol.joints), bool)
-        others[list(range(len(others)) if joints is None else joints)] = False
-        normal = np.diag(np.full(len(self.names), 1 / SPREAD**2))
-        at = np.array([refit.nuisance for refit in refits])
-        gradients, cost = at / SPREAD**2, np.square(at / SPREAD).sum(axis=1)
-        for k in seen:
-            errors = self._errors(k, [self.robot(refit, k) for refit in refits], self._glance[k])
-            errors[..., others] = np.nan
-            looked = np.isfinite(errors).any(axis=0).ravel()
-            errors = (np.nan_to_num(errors) * self._weight(k)).reshape(len(refits), -1)[:, looked]
-            slopes = self._learnt[k][:, looked].astype(np.float64)
-            normal += slopes @ slopes.T
-            gradients += errors @ slopes.T
-            cost += np.square(errors).sum(axis=1)
-        root = np.linalg.cholesky(normal)
-        out = np.empty(len(refits))
-        for r, gradient in enumerate(gradients):
-            ends = np.minimum(-END - at[r], 0) - TINY, np.maximum(END - at[r], 0) + TINY
-            u = lsq_linear(root.T, -np.linalg.solve(root, gradient), bounds=ends).x
-            out[r] = cost[r] + 2 * gradient @ u + u @ normal @ u
-        return out
-
-    def strained(self, seen: Sequence[int], times: float = STRAINED) -> list[int]:
-        """Joints of which the model leaves so many times what it leaves of others with the same servo.
-
-        Of all runs one at most, and one of the stand's: on the floor what one leg does wrong shows in all. After a re-fit of
-        `nothing` on these runs.
-        """
-        stand = [k for k in seen if self.protocol.runs[k].plant.setup is Setup.STAND]
-        found = [self._outlier(runs, times) for runs in (seen, stand) if len(runs)]
-        return sorted({joint for joint in found if joint is not None})
-
-    def _outlier(self, seen: Sequence[int], times: float) -> int | None:
-        left = np.sqrt(np.mean([np.square(self._plain[k]) for k in seen], axis=0))
-        return _outlier(left, self.protocol.servos(), times)
 
     def _weight(self, k: int) -> Array:
         """(joints,) that errors of a run are multiplied by: its rows go together, and windows stand for those not followed."""
@@ -528,22 +412,26 @@ class Windows:
         out: Array = np.sqrt(FOLLOWED[played.plant.setup] / max(1.0, INDEPENDENT_S / period)) / self._sigma
         return out
 
-    def _solve(self, descent: _Descent, blocks: Iterable[Sequence[Array]]) -> Array:
-        """Where the runs' blocks lead, made where the descent is at."""
+    def _count(self, k: int) -> float:
+        """How many independent errors the rows of a run are, as weighted."""
+        weight = np.square(self._weight(k) * self._sigma)
+        return float((np.isfinite(self.measured[k]) & self._followed[k][:, None]).sum(axis=0) @ weight)
+
+    def _solve(self, descent: _Descent, runs: Sequence[int]) -> Array:
+        """Where the blocks of some runs lead, made where the descent was best."""
         u, prior, scale = descent.at, descent.prior, descent.scale
-        normal, gradient = np.diag(1 / scale**2), (u - prior) / scale**2
-        for more, slope in blocks:
-            normal, gradient = normal + more, gradient + slope
         ends = [_limits(q, float(at)) for q, at in zip(_quantities(descent.start), prior, strict=False)]
         low, high = np.array([*ends, *[(-END, END)] * len(self.names)]).T
-        # What ends at a bound leaves its part to the others: clipped afterwards it would leave it undone.
-        root = np.linalg.cholesky(normal)
-        inside = lsq_linear(
-            root.T,
-            -np.linalg.solve(root, gradient),
-            bounds=(np.minimum(low - u, 0) - TINY, np.maximum(high - u, 0) + TINY),
-        )
-        found: Array = np.clip(u + inside.x, low, high)
+        within = np.minimum(low - u, 0) - TINY, np.maximum(high - u, 0) + TINY
+        cost, more, slope = (sum(parts) for parts in zip(*(descent.blocks[k] for k in runs), strict=True))
+        count, found = max(sum(self._count(k) for k in runs), 1.0), u
+        for _ in range(INFLATIONS):
+            moved = found - u
+            inflation = max(1.0, float(cost + 2 * slope @ moved + moved @ more @ moved) / count)
+            # What ends at a bound leaves its part to the others: clipped afterwards it would leave it undone.
+            root = np.linalg.cholesky(np.diag(1 / scale**2) + more / inflation)
+            target = -np.linalg.solve(root, (u - prior) / scale**2 + slope / inflation)
+            found = np.clip(u + lsq_linear(root.T, target, bounds=within).x, low, high)
         return found
 
     def _linearize(self, descents: Sequence[_Descent], fitted: Sequence[int]) -> None:
@@ -559,7 +447,6 @@ class Windows:
             errors = self.errors(k, refits, quick=True)
             at = 0
             for one, mine in zip(descents, columns, strict=True):
-                followed = np.isfinite(errors[at]).any(axis=-1)
                 base = np.nan_to_num(errors[at]) * weight
                 slopes = np.zeros((len(one.u), base.size), np.float32)
                 if k in one.slopes:
@@ -571,8 +458,6 @@ class Windows:
                 at += 1 + len(mine)
                 left = base.ravel().astype(np.float32)
                 one.slopes[k] = slopes
-                if not one.causes:
-                    self._plain[k] = np.sqrt(np.mean(np.square(base[followed]), axis=0)) / weight
                 one.seen[k] = (
                     float(left.astype(np.float64) @ left),
                     (slopes @ slopes.T).astype(np.float64),
@@ -614,62 +499,51 @@ class Windows:
         return out + [members for _, members in used]
 
 
-def _restarted(one: Played, leader: mujoco.MjModel | None = None) -> Rollouts:
+def _restarted(one: Played) -> Rollouts:
     """A run, begun anew from measurement as the gap is defined: all of it, or what of it is simulated."""
     if one.windows is None:
-        return Rollouts(one.plant, [one.run], HORIZON_S, leader=leader)
+        return Rollouts(one.plant, [one.run], HORIZON_S)
     parts = []
     for start, stop in one.windows:
         edges = np.linspace(start, stop, max(1, round((stop - start) / HORIZON_S)) + 1).tolist()
         parts += list(itertools.pairwise(edges))
-    return Rollouts(one.plant, [one.run], leader=leader, windows=[parts])
+    return Rollouts(one.plant, [one.run], windows=[parts])
 
 
 def closures(
-    windows: Windows, starts: Sequence[Refit], held_out: Sequence[int], training: Sequence[int], *, anew: bool = False
-) -> tuple[float, float, list[ClosureByJoint]]:
-    """The gap before, the floor (rad), and what each hypothesis leaves.
+    windows: Windows, starts: Sequence[Refit], folds: Sequence[Collection[int]], training: Sequence[int]
+) -> list[Closure]:
+    """What each hypothesis leaves of the gap.
 
     Args:
-        held_out: runs that nothing was fitted on; empty to leave out each in turn.
-        training: the runs to fit on. anew: see `Windows.refit`.
+        folds: runs judged together by fits that have not seen them. training: the runs to fit on, but for those of the fold.
     """
-    judged = list(held_out or training)
-    fits = windows.refit(starts, training, () if held_out else judged, anew=anew)
-    joints = len(windows.protocol.joints)
-    each, known = np.zeros((len(starts) + 1, len(judged), joints)), np.zeros((len(judged), joints))
-    for n, k in enumerate(judged):
-        refits = [whole if held_out else folds[n] for whole, folds in fits]
+    fits = windows.refit(starts, training, folds)
+    judged = {k for fold in folds for k in fold}
+    each, counts = np.zeros((len(starts) + 1, len(folds))), np.zeros(len(folds))
+    seen, rows = np.zeros(len(starts) + 1), 0
+    for k in sorted(judged | set(training)):
+        mine = [f for f, fold in enumerate(folds) if k in fold]
+        refits = [one for whole, parts, _ in fits for one in (whole, *(parts[f] for f in mine))]
         errors = np.concatenate([windows.before(k)[None], windows.errors(k, refits)])
         good = np.isfinite(errors).all(axis=0)
-        each[:, n] = np.square(np.where(good, errors, 0.0)).sum(axis=1)
-        known[n] = good.sum(axis=0)
-    squares, counts = each.sum(axis=2), known.sum(axis=1)
-    means = each.sum(axis=1) / np.maximum(known.sum(axis=0), 1)
+        squares = np.square(np.where(good, errors, 0.0)).sum(axis=(1, 2))
+        of = squares[1:].reshape(len(starts), 1 + len(mine))
+        if k in training:
+            seen, rows = seen + np.array([squares[0], *of[:, 0]]), rows + int(good.sum())
+        each[0, mine] += squares[0]
+        each[1:, mine] += of[:, 1:]
+        counts[mine] += good.sum()
     floor = float(np.sqrt(np.mean(windows.floor**2)))
-    before = float(np.sqrt(squares[0].sum() / counts.sum()))
+    fitted = [_closed(float(np.sqrt(seen[0] / rows)), float(np.sqrt(one / rows)), floor) for one in seen[1:]]
     out = []
-    for s in range(len(starts)):
-        after = float(np.sqrt(squares[s + 1].sum() / counts.sum()))
-        low, high = _interval(squares[0], squares[s + 1], counts, floor)
-        runs = [
-            _closed(float(np.sqrt(a / c)), float(np.sqrt(b / c)), floor)
-            for a, b, c in zip(squares[0], squares[s + 1], counts, strict=True)
-            if np.sqrt(a / c) > 1.5 * floor
-        ]
-        closed, worst = _closed(before, after, floor), min(runs, default=float("nan"))
-        out.append(ClosureByJoint(after, closed, low, high, worst, fits[s][0], means[[0, s + 1]], floor))
-    return before, floor, out
-
-
-def _outlier(left: Array, groups: Iterable[Sequence[int]], times: float) -> int | None:
-    share = np.ones(len(left))
-    for group in groups:
-        for j in group:
-            others = [left[i] for i in group if i != j]
-            share[j] = left[j] / np.median(others) if others else 1.0
-    worst = int(np.argmax(share))
-    return worst if share[worst] > times else None
+    for n, (whole, _, std) in enumerate(fits):
+        both = each[[0, n + 1]]
+        before, after = np.sqrt(both.sum(axis=1) / counts.sum())
+        low, high = _interval(both[0], both[1], counts, floor)
+        closed = _closed(float(before), float(after), floor)
+        out.append(Closure(float(after), floor, closed, low, high, fitted[n], both, counts, whole, std))
+    return out
 
 
 def _closed(before: float, after: float, floor: float) -> float:
@@ -678,7 +552,7 @@ def _closed(before: float, after: float, floor: float) -> float:
 
 
 def _interval(before: Array, after: Array, counts: Array, floor: float) -> tuple[float, float]:
-    """95 % of the closure over runs drawn with replacement."""
+    """95 % of the closure over folds drawn with replacement."""
     rng = np.random.default_rng(0)
     draws = rng.integers(len(counts), size=(400, len(counts)))
     values = []
@@ -725,7 +599,6 @@ def calibration_of(windows: Windows, refit: Refit, judged: Sequence[int]) -> dic
     """
     out: dict[str, dict[str, float]] = {}
     joints = windows.protocol.joints
-    out |= {kind: {BODY: 1.0} for kind, cone in CONES.items() if cone == windows.cone}
     for one, u in zip(windows.names, refit.nuisance, strict=True):
         value = one.value(float(u))
         if one.name == HEAT_LOSS:
@@ -734,8 +607,6 @@ def calibration_of(windows: Windows, refit: Refit, judged: Sequence[int]) -> dic
                     if kind in out:
                         out[kind][joint] *= float(left)
             continue
-        if one.name == "impratio":
-            value *= windows.usual_ratio()
         for name in [joints[j] for j in one.joints] or [BODY]:
             out.setdefault(one.name, {})[name] = value
     return {kind: {name: float(f"{value:.6g}") for name, value in values.items()} for kind, values in out.items()}
@@ -750,8 +621,8 @@ def heat_loss_of(windows: Windows, refit: Refit) -> float | None:
 
 
 def unmoved(windows: Windows, parts: Iterable[Part], x: Iterable[Mapping[str, float]]) -> Refit:
-    """Causes at these coordinates, and no joint moved within tolerance yet; contacts are where they were found."""
-    return Refit(tuple(parts), tuple(x), windows.contacts)
+    """Causes at these coordinates, from where a re-fit without them came to."""
+    return Refit(tuple(parts), tuple(x), windows.found)
 
 
 def nothing(windows: Windows) -> Refit:

@@ -1,61 +1,40 @@
-"""The diagnosis: where the gap lies, which causes explain it, and how far it closes on runs that were not used.
+"""The diagnosis of whatever was recorded: where the gap lies, which causes explain it, and how far that closes it on held-out data.
 
-A judge that has seen thousands of simulated robots names suspects; fits on simulated robots say where each would sit and how
-large it would be; held-out closure decides between them, and says when none will do.
+In this order, a module each: `experiment` (the windows that tell most), `assess` (what each cause would do to them, and what the evidence
+comes to), `trials` (what the likeliest close on folds that their fits have not seen), `decide`, `finding` (what is handed on).
 """
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import hashlib
 import math
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.errors import BadInput
-from openant_tools.gap.diagnosis import NONE, Diagnosis
-from openant_tools.gap.explain import Scene, explain
-from openant_tools.gap.judge import Judgement
-from openant_tools.gap.kept import judge_of, kept_metric
-from openant_tools.gap.measure import measure
-from openant_tools.gap.patient import Patient, diagnosis_of, shown, unfitted
-from openant_tools.gap.prepare import Prepared, prepare
-from openant_tools.gap.protocol import Protocol
-from openant_tools.gap.recording import diagnose_recording
-from openant_tools.gap.thresholds import (
-    BEFOREHAND_S,
-    COPPER,
-    DOUBT,
-    FEW_JOINTS,
-    FINDING,
-    HEAT,
-    LIKELIEST,
-    PUZZLED,
-    STRANGE,
-    SUSPECT,
-    SUSPECTS,
-    WARMED_C,
-)
-from openant_tools.gap.together import decide_together
-from openant_tools.gap.verdict import decide
-from openant_tools.model.of_run import own_model
-from openant_tools.model.plant import Setup
+from openant_tools.gap.assess import Assessment, assess
+from openant_tools.gap.decide import Row, adds, decide
+from openant_tools.gap.diagnosis import UNEXPLAINED, Diagnosis
+from openant_tools.gap.experiment import Experiment
+from openant_tools.gap.finding import Given, finding
+from openant_tools.gap.trials import Trials
 from openant_tools.recording.run import Run
 from openant_tools.sysid.identify import joints_in_common
 
-__all__ = ["diagnose"]
+__all__ = ["diagnose", "prepare"]
 
 Progress = Callable[[float, str], None]
 
-#: s that a diagnosis gives to simulated robots where the protocol was never seen; `prepare` by itself takes what it needs. On two
-#: usual cores they are there before; on slow ones it is better to wait than to judge by few
-PREPARE_S = 1080.0
+#: causes that are fitted: as likely as this; of a robot of so many joints one, but not fewer or more at once
+SUSPECT, JOINTS, FEWEST, MOST = 0.03, 24, 3, 8
+#: causes of one improved model
+CAUSES = 3
+#: what a builder's word is worth who expects a cause: odds, to one
+EXPECTED = 10.0
 
 
 def diagnose(
@@ -64,76 +43,87 @@ def diagnose(
     *,
     hold_out: Sequence[Run] = (),
     joints: Sequence[str] | None = None,
-    robots: int | None = None,
     prior: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Diagnose the gap between a robot and its model.
 
     Args:
-        runs: recordings of one robot. hold_out: recordings to judge on; without them each run is left out in turn.
+        runs: recordings of one robot. hold_out: recordings to judge on; without them parts of the runs are left out in turn.
         joints: default every position servo of the model that all runs command and measure.
-        robots: how many to simulate where the protocol was never prepared.
         prior: effects that are known or expected of this robot: where the runs cannot tell causes apart, they do.
         progress: told a share and words.
 
     Raises:
         BadInput: no such effect, or runs from which no diagnosis can be made.
     """
-    tell, began = progress or (lambda share, words: None), time.monotonic()
-    everything = [*runs, *hold_out]
+    tell = progress or (lambda share, words: None)
     _check(runs, hold_out)
     _check_prior(prior)
-    wanted = joints_in_common(everything, model, joints)
-    _check_motion(everything, wanted)
-    if len(everything) == 1:
-        unasked = (
-            [f"that {' and '.join(prior)} is expected had no part in the diagnosis of a single run"] if prior else []
-        )
-        return diagnose_recording(runs, model, wanted, progress, unasked)
-    played = Protocol.of(runs, model, wanted, [own_model(run) for run in runs])
-    measured = measure(list(hold_out) or list(runs), model, wanted)
-    tell(0.02, "simulated robots")
-    prepared = prepare(played, robots, seconds=PREPARE_S, progress=lambda share, words: tell(0.02 + 0.6 * share, words))
-    coarse = played.started_as(prepared.protocol).coarse()
-    protocol = played
-    if hold_out:
-        protocol = Protocol.of(everything, model, wanted, [own_model(run) for run in everything])
-    protocol = dataclasses.replace(protocol, reference=coarse.reference)
-    found = coarse.features()
-    judge = judge_of(prepared, played, progress=lambda share, words: tell(0.63 + 0.07 * share, words))
-    training = prepared.ordered
-    tell(0.7, "causes")
-    began = max(began, time.monotonic() - BEFOREHAND_S)
-    patient = Patient(protocol, coarse, prepared, measured, judge, found, training, model, runs, hold_out, prior, began)
-    judgement = judge.say(patient.features)
-    first = shown(judgement, protocol)
-    # No template was as warm as this robot was in each run: what a thermometer shows is asked about wherever it may sit.
-    warmed = [HEAT] if protocol.warmed_c > WARMED_C else []
-    # Nor is a thermometer a reason to ask where nothing differs from healthy robots.
-    if first[0][1] < DOUBT and judgement.energy < (1.0 if warmed else STRANGE):
-        tell(1.0, "done")
-        return _healthy(patient, judgement, first)
-    scenes = _scenes(prepared, coarse, found, training)
-    # Where nothing is likely and yet the log is strange, the likeliest few have to answer.
-    puzzled = first[0][1] < FINDING and judgement.energy > STRANGE
-    suspects = [name for n, (name, chance) in enumerate(first) if chance > SUSPECT or n < LIKELIEST][:SUSPECTS]
-    suspects += [name for name in catalogue()[suspects[0]].alike if name not in suspects and name in judgement.places]
-    few = len(wanted) <= FEW_JOINTS
-    if puzzled or few:
-        suspects = [name for name, _ in first[: max(PUZZLED, len(suspects))]]
-    if few:
-        suspects += [name for name in _questioned(protocol) if name not in suspects and name in judgement.places]
-    suspects += [name for name in prior if name not in suspects and name in judgement.places]
-    suspects += [name for name in warmed if name not in suspects and name in judgement.places]
-    explained = explain(scenes, suspects, judgement, thorough=warmed)
-    tell(0.85, "held-out runs")
-    if few:
-        # There sizes come from the fits alone: what any motor loses is no cause.
-        if warmed and HEAT in explained and explained[HEAT].x["loss_per_c"] < COPPER and len(explained) > 1:
-            del explained[HEAT]
-        return decide_together(patient, judgement, first, explained)
-    return decide(patient, judgement, first, explained, scenes)
+    wanted = joints_in_common([*runs, *hold_out], model, joints)
+    _check_motion([*runs, *hold_out], wanted)
+    # In whatever order runs are named, the same robots are simulated for them.
+    experiment = Experiment.of(sorted(runs, key=_content), model, wanted, sorted(hold_out, key=_content))
+    tell(0.02, str(experiment.selection))
+    assessment = assess(experiment.protocol, lambda share, words: tell(0.02 + 0.58 * share, words))
+    leads = _expected(assessment, prior)
+    ranked = sorted(leads, key=lambda name: -leads[name])
+    count = min(max(JOINTS // len(wanted), FEWEST), MOST)
+    suspects = [name for name in ranked if leads[name] > SUSPECT][:count]
+    suspects += [name for name in prior if name in leads and name not in suspects]
+    tell(0.6, "what the likeliest causes close on held-out parts")
+    trials = Trials.of(experiment, assessment)
+    trials.fit([(), *((name,) for name in suspects)])
+    rows = [Row((), probability=assessment.none), *(trials.row((name,), leads[name]) for name in ranked)]
+    decision = decide(rows, assessment.outside)
+    if decision.verdict == UNEXPLAINED and suspects:
+        # What no cause explains by itself two may.
+        tell(0.75, "what two causes close together")
+        first = max(suspects, key=lambda name: trials.closures[name,].closed)
+        trials.fit(pairs := _beside(assessment, (first,), count))
+        likely = [assessment.present[first] * assessment.present[causes[-1]] for causes in pairs]
+        both = [trials.whole(causes, chance) for causes, chance in zip(pairs, likely, strict=True)]
+        decision = decide([*rows, *both], assessment.outside)
+    chosen = tuple(name for row in decision.selected for name in row.causes)
+    while chosen in trials.closures and 0 < len(chosen) < CAUSES:
+        tell(0.8 + 0.05 * len(chosen), f"what acts beside {' and '.join(chosen)}")
+        trials.fit(further := _beside(assessment, chosen, count))
+        more = adds([trials.row(causes, assessment.present[causes[-1]]) for causes in further])
+        if more is None:
+            break
+        chosen = more.causes
+    tell(1.0, "decision")
+    return finding(trials, Given(model, tuple(runs), tuple(hold_out), tuple(prior)), rows, decision, chosen)
+
+
+def prepare(
+    runs: Sequence[Run], model: Path, joints: Sequence[str] | None = None, progress: Progress | None = None
+) -> int:
+    """Simulate what a diagnosis of these runs will be judged by, so that it takes seconds; no verdict depends on it.
+
+    Returns:
+        how many robots.
+    """
+    experiment = Experiment.of(sorted(runs, key=_content), model, joints_in_common(runs, model, joints))
+    return assess(experiment.protocol, progress or (lambda share, words: None)).robots
+
+
+def _beside(assessment: Assessment, chosen: tuple[str, ...], count: int) -> list[tuple[str, ...]]:
+    """What is chosen with one cause more, the likeliest ones."""
+    present = sorted(assessment.present, key=lambda name: -assessment.present[name])
+    return [(*chosen, name) for name in present if name not in chosen][:count]
+
+
+def _expected(assessment: Assessment, prior: Sequence[str]) -> dict[str, float]:
+    """Cause → how likely it leads, with what its builder declared, and where a cause of sensors alone may lead at all."""
+    moves = assessment.anomalies.get("pos", 0.0)
+    elsewhere = max((size for signal, size in assessment.anomalies.items() if signal != "pos"), default=0.0)
+    out = {}
+    for name, probability in assessment.leads.items():
+        # A gap is led by where it is largest: a sensor that is off is none of a motion that is.
+        of_sensors = catalogue()[name].of_sensors_at(assessment.template(name))
+        out[name] = probability * (EXPECTED if name in prior else 1.0) * (not of_sensors or elsewhere >= moves)
+    return out
 
 
 def _check(runs: Sequence[Run], hold_out: Sequence[Run]) -> None:
@@ -176,42 +166,3 @@ def _check_motion(runs: Sequence[Run], joints: Sequence[str]) -> None:
             f"nothing moves: no joint goes farther than {math.degrees(moved):.2f}°", where=runs[0].path or runs[0].name,
             remedy="record a protocol that moves the joints, see `openant sysid record --list`; angles are in rad",
         )  # fmt: skip
-
-
-def _scenes(
-    prepared: Prepared,
-    coarse: Protocol,
-    found: Sequence[tuple[NDArray[np.float32], NDArray[np.bool_]]],
-    training: Sequence[int],
-) -> dict[Setup, Scene]:
-    """Where hypotheses are compared: the runs of each setup."""
-    scenes = {}
-    for setup in Setup:
-        mine = [k for k in training if coarse.runs[k].plant.setup is setup]
-        if not mine:
-            continue
-        metric = kept_metric(prepared, mine, [found[k][1] for k in mine])
-        seen = np.concatenate([found[k][0] for k in mine])
-        scenes[setup] = Scene(coarse, [coarse.runs[k] for k in mine], metric, seen)
-    return scenes
-
-
-def _questioned(protocol: Protocol) -> list[str]:
-    """What the given model may get wrong by construction: that is tried whatever the judge says."""
-    out = []
-    if not protocol.reference.friction.any():
-        out.append("coulomb_friction")
-    if any((one.run.signal("torque", protocol.joints, default=1.0) == 0).any() for one in protocol.runs):
-        # Damping that stands in the joint brakes with torque off, too.
-        out.append("electrical_damping")
-    return out
-
-
-def _healthy(patient: Patient, judgement: Judgement, ranked: Sequence[tuple[str, float]]) -> Diagnosis:
-    """No cause is likely: the gap is one of tolerances and noise."""
-    gap = {
-        "before": patient.measured.gaps["pos"],
-        "after": patient.measured.gaps["pos"],
-        "floor": patient.measured.floors["pos"],
-    }
-    return diagnosis_of(patient, NONE, 1 - ranked[0][1], unfitted(ranked, ()), (), (), gap, {}, judgement, None)

@@ -64,7 +64,7 @@ class Diagnosis:
         ambiguous_with: sets that these runs cannot tell apart.
         gap: "before", "after", "floor" in rad, "signals" besides.
         where: shares of the excess, largest first, with what the improved model leaves there, if there is one.
-        rest: what that leaves, and what it follows (`gap.rest.Following`); empty where nothing was fitted.
+        rest: what that leaves, and what it follows (`gap.residual.Residual`); empty where nothing was fitted.
         calibration: kind → joint → factor or amount that the re-fit within tolerance found, for the improved model.
         refuted: effect → what signature speaks against it, in words.
         notes: what it rests on, and what more signals would add.

@@ -22,7 +22,7 @@ from openant_tools.gap.features import (
     ARRIVAL,
     COLUMNS,
     FLOOR_BLOCK_S,
-    FOLLOWING,
+    IMU_DELAY,
     LATENESS,
     ONE_JOINT_BLOCK_S,
     SKIP_S,
@@ -33,7 +33,7 @@ from openant_tools.gap.population import Case
 from openant_tools.gap.templates import Template, Templates
 from openant_tools.gap.whitening import Whitening, whiten
 
-__all__ = ["COLUMN_NAMES", "Evidence", "Layouts", "RunLayout", "Scale", "evidence_of", "unknown_signals"]
+__all__ = ["COLUMN_NAMES", "Evidence", "Layouts", "RunLayout", "Scale", "anomalies", "evidence_of", "unknown_signals"]
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -46,7 +46,7 @@ LOGS: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(SIGNALS, ("size", "rough")),
     LATENESS: ("size", "peak"),
     ARRIVAL: ("size", "skew", "shared"),
-    FOLLOWING: ("lag", "loose", "worse"),
+    IMU_DELAY: ("lag", "loose", "worse"),
 }
 #: how often the best cause is taken out
 PEELED = 2
@@ -60,6 +60,8 @@ RIDGE = 0.02
 AMPLITUDE = (0.0, 2.5)
 #: causes that may explain a signal, and times the farthest healthy robot beyond which it is unknown
 EXPLAINING, OUTSIDE_HEALTHY = 3, 1.3
+#: of healthy robots that are within what most of them are off by
+QUANTILE = 0.95
 #: of what does not apply
 ABSENT = -20.0
 
@@ -118,7 +120,17 @@ class Layouts:
         )  # fmt: skip
 
     def only(self, some: Bools) -> Layouts:
-        return Layouts(*(values[some] for values in vars(self).values()))
+        """Those features; runs of which none is left do not count."""
+        run = np.unique(self.run[some], return_inverse=True)[1]
+        return Layouts(
+            self.mean[some],
+            self.signal[some],
+            self.kind[some],
+            self.floor[some],
+            self.joint[some],
+            self.time[some],
+            run,
+        )
 
     def folds(self) -> Ints:
         """(features,) the contiguous part of a run that each belongs to; at least FOLDS in all."""
@@ -218,7 +230,7 @@ class Scale:
         logs = h[:, ~mine.mean]
         return cls(
             mine, known, whitening, found, np.median(logs, axis=0), logs.std(axis=0) + LEAST_SPREAD,
-            len(reference.torque), int(layouts.run.max()) + 1,
+            len(reference.torque), int(mine.run.max()) + 1,
         )  # fmt: skip
 
     @cached_property
@@ -281,6 +293,22 @@ def evidence_of(scale: Scale, features: Floats) -> Evidence:
     # What the best causes leave is as large as the noise that an amplitude is known by.
     deviations = np.maximum(size / root, 1.0) / length[best]
     return Evidence(t.causes, rows, (size[:, 0] / root).astype(np.float32), best, amplitudes, deviations, t.bank)
+
+
+def anomalies(scale: Scale, healthy: Floats, features: Floats) -> dict[str, float]:
+    """Signal → how far it is from the model's, as a factor of what most healthy robots (QUANTILE of them) are off by at most.
+
+    Args:
+        healthy: (robots, features) not those of the scale. features: (features,) of the robot at hand.
+    """
+    means = scale.means
+    z = scale.whitening(np.vstack([healthy, features])[:, scale.some][:, scale.layouts.mean].astype(np.float32))
+    out = {}
+    for signal in SIGNALS:
+        size = np.linalg.norm(z[:, means.signal == signal], axis=1)
+        if (means.signal == signal).any():
+            out[signal] = float(size[-1] / np.quantile(size[:-1], QUANTILE))
+    return out
 
 
 def unknown_signals(scale: Scale, healthy: Floats, features: Floats) -> dict[str, float]:

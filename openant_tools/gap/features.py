@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from openant_tools.effects.robot import USUAL_NOISE, Robot
 from openant_tools.gap.arrivals import KINDS_OF_ONE, Arrivals
-from openant_tools.gap.following import KINDS, Following
-from openant_tools.gap.neighbours import beside_neighbours
+from openant_tools.gap.imu_delay import KINDS, ImuDelay
+from openant_tools.gap.neighbours import against_neighbours
 from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
 
 __all__ = [
-    "ARRIVAL", "COLUMNS", "FOLLOWING", "LATENESS", "SKIP_S", "Layout", "Signals", "around_switching", "logged", "with_noise",
+    "ARRIVAL", "COLUMNS", "IMU_DELAY", "LATENESS", "SKIP_S", "Layout", "Signals", "around_switching", "logged", "with_noise",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ OWN_SCALE = 2.0
 #: least size of a scatter, as a share of the signal's noise
 LEAST = 0.3
 #: what the features of rows that are late are called, those of commands, and those of the body behind its legs
-LATENESS, ARRIVAL, FOLLOWING = "lateness", "arrival", "following"
+LATENESS, ARRIVAL, IMU_DELAY = "lateness", "arrival", "imu_delay"
 #: rad/s, a speed from which positions tell how late a row is
 TELLS_RAD_S = 1.0
 #: s, the least size of a scatter of lateness
@@ -79,7 +79,7 @@ class Layout:
     seconds: float
     unsure: Bools
     arrivals: Arrivals | None = None
-    following: Following | None = None
+    imu_delay: ImuDelay | None = None
 
     def blocks(self, signal: str) -> Array:
         """Edges of the blocks of a signal, s."""
@@ -102,8 +102,8 @@ class Layout:
         out[LATENESS] = ["size"] * n + ["peak"] * n
         if self.arrivals is not None:
             out[ARRIVAL] = [kind for kind in KINDS_OF_ONE for _ in range(n)] + ["shared"]
-        if self.following is not None:
-            out[FOLLOWING] = list(KINDS)
+        if self.imu_delay is not None:
+            out[IMU_DELAY] = list(KINDS)
         return out
 
     def joints_of(self, signal: str) -> list[int]:
@@ -113,7 +113,7 @@ class Layout:
         if signal == ARRIVAL:
             return len(KINDS_OF_ONE) * [*range(self.joints), -1] + [-1]
         count = len(self.groups()[signal])
-        return [-1] * count if signal in (*COLUMNS, FOLLOWING) else [k % self.joints for k in range(count)]
+        return [-1] * count if signal in (*COLUMNS, IMU_DELAY) else [k % self.joints for k in range(count)]
 
     def features(self, seen: Signals, simulated: Signals) -> Floats:
         """(robots, features): block means, and logarithms of sizes, of how logs differ from what the model does.
@@ -139,8 +139,8 @@ class Layout:
         parts += self._late(apart["pos"], simulated["pos"])
         if self.arrivals is not None:
             parts += self.arrivals(apart["pos"], simulated["pos"][0])
-        if self.following is not None:
-            parts.append(self.following(seen["pos"], seen["gyro"]))
+        if self.imu_delay is not None:
+            parts.append(self.imu_delay(seen["pos"], seen["gyro"]))
         return np.concatenate(parts, axis=1).astype(np.float32)
 
     def known(self, seen: Signals) -> Bools:
@@ -158,8 +158,8 @@ class Layout:
         parts += [np.ones(len(groups[LATENESS]), bool)]
         if self.arrivals is not None:
             parts += [np.ones(len(groups[ARRIVAL]), bool)]
-        if self.following is not None:
-            parts += [np.full(len(groups[FOLLOWING]), "gyro" in seen)]
+        if self.imu_delay is not None:
+            parts += [np.full(len(groups[IMU_DELAY]), "gyro" in seen)]
         return np.concatenate(parts)
 
     def _late(self, x: Floats, simulated: Floats) -> list[Floats]:
@@ -171,7 +171,7 @@ class Layout:
         Args:
             x: (robots, rows, joints) rad, NaN where nobody knows. simulated: the same of the model.
         """
-        jump = beside_neighbours(x, self.t)[:, self.t >= SKIP_S]
+        jump = against_neighbours(x, self.t)[:, self.t >= SKIP_S]
         speed = np.nan_to_num(np.gradient(simulated, self.t, axis=1))[:, self.t >= SKIP_S]
         weight = np.square(speed) + TELLS_RAD_S**2
         late = np.concatenate(

@@ -17,6 +17,8 @@ __all__ = ["FOLDS", "Part", "folds"]
 
 #: a single run is cut into so many folds; s between two of them
 FOLDS, APART_S = 4, 1.0
+#: s from which a part of one run of several is worth the pause before it
+LONG_S = 4.0
 #: share of a fold by which its end moves to a pause that is there anyway
 TO_PAUSE = 0.25
 
@@ -55,30 +57,39 @@ class Part:
         return part
 
 
-def folds(usable: Sequence[Usable]) -> tuple[Part, ...]:
-    """What is held out in turn: of several runs each, of a single one FOLDS contiguous parts, APART_S from each other.
+def folds(usable: Sequence[Usable]) -> tuple[tuple[int, Part], ...]:
+    """What is held out in turn, and of which run: runs, where there are FOLDS of them or they are short, else parts of each.
 
-    Runs of which nothing can be simulated are none.
+    Parts are contiguous and APART_S from each other. Runs of which nothing can be simulated are none.
 
     Raises:
         BadInput: too little of a single run can be simulated, or nothing of any.
     """
-    there = [one for one in usable if one.stretches]
+    there = [k for k, one in enumerate(usable) if one.stretches]
     if not there:
         lines = "; ".join(str(one) for one in usable)
         raise BadInput(
             f"nothing of these recordings can be simulated: {lines}", remedy="record the robot as it moves by itself"
         )
-    if len(there) > 1:
-        return tuple(Part(one.run) for one in there)
-    return _parts(there[0])
+    each = math.ceil(FOLDS / len(there))
+    long = len(there) == 1 or all(usable[k].usable_s > each * LONG_S for k in there)
+    found = [(k, part) for k in there for part in _parts(usable[k], each if long else 1)]
+    if len(found) == 1:
+        (one,) = (usable[k] for k in there)
+        raise BadInput(
+            f"{one.usable_s:.1f} s of the one run can be simulated, too little to hold parts of it out",
+            where=one.run,
+            remedy=f"record {FOLDS * LEAST_S + (FOLDS - 1) * APART_S + 1:g} s or more in one piece, or a second run",
+        )
+    return tuple(found)
 
 
-def _parts(one: Usable) -> tuple[Part, ...]:
+def _parts(one: Usable, count: int) -> list[Part]:
+    """A run in so many parts, or whole, where it is too short for that."""
     stretches = one.stretches
     pauses = [a[1] for a, b in itertools.pairwise(stretches) if b[0] - a[1] >= APART_S]
     parts, start = [], stretches[0][0]
-    for left in range(FOLDS, 0, -1):
+    for left in range(count, 0, -1):
         gone = _until(stretches, start)
         each = (one.usable_s - gone - (left - 1) * APART_S) / left
         stop = stretches[-1][1] if left == 1 else _after(stretches, gone + each)
@@ -89,13 +100,8 @@ def _parts(one: Usable) -> tuple[Part, ...]:
         start = stop + APART_S
         if near:
             start = max(start, next(begin for begin, _ in stretches if begin > stop))
-    if not all(any(min(b, part.stop) - max(a, part.start) >= LEAST_S for a, b in stretches) for part in parts):
-        raise BadInput(
-            f"{one.usable_s:.1f} s of the one run can be simulated, too little to hold parts of it out",
-            where=one.run,
-            remedy=f"record {FOLDS * LEAST_S + (FOLDS - 1) * APART_S + 1:g} s or more in one piece, or a second run",
-        )
-    return tuple(parts)
+    long = all(any(min(b, part.stop) - max(a, part.start) >= LEAST_S for a, b in stretches) for part in parts)
+    return parts if count > 1 and long else [Part(one.run)]
 
 
 def _after(stretches: Sequence[tuple[float, float]], seconds: float) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-__all__ = ["beside_neighbours"]
+__all__ = ["against_neighbours"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -16,7 +16,7 @@ Bools = NDArray[np.bool_]
 ABOUT_S = 0.1
 
 
-def beside_neighbours(x: Floats, t: Array) -> Array:
+def against_neighbours(x: Floats, t: Array) -> Array:
     """(robots, rows, columns) how far each row lies off the mean of those `ABOUT_S` about it; 0 where nobody knows."""
     known = np.isfinite(x)
     values = np.where(known, x, np.float32(0))

@@ -22,7 +22,7 @@ from openant_tools.gap.arrivals import Arrivals
 from openant_tools.gap.features import (
     ARRIVAL,
     COLUMNS,
-    FOLLOWING,
+    IMU_DELAY,
     LATENESS,
     SKIP_S,
     Floats,
@@ -30,14 +30,14 @@ from openant_tools.gap.features import (
     around_switching,
     logged,
 )
-from openant_tools.gap.following import Following
+from openant_tools.gap.imu_delay import ImuDelay
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.floor import resolution
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 
-__all__ = ["Played", "Players", "Protocol", "alike", "rollouts_of", "same", "shown"]
+__all__ = ["Played", "Players", "Protocol", "alike", "rollouts_of"]
 
 Array = NDArray[np.float64]
 
@@ -105,26 +105,13 @@ class Played:
         return Layout(
             t, self.plant.setup, len(self.plant.joints), self.signals, self.run.duration_s,
             around_switching(self.run, self.plant.joints), Arrivals.of(self.run, self.plant, t >= SKIP_S),
-            Following.of(t) if "gyro" in self.signals else None,
+            ImuDelay.of(t) if "gyro" in self.signals else None,
         )  # fmt: skip
 
     def features(self, nominal: Mapping[str, Floats]) -> tuple[Floats, NDArray[np.bool_]]:
         """(features,) of the run itself against what the model does, and which of them its log has."""
         seen = {name: self.seen.get(name, nominal[name]) for name in self.signals}
         return self.layout.features(seen, nominal)[0], self.there(self.seen)
-
-    def rest(self) -> Array:
-        """(joints,) rad where the model comes to rest under the run's first commands."""
-        joints = self.plant.joints
-        t = np.arange(0.0, REST_S, REST_ROW_S)
-        columns = {}
-        for joint in joints:
-            command = self.run.column(f"cmd.{joint}")
-            asked = command[np.isfinite(command)][:1]
-            columns[f"cmd.{joint}"] = columns[f"pos.{joint}"] = np.full(len(t), asked[0] if len(asked) else np.nan)
-            columns[f"torque.{joint}"] = np.full(len(t), self.run.signal("torque", [joint], default=1.0)[0, 0])
-        out: Array = Rollouts(self.plant, [dataclasses.replace(self.run, t=t, columns=columns)])().pos[0, -1]
-        return out
 
     def there(self, seen: Collection[str]) -> NDArray[np.bool_]:
         """(features,) which of them a log of these signals has."""
@@ -257,32 +244,6 @@ class Protocol:
         out["volt"] = min((float(c[c > LEAST_CHANGE].min(initial=np.inf)) for c in changes), default=np.inf)
         return {signal: step if np.isfinite(step) else 0.0 for signal, step in out.items()}
 
-    def started_as(self, other: Protocol) -> Protocol:
-        """The same in the measures of another robot's, simulated from where its runs began.
-
-        Runs that began elsewhere on purpose stay as they are.
-
-        Dry friction lets every robot rest a little differently; only where all simulations begin at one place is that
-        among what healthy robots are seen to do.
-        """
-        begun = self._begun([_first(one.run, self.joints) for one in other.runs])
-        return dataclasses.replace(begun, reference=dataclasses.replace(self.reference, seen=other.reference.seen))
-
-    def at_rest(self) -> Protocol:
-        """The same, simulated from where the model itself rests under the first commands, if runs began about there.
-
-        How the robot that came first had come to rest is its own: another one's feet did not hold its legs twisted so.
-        """
-        return self._begun([one.rest() for one in self.runs])
-
-    def _begun(self, starts: Sequence[Array]) -> Protocol:
-        """The same, simulated from these (joints,) positions, but for runs that began elsewhere."""
-        runs = [
-            dataclasses.replace(one, run=_begun(one.run, start, self.joints))
-            for one, start in zip(self.runs, starts, strict=True)
-        ]
-        return dataclasses.replace(self, runs=tuple(runs))
-
     def nominal(self, robot: Robot | None = None) -> list[dict[str, Floats]]:
         """Of each run, what the model (or another robot) does with its commands from its start on, at its own rows."""
         return Players.of(self.runs).play([robot or Robot(len(self.joints))])
@@ -290,20 +251,6 @@ class Protocol:
     def features(self, robot: Robot | None = None) -> list[tuple[Floats, NDArray[np.bool_]]]:
         """Of each run, its features against the model (or another robot) and which of them its log has."""
         return [one.features(nominal) for one, nominal in zip(self.runs, self.nominal(robot), strict=True)]
-
-    def logs(self) -> list[NDArray[np.bool_]]:
-        """Of each run which features its log has."""
-        return [one.there(one.seen) for one in self.runs]
-
-    def commands(self) -> list[Array]:
-        """Of each run (times, joints) rad on a grid."""
-        return [_on_grid(one.run, self.joints) for one in self.runs]
-
-    def places(self) -> Array:
-        """(runs, 2) of each run whether it stands on the floor, and its heading, rad."""
-        return np.array(
-            [[one.plant.setup is Setup.FLOOR, round(one.run.facts.heading_rad or 0.0, 1)] for one in self.runs], float
-        )
 
     def fingerprint(self) -> str:
         """Of what decides the simulations but for the runs themselves: model and joints."""
@@ -316,16 +263,7 @@ class Protocol:
 
 def _read_from(signal: str) -> str:
     """The signal that features are of: how late rows and commands are is read from positions, how late a body is where it turns."""
-    return "pos" if signal in (LATENESS, ARRIVAL) else "gyro" if signal == FOLLOWING else signal
-
-
-def same(one: Array, other: Array) -> bool:
-    """Whether commands of two runs (as `Protocol.commands`) are the same but for jitter of their times."""
-    n = min(len(one), len(other))
-    if abs(len(one) - len(other)) * GRID_S > 0.1 + 0.01 * n * GRID_S:
-        return False
-    # A step that comes a sample early is a large difference for a moment: the median does not see it.
-    return float(np.quantile(np.abs(one[:n] - other[:n]).max(axis=1), 0.75)) <= SAME_RAD
+    return "pos" if signal in (LATENESS, ARRIVAL) else "gyro" if signal == IMU_DELAY else signal
 
 
 def alike(one: Run, other: Run, joints: Sequence[str]) -> bool:
@@ -369,23 +307,6 @@ def _warmer(runs: Sequence[Run], joints: Sequence[str]) -> Array:
         temperature = np.array([np.nanmedian(run.signal("temp", joints), axis=0) for run in runs])
         warmer: Array = np.nan_to_num(temperature - np.nanmin(temperature, axis=0))
     return warmer
-
-
-def _first(run: Run, joints: Sequence[str]) -> Array:
-    """(joints,) rad where a run begins; NaN where a joint was not measured all that time."""
-    begin: Array = run.signal("pos", joints)[run.t < run.t[0] + BEGIN_S].mean(axis=0)
-    return begin
-
-
-def _begun(run: Run, start: Array, joints: Sequence[str]) -> Run:
-    """A run whose first positions are these, if it began about there."""
-    first = run.t < run.t[0] + BEGIN_S
-    if not (np.abs(run.signal("pos", joints)[first] - start) <= ELSEWHERE_RAD).all():
-        return run
-    columns = dict(run.columns)
-    for joint, there in zip(joints, start, strict=True):
-        columns[f"pos.{joint}"] = np.where(first, there, run.column(f"pos.{joint}"))
-    return dataclasses.replace(run, columns=columns)
 
 
 def shown(runs: Sequence[Run], joints: Sequence[str]) -> Seen:

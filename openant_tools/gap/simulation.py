@@ -21,8 +21,8 @@ from openant_tools.effects.robot import Cable, Form, Robot, tilted
 from openant_tools.effects.rollout import laws_of
 from openant_tools.effects.servos import batch_of
 from openant_tools.effects.step import Law, Step
+from openant_tools.gap.initial_state import heats, setpoints
 from openant_tools.gap.laws import Fields, Transmission, back_emf, first_laws, last_laws
-from openant_tools.gap.memory import heats, setpoints
 from openant_tools.model.body import torso_body
 from openant_tools.model.plant import Plant, Setup
 from openant_tools.model.rollout import VELOCITY_SPAN_S, Rollouts, Segment
@@ -368,10 +368,10 @@ class _Batch:
             mean = np.empty((len(edges) - 1, len(plant.joints)))
             times = commands.times
             one_packet = robot.form is None or robot.form.one_packet
-            packet = self._late(robot, times) if one_packet else None
+            packet = self._read_at(robot, times) if one_packet else None
             shared = self._lost(robot, times, 0) if robot.shared_dropout else None
             for j in range(len(plant.joints)):
-                late = packet if packet is not None else self._late(robot, times)
+                late = packet if packet is not None else self._read_at(robot, times)
                 lost = shared if shared is not None else self._lost(robot, times, j)
                 column = dataclasses.replace(commands, times=late, values=_without(commands.values[:, j : j + 1], lost))
                 mean[:, j] = column.mean(edges - robot.delay[j])[:, 0]
@@ -385,7 +385,7 @@ class _Batch:
                 mean[:, filtered] = _filtered(whole, h / float(robot.lag[filtered]))[len(before) :]
         return mean
 
-    def _late(self, robot: Robot, times: Array) -> Array:
+    def _read_at(self, robot: Robot, times: Array) -> Array:
         """When commands that were due at these times act, in order."""
         if robot.jitter_s <= 0:
             return times

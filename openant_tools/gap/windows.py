@@ -26,7 +26,7 @@ __all__ = ["AT_MOST_S", "Selection", "cut", "select", "window_s"]
 Array = NDArray[np.float64]
 
 #: s of all windows together, and of one on a stand and on a floor
-AT_MOST_S, STAND_S, FLOOR_S = 20.0, 1.0, 2.0
+AT_MOST_S, STAND_S, FLOOR_S = 12.0, 1.0, 2.0
 #: by how much longer than asked a window may be before two are made of it
 LONGER = 0.25
 #: s, the grid on which a window's motion is looked at, whatever its rows are
@@ -91,14 +91,13 @@ def select(
     """
     able = tuple(usable(run, plant) for run, plant in zip(runs, plants, strict=True))
     parts = folds(able)
-    there = [k for k, one in enumerate(able) if one.stretches]
     pieces = [
         _Piece(k, f, start, stop)
-        for f, (k, part) in enumerate(zip(there if len(there) > 1 else there * len(parts), parts, strict=True))
+        for f, (k, part) in enumerate(parts)
         for start, stop in cut(able[k].stretches, part, length_s or window_s(plants[k].setup))
     ]
     if sum(piece.seconds for piece in pieces) > at_most_s:
-        shown = {k: _Shown(runs[k], plants[k]) for k in there}
+        shown = {k: _Shown(runs[k], plants[k]) for k, _ in parts}
         what = np.array([shown[piece.run].window(piece.start, piece.stop) for piece in pieces])
         pieces = _most_telling(pieces, what, at_most_s)
     # A fold of which nothing is simulated cannot be held out.
@@ -106,7 +105,7 @@ def select(
     own = [[piece for piece in pieces if piece.run == k] for k in range(len(runs))]
     return Selection(
         able,
-        tuple(parts[f] for f in kept),
+        tuple(parts[f][1] for f in kept),
         tuple(tuple((piece.start, piece.stop) for piece in mine) for mine in own),
         tuple(tuple(kept.index(piece.fold) for piece in mine) for mine in own),
     )
@@ -125,7 +124,7 @@ class _Piece:
     def seconds(self) -> float:
         return self.stop - self.start
 
-    def beside(self, other: _Piece) -> bool:
+    def adjacent(self, other: _Piece) -> bool:
         """Whether one follows the other."""
         return self.run == other.run and (self.start == other.stop or self.stop == other.start)
 
@@ -160,7 +159,7 @@ def _most_telling(pieces: Sequence[_Piece], what: Array, at_most_s: float) -> li
         best = int(np.argmax(np.where(fits, np.round(gain, DIGITS), -np.inf)))
         left[best] = False
         spent[fold[best]] += seconds[best]
-        follows |= [piece.beside(pieces[best]) for piece in pieces]
+        follows |= [piece.adjacent(pieces[best]) for piece in pieces]
         along = inverse @ what[best]
         inverse -= np.outer(along, along) / (1.0 + what[best] @ along)
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from openant_tools.gap.decide import Row, decide
 
 NOTHING = Row((), probability=0.05)
-LAG = Row(("actuator_lag",), ((0,),), 0.85, gain=0.5, error=0.02, foretold=0.6)
-DELAY = Row(("action_delay",), ((0,),), 0.06, gain=0.45, error=0.02, foretold=0.6)
+LAG = Row(("actuator_lag",), ((0,),), 0.85, gain=0.5, error=0.02, expected=0.6)
+DELAY = Row(("action_delay",), ((0,),), 0.06, gain=0.45, error=0.02, expected=0.6)
 
 
 def test_what_evidence_and_held_out_data_speak_for_leads() -> None:
@@ -23,15 +23,15 @@ def test_what_evidence_and_held_out_data_speak_for_leads() -> None:
 
 def test_nothing_known_shares_what_held_out_data_refute() -> None:
     worse = replace(LAG, gain=-0.3, error=0.05)
-    assert worse.contradicted
+    assert worse.refuted
     assert decide([NOTHING, worse, DELAY], outside=0.04).verdict == "unexplained"
     silent = replace(LAG, gain=0.0, error=0.02)  # it should show, and shows nothing
-    assert silent.contradicted
+    assert silent.refuted
 
 
 def test_where_its_gain_would_lie_below_the_noise_held_out_data_are_no_evidence() -> None:
-    unseen = replace(LAG, gain=0.0, error=0.2, foretold=0.3)  # a stop where the held-out motion never goes
-    assert not unseen.contradicted
+    unseen = replace(LAG, gain=0.0, error=0.2, expected=0.3)  # a stop where the held-out motion never goes
+    assert not unseen.refuted
     assert decide([NOTHING, unseen], outside=0.04).verdict == "actuator_lag"
 
 
@@ -43,7 +43,11 @@ def test_two_that_share_what_is_likely_are_ambiguous() -> None:
 
 
 def test_a_healthy_robot_has_nothing() -> None:
-    rows = [replace(NOTHING, probability=0.9), replace(LAG, probability=0.05), replace(DELAY, probability=0.02)]
+    rows = [
+        replace(NOTHING, probability=0.9),
+        replace(LAG, probability=0.05, gain=0.01),
+        replace(DELAY, probability=0.02, gain=0.0),
+    ]
     found = decide(rows, outside=0.03)
     assert (found.verdict, found.selected) == ("none", ())
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from openant_tools.gap.assess import layouts_of
-from openant_tools.gap.cloud import robots_at, templates_at, templates_of
+from openant_tools.gap.ensemble import robots_at, templates_at, templates_of
 from openant_tools.gap.evidence import COLUMN_NAMES, Layouts, RunLayout, Scale, evidence_of
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.population import Case, draw
@@ -43,7 +43,7 @@ def _recorded(model: Path, joints: tuple[str, ...], seconds: float, *, torque: b
             if torque:
                 columns[f"cur.{joint}"] = 0.1 * np.sin(t)
         runs.append(Run(f"run{seed}", Facts(joints=joints, setup="stand"), t, columns))
-    return Experiment.of(runs, model, joints, [None, None]).protocol.coarse()
+    return Experiment.of(runs, model, joints).protocol.coarse()
 
 
 @pytest.fixture(scope="module")

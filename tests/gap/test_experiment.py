@@ -25,7 +25,7 @@ def test_an_hour_is_no_more_to_simulate_than_its_twenty_telling_seconds(tmp_path
     command = 0.5 * np.sin(0.7 * t) * (1 + 0.5 * np.sin(0.05 * t))
     columns = {"cmd.hinge": command, "pos.hinge": command, "cmd_t": t - 0.003}
     run = Run("long", Facts(joints=("hinge",), setup="stand"), t, columns)
-    made = Experiment.of([run], model, ["hinge"], [None])
+    made = Experiment.of([run], model, ["hinge"])
 
     (one,) = made.protocol.runs
     assert made.selection.seconds <= 20.0 + 1e-6
@@ -41,5 +41,5 @@ def test_an_hour_is_no_more_to_simulate_than_its_twenty_telling_seconds(tmp_path
     simulated = rollouts_of([one])().pos[0, :, 0]
     assert np.isfinite(simulated).sum() * 0.02 <= 20.5
 
-    assert len(made.folds.runs) >= 4
-    assert [played.run.name for played in made.folds.runs] == [str(part) for part in made.selection.folds]
+    assert len(made.folds) >= 4
+    assert [played.run.name for played in made.parts.runs] == [str(part) for part in made.selection.folds]

@@ -12,9 +12,9 @@ import pytest
 from openant_tools.effects.catalogue import enter
 from openant_tools.effects.robot import Robot
 from openant_tools.errors import BadInput
-from openant_tools.gap import prepare
+from openant_tools.gap import cache
+from openant_tools.gap.cache import CACHE_VARIABLE
 from openant_tools.gap.diagnose import diagnose
-from openant_tools.gap.prepare import CACHE_VARIABLE
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.rollout import Rollouts
@@ -86,10 +86,10 @@ def test_what_is_too_short_to_hold_anything_out_is_refused_in_one_line(model: Pa
 
 
 def test_recordings_that_were_looked_at_long_ago_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(prepare, "LARGEST_BYTES", 25)
-    place = prepare.cache_folder()
+    monkeypatch.setattr(cache, "LARGEST_BYTES", 25)
+    place = cache.cache_folder()
     for age, name in enumerate(("recording-new.npz", "recording-used.npz", "recording-old.npz")):
         (place / name).write_bytes(bytes(10))
         os.utime(place / name, (1e9 - age, 1e9 - age))
-    prepare.keep_small(place / "recording-new.npz")
+    cache.keep_small(place / "recording-new.npz")
     assert sorted(path.name for path in place.iterdir()) == ["recording-new.npz", "recording-used.npz"]

@@ -37,10 +37,10 @@ PLACES, CANDIDATES = 5, 5
 STAMP = "%Y%m%dT%H%M%SZ"
 IMPROVED = "improved.xml"
 NONE_YET = (
-    "No diagnosis yet.\n\nChoose at least two runs of different motions in the list on the left (Enter), on the stand and "
-    "on the floor if you can, then press d. A diagnosis says where the simulation differs from the robot, which unmodelled "
-    "effect causes it, and how far the gap closes once that effect is added.\n\nOf commands that were never seen thousands "
-    "of robots are simulated first: a quarter of an hour, once."
+    "No diagnosis yet.\n\nChoose runs in the list on the left (Enter), a policy's or, better, several motions on the stand and "
+    "on the floor, then press d. A diagnosis says where the simulation differs from the robot, which unmodelled "
+    "effect causes it, and how far the gap closes once that effect is added. It takes "
+    "a minute or two, and seconds where the same runs were diagnosed before."
 )
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openant_tools.gap.following import LAG_S, Following
+from openant_tools.gap.imu_delay import LAG_S, ImuDelay
 
 JOINTS, ROWS, PERIOD_S = 8, 450, 0.02
 T = np.arange(ROWS) * PERIOD_S
@@ -30,7 +30,7 @@ def turning(t: np.ndarray, seed: int = 0, noise: float = 0.0) -> np.ndarray:
 
 
 def said(pos: np.ndarray, gyro: np.ndarray) -> np.ndarray:
-    following = Following.of(T)
+    following = ImuDelay.of(T)
     assert following is not None
     out: np.ndarray = following(pos.astype(np.float32), gyro)[0]
     return out
@@ -67,7 +67,7 @@ def test_rows_that_nobody_knows_change_little() -> None:
 
 
 def test_without_a_gyroscope_or_time_enough_nothing_is_claimed() -> None:
-    assert Following.of(T[:40]) is None
+    assert ImuDelay.of(T[:40]) is None
     # A body that never turns, or a column without a value: finite, and nothing is explained.
     for dead in (np.zeros((1, ROWS, 3)), np.full((1, ROWS, 3), np.nan)):
         out = said(legs(T)[None], dead.astype(np.float32))

@@ -13,7 +13,7 @@ from openant_tools.effects.catalogue import catalogue, enter
 from openant_tools.effects.robot import Robot
 from openant_tools.effects.step import Step
 from openant_tools.effects.thermal_derating import FULL_HEAT_C
-from openant_tools.gap.memory import heats, setpoints
+from openant_tools.gap.initial_state import heats, setpoints
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.rollout import Measured, Rollouts, Staircase

@@ -39,7 +39,7 @@ from openant_tools.robot.pair import PLAIN, mark_of
 
 Array = NDArray[np.float64]
 
-ANT = Path(__file__).parents[1] / "openant_tools" / "robot" / "assets" / "ant_standard.xml"
+ANT = Path(__file__).parents[2] / "openant_tools" / "robot" / "assets" / "ant_standard.xml"
 T = np.arange(0.0, 2.5, 0.01)
 #: of the motion that an effect changes, and rad beside it, by which the replay may differ: rows of the population are at
 #: steps of the same length, but its friction, stops and filters are other code
@@ -180,7 +180,6 @@ def test_body_and_floor_are_in_the_file(name: str, walk: tuple[Plant, Run], tmp_
     ("kind", "value"),
     [
         ("impratio", 0.1),
-        ("pyramidal_cones", 1.0),
         ("contact_damping", 1.5),
         ("contact_give", 0.6),
         ("contact_depth", 1.8),

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-__all__ = ["KINDS", "Following"]
+__all__ = ["KINDS", "ImuDelay"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -34,7 +34,7 @@ LEAST_SHARE = 1e-4
 
 
 @dataclass(frozen=True)
-class Following:
+class ImuDelay:
     """The rows of a run at which body and legs are compared.
 
     Attributes:
@@ -49,7 +49,7 @@ class Following:
     share: Array
 
     @classmethod
-    def of(cls, t: Array) -> Following | None:
+    def of(cls, t: Array) -> ImuDelay | None:
         """For rows at these times, s; None where there are too few."""
         shifts = np.arange(SHIFTS_S[0], SHIFTS_S[1] + SPACING_S / 2, SPACING_S)
         inside = np.flatnonzero((t > t[0] + SKIP_S - SHIFTS_S[0]) & (t < t[-1] - SHIFTS_S[1]))

@@ -10,19 +10,18 @@ import numpy as np
 import pytest
 from plants import BENCH, ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, write
 
-from openant_tools.effects.catalogue import catalogue
-from openant_tools.gap.closure import Windows
-from openant_tools.gap.explain import Part
-from openant_tools.gap.late import late_velocity
+from openant_tools.gap.assess import assess
+from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.next import suggestion
-from openant_tools.gap.protocol import Protocol
-from openant_tools.gap.sets import SetFits, choose, folds_of, motions_of
+from openant_tools.gap.trials import Trials
+from openant_tools.gap.velocity_delay import velocity_delay
+from openant_tools.model.plant import load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
 
 RATE_HZ = 50
-REAL = Path(__file__).parents[2] / "shared" / "realdata" / "bam-xl330"
+REAL = Path(__file__).parents[3] / "shared" / "realdata" / "bam-xl330"
 #: the given model has all of its damping in the joint and no friction; the robot's is back-EMF, and it rubs
 GIVEN = pendulum(f'<position {SERVO} kp="8" forcerange="-4 4"/>', joint='damping="0.12" armature="0.006"')
 ROBOT = pendulum(
@@ -46,42 +45,45 @@ def recorded(**facts: str) -> list[Run]:
     return runs
 
 
-def protocol_of(runs: list[Run], model: Path) -> Protocol:
-    return Protocol.of(runs, model, ["joint"], [None] * len(runs))
-
-
-def test_two_causes_are_found_together_and_a_third_is_spared(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_two_causes_that_act_beside_each_other_are_both_found(tmp_path: Path) -> None:
+    """Either alone is bent to make up for the other, and that shows on the motion that was left out."""
     runs = recorded()
-    protocol = protocol_of(runs, write(tmp_path / "given.xml", GIVEN))
-    names = ["coulomb_friction", "electrical_damping", "dead_zone"]
-    fits = SetFits(Windows(protocol), [0, 1, 2], [])
-    choice = choose(
-        fits, [Part(name, (0,)) for name in names], [catalogue()[name].starts(0.4)[0] for name in names],
-        dict.fromkeys(names, 0.4),
-    )  # fmt: skip
-    assert set(choice.chosen.names) == {"coulomb_friction", "electrical_damping"}
-    assert choice.chosen.closed > 0.6
-    assert choice.chosen.worst > 0.4
-    # Either alone is bent to make up for the other, and shows on the motion that was left out.
-    assert all(choice.alone[name].closed < choice.chosen.closed - 0.1 for name in names)
-    assert min(choice.removal.values()) > 0.1
-    assert not choice.open
-    assert choice.chosen.point("coulomb_friction")["torque_nm"] > 0
-    assert set(choice.chosen.spread("electrical_damping")) == {"share"}
+    model = write(tmp_path / "given.xml", GIVEN)
+    experiment = Experiment.of(runs, model, ["joint"])
+    trials = Trials.of(experiment, assess(experiment.protocol))
+    both = ("coulomb_friction", "electrical_damping")
+    trials.fit([(), both[:1], both[1:], both])
+    closed = {causes: one.closed for causes, one in trials.closures.items()}
+    assert closed[both] > 0.6
+    assert all(closed[one] < closed[both] - 0.1 for one in (both[:1], both[1:]))
+    row = trials.row(both, 0.3)
+    assert row.told
+    assert row.ratio > 0, "what it closes on held-out parts speaks for the second"
+    assert min(trials.removal(both).values()) > 0.1
 
 
 def test_folds_leave_out_motions_and_settings(tmp_path: Path) -> None:
-    model, other = write(tmp_path / "a.xml", GIVEN), write(tmp_path / "b.xml", GIVEN)
     first, second, _ = recorded()
-    one = Protocol.of([first, second], model, ["joint"], [None, None])
-    assert [fold.out for fold in folds_of(one, [0, 1])] == [(0,), (1,)]
+    two = Experiment.of([first, second], write(tmp_path / "a.xml", GIVEN), ["joint"])
+    assert two.folds == ((0,), (1,)), "they are too short to be cut"
     small = dataclasses.replace(
         first, columns={**first.columns, "cmd.joint": 0.7 * first.column("cmd.joint")}, name="smaller"
     )
+    other = str(write(tmp_path / "b.xml", GIVEN))
+    at_other = [dataclasses.replace(one, facts=dataclasses.replace(one.facts, model=other)) for one in (small, second)]
     # The same motion in another size and at another gain is no other motion.
-    four = Protocol.of([first, second, small, second], model, ["joint"], [model, model, other, other])
-    assert motions_of(four, range(4)) == [[0, 2], [1, 3]]
-    assert [(fold.name, fold.out) for fold in folds_of(four, range(4))][2:] == [("a", (0, 1)), ("b", (2, 3))]
+    four = Experiment.of([first, second, *at_other], tmp_path / "a.xml", ["joint"])
+    assert four.folds == ((0, 2), (1, 3), (0, 1), (2, 3))
+
+
+def test_held_out_runs_alone_are_judged(tmp_path: Path) -> None:
+    runs = recorded()
+    made = Experiment.of(runs[:2], write(tmp_path / "given.xml", GIVEN), ["joint"], hold_out=runs[2:])
+    names = [made.parts.runs[k].run.name for fold in made.folds for k in fold]
+    assert all(name.startswith("other") for name in names)
+    assert {made.parts.runs[k].run.name.split("[")[0] for k in made.training} == {"sweep", "lift"}
+    assert [one.run.name for one in made.protocol.runs] == ["sweep", "lift"]
 
 
 def test_a_diagnosis_of_one_motion_asks_for_more() -> None:
@@ -96,22 +98,21 @@ def test_a_log_tells_how_late_its_velocities_are(late_s: float, tmp_path: Path) 
     runs = []
     model = write(tmp_path / "given.xml", GIVEN)
     for run in recorded():
-        protocol = protocol_of([run], model)
-        smooth = Rollouts(protocol.runs[0].plant, [run])()
+        smooth = Rollouts(load_plant(model, ["joint"]), [run])()
         velocity = np.interp(run.t - late_s, run.t, smooth.vel[0, :, 0])
         runs.append(dataclasses.replace(run, columns={**run.columns, "pos.joint": smooth.pos[0, :, 0], "vel.joint": velocity}))  # fmt: skip
-    late = late_velocity(runs, ["joint"])
+    late = velocity_delay(runs, ["joint"])
     assert late is not None
     assert late.delay_s == pytest.approx(late_s, abs=0.002)
     assert late.beyond(0.02) == pytest.approx(float(late_s > 0.02), abs=0.01)
 
 
 def test_without_velocities_a_log_tells_nothing_of_them() -> None:
-    assert late_velocity(recorded(), ["joint"]) is None
+    assert velocity_delay(recorded(), ["joint"]) is None
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="shared/ is not here")
 def test_a_real_velocity_register_lags_by_what_is_documented() -> None:
-    late = late_velocity([read_run(path) for path in sorted(REAL.glob("*.parquet"))], ["joint"])
+    late = velocity_delay([read_run(path) for path in sorted(REAL.glob("*.parquet"))], ["joint"])
     assert late is not None
     assert late.delay_s == pytest.approx(0.021, abs=0.002)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from openant_tools.recording.run import Run
 
-__all__ = ["Late", "late_velocity"]
+__all__ = ["velocity_delay"]
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ LEAST_STD_S = 0.001
 
 
 @dataclass(frozen=True)
-class Late:
+class VelocityDelay:
     """By how much velocities lag positions, s, and its standard deviation."""
 
     delay_s: float
@@ -39,7 +39,7 @@ class Late:
         return 0.5 * (1 + math.erf((self.delay_s - delay_s) / self.std_s / math.sqrt(2)))
 
 
-def late_velocity(runs: Sequence[Run], joints: Sequence[str]) -> Late | None:
+def velocity_delay(runs: Sequence[Run], joints: Sequence[str]) -> VelocityDelay | None:
     """The lag of all runs' velocities behind the slopes of their positions; None where nothing tells.
 
     Rows that are too far apart for a slope tell less, but they tell: both ends of it lie around the row.
@@ -48,7 +48,7 @@ def late_velocity(runs: Sequence[Run], joints: Sequence[str]) -> Late | None:
     if not found:
         return None
     spread = float(np.std(found, ddof=1)) / math.sqrt(len(found)) if len(found) > 1 else math.inf
-    return Late(float(np.mean(found)), max(spread, LEAST_STD_S)) if math.isfinite(spread) else None
+    return VelocityDelay(float(np.mean(found)), max(spread, LEAST_STD_S)) if math.isfinite(spread) else None
 
 
 def _late(run: Run, joint: str) -> float | None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from plants import ENCODER_RAD, drive, pendulum, sweep, write
 
 from openant_tools.gap.measure import measure
-from openant_tools.gap.rest import following, places_left
+from openant_tools.gap.residual import places_left, residual_of
 from openant_tools.model.plant import load_plant
 from openant_tools.recording.run import Facts, Run
 
@@ -45,13 +45,13 @@ def error_of(values: Array, joint: int, seed: int, noise: float = 2e-3) -> Array
 def test_what_the_rest_follows_is_found_by_joint_and_by_band() -> None:
     runs, simulated = zip(*(moving(seed) for seed in range(2)), strict=True)
     turning = [error_of(np.tanh(one["vel"][:, 1] / 0.05), 1, n) for n, one in enumerate(simulated)]
-    found = following(runs, JOINTS, turning, simulated)
+    found = residual_of(runs, JOINTS, turning, simulated)
     assert found is not None
     assert (found.joint, found.regressor) == ("knee", "the direction in which it moves")
     assert found.coherence > 0.7
     assert 0.2 < found.low_hz < found.high_hz < 4
     sagging = [error_of(run.column("volt.hip"), 0, n) for n, run in enumerate(runs)]
-    found = following(runs, JOINTS, sagging, simulated)
+    found = residual_of(runs, JOINTS, sagging, simulated)
     assert found is not None
     assert (found.joint, found.regressor) == ("hip", "the supply's voltage")
     assert found.high_hz < 2
@@ -60,7 +60,7 @@ def test_what_the_rest_follows_is_found_by_joint_and_by_band() -> None:
 def test_a_rest_that_follows_nothing_is_said_to() -> None:
     runs, simulated = zip(*(moving(seed) for seed in range(2)), strict=True)
     rng = np.random.default_rng(7)
-    found = following(runs, JOINTS, [rng.normal(0, 0.01, (len(T), 2)) for _ in runs], simulated)
+    found = residual_of(runs, JOINTS, [rng.normal(0, 0.01, (len(T), 2)) for _ in runs], simulated)
     assert found is not None
     assert found.regressor is None
 
@@ -69,7 +69,7 @@ def test_a_rest_of_less_than_a_few_segments_says_nothing() -> None:
     run, simulated = moving(0)
     short = Run("short", run.facts, T[:80], {name: values[:80] for name, values in run.columns.items()})
     cut = {name: values[:80] for name, values in simulated.items()}
-    assert following([short], JOINTS, [np.zeros((80, 2))], [cut]) is None
+    assert residual_of([short], JOINTS, [np.zeros((80, 2))], [cut]) is None
 
 
 def test_places_show_what_another_model_leaves_of_the_gap_there(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,11 @@ import openant_tools.gap.closure as closure
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.closure import Refit, Windows, calibration_of, closures, heat_loss_of, nothing
-from openant_tools.gap.explain import Part
+from openant_tools.gap.hypothesis import Part
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.simulation import Log, simulate
-from openant_tools.model.plant import Setup, load_plant
+from openant_tools.model.plant import load_plant
 from openant_tools.model.rollout import Rollouts
-from openant_tools.recording.run import Facts, Run
-from openant_tools.robot.mjcf import nominal_mjcf
 
 T = 2.0 + np.arange(150) / 50
 
@@ -48,20 +47,22 @@ def protocol(folder: Path, *, kp: float, dry: float) -> Protocol:
 def test_a_refit_stays_within_tolerance_and_is_the_best_there(tmp_path: Path) -> None:
     """Stiffness is half as large again, far beyond its 15 %: some end at their bounds, the others where they then serve best."""
     windows = Windows(protocol(tmp_path, kp=12.0, dry=0.05))
-    ((found, _),) = windows.refit([nothing(windows)], [0, 1], ())
+    ((found, _, _),) = windows.refit([nothing(windows)], [0, 1], ())
     assert np.abs(found.nuisance).max() == pytest.approx(1.0)
 
-    def left(u: np.ndarray[Any, np.dtype[np.float64]]) -> float:
+    def cost(u: np.ndarray[Any, np.dtype[np.float64]]) -> float:
+        """Minus twice the logarithm of how likely it is, of 2 · 30 independent errors as large as it leaves them."""
         refits = [dataclasses.replace(found, nuisance=u)]
-        return sum(float(np.nansum(windows.errors(k, refits) ** 2)) for k in (0, 1))
+        left = sum(float(np.nansum(windows.errors(k, refits) ** 2)) for k in (0, 1))
+        return 60 * math.log(left) + float(np.sum((u / closure.SPREAD) ** 2))
 
-    least = left(found.nuisance)
-    assert least < 0.1 * left(np.zeros(len(windows.names)))
+    least = cost(found.nuisance)
+    assert least < cost(np.zeros(len(windows.names))) - 60
     for k in range(len(windows.names)):
         for step in (-0.3, 0.3):
             moved = found.nuisance.copy()
             moved[k] = np.clip(moved[k] + step, -1.0, 1.0)
-            assert least < 1.25 * left(moved)
+            assert least < cost(moved) + 12
 
 
 def test_a_warm_motor_is_weaker_and_the_refit_says_by_how_much(tmp_path: Path) -> None:
@@ -76,14 +77,14 @@ def test_a_warm_motor_is_weaker_and_the_refit_says_by_how_much(tmp_path: Path) -
         runs.append(run_of(columns, T, ["joint"], f"sweep-{n}"))
     model = write(tmp_path / "given.xml", pendulum(f'<position {SERVO} kp="8" forcerange="-4 4"/>'))
     windows = Windows(Protocol.of(runs, model, ["joint"], [None] * 3))
-    *_, (left,) = closures(windows, [nothing(windows)], [2], [0, 1])
+    (left,) = closures(windows, [nothing(windows)], [(2,)], [0, 1])
     assert left.closed > 0.8
     warmest = calibration_of(windows, left.refit, [2])["stiffness"]["joint"]
     assert warmest == pytest.approx(1 / (1 + loss * 50), rel=0.03)
     assert calibration_of(windows, left.refit, [0])["stiffness"]["joint"] == pytest.approx(1.0, rel=0.03)
     assert heat_loss_of(windows, left.refit) == pytest.approx(loss, rel=0.15)
     # One model for the warmest run alone is as good as knowing how warm it was; one for all three is not.
-    assert windows.written(left.refit, [2]) == pytest.approx(left.after, rel=1e-6)
+    assert windows.written(left.refit, [2]) == pytest.approx(left.after, rel=0.01)
     assert windows.written(left.refit, [0, 1, 2]) > 2 * left.after
     unmeasured = [
         dataclasses.replace(run, columns={k: v for k, v in run.columns.items() if k != "temp.joint"}) for run in runs
@@ -91,26 +92,17 @@ def test_a_warm_motor_is_weaker_and_the_refit_says_by_how_much(tmp_path: Path) -
     assert "heat_loss" not in [one.name for one in Windows(Protocol.of(unmeasured, model, ["joint"], [None] * 3)).names]
 
 
-def test_slopes_learnt_where_a_cause_was_found_leave_less(tmp_path: Path) -> None:
-    """What tolerances do was learnt without any cause: of a servo half as strong again that is not what they do with it."""
-    windows = Windows(protocol(tmp_path, kp=16.0, dry=0.05))
-    closures(windows, [nothing(windows)], [1], [0])
-    stiff = Refit((Part("stiffness_error", (0,)),), (catalogue()["stiffness_error"].starts(0.5)[0],), windows.contacts)
-    _, _, (found,) = closures(windows, [stiff], [1], [0])
-    before, _, (again,) = closures(windows, [found.refit], [1], [0], anew=True)
-    assert again.after < found.after
-    assert before == float(np.sqrt(np.nanmean(np.square(windows.before(1)))))
-
-
 @pytest.mark.parametrize("name", ["actuator_lag", "action_delay", "load_friction", "backlash"])
 def test_a_cause_that_is_not_there_ends_at_nothing_and_not_beyond(name: str, tmp_path: Path) -> None:
     windows = Windows(protocol(tmp_path, kp=8.0, dry=0.03))
     start = catalogue()[name].starts(0.2)[0]
     cause = Refit((Part(name, (0,)),), (start,), np.zeros(len(windows.names)))
-    before, floor, (_, found) = closures(windows, [nothing(windows), cause], (), [0, 1])
+    plain, found = closures(windows, [nothing(windows), cause], [(0,), (1,)], [0, 1])
     size = catalogue()[name].quantities[0].name
     assert 0 <= found.refit.x[0][size] < start[size]
-    assert np.isfinite([before, floor, found.after, found.low, found.high]).all()
+    gain, error = found.beyond(plain)
+    assert gain < 3 * error
+    assert np.isfinite([found.before, found.floor, found.after, found.low, found.high, gain]).all()
 
 
 def test_a_simulation_that_falls_apart_is_wrong_and_not_unknown(
@@ -128,49 +120,6 @@ def test_a_simulation_that_falls_apart_is_wrong_and_not_unknown(
     right, wrong = windows.errors(0, [None, None])
     assert np.nanmax(np.abs(right)) < 0.1
     assert np.nanmin(np.abs(wrong[len(T) // 2 :])) == pytest.approx(closure.LOST_RAD)
-
-
-def walks(folder: Path, robot: Robot) -> Protocol:
-    """Three runs of 3 s of a robot that scrubs its feet over the floor and lifts them, without a measured base."""
-    plant = load_plant(write(folder / "given.xml", nominal_mjcf("standard")), None, Setup.FLOOR)
-    home = np.array([0.0 if joint.startswith("hip") else -0.6 for joint in plant.joints])
-    t = np.arange(150) / 50
-    runs = []
-    for n, speed in enumerate((1.1, 1.4, 1.25)):
-        phase = np.arange(8) * (1.3 + 0.7 * n)
-        reach = np.array([0.35 if joint.startswith("hip") else 0.25 for joint in plant.joints])
-        commands = home + np.minimum(1.0, 2 * t)[:, None] * reach * np.sin(2 * np.pi * speed * t[:, None] + phase)
-        columns = {f"cmd.{joint}": commands[:, j] for j, joint in enumerate(plant.joints)}
-        columns |= {f"pos.{joint}": np.full(len(t), home[j]) for j, joint in enumerate(plant.joints)}
-        run = Run(f"walk-{n}", Facts(joints=plant.joints, setup="floor"), t, columns)
-        seen = simulate(Rollouts(plant, [run]), [robot], signals=["pos"]).signals["pos"][0].astype(float)
-        columns = {**columns, **{f"pos.{joint}": seen[:, j] for j, joint in enumerate(plant.joints)}}
-        runs.append(dataclasses.replace(run, columns=columns))
-    return Protocol.of(runs, plant.path, plant.joints, [None] * 3)
-
-
-def left_of(windows: Windows) -> float:
-    """rad, of the last run, after a re-fit on the others."""
-    *_, (left,) = closures(windows, [nothing(windows)], [2], [0, 1])
-    return left.after
-
-
-@pytest.mark.parametrize("cone", [None, int(mujoco.mjtCone.mjCONE_PYRAMIDAL)])
-def test_feet_meet_the_floor_as_the_runs_say(cone: int | None, tmp_path: Path) -> None:
-    """Contacts are found, and which of MuJoCo's cones they slip by; bases that nobody measured are led by what was found."""
-    robot = Robot(8)
-    robot.contact_give, robot.softness, robot.floor_friction, robot.contact_damping = 0.6, 0.85, 0.9, 0.8
-    robot.cone, robot.impratio = cone, 1.0 if cone is None else 0.15
-    windows = Windows(walks(tmp_path, robot))
-    windows.refit([nothing(windows)], [0, 1], ())
-    before = left_of(windows)
-    windows.settle(nothing(windows), [0, 1])
-    after = left_of(windows)
-    assert windows.cone == cone
-    assert after < 0.8 * before
-    stated = calibration_of(windows, nothing(windows), [2])
-    assert ("pyramidal_cones" in stated) == (cone is not None)
-    assert stated["floor_friction"]["body"] == pytest.approx(0.9, rel=0.05)
 
 
 def test_what_falls_apart_leaves_no_word_of_it(

@@ -19,7 +19,7 @@ from openant_tools.gap.closure import Refit, Windows
 from openant_tools.gap.measure import Measurement
 from openant_tools.recording.run import Run
 
-__all__ = ["Following", "following", "places_left", "rest_of"]
+__all__ = ["Residual", "places_left", "residual_after", "residual_of"]
 
 Array = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ TURN_RAD_S = 0.05
 
 
 @dataclass(frozen=True)
-class Following:
+class Residual:
     """What most of the rest moves with.
 
     Attributes:
@@ -57,9 +57,9 @@ class Following:
         }  # fmt: skip
 
 
-def following(
+def residual_of(
     runs: Sequence[Run], joints: Sequence[str], errors: Sequence[Array], simulated: Sequence[Mapping[str, Array]]
-) -> Following | None:
+) -> Residual | None:
     """What the errors of a model follow; None where runs are too short to say.
 
     By coherence, |S_xy|² / (S_xx S_yy), from spectra averaged over half-overlapping segments (Welch 1967) of all runs, less what as
@@ -96,15 +96,15 @@ def following(
         beyond = (raw - 1 / independent) / (1 - 1 / independent)
         if beyond > coherence:
             best, coherence = words, beyond
-    return Following(
+    return Residual(
         joints[worst], float(f[band].min() - f[1] / 2), float(f[band].max() + f[1] / 2),
         float(power[band].real.sum() / power[f > 0].real.sum()), best if coherence > FOLLOWS else None, coherence,
     )  # fmt: skip
 
 
-def rest_of(
+def residual_after(
     windows: Windows, refit: Refit, judged: Sequence[int], measured: Measurement
-) -> tuple[Following | None, list[dict[str, Any]]]:
+) -> tuple[Residual | None, list[dict[str, Any]]]:
     """What a re-fitted model leaves on these runs: what it follows, and the places of the gap with what is left there.
 
     Args:
@@ -114,7 +114,7 @@ def rest_of(
     runs = [windows.protocol.runs[k].run for k in judged]
     simulated = [windows.simulated(k, refit, ("pos", "vel", "torque")) for k in judged]
     errors = [windows.measured[k] - one["pos"] for k, one in zip(judged, simulated, strict=True)]
-    return following(runs, joints, errors, simulated), places_left(measured, simulated)
+    return residual_of(runs, joints, errors, simulated), places_left(measured, simulated)
 
 
 def places_left(measured: Measurement, simulated: Sequence[Mapping[str, Array]]) -> list[dict[str, Any]]:

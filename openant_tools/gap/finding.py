@@ -1,0 +1,209 @@
+"""What a diagnosis hands on (formats, section 2), from what was tried and decided."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from openant_tools.effects.catalogue import catalogue
+from openant_tools.effects.effect import Scope
+from openant_tools.gap.closure import Closure, calibration_of, heat_loss_of
+from openant_tools.gap.decide import Decision, Row
+from openant_tools.gap.diagnosis import Diagnosis, Found, Span
+from openant_tools.gap.measure import measure
+from openant_tools.gap.next import suggestion
+from openant_tools.gap.residual import residual_after
+from openant_tools.gap.trials import Trials
+from openant_tools.gap.velocity_delay import velocity_delay
+from openant_tools.recording.run import Run
+
+__all__ = ["Given", "finding"]
+
+#: signals of features → columns of run tables
+COLUMNS: Mapping[str, str] = {"torque": "cur", "yaw": "base"}
+#: probability from which a cause of sensors is found
+FOUND = 0.5
+#: standard deviations of an interval of 95 %
+INTERVAL = 1.96
+#: s by which a healthy servo's filter makes its velocities late
+HEALTHY_LATE_S = 0.012
+
+
+@dataclass(frozen=True)
+class Given:
+    """What was asked about: the model, runs, and what was expected of the robot."""
+
+    model: Path
+    runs: tuple[Run, ...]
+    hold_out: tuple[Run, ...]
+    prior: tuple[str, ...]
+
+
+def finding(
+    trials: Trials, given: Given, rows: Sequence[Row], decision: Decision, chosen: tuple[str, ...]
+) -> Diagnosis:
+    """
+    Args:
+        rows: the causes by themselves. chosen: causes that go into the improved model, the one that leads first.
+    """
+    experiment, windows = trials.experiment, trials.windows
+    best, plain = trials.closures.get(chosen), trials.closures[()]
+    judged = sorted({k for fold in experiment.folds for k in fold})
+    parts = [experiment.parts.runs[k].run for k in judged]
+    measured = measure(parts, given.model, experiment.parts.joints)
+    removal = trials.removal(chosen) if best is not None and chosen else {}
+    where, rest, calibration = measured.as_json()["where"], None, {}
+    notes = [str(experiment.selection), *_notes(trials, given, decision)]
+    if best is not None and chosen:
+        rest, where = residual_after(windows, best.refit, judged, measured)
+        calibration = calibration_of(windows, best.refit, judged)
+        if (loss := heat_loss_of(windows, best.refit)) is not None:
+            notes.append(
+                f"servos lose {100 * loss:.2f} % of their torque per °C; a written model is always as warm as on average here, and "
+                f"leaves {1e3 * windows.written(best.refit, judged):.2f} mrad"
+            )
+    effects = sorted(
+        (_found(trials, row, best) for row in rows if row.causes), key=lambda one: -_rank(one, rows, chosen)
+    )
+    return Diagnosis(
+        model=str(given.model),
+        runs=tuple(run.name for run in given.runs),
+        held_out=tuple(run.name for run in parts),
+        verdict=decision.verdict,
+        confidence=decision.confidence,
+        effects=tuple(effects),
+        selected=chosen,
+        ambiguous_with=decision.alike,
+        next_experiment=suggestion(decision.verdict, decision.alike, len(experiment.folds)),
+        gap={
+            "before": plain.before,
+            "after": plain.before if best is None or not chosen else best.after,
+            "floor": plain.floor,
+            "signals": measured.as_json()["signals"],
+        },
+        where=where,
+        calibration=calibration,
+        removal=removal,
+        refuted={row.causes[0]: _why_not(row, plain) for row in rows if row.causes and row.refuted},
+        notes=tuple(notes),
+        rest={} if rest is None else rest.as_json(),
+        sensors=_sensors(trials, given),
+    )
+
+
+def _rank(one: Found, rows: Sequence[Row], chosen: Sequence[str]) -> float:
+    """What is chosen, in its order, before what is likelier to lead."""
+    if one.effect in chosen:
+        return float(len(chosen) - chosen.index(one.effect)) + 1.0
+    return next(row.probability * (0.0 if row.refuted else 1.0) for row in rows if row.causes == (one.effect,))
+
+
+def _why_not(row: Row, plain: Closure) -> str:
+    assert row.gain is not None
+    words = "closes no more" if row.gain <= row.error else f"closes {100 * row.gain:.0f} % more"
+    return f"on held-out data it {words} than a re-fit within tolerance, which closes {100 * plain.closed:.0f} %"
+
+
+def _found(trials: Trials, row: Row, best: Closure | None) -> Found:
+    """One cause, as it is in the improved model if that has it, else by itself."""
+    (name,) = row.causes
+    effect, protocol, assessment = catalogue()[name], trials.experiment.parts, trials.assessment
+    alone, at = trials.closures.get((name,)), assessment.place(name)
+    evidence = assessment.evidence
+    c, where = evidence.causes.index(name), np.array(at)
+    within = [] if best is None else [part.cause for part in best.refit.hypothesis]
+    of = best if name in within else alone
+    if of is None:
+        x, length = dict(trials.size(name)), float(evidence.deviations[0, c])
+        std = {q.name: 0.0 if q.shape else abs(assessment.template(name)[q.name]) * length for q in effect.quantities}
+    else:
+        k = [part.cause for part in of.refit.hypothesis].index(name)
+        x, std = dict(of.refit.x[k]), dict(of.std[k])
+
+    def stated(point: Mapping[str, float]) -> dict[str, float]:
+        return effect.stated(effect.values(dict(point), protocol.reference, where), protocol.reference, where)
+
+    centre, ends = stated(x), []
+    for q in effect.quantities:
+        for sign in (-INTERVAL, INTERVAL):
+            moved = x[q.name] + sign * std[q.name]
+            ends.append({**x, q.name: moved if q.signed else max(moved, 1e-6)})
+    with np.errstate(over="ignore"):  # of what no run says, an end may be infinite
+        known = [stated(end) for end in ends]
+    spans = {
+        key: Span(value, min(value, *(end.get(key, value) for end in known)), max(value, *(end.get(key, value) for end in known)))
+        for key, value in centre.items()
+    }  # fmt: skip
+    joints: tuple[str, ...] | str = tuple(protocol.joints[j] for j in at)
+    if effect.of_body:
+        joints = "body"
+    elif len(at) == len(protocol.joints) and Scope.ALL in effect.scopes:
+        joints = "all"
+    return Found(
+        name, joints, spans, assessment.present[name], None if alone is None else alone.closed,
+        None if alone is None else alone.low, None if alone is None else alone.high, effect.native, x,
+    )  # fmt: skip
+
+
+def _notes(trials: Trials, given: Given, decision: Decision) -> list[str]:
+    """What it rests on, and what more signals would add."""
+    protocol = trials.experiment.protocol
+    seen = {name for one in protocol.runs for name in one.seen}
+    notes = [
+        f"judged by {trials.assessment.robots} robots simulated for these recordings",
+        "held-out runs as given" if given.hold_out else "parts left out of the fits in turn",
+    ]
+    for signal, times in trials.assessment.set_aside.items():
+        notes.append(
+            f"the {COLUMNS.get(signal, signal)} column behaves like none that is known ({times:.1f} times the farthest healthy robot): "
+            "judged without it"
+        )
+    if decision.verdict in given.prior:
+        notes.append(f"{decision.verdict} was declared beforehand, which was taken to make it ten times as likely")
+    if not protocol.reference.floor:
+        notes.append("no run on the floor: body, contact and environment cannot show")
+    elif not protocol.reference.imu:
+        notes.append("no IMU: tilt, cable and payload are hard to tell apart")
+    if "torque" not in seen:
+        notes.append("no current or load: stiffness and torque scale are known only together")
+    if "volt" not in seen:
+        notes.append("no voltage: a sagging supply looks like weak motors")
+    return notes
+
+
+def _sensors(trials: Trials, given: Given) -> tuple[dict[str, Any], ...]:
+    """What was found of each signal of the log."""
+    protocol, assessment = trials.experiment.protocol, trials.assessment
+    out: list[dict[str, Any]] = []
+    acting = {name: assessment.template(name) for name, chance in assessment.present.items() if chance > FOUND}
+    for signal in sorted({name for one in protocol.runs for name in one.seen}):
+        used = signal not in assessment.set_aside
+        found: dict[str, Any] = {
+            "signal": COLUMNS.get(signal, signal), "joints": "all" if signal in ("pos", "vel", "torque", "volt") else "body",
+            "finding": "as_modelled" if used else "unknown_form", "used": used, "parameters": {},
+        }  # fmt: skip
+        for name, x in acting.items():
+            if used and catalogue()[name].of_sensors_at(x) and _shows(name, x, signal):
+                found |= {"finding": name}
+        late = velocity_delay(given.runs, protocol.joints) if signal == "vel" else None
+        if late is not None and late.beyond(HEALTHY_LATE_S) > FOUND:
+            ends = {"low": late.delay_s - INTERVAL * late.std_s, "high": late.delay_s + INTERVAL * late.std_s}
+            found |= {"finding": "sensor_delay", "parameters": {"vel.delay_s": {"value": late.delay_s, **ends}}}
+        if not any(one["signal"] == found["signal"] for one in out):
+            out.append(found)
+    return tuple(out)
+
+
+def _shows(name: str, x: Mapping[str, float], signal: str) -> bool:
+    """Whether a cause of sensors acts on a signal."""
+    effect = catalogue()[name]
+    on = (
+        {effect.signal}
+        if effect.signal is not None
+        else {q.name for q in effect.quantities if abs(x[q.name]) >= q.small}
+    )
+    return ("imu" if signal in ("gyro", "acc") else "base" if signal == "yaw" else signal) in on

@@ -1,0 +1,95 @@
+"""What hypotheses close of the gap on folds that their fits have not seen: causes by themselves, then beside each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from openant_tools.effects.catalogue import catalogue
+from openant_tools.gap.assess import Assessment
+from openant_tools.gap.closure import Closure, Refit, Windows, closures, nothing, unmoved
+from openant_tools.gap.decide import Row
+from openant_tools.gap.experiment import Experiment
+from openant_tools.gap.hypothesis import Part, bounds_of
+
+__all__ = ["Trials"]
+
+Causes = tuple[str, ...]
+
+
+@dataclass
+class Trials:
+    """Hypotheses that were fitted to a recording.
+
+    Attributes:
+        closures: causes → what they close; of none at all what a re-fit within tolerance does by itself.
+    """
+
+    experiment: Experiment
+    assessment: Assessment
+    windows: Windows
+    closures: dict[Causes, Closure] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, experiment: Experiment, assessment: Assessment) -> Trials:
+        return cls(experiment, assessment, Windows(experiment.parts))
+
+    def fit(self, sets: Sequence[Causes]) -> None:
+        """Fit sets of causes, each at its best place, on all parts but those of each fold."""
+        starts = [self._start(causes) for causes in sets]
+        done = closures(self.windows, starts, self.experiment.folds, self.experiment.training)
+        self.closures |= zip(sets, done, strict=True)
+
+    def row(self, causes: Causes, probability: float) -> Row:
+        """What is known of the last of some causes, beside the others."""
+        places = tuple(self.assessment.place(name) for name in causes)
+        one, other = self.closures.get(causes), self.closures.get(causes[:-1])
+        effect = catalogue()[causes[-1]]
+        # What joints' positions hardly show, or no simulation repeats, held-out positions do not tell.
+        if one is None or other is None or effect.random or effect.unseen_in_joints:
+            return Row(causes, places, probability)
+        gain, error = one.beyond(other)
+        # Who leads should close what nothing else does; who comes beside, as much as it closes where it was fitted.
+        expected = 1 - other.closed if len(causes) == 1 else one.fitted - other.fitted
+        return Row(causes, places, probability, gain, error, max(expected, 0.0))
+
+    def whole(self, causes: Causes, probability: float) -> Row:
+        """What is known of causes together, that which does more of it first."""
+        gain, error = self.closures[causes].beyond(self.closures[()])
+        first = max(causes, key=lambda name: self.closures[name,].closed if (name,) in self.closures else -np.inf)
+        ordered = (first, *(name for name in causes if name != first))
+        expected = max(0.0, 1 - self.closures[()].closed)
+        return Row(ordered, tuple(map(self.assessment.place, ordered)), probability, gain, error, expected)
+
+    def removal(self, causes: Causes) -> dict[str, float]:
+        """Of causes together, what closes less without each, the most first; of those that were tried without it."""
+        whole, out = self.closures[causes], {}
+        for name in causes:
+            rest = tuple(other for other in causes if other != name)
+            known = next((one for tried, one in self.closures.items() if set(tried) == set(rest)), None)
+            if known is not None:
+                out[name] = whole.closed - known.closed
+        return dict(sorted(out.items(), key=lambda item: -item[1]))
+
+    def size(self, name: str) -> Mapping[str, float]:
+        """How large a cause would be by its best template's amplitude: where fits start from."""
+        evidence = self.assessment.evidence
+        c = evidence.causes.index(name)
+        _, _, x = evidence.bank[int(evidence.places[0, c])]
+        amplitude, out = float(evidence.amplitudes[0, c]), {}
+        for q in catalogue()[name].quantities:
+            low, high = bounds_of(q)
+            out[q.name] = x[q.name] if q.shape else float(np.clip(amplitude * x[q.name], low, high))
+        return out
+
+    def _start(self, causes: Causes) -> Refit:
+        """From what is known: the same without its last cause, and that one as large as templates say."""
+        if not causes:
+            return nothing(self.windows)
+        parts = [Part(name, self.assessment.place(name)) for name in causes]
+        before = self.closures.get(causes[:-1]) if len(causes) > 1 else None
+        if before is None:
+            return unmoved(self.windows, parts, [self.size(name) for name in causes])
+        return Refit(tuple(parts), (*before.refit.x, self.size(causes[-1])), before.refit.nuisance)
