@@ -183,13 +183,15 @@ def _print(found: Diagnosis) -> None:
     from openant_tools.gap.words import rest_words, sentence, where_words
 
     click.echo(sentence(found))
-    click.echo("effect               where               present  closes  parameters")
-    for one in found.effects[:SHOWN]:
+    shown = found.effects[:SHOWN]
+    wide = max((len(where_words(one.joints)) for one in shown), default=0)
+    click.echo(f"{'effect':20} {'where':{wide}}  present  closes  parameters")
+    for one in shown:
         values = ", ".join(f"{name} {span}" for name, span in one.parameters.items())
         closed = "–" if one.gap_closed is None else f"{100 * one.gap_closed:.0f} %"
         mark = "*" if one.effect in found.selected else " "
         click.echo(
-            f"{mark}{one.effect:19}  {where_words(one.joints):18}  {100 * one.probability:5.0f} %  {closed:>6}  {values}"
+            f"{mark}{one.effect:19} {where_words(one.joints):{wide}}  {100 * one.probability:5.0f} %  {closed:>6}  {values}"
         )
     gap = found.gap
     click.echo(
