@@ -14,8 +14,10 @@ from openant_tools.calib.wires import journalled, opened_bus, robot_servos, wait
 from openant_tools.comms.bus import Bus, Found
 from openant_tools.comms.faults import NoAnswer
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servo, Servos
+from openant_tools.comms.setup import find_bus
 from openant_tools.comms.silence import diagnose
 from openant_tools.comms.state import Difference, differences_of_robot, passport_registers, read_state
+from openant_tools.comms.vendor_sdk import VendorSdk
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import (
@@ -32,10 +34,10 @@ from openant_tools.procedure.step import (
 )  # fmt: skip
 from openant_tools.robot.config import Motor, Provenance, RobotConfig
 from openant_tools.robot.joints import JOINTS
-from openant_tools.robot.registers import EEPROM_END
+from openant_tools.robot.registers import EEPROM_END, Register
 from openant_tools.robot.servo import baud_code, servo_model
 
-__all__ = ["FIRMWARE_BRINGS", "inventory", "silence_words"]
+__all__ = ["FIRMWARE_BRINGS", "inventory", "inventory_by_sdk", "silence_words"]
 
 COMMAND = "openant calib inventory"
 #: firmware → what it brought (ROBOTIS e-manual); older ones lack it.
@@ -47,6 +49,8 @@ FIRMWARE_BRINGS: Mapping[int, str] = {
 #: Return delays to try, in counts of 2 µs; the factory's is the last.
 DELAYS = (0, 1, 5, 10, 25, 50, 125, 250)
 SWEEP_READS = 120
+#: The vendor's SDK asks once and waits for milliseconds: a computer that is busy for longer is no silent servo.
+SDK_TRIES = 3
 FIX_ALL, FIX_ONE, ACCEPT = "fix all", "fix one by one", "accept"
 
 
@@ -130,6 +134,43 @@ def inventory(bench: Bench) -> Procedure:
         "" if ok else "mend what is listed and run it again",
         COMMAND,
         data={"eeprom": table, "registers": state, "accepted": [one.what for one in left], "volts": volts},
+        problems=tuple(problems),
+    )
+
+
+def inventory_by_sdk(bench: Bench) -> Procedure:
+    """What the vendor's own SDK finds in every servo: a second opinion, which writes nothing and keeps nothing."""
+    config = bench.folder.config()
+    problems, table = list[str](), dict[str, dict[str, int]]()
+    found: dict[str, Found] = {}
+    with VendorSdk(find_bus(bench.bus, config), config.bus.baud) as sdk:
+        for k, servo in enumerate(robot_servos(config)):
+            yield Progress(k / len(config.motors), f"the vendor's SDK asks {servo.joint}")
+            seen = sdk.ping(servo.id, SDK_TRIES)
+            if seen is None:
+                problems.append(f"{servo.joint} (id {servo.id}): the vendor's SDK gets no answer: {sdk.why(servo.id)}")
+                continue
+            found[servo.joint] = seen
+            if _wrong(found, config, servo.joint):
+                continue
+            for stretch in _stretches(servo, seen.firmware):
+                start = stretch[0].address
+                data = sdk.read(servo.id, start, stretch[-1].end - start, SDK_TRIES)
+                if data is None:
+                    problems.append(f"{servo.joint}: {stretch[0].name} and what follows: {sdk.why(servo.id)}")
+                else:
+                    table.setdefault(servo.joint, {}).update(_values(stretch, data))
+            if seen.alert:
+                problems.append(f"{servo.joint} reports a hardware error → `openant comms reboot --id {servo.id}`")
+    problems += _wrong_models(found, config)
+    return Finding(
+        "inventory",
+        not problems,
+        f"the vendor's SDK reads {len(table)} of {len(config.motors)} servos, {sum(map(len, table.values()))} items",
+        (),
+        "" if not problems else f"compare with `{COMMAND}`: what both miss is the bus or the servo, not the program",
+        f"{COMMAND} --driver sdk",
+        data={"driver": "sdk", "eeprom": table},
         problems=tuple(problems),
     )
 
@@ -249,20 +290,32 @@ def _name(number: int) -> str:
 
 
 def _read_eeprom(servos: Servos, servo: Servo, firmware: int) -> dict[str, int]:
-    """Every item below 64 that this firmware has, by one read for each stretch without a hole: holes refuse."""
+    """Every item below 64 that this firmware has."""
+    values: dict[str, int] = {}
+    for stretch in _stretches(servo, firmware):
+        start = stretch[0].address
+        values |= _values(stretch, servos.bus.read(servo.id, start, stretch[-1].end - start))
+    return values
+
+
+def _stretches(servo: Servo, firmware: int) -> list[list[Register]]:
+    """The EEPROM's items that this firmware has, in stretches without a hole, each for one read: holes refuse."""
     items = sorted(
         (r for r in servo.model.registers.values() if r.end <= EEPROM_END and r.min_firmware <= firmware),
         key=lambda register: register.address,
     )
-    values: dict[str, int] = {}
-    while items:
-        stretch = [items.pop(0)]
-        while items and items[0].address == stretch[-1].end:
-            stretch.append(items.pop(0))
-        start = stretch[0].address
-        data = servos.bus.read(servo.id, start, stretch[-1].end - start)
-        values |= {r.name: r.decode(data[r.address - start : r.end - start]) for r in stretch}
-    return values
+    stretches: list[list[Register]] = []
+    for item in items:
+        if stretches and stretches[-1][-1].end == item.address:
+            stretches[-1].append(item)
+        else:
+            stretches.append([item])
+    return stretches
+
+
+def _values(stretch: Sequence[Register], data: bytes) -> dict[str, int]:
+    start = stretch[0].address
+    return {r.name: r.decode(data[r.address - start : r.end - start]) for r in stretch}
 
 
 def _mend(servos: Servos, odd: Sequence[Difference]) -> Generator[Event, Answer, list[Difference]]:

@@ -11,7 +11,7 @@ import click
 
 from openant_tools.bringup.walk import WALK
 from openant_tools.cli.hardware import Moving, adapter_option, camera_option, imu_option
-from openant_tools.cli.options import joint_option, json_option, robot_option
+from openant_tools.cli.options import driver_option, joint_option, json_option, robot_option
 from openant_tools.cli.virtual_for_command import virtual_option
 from openant_tools.procedure.step import Bench, Procedure, Step
 
@@ -69,7 +69,7 @@ def _folder_of(robot: Path | None) -> RobotFolder:
 @contextlib.contextmanager
 def bench_of(
     robot: Path | None, port: str | None, imu: str | None, camera: str | None, virtual_source: str | None, yes: bool,
-    joints: tuple[str, ...] = (), *, sees: bool = False,
+    joints: tuple[str, ...] = (), *, sees: bool = False, clock: str | None = None,
 ) -> Iterator[tuple[Bench, Any]]:  # fmt: skip
     """The bench and the face that a step runs with; a virtual robot started for it, with a camera where the step `sees`,
     ends with the block. No other program moves the robot or writes into its folder meanwhile."""
@@ -83,7 +83,9 @@ def bench_of(
         if virtual_source is None:
             yield Bench(folder, port, imu, camera, None, joints), CommandFace(yes=yes)
             return
-        found = stack.enter_context(virtual_robot(virtual_source, clock=clock_of_its_own(virtual_source), camera=sees))
+        found = stack.enter_context(
+            virtual_robot(virtual_source, clock=clock or clock_of_its_own(virtual_source), camera=sees)
+        )
         control = str(found["control"])
         hands = VirtualHands(control)
         stack.callback(hands.close)
@@ -127,6 +129,7 @@ def _command(step: Step) -> click.Command:
         yes: bool,
         json_file: Path | None,
         joints: tuple[str, ...],
+        driver: str = "own",
     ) -> int:
         from openant_tools.errors import BadInput
         from openant_tools.robot.joints import JOINT_NAMES
@@ -134,11 +137,21 @@ def _command(step: Step) -> click.Command:
         for joint in joints:
             if joint not in JOINT_NAMES:
                 raise BadInput(f"there is no joint {joint!r}", remedy=f"the joints are {', '.join(JOINT_NAMES)}")
-        with bench_of(robot, port, imu, camera, virtual_source, yes, joints, sees=step.sees) as (bench, face):
-            finding = run_and_keep(step.start(bench), bench, face)
+        clock = "real" if driver == "sdk" else None  # the SDK waits by the machine's own clock
+        with bench_of(robot, port, imu, camera, virtual_source, yes, joints, sees=step.sees, clock=clock) as (
+            bench,
+            face,
+        ):
+            if driver == "sdk":
+                from openant_tools.calib.inventory import inventory_by_sdk
+                from openant_tools.procedure.step import drive
+
+                finding = drive(inventory_by_sdk(bench), face)
+            else:
+                finding = run_and_keep(step.start(bench), bench, face)
         return show_finding(finding, json_file)
 
-    return command
+    return driver_option(command) if step.name == "inventory" else command
 
 
 def _help(step: Step) -> str:

@@ -16,12 +16,13 @@ from openant_tools.cli.comms_diagnose import diagnose, timing
 from openant_tools.cli.comms_reboot import reboot
 from openant_tools.cli.comms_soak import soak
 from openant_tools.cli.hardware import engine_config, port_option, robot_of
-from openant_tools.cli.options import SECONDS, json_option, robot_option
+from openant_tools.cli.options import SECONDS, driver_option, json_option, robot_option
 from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_option, virtual_robot
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from openant_tools.comms.messages import EngineConfig
     from openant_tools.comms.scan import Scan
 
 __all__ = ["comms"]
@@ -80,13 +81,7 @@ def ports(json_file: Path | None) -> None:
 @click.option(
     "--id", "wanted", multiple=True, type=click.IntRange(0, 252), help="Ask for this id, too, and why it is silent."
 )
-@click.option(
-    "--driver",
-    type=click.Choice(("own", "sdk")),
-    default="own",
-    show_default=True,
-    help="Who asks: these tools, or the vendor's SDK (ten seconds; it does not say why somebody is silent).",
-)
+@driver_option
 @json_option
 def scan(
     paths: Sequence[str], virtual_source: str | None, bauds: Sequence[int], wanted: Sequence[int], driver: str,
@@ -233,11 +228,16 @@ def bench(
 @virtual_option
 @robot_option
 @click.option("--seconds", type=SECONDS, metavar="S", help="Stop after so long. Default: until Ctrl-C.")
+@driver_option
 @json_option
 def watch(
-    port: str | None, virtual_source: str | None, robot: Path | None, seconds: float | None, json_file: Path | None
-) -> None:
-    """Show the bus live: angles, supply, heat, and per servo what is lost and how long answers take. Torque is off."""
+    port: str | None, virtual_source: str | None, robot: Path | None, seconds: float | None, driver: str,
+    json_file: Path | None,
+) -> None:  # fmt: skip
+    """Show the bus live: angles, supply, heat, and per servo what is lost and how long answers take. Torque is off.
+
+    With --driver sdk the vendor's own code asks, five times a second: what it loses, too, these tools are not to blame for.
+    """
     from rich.console import Console
     from rich.live import Live
 
@@ -247,6 +247,12 @@ def watch(
     console = Console()
     statistics: dict[str, Any] = {}
     folder = robot_of(robot, needed=False)
+    if driver == "sdk":
+        with engine_config(folder, port, virtual_source, clock="real") as config:
+            statistics = _watch_by_sdk(config, seconds)
+        if json_file:
+            _write_json(json_file, statistics)
+        return
     with engine_config(folder, port, virtual_source, clock="real") as config, EngineProcess(config) as engine:
         end = None if seconds is None else time.monotonic() + seconds
         with contextlib.suppress(KeyboardInterrupt), Live(console=console, auto_refresh=False) as live:
@@ -258,6 +264,44 @@ def watch(
                     live.update(_table(engine.columns, rows[-1], statistics), refresh=True)
     if json_file:
         _write_json(json_file, statistics)
+
+
+def _watch_by_sdk(config: EngineConfig, seconds: float | None) -> dict[str, Any]:
+    """Ask with the vendor's SDK until the time is over or Ctrl-C; what it lost, by servo."""
+    from rich.live import Live
+    from rich.table import Table
+
+    from openant_tools.comms.servos import BLOCK, BLOCK_ADDRESS, BLOCK_SIZE, Block
+    from openant_tools.comms.vendor_sdk import VendorSdk
+
+    ids, cycles = [servo.id for servo in config.servos], 0
+    end = None if seconds is None else time.monotonic() + seconds
+    with (
+        VendorSdk(config.port, config.baud) as sdk,
+        Live(auto_refresh=False) as live,
+        contextlib.suppress(KeyboardInterrupt),
+    ):
+        while end is None or time.monotonic() < end:
+            found = sdk.sync_read(ids, BLOCK_ADDRESS, BLOCK_SIZE)
+            cycles += 1
+            table = Table(title=f"{cycles} cycles, asked by the vendor's SDK", box=None, padding=(0, 1, 0, 0))
+            for name in ("joint", "rad", "V", "°C", "lost", "in its words"):
+                table.add_column(name, justify="left" if name in ("joint", "in its words") else "right")
+            for servo in config.servos:
+                data, cells = found.get(servo.id), ("", "", "")
+                if data is not None:
+                    block = Block._make(BLOCK.unpack(data))
+                    angle = servo.to_joint(block.position * servo.model.registers["present_position"].scale)
+                    cells = f"{angle:.3f}", f"{block.voltage / 10:.1f}", f"{block.temperature}"
+                lost = sum(sdk.lost.get(servo.id, {}).values())
+                table.add_row(servo.joint, *cells, f"{lost}/{sdk.asked[servo.id]}", sdk.why(servo.id))
+            live.update(table, refresh=True)
+            time.sleep(0.2)
+    servos = [
+        {"joint": one.joint, "id": one.id, "asked": sdk.asked[one.id], "lost": dict(sdk.lost.get(one.id, {}))}
+        for one in config.servos
+    ]
+    return {"driver": "sdk", "cycles": cycles, "servos": servos}
 
 
 def _table(columns: Sequence[str], row: Sequence[float], statistics: Mapping[str, Any]) -> Table:

@@ -10,7 +10,7 @@ import logging.handlers
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import click
 
@@ -23,6 +23,17 @@ _LEVELS = {-1: logging.ERROR, 0: logging.WARNING, 1: logging.INFO, 2: logging.DE
 
 _stderr: logging.Handler | None = None
 _level = 0
+
+
+class _Stderr(logging.StreamHandler[TextIO]):
+    """Writes to whatever stands for stderr at that moment."""
+
+    def __init__(self) -> None:
+        logging.Handler.__init__(self)
+
+    @property
+    def stream(self) -> TextIO:  # type: ignore[override]
+        return sys.stderr
 
 
 def state_folder() -> Path:
@@ -39,7 +50,7 @@ def begin(argv: list[str]) -> None:
         root.removeHandler(handler)
         handler.close()
     _level = 0
-    _stderr = logging.StreamHandler(sys.stderr)
+    _stderr = _Stderr()
     _stderr.setFormatter(logging.Formatter("%(message)s"))
     _stderr.setLevel(_LEVELS[0])
     handlers: list[logging.Handler] = [_stderr]

@@ -11,7 +11,7 @@ import click
 from openant_tools.errors import BadInput
 
 __all__ = [
-    "MINUTES", "POSITIVE", "SECONDS", "Number", "joint_option", "json_option", "model_option", "out_option", "rate_option", "report_option", "robot_folder",
+    "MINUTES", "POSITIVE", "SECONDS", "Number", "driver_option", "joint_option", "json_option", "model_option", "out_option", "rate_option", "report_option", "robot_folder",
     "robot_option", "seconds_option", "tie_option",
 ]  # fmt: skip
 
@@ -90,6 +90,15 @@ tie_option = click.option(
     default="joint",
     show_default=True,
     help="One value a joint, one a servo model, or one for all.",
+)
+
+
+driver_option = click.option(
+    "--driver",
+    type=click.Choice(("own", "sdk")),
+    default="own",
+    show_default=True,
+    help="Who asks: these tools, or the vendor's SDK, as a second opinion; it writes nothing.",
 )
 
 

@@ -31,6 +31,9 @@ words from (`python -m openant_tools.comms.troubleshooting`); the examples speak
 
 `openant comms scan` asks who is there and, with `--id N`, why one is silent. `openant comms watch` shows losses live.
 `openant comms soak` and `openant comms diagnose` find out what loses answers now and then.
+
+In doubt about these tools? `openant comms scan --driver sdk`, `openant comms watch --driver sdk` and `openant calib inventory
+--driver sdk` ask with the vendor's own DynamixelSDK: where it meets the same silence, the bus or the servo is silent.
 """
 _SILENCE = """## A servo, or the whole bus, is silent
 
