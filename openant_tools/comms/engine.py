@@ -60,11 +60,13 @@ from openant_tools.comms.state import (
 from openant_tools.comms.thinning import Thinning
 from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
+from openant_tools.numbers import percent
 from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.recording.resume import continuation
 from openant_tools.recording.telemetry import Answer as RecordedAnswer
 from openant_tools.recording.telemetry import Cycle, ServoChannel
 from openant_tools.recording.writer import RecordingStopped, RecordingWriter
+from openant_tools.robot.registers import PWM_FULL
 
 if TYPE_CHECKING:
     from openant_tools.comms.body_camera import BodyCamera, CameraConfig
@@ -221,8 +223,8 @@ class Engine:
             self._ensure_position_mode()
             self._ensure_torque_waits()
         self._eeprom_writes = list(servos.journal)
-        for write in servos.journal:
-            self._notice(f"{write.joint} (id {write.id}): {write.register} changed from {write.old} to {write.new}")
+        for words in _changes(servos.journal):
+            self._notice(words)
         self._servos = self._on_this_turn()
         self._read_registers()
         for difference in self._differences:
@@ -1293,6 +1295,17 @@ def _refusal(number: int, command: messages.Command | None, error: OpenAntError)
     return messages.Reply(
         number, error=(error.what, error.where, error.remedy), cause=_cause_of(error) if ends else None
     )
+
+
+def _changes(writes: Sequence[EepromWrite]) -> Iterator[str]:
+    """What was written to the servos' memory, one line for all that got the same."""
+    alike: dict[tuple[str, int, int], list[EepromWrite]] = {}
+    for write in writes:
+        alike.setdefault((write.register, write.old, write.new), []).append(write)
+    for (register, old, new), found in alike.items():
+        who = f"{len(found)} servos" if len(found) > 1 else f"{found[0].joint} (id {found[0].id})"
+        power = f": at most {percent(new / PWM_FULL)} of full power" if register == "pwm_limit" else ""
+        yield f"{who}: {register} {old} → {new}{power}"
 
 
 def main() -> None:

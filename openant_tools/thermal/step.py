@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from openant_tools.calib.wires import engine_config
+from openant_tools.numbers import number
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.step import Ask, Bench, Intent, Live, Procedure, Progress, Say
 from openant_tools.recording.tables import read_run
@@ -25,6 +26,11 @@ RATE_HZ = 5.0
 COOLING_SHARE = 0.3
 
 
+def _minutes(minutes: float) -> str:
+    """A time in words, in seconds where it is short."""
+    return f"{number(minutes)} min" if minutes >= 2.0 else f"{number(60 * minutes, decimals=0)} s"
+
+
 def thermal_soak(bench: Bench) -> Procedure:
     """Hold the home pose on the stand, keep every temperature, and say what heat will do to this robot."""
     config = bench.folder.config()
@@ -37,7 +43,7 @@ def thermal_soak(bench: Bench) -> Procedure:
     minutes = float(minutes) if isinstance(minutes, int | float) else DEFAULT_MIN
     cooling = COOLING_SHARE * minutes
     yield Intent(
-        f"hold the home pose for {minutes:.0f} min, then let go and record {cooling:.0f} min of cooling", moves=True
+        f"hold the home pose for {_minutes(minutes)}, then let go and record {_minutes(cooling)} of cooling", moves=True
     )
     path = bench.folder.recordings / "soak.mcap"
     path.unlink(missing_ok=True)

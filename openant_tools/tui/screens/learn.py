@@ -56,7 +56,7 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
             with Horizontal(classes="line"):
                 yield Label("seed")
                 yield Input("0", type="integer", id="seed")
-                yield Label("of its chance; each has a run of its own", classes="after")
+                yield Label("what chance begins with; each has a run of its own", classes="after")
             yield Choices(
                 *(Option(f"Train {name} in simulation: {_WORDS[name]}", id=name) for name in AGENTS),
                 *(Option(f"Train {name} on the robot: it moves", id=f"{name}{ON_ROBOT}") for name in AGENTS),

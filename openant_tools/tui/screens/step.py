@@ -400,7 +400,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
         if self._run is None:
             return
         if isinstance(self._pending, Ask) and STOP in self._pending.choices:
-            self.reply(STOP, "stop key")
+            self.reply(STOP, "(done, by the stop key)")
         else:
             self.say(marked("fail", "STOP: torque off; the step ends"))
             self._run.end("stopped by hand")
