@@ -33,8 +33,8 @@ Array = NDArray[np.float64]
 
 #: s shown around the worst moment
 WINDOW_S = 3.0
-#: candidates and places on the first page
-CANDIDATES, PLACES = 6, 8
+#: candidates, runners-up and places on the first page
+CANDIDATES, RUNNERS_UP, PLACES = 6, 3, 8
 #: of the excess, below which a place is not worth a line
 LEAST_SHARE = 0.005
 
@@ -59,31 +59,34 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
         KeyFigure("floor", f"{1e3 * gap['floor']:.2f} mrad", "what no model could beat"),
         KeyFigure("closed", f"{100 * share:.0f} %", "of the excess, on held-out runs", "good" if share > 0.7 else ""),
     )
-    report.section("Where")
-    if found.where:
-        report.figure(
-            places(found),
-            "Share of the excess gap of the given model, largest first, and what the improved model leaves of it; on a walking "
-            "robot also by joint from above.",
-        )
-    report.section("Which")
-    report.figure(
-        candidates(found), "How likely each effect is present beyond tolerance, and what it closes by itself."
-    )
-    report.table(
-        ["effect", "where", "present", "closes alone", "parameters", "stands"],
-        [
-            [one.effect, where_words(one.joints), f"{100 * one.probability:.0f} %", _percent(one.gap_closed),
-             _parameters(one), standing(found, one)]
-            for one in found.effects[:CANDIDATES]
-        ],
-    )  # fmt: skip
-    report.section("How far")
     report.figure(
         worst(found, held_out or runs, model),
         f"Measured and simulated around the moment at which the given model is farthest off, re-initialised every "
         f"{HORIZON_S:g} s; of {'the held-out runs' if held_out else 'all runs'}.",
     )
+    if found.where:
+        report.figure(
+            places(found),
+            "Where the excess gap of the given model lies, largest first, and what the improved model leaves of it; on a walking "
+            "robot also by joint from above.",
+        )
+    runners_up = [one for one in found.effects if one.effect not in found.selected][:RUNNERS_UP]
+    if runners_up:
+        report.section("Why not something else").table(
+            ["effect", "where", "present", "closes alone", "why not"],
+            [
+                [one.effect, where_words(one.joints), f"{100 * one.probability:.0f} %", _percent(one.gap_closed), standing(found, one)]
+                for one in runners_up
+            ],
+        )  # fmt: skip
+    if found.sensors:
+        report.section("Sensors").table(
+            ["signal", "of", "finding", "had a part in the verdict"],
+            [
+                [one["signal"], where_words(_joints(one["joints"])), str(one["finding"]).replace("_", " "), "yes" if one["used"] else "no"]
+                for one in found.sensors
+            ],
+        )  # fmt: skip
     if found.rest and found.verdict != UNEXPLAINED:  # there the verdict says it
         report.text(rest_words(found))
     report.section("What next").text(what_next(found))
@@ -96,13 +99,16 @@ def _details(report: Report, found: Diagnosis) -> None:
     parts = [Table(["held out", "closure lost without it"], [[name, value] for name, value in found.removal.items()])]
     if found.removal:
         report.details("What each selected effect is worth", *parts)
+    report.figure(
+        candidates(found), "How likely each effect is present beyond tolerance, and what it closes by itself."
+    )
     report.details(
         "All effects considered",
         Table(
-            ["effect", "where", "present", "closes alone", "interval", "MuJoCo carries it"],
+            ["effect", "where", "present", "closes alone", "interval", "parameters", "MuJoCo carries it"],
             [
                 [one.effect, where_words(one.joints), f"{100 * one.probability:.1f} %", _percent(one.gap_closed),
-                 f"{_percent(one.gap_closed_low)} … {_percent(one.gap_closed_high)}", one.native]
+                 f"{_percent(one.gap_closed_low)} … {_percent(one.gap_closed_high)}", _parameters(one), one.native]
                 for one in found.effects
             ],
         ),
@@ -243,6 +249,10 @@ def worst(found: Diagnosis, runs: Sequence[Run], model: Path) -> MatplotlibFigur
     axes.set_title(f"{joints[j]}, {run.name}", loc="left", fontsize=10, fontweight="bold")
     plots.legend(axes)
     return figure
+
+
+def _joints(words: str | Sequence[str]) -> tuple[str, ...] | str:
+    return words if isinstance(words, str) else tuple(words)
 
 
 def _percent(value: float | None) -> str | None:

@@ -10,9 +10,6 @@ from openant_tools.model.gap import share_closed
 
 __all__ = ["closed", "rest_words", "sentence", "standing", "what_next", "where_words"]
 
-#: probability below which an effect is refuted rather than a runner-up
-REFUTED = 0.2
-
 
 def sentence(found: Diagnosis) -> str:
     """The verdict, with its confidence."""
@@ -71,11 +68,12 @@ def standing(found: Diagnosis, one: Found) -> str:
         return "selected" + (f"; without it {100 * lost:.0f} % less closes" if lost is not None else "")
     if any(one.effect in group for group in found.ambiguous_with):
         return "these runs cannot tell"
-    if one.probability < REFUTED:
-        return "unlike what simulated robots with it show"
-    if one.gap_closed is not None and one.gap_closed < 0.1:
-        return "closes nothing by itself on held-out runs"
-    return "not needed beside what was selected"
+    leads = next((other for other in found.effects if other.effect == found.verdict), None)
+    if one.gap_closed is not None and leads is not None and leads.gap_closed is not None:
+        return f"by itself it closes {100 * one.gap_closed:.0f} %, {leads.effect} {100 * leads.gap_closed:.0f} %"
+    if one.gap_closed is not None:
+        return f"by itself it closes {100 * one.gap_closed:.0f} %, which is not enough"
+    return f"the recording looks as with it in {100 * one.probability:.0f} of 100 cases"
 
 
 def _closest(found: Diagnosis) -> Found | None:
