@@ -1,10 +1,11 @@
 """Teach how evidence weighs on shards, and say how well it does on experiments that it has not seen.
 
-    python -m benchmarks.gap_training.train FOLDER [--out openant_tools/gap]
+    python -m benchmarks.gap_training.train FOLDER… [--out openant_tools/gap] [--rows tests/gap/rows.npz]
 
 Every experiment is described with the sensors that its log had, with fewer, and by some of its runs alone. Then once more for some causes as if no
 catalogue had them: that is what an outsider looks like. First the classifier learns; then, on judgements of experiments that it had
-not seen, the weights of the posterior. Figures are of folds over experiments.
+not seen, the weights of the posterior. Figures are of folds over experiments. With --rows the last experiments that have a current
+(KEPT_OUT of them) teach nothing: rows of their robots, with that column and without, are kept for a test that it never hurts.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ TREES, LEAVES, RATE = 300, 24, 0.06
 LEFT_OUT, LOOKED_FOR = 6, 0.25
 #: descriptions of an experiment of several runs by some of them
 SHORTER = 2
+#: experiments of which rows are kept for a test, and which teach nothing; robots of each
+KEPT_OUT, HEALTHY_KEPT, ILL_KEPT = 3, 10, 20
 #: weights this large cost as much as one robot's surprise
 FAR = 3.0
 
@@ -94,6 +97,21 @@ def _strength(case: Case) -> float:
     ((name, (_at, x)),) = case.causes.items()
     sizes = [q for q in catalogue()[name].quantities if not q.shape]
     return max(float(np.log(max(abs(x[q.name]) / q.small, 1e-6)) / np.log(q.large / q.small)) for q in sizes)
+
+
+def with_and_without(shard: Shard, signal: str) -> dict[str, NDArray[np.generic]]:
+    """Rows of an experiment's robots, with a signal and without it."""
+    less = shard.known & (shard.layouts.signal != signal)
+    both = [shard.evidence(known) for known in (shard.known, less)]
+    (causes,) = {found.causes for found in both}
+    count = np.array([len(case.causes) for case in shard.learned])
+    some = np.sort(np.concatenate([np.flatnonzero(count == 0)[:HEALTHY_KEPT], np.flatnonzero(count > 0)[:ILL_KEPT]]))
+    return {
+        "with": both[0].rows[some].astype(np.float16),
+        "without": both[1].rows[some].astype(np.float16),
+        "true": np.array([[cause in case.causes for cause in causes] for case in shard.learned])[some],
+        "count": count[some],
+    }
 
 
 def taught(parts: Sequence[Described], trees: int = TREES) -> Classifier:
@@ -191,13 +209,24 @@ def figures(parts: Sequence[Described], odds: Sequence[Floats], weights: dict[st
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, nargs="+")
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--rows", type=Path)
     parser.add_argument("--folds", type=int, default=3)
     parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
-    seeds = sorted(int(path.stem) for path in options.folder.glob("*.npz"))
-    every = joblib.Parallel(n_jobs=options.jobs)(joblib.delayed(described)(options.folder, seed) for seed in seeds)
+    seeds = [(folder, int(path.stem)) for folder in options.folder for path in sorted(folder.glob("*.npz"))]
+    if options.rows:
+        rows: dict[str, NDArray[np.generic]] = {}
+        for folder, seed in reversed(seeds.copy()):
+            shard = read_shard(folder, seed)
+            if len(shard.reference.torque) == 8 and (shard.known & (shard.layouts.signal == "torque")).any():
+                seeds.remove((folder, seed))
+                rows |= {f"{seed} {name}": values for name, values in with_and_without(shard, "torque").items()}
+            if len(rows) == 4 * KEPT_OUT:
+                break
+        write_arrays(options.rows, rows)
+    every = joblib.Parallel(n_jobs=options.jobs)(joblib.delayed(described)(folder, seed) for folder, seed in seeds)
     print(
         f"{len(every)} experiments, {sum(len(part.true) for parts in every for part in parts[:1])} robots", flush=True
     )

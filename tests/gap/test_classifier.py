@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import binomtest
 from sklearn.ensemble import HistGradientBoostingClassifier
 
 from openant_tools.arrays import read_arrays, write_arrays
@@ -67,3 +68,25 @@ def test_what_comes_with_the_package_is_whole_and_small() -> None:
     assert set(weights()) == set(WEIGHTS)
     size = sum((ROOT / "openant_tools" / "gap" / name).stat().st_size for name in ("classifier.npz", "posterior.json"))
     assert size < 10e6
+
+
+def test_a_current_that_is_logged_hurts_nothing() -> None:
+    """On robots of experiments that taught nothing: fewer right names or more false alarms with that column are chance."""
+    kept, worse, better, alarms, quiet, robots = read_arrays(Path(__file__).parent / "rows.npz"), 0, 0, 0, 0, 0
+    for seed in sorted({name.split()[0] for name in kept}):
+        true, count = kept[f"{seed} true"].astype(bool), kept[f"{seed} count"]
+        right, alarm = [], []
+        for which in ("with", "without"):
+            rows = kept[f"{seed} {which}"].astype(np.float32)
+            p = log_posterior(features_of(rows, classifier()(rows)), weights())
+            right.append(np.take_along_axis(true, p[:, 2:].argmax(axis=1)[:, None], axis=1)[:, 0] & (count > 0))
+            alarm.append((p.argmax(axis=1) != NONE) & (count == 0))
+        worse += int((right[1] & ~right[0]).sum())
+        better += int((right[0] & ~right[1]).sum())
+        alarms += int((alarm[0] & ~alarm[1]).sum())
+        quiet += int((alarm[1] & ~alarm[0]).sum())
+        robots += len(true)
+    assert robots >= 60
+    # Of pairs that differ, as many may be worse as a fair coin gives (one-sided, 5 %).
+    assert worse + better == 0 or binomtest(worse, worse + better, alternative="greater").pvalue > 0.05
+    assert alarms + quiet == 0 or binomtest(alarms, alarms + quiet, alternative="greater").pvalue > 0.05
