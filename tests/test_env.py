@@ -443,7 +443,7 @@ def test_without_opengl_only_the_picture_fails_and_says_why(monkeypatch):
     monkeypatch.setattr(rendering, "_backends", lambda: ["no_such_backend"])
     env = make(render_mode="rgb_array")
     env.reset(seed=0)
-    with pytest.raises(NoOpenGL, match=r"no picture .* there is no OpenGL here .*no_such_backend.* → install"):
+    with pytest.raises(NoOpenGL, match=r"no picture .* there is no OpenGL here .*no_such_backend.* → pip install"):
         env.render()
     env.step(np.zeros(8))
     env.close()

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from rich.text import Text
 from textual.pilot import Pilot
+from textual.widgets import Input
 
 from openant_tools.calib.wires import engine_config
 from openant_tools.comms import messages
@@ -226,6 +227,8 @@ def test_every_screen_looks_as_it_did(
             app.session.selected = "knee_fl"
             frozen(app, run, 10.0)
             await pilot.pause(2 * REST_S)
+        for one in app.screen.query(Input):
+            one.cursor_blink = False  # a picture shows the cursor, whenever it is taken
         await pilot.pause()
 
     assert snap_compare(app, terminal_size=size, run_before=before)
