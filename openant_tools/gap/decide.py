@@ -9,6 +9,7 @@ the evidence said; where what it should gain lies below the noise the ratio is o
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -87,7 +88,8 @@ class Row:
         ends = np.array([-share, 1 - share]) / noise
         below, between = norm.cdf(ends), norm.pdf(ends)
         falling = 2 / self.expected * ((1 - share) * (below[1] - below[0]) - noise * (between[0] - between[1]))
-        return float(math.log((1 - nothing) * falling + nothing * norm.pdf(self._within, 0.0, self._noise)))
+        likely = (1 - nothing) * falling + nothing * norm.pdf(self._within, 0.0, self._noise)
+        return math.log(max(float(likely), sys.float_info.min))
 
     @property
     def _within(self) -> float:

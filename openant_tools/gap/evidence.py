@@ -306,8 +306,9 @@ def anomalies(scale: Scale, healthy: Floats, features: Floats) -> dict[str, floa
     out = {}
     for signal in SIGNALS:
         size = np.linalg.norm(z[:, means.signal == signal], axis=1)
-        if (means.signal == signal).any():
-            out[signal] = float(size[-1] / np.quantile(size[:-1], QUANTILE))
+        usual = float(np.quantile(size[:-1], QUANTILE))
+        if usual > 0:  # what no robot differs in says nothing
+            out[signal] = float(size[-1]) / usual
     return out
 
 
@@ -328,8 +329,8 @@ def unknown_signals(scale: Scale, healthy: Floats, features: Floats) -> dict[str
         beyond = 0.0
         for floor in (False, True):
             mine = (means.signal == signal) & (means.floor == floor)
-            if mine.any():
-                usual = float(np.linalg.norm(z[:-1, mine], axis=1).max())
+            usual = float(np.linalg.norm(z[:-1, mine], axis=1).max())
+            if usual > 0:
                 beyond = max(beyond, float(np.linalg.norm(left[mine])) / usual)
         if beyond > OUTSIDE_HEALTHY:
             out[signal] = beyond

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.assess import layouts_of
 from openant_tools.gap.ensemble import robots_at, templates_at, templates_of
-from openant_tools.gap.evidence import COLUMN_NAMES, Layouts, RunLayout, Scale, evidence_of
+from openant_tools.gap.evidence import COLUMN_NAMES, Layouts, RunLayout, Scale, anomalies, evidence_of, unknown_signals
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.population import Case, draw
 from openant_tools.gap.protocol import Protocol
@@ -98,6 +98,20 @@ def test_each_cause_is_among_the_first_by_what_it_would_do_to_this_very_recordin
         assert np.median(best[:, COLUMN_NAMES.index("gain")]) > np.median(
             others.rows[:, others.causes.index(cause), COLUMN_NAMES.index("gain")]
         ), "what is fitted to some folds foretells the others"
+
+
+def test_a_signal_in_which_no_robot_differs_says_nothing(pendulum: Protocol) -> None:
+    """A supply that never sags, in whatever log it is."""
+    rng = np.random.default_rng(0)
+    layouts, bank = layouts_of(pendulum), templates_of(pendulum)[:8]
+    still = layouts.signal == "volt"
+    healthy, templates = (rng.normal(size=(n, len(still))).astype(np.float32) * ~still for n in (40, len(bank)))
+    known = np.ones(len(still), bool)
+    scale = Scale.of(layouts, known, healthy[:30], templates, bank, pendulum.reference)
+    assert "volt" not in unknown_signals(scale, healthy[30:], healthy[0])
+    found = anomalies(scale, healthy[30:], healthy[0])
+    assert "volt" not in found
+    assert np.isfinite(list(found.values())).all()
 
 
 def test_on_a_stand_legs_that_do_not_move_each_other_are_simulated_side_by_side(tmp_path: Path) -> None:
