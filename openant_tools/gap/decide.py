@@ -29,7 +29,7 @@ CHANCE = 0.02
 #: logarithm of the most that held-out data may speak for a cause: they cannot tell it from others that close as much
 MOST = 3.0
 #: what it costs to give a wrong name, to give none where there is one, to leave open what is known, and to name it as one of two
-WRONG, MISSED, OPEN, EITHER = 1.0, 0.7, 0.35, 0.2
+WRONG, MISSED, OPEN, EITHER = 1.0, 0.7, 0.7, 0.2
 #: probability from which a further cause goes into the improved model
 PRESENT = 0.5
 
