@@ -26,6 +26,7 @@ from openant_tools.gap.population import Case
 from openant_tools.gap.posterior import NONE, OUTSIDE, features_of, log_posterior
 from openant_tools.gap.protocol import Protocol
 from openant_tools.gap.templates import Template
+from openant_tools.workers import tied
 
 __all__ = ["Assessment", "assess", "layouts_of"]
 
@@ -139,10 +140,12 @@ def _simulated(
         except (BadInput, OSError, KeyError):
             pass  # cut or another's: it is made anew
     step = -(-len(bank) // 4)
-    work = [joblib.delayed(templates_at)(protocol, bank[n : n + step]) for n in range(0, len(bank), step)]
+    work = [joblib.delayed(tied(templates_at))(protocol, bank[n : n + step]) for n in range(0, len(bank), step)]
     parts = len(work)
     healthy = [Case({}, seed) for seed in range(MEASURE + OTHERS)]
-    work += [joblib.delayed(robots_at)(protocol, healthy[n : n + BATCH], n) for n in range(0, len(healthy), BATCH)]
+    work += [
+        joblib.delayed(tied(robots_at))(protocol, healthy[n : n + BATCH], n) for n in range(0, len(healthy), BATCH)
+    ]
     found = []
     for done in joblib.Parallel(n_jobs=jobs, return_as="generator")(work):
         found.append(np.concatenate(done, axis=1))

@@ -24,7 +24,7 @@ from openant_tools.effects.step import Law, Step
 from openant_tools.gap.initial_state import heats, setpoints
 from openant_tools.gap.laws import Fields, Transmission, back_emf, first_laws, last_laws
 from openant_tools.model.body import torso_body
-from openant_tools.model.plant import Plant, Setup
+from openant_tools.model.plant import Plant, Setup, without_words
 from openant_tools.model.rollout import VELOCITY_SPAN_S, Rollouts, Segment
 
 __all__ = ["BASE", "Log", "simulate"]
@@ -81,6 +81,7 @@ def simulate(
         warm_c: of each run (joints,) °C, by which servos are known to be warmer than in the coolest one; default none.
         misread: simulations that begin anew begin where noisy sensors say, as those of a real log do.
     """
+    without_words()
     plant, rows = rollouts.plant, rollouts.rows[-1].stop
     floor = plant.setup is Setup.FLOOR and plant.free_joint is not None
     names = [name for name in ("pos", "vel", "torque", "volt") if signals is None or name in signals]

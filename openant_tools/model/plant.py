@@ -26,7 +26,17 @@ from openant_tools.model.attribute import Stated, set_stated
 from openant_tools.model.stripped import strip_colliding, strip_visual
 from openant_tools.robot.model_file import check_model_file
 
-__all__ = ["Plant", "Setup", "is_filtered", "is_motor", "load_plant", "position_servos", "setup_of", "world_bodies"]
+__all__ = [
+    "Plant",
+    "Setup",
+    "is_filtered",
+    "is_motor",
+    "load_plant",
+    "position_servos",
+    "setup_of",
+    "without_words",
+    "world_bodies",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -123,6 +133,15 @@ class Plant:
         return limp
 
 
+def without_words() -> None:
+    """Let MuJoCo say nothing on the terminal, and write no file where this process happens to run.
+
+    That a simulation falls apart is said by who asked for it. Each process has to be told by itself, also one that was handed a plant.
+    """
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(_log.debug)
+
+
 def load_plant(
     path: Path | str,
     joints: Sequence[str] | None = None,
@@ -154,9 +173,7 @@ def load_plant(
             `joints`.
     """
     path = Path(path)
-    if mujoco.get_mju_user_warning() is None:
-        # That a simulation falls apart is said by who asked for it; MuJoCo says it on the terminal, and in a file where it runs.
-        mujoco.set_mju_user_warning(_log.debug)
+    without_words()
     # What cannot be compiled without its looks may compile with them, or MuJoCo says what is wrong with the file itself.
     whole = partial(
         load_plant, path, joints, setup,

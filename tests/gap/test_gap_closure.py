@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from pathlib import Path
 from typing import Any
 
+import joblib
 import mujoco
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.closure import Refit, Windows, calibration_of, closures, heat_loss_of, nothing
 from openant_tools.gap.hypothesis import Part
-from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.protocol import Played, Protocol
 from openant_tools.gap.simulation import Log, simulate
 from openant_tools.model.plant import load_plant
 from openant_tools.model.rollout import Rollouts
@@ -122,17 +124,28 @@ def test_a_simulation_that_falls_apart_is_wrong_and_not_unknown(
     assert np.nanmin(np.abs(wrong[len(T) // 2 :])) == pytest.approx(closure.LOST_RAD)
 
 
-def test_what_falls_apart_leaves_no_word_of_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """MuJoCo would write MUJOCO_LOG.TXT wherever a builder happens to be."""
-    monkeypatch.chdir(tmp_path)
-    one = protocol(tmp_path, kp=8.0, dry=0.03).runs[0]
+def falls_apart(folder: Path, one: Played) -> float:
+    """rad, by which a servo that no step can hold ends beside a sound one, simulated in a folder."""
+    os.chdir(folder)
     wild = Robot(1)
     wild.factor("armature")[:] = 1e-12
     wild.factor("stiffness")[:] = 1e15
     wild.factor("torque_limit")[:] = 1e15
     sound, found = simulate(Rollouts(one.plant, [one.run]), [Robot(1), wild], signals=["pos"]).signals["pos"]
-    assert np.abs(found - sound).max() > 0.1  # MuJoCo begins such a one anew, again and again
+    return float(np.abs(found - sound).max())
+
+
+@pytest.mark.parametrize("elsewhere", [False, True], ids=["here", "in another process"])
+def test_what_falls_apart_leaves_no_word_of_it(
+    elsewhere: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """MuJoCo would write MUJOCO_LOG.TXT wherever a builder happens to be."""
+    monkeypatch.chdir(tmp_path)
+    one = protocol(tmp_path, kp=8.0, dry=0.03).runs[0]
+    if elsewhere:
+        (apart,) = joblib.Parallel(n_jobs=2)([joblib.delayed(falls_apart)(tmp_path, one)])
+    else:
+        apart = falls_apart(tmp_path, one)
+    assert apart > 0.1  # MuJoCo begins such a one anew, again and again
     assert not list(tmp_path.glob("MUJOCO*"))
     assert "WARNING" not in "".join(capfd.readouterr())
