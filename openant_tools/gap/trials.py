@@ -51,8 +51,8 @@ class Trials:
         if one is None or other is None or effect.random or effect.unseen_in_joints:
             return Row(causes, places, probability)
         gain, error = one.beyond(other)
-        # Who leads should close what nothing else does; who comes beside, as much as it closes where it was fitted.
-        expected = 1 - other.closed if len(causes) == 1 else one.fitted - other.fitted
+        # Who leads should close as much as anything that was fitted did there; who comes beside, as much as it did itself.
+        expected = self._most() if len(causes) == 1 else one.fitted - other.fitted
         return Row(causes, places, probability, gain, error, max(expected, 0.0))
 
     def whole(self, causes: Causes, probability: float) -> Row:
@@ -60,8 +60,11 @@ class Trials:
         gain, error = self.closures[causes].beyond(self.closures[()])
         first = max(causes, key=lambda name: self.closures[name,].closed if (name,) in self.closures else -np.inf)
         ordered = (first, *(name for name in causes if name != first))
-        expected = max(0.0, 1 - self.closures[()].closed)
-        return Row(ordered, tuple(map(self.assessment.place, ordered)), probability, gain, error, expected)
+        return Row(ordered, tuple(map(self.assessment.place, ordered)), probability, gain, error, self._most())
+
+    def _most(self) -> float:
+        """The most that anything closed where it was fitted, beyond a re-fit within tolerance."""
+        return max(one.fitted for one in self.closures.values()) - self.closures[()].fitted
 
     def removal(self, causes: Causes) -> dict[str, float]:
         """Of causes together, what closes less without each, the most first; of those that were tried without it."""
