@@ -35,13 +35,13 @@ def cache_folder() -> Path:
     return folder
 
 
-def keep_small(kept: Path) -> None:
+def keep_small(newest: Path) -> None:
     """Drop what was used longest ago until the cache is within its bound."""
     places = sorted((one for one in cache_folder().iterdir() if one.is_file()), key=lambda one: one.stat().st_mtime)
     total = {place: place.stat().st_size for place in places}
     for place in places:
         if sum(total.values()) <= LARGEST_BYTES:
             return
-        if place != kept:
+        if place != newest:
             place.unlink(missing_ok=True)
             del total[place]

@@ -29,7 +29,7 @@ from openant_tools.model.plant import Setup
 from openant_tools.model.rollout import Rollouts
 
 __all__ = [
-    "BODY", "Closure", "Refit", "Windows", "adjust", "calibration_of", "closures", "heat_loss_of", "nothing", "unmoved",
+    "BODY", "TWO_SIDED_95", "Closure", "Refit", "Windows", "adjust", "calibration_of", "closures", "heat_loss_of", "nothing", "unmoved",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]

@@ -73,22 +73,23 @@ class Row:
         return self.ratio < -MOST
 
     @property
-    def _noise(self) -> float:
+    def noise(self) -> float:
+        """Deviation of the gain by chance."""
         return math.hypot(self.error, CHANCE)
 
     @property
     def _true(self) -> float:
         assert self.gain is not None
-        mean, deviation = GAINS * self.expected, math.hypot(self._noise, SPREAD * self.expected)
+        mean, deviation = GAINS * self.expected, math.hypot(self.noise, SPREAD * self.expected)
         return float(norm.logpdf(min(self.gain, self.expected), mean, deviation))
 
     def _else(self, nothing: float) -> float:
         """Of another cause's being true, or of none: it gains nothing, or a share, the larger the seldomer (a falling line)."""
-        share, noise = self._within / self.expected, self._noise / self.expected
+        share, noise = self._within / self.expected, self.noise / self.expected
         ends = np.array([-share, 1 - share]) / noise
         below, between = norm.cdf(ends), norm.pdf(ends)
         falling = 2 / self.expected * ((1 - share) * (below[1] - below[0]) - noise * (between[0] - between[1]))
-        likely = (1 - nothing) * falling + nothing * norm.pdf(self._within, 0.0, self._noise)
+        likely = (1 - nothing) * falling + nothing * norm.pdf(self._within, 0.0, self.noise)
         return math.log(max(float(likely), sys.float_info.min))
 
     @property
@@ -122,14 +123,21 @@ def decide(rows: Sequence[Row], outside: float) -> Decision:
     none = next(row for row in rows if not row.causes)
     causes = [row for row in rows if row.causes]
     # Gains of causes go together: only the best of them says whether there was anything to gain.
-    best = max((row for row in causes if row.told), key=lambda row: (row.gain or 0.0) / row.error, default=none)
+    best = max((row for row in causes if row.told), key=lambda row: (row.gain or 0.0) / row.noise, default=none)
     weighed = [(row, row.probability * math.exp(row.ratio)) for row in causes]
     # What held-out data refute was evidence of something: that it is none of what is known.
     lost = math.fsum(max(0.0, row.probability - weight) for row, weight in weighed if row.refuted)
     weight_none, weight_outside = none.probability * math.exp(best.ratio_of_none), outside + lost
     whole = math.fsum([weight_none, weight_outside, *(weight for _, weight in weighed)])
     p_none, p_outside = weight_none / whole, weight_outside / whole
-    named = sorted(((row, weight / whole) for row, weight in weighed), key=lambda one: -one[1])
+    # A cause by itself and the same with another beside it are one name.
+    of_name: dict[str, list[tuple[Row, float]]] = {}
+    for row, weight in weighed:
+        of_name.setdefault(row.causes[0], []).append((row, weight / whole))
+    named = sorted(
+        ((max(same, key=lambda one: one[1])[0], math.fsum(p for _, p in same)) for same in of_name.values()),
+        key=lambda one: -one[1],
+    )
     costs = {NONE: MISSED * (1 - p_none), UNEXPLAINED: OPEN * (1 - p_outside - p_none) + WRONG * p_none}
     if named:
         costs[named[0][0].causes[0]] = WRONG * (1 - named[0][1])

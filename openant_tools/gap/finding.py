@@ -11,7 +11,7 @@ import numpy as np
 
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.effect import Scope
-from openant_tools.gap.closure import Closure, calibration_of, heat_loss_of
+from openant_tools.gap.closure import TWO_SIDED_95, Closure, calibration_of, heat_loss_of
 from openant_tools.gap.decide import Decision, Row
 from openant_tools.gap.diagnosis import Diagnosis, Found, Span
 from openant_tools.gap.measure import measure
@@ -27,8 +27,6 @@ __all__ = ["Given", "finding"]
 COLUMNS: Mapping[str, str] = {"torque": "cur", "yaw": "base"}
 #: probability from which a cause of sensors is found
 FOUND = 0.5
-#: standard deviations of an interval of 95 %
-INTERVAL = 1.96
 #: s by which a healthy servo's filter makes its velocities late
 HEALTHY_LATE_S = 0.012
 
@@ -46,7 +44,8 @@ class Given:
 def finding(
     trials: Trials, given: Given, rows: Sequence[Row], decision: Decision, chosen: tuple[str, ...]
 ) -> Diagnosis:
-    """
+    """The diagnosis that is handed on.
+
     Args:
         rows: the causes by themselves. chosen: causes that go into the improved model, the one that leads first.
     """
@@ -78,7 +77,7 @@ def finding(
         effects=tuple(effects),
         selected=chosen,
         ambiguous_with=decision.alike,
-        next_experiment=suggestion(decision.verdict, decision.alike, len(experiment.folds)),
+        next_experiment=suggestion(decision.verdict, decision.alike, len(given.runs) + len(given.hold_out)),
         gap={
             "before": plain.before,
             "after": plain.before if best is None or not chosen else best.after,
@@ -129,7 +128,7 @@ def _found(trials: Trials, row: Row, best: Closure | None) -> Found:
 
     centre, ends = stated(x), []
     for q in effect.quantities:
-        for sign in (-INTERVAL, INTERVAL):
+        for sign in (-TWO_SIDED_95, TWO_SIDED_95):
             moved = x[q.name] + sign * std[q.name]
             ends.append({**x, q.name: moved if q.signed else max(moved, 1e-6)})
     with np.errstate(over="ignore"):  # of what no run says, an end may be infinite
@@ -191,7 +190,7 @@ def _sensors(trials: Trials, given: Given) -> tuple[dict[str, Any], ...]:
                 found |= {"finding": name}
         late = velocity_delay(given.runs, protocol.joints) if signal == "vel" else None
         if late is not None and late.beyond(HEALTHY_LATE_S) > FOUND:
-            ends = {"low": late.delay_s - INTERVAL * late.std_s, "high": late.delay_s + INTERVAL * late.std_s}
+            ends = {"low": late.delay_s - TWO_SIDED_95 * late.std_s, "high": late.delay_s + TWO_SIDED_95 * late.std_s}
             found |= {"finding": "sensor_delay", "parameters": {"vel.delay_s": {"value": late.delay_s, **ends}}}
         if not any(one["signal"] == found["signal"] for one in out):
             out.append(found)

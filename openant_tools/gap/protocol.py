@@ -41,16 +41,10 @@ __all__ = ["Played", "Players", "Protocol", "alike", "rollouts_of"]
 
 Array = NDArray[np.float64]
 
-#: s: the grid on which commands are compared, so that jitter of time stamps does not make another protocol
+#: s: the grid on which commands are compared, so that jitter of time stamps does not make another motion
 GRID_S = 0.02
-#: rad: commands that differ by less on the whole are the same
-SAME_RAD = 0.01
 #: correlation from which commands are those of one kind of motion
 ALIKE = 0.95
-#: s at a run's beginning in which its positions say where it rests, and rad by which robots at rest differ at most
-BEGIN_S, ELSEWHERE_RAD = 0.1, 0.05
-#: s in which a model comes to rest under its first commands, and between the rows of what it does meanwhile
-REST_S, REST_ROW_S = 2.0, 0.02
 #: share of the time in which commands are slower than what they often ask for, and the least of the fastest that this is
 OFTEN, LEAST_OF_MOST = 0.9, 0.2
 #: smaller changes of a supply's share are rounding of numbers

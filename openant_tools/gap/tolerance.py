@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.robot import USUAL_NOISE, Form, Reference, Robot
 
-__all__ = ["FACTORS", "FLOOR", "random_form", "resting", "scatter", "tolerance_of", "torso_kg"]
+__all__ = ["FACTORS", "FLOOR", "random_form", "scatter", "tolerance_of", "torso_kg"]
 
 Array = NDArray[np.float64]
 
@@ -53,10 +53,6 @@ ACC_LATE_S = 0.010
 VOLT_BETWEEN = 0.5
 #: logarithms of factors on what a contact is like beside its softness
 CONTACT_DAMPING, CONTACT_FORM = (-0.4, 0.15), (-0.9, 0.6)
-#: rad: no joint rests farther off than this
-FARTHEST_REST_RAD = 0.03
-#: share of a joint's usual torque with which a foot that stands may hold its leg twisted
-GRIP = 0.3
 #: logarithms between which a sensor's noise lies, as a factor on the usual: nobody says how good a sensor is
 NOISE = (-1.8, 0.5)
 
@@ -137,17 +133,3 @@ def random_form(rng: np.random.Generator, encoder_rad: float) -> Form:
         one_packet=bool(rng.random() < 0.6),
         never_early=bool(rng.random() < 0.4),
     )  # fmt: skip
-
-
-def resting(robot: Robot, reference: Reference, rng: np.random.Generator, *, standing: bool) -> Array:
-    """(joints,) rad: how far from where it is asked to be each joint may have come to rest, held by dry friction.
-
-    Args:
-        standing: feet on a floor hold legs as they came down, too; most do little.
-    """
-    held = np.maximum(reference.friction + robot.add.get("coulomb_friction", 0.0), 0.0)
-    if standing:
-        held = held + GRIP * reference.torque * rng.uniform(0, 1) ** 3
-    share = rng.uniform(0, 1)
-    out: Array = share * rng.uniform(-1, 1, robot.joints) * np.minimum(held / reference.stiffness, FARTHEST_REST_RAD)
-    return out

@@ -17,7 +17,7 @@ from openant_tools.effects.robot import Reference
 from openant_tools.gap.features import Floats
 from openant_tools.gap.population import Case
 
-__all__ = ["CLIP", "Metric", "Whitening", "whiten"]
+__all__ = ["CLIP", "Whitening", "whiten"]
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -57,22 +57,6 @@ class Whitening:
     def of_templates(self, x: Floats) -> Floats:
         """(templates, features) of robots without scatter: their differences count from the model, not from the median robot."""
         return self.measure(np.clip(x / self.scale, -CLIP, CLIP).astype(np.float32))
-
-
-@dataclass(frozen=True)
-class Metric:
-    """What distances between robots are measured in: a whitening of some features.
-
-    Attributes:
-        columns: (features,) which it takes.
-    """
-
-    whitening: Whitening
-    columns: Bools
-
-    def __call__(self, x: Floats) -> Floats:
-        """(robots, features) of differences, all of them."""
-        return self.whitening(x[:, self.columns])
 
 
 def whiten(x: Floats, templates: Floats, bank: Sequence[Case], reference: Reference) -> Whitening:

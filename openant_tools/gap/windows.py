@@ -101,13 +101,13 @@ def select(
         what = np.array([shown[piece.run].window(piece.start, piece.stop) for piece in pieces])
         pieces = _most_telling(pieces, what, at_most_s)
     # A fold of which nothing is simulated cannot be held out.
-    kept = sorted({piece.fold for piece in pieces})
+    there = sorted({piece.fold for piece in pieces})
     own = [[piece for piece in pieces if piece.run == k] for k in range(len(runs))]
     return Selection(
         able,
-        tuple(parts[f][1] for f in kept),
+        tuple(parts[f][1] for f in there),
         tuple(tuple((piece.start, piece.stop) for piece in mine) for mine in own),
-        tuple(tuple(kept.index(piece.fold) for piece in mine) for mine in own),
+        tuple(tuple(there.index(piece.fold) for piece in mine) for mine in own),
     )
 
 

@@ -42,6 +42,19 @@ def test_two_that_share_what_is_likely_are_ambiguous() -> None:
     assert found.selected == ()
 
 
+def test_a_cause_is_not_open_against_itself_with_another_beside_it() -> None:
+    alone = replace(LAG, probability=0.45)
+    both = replace(alone, causes=("actuator_lag", "backlash"), joints=((0,), (0,)), gain=0.52)
+    found = decide([NOTHING, alone, both], outside=0.05)
+    assert found.verdict == "actuator_lag"
+    assert found.selected == (both,), "the likelier of the two"
+
+
+def test_gains_that_are_the_same_in_every_fold_are_no_fault() -> None:
+    sure = replace(LAG, error=0.0)
+    assert decide([NOTHING, sure], outside=0.05).verdict == "actuator_lag"
+
+
 def test_a_healthy_robot_has_nothing() -> None:
     rows = [
         replace(NOTHING, probability=0.9),
