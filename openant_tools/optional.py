@@ -19,6 +19,10 @@ __all__ = ["NotInstalled", "OpenCV", "installed", "opencv"]
 #: name here → (module, what people call it, the extra that brings it)
 PACKAGES = {
     "cv2": ("cv2", "OpenCV", "camera"),
+    "foxglove": ("foxglove", "Foxglove's SDK", "view"),
+    "foxglove_channels": ("foxglove.channels", "Foxglove's SDK", "view"),
+    "foxglove_messages": ("foxglove.messages", "Foxglove's SDK", "view"),
+    "rerun": ("rerun", "Rerun", "view"),
     "pa": ("pyarrow", "pyarrow", "parquet"),
     "pc": ("pyarrow.compute", "pyarrow", "parquet"),
     "pq": ("pyarrow.parquet", "pyarrow", "parquet"),

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import textwrap
 import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from openant_tools.cli import main
 from openant_tools.cli.rec import rec
@@ -28,6 +30,7 @@ from openant_tools.recording import writer as writer_module
 from openant_tools.recording.convert import import_run
 from openant_tools.recording.reader import Samples, merge_nearest, read_recording
 from openant_tools.recording.repair import repair
+from openant_tools.recording.resume import continuation
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run, read_table, write_table
 from openant_tools.recording.telemetry import Answer, Cycle, ServoChannel, Telemetry
@@ -251,6 +254,38 @@ def test_a_zeroed_tail_gives_every_whole_record_before(
     # A byte that was zero before is not lost by zeroing it.
     touched = next(k for k in range(start, len(data)) if data[k])
     assert rows == max([count for end, count in chunk_ends(whole) if end <= touched], default=0)
+
+
+def test_a_file_from_before_wall_clocks_is_read_and_gone_on_with(whole: Path, tmp_path: Path) -> None:
+    """Its time stamps are those of the rows themselves, and nothing in it says otherwise."""
+    old = tmp_path / "old.mcap"
+    with whole.open("rb") as source, old.open("wb") as stream:
+        writer, reader = Writer(stream), make_reader(source)
+        writer.start(profile="openant")
+        (metadata,) = reader.iter_metadata()
+        content = json.loads(metadata.metadata["content"])
+        offset = content.pop("stamp_offset_ns")
+        text = json.dumps(content)
+        writer.add_metadata(metadata.name, {"content": text, "crc32": f"{zlib.crc32(text.encode()):08x}"})
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            if channel.id not in channels and schema is not None:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
+            stamp = message.log_time - offset
+            writer.add_message(channels[channel.id], stamp, message.data, stamp)
+        writer.finish()
+    assert read_run(old).columns.keys() == read_run(whole).columns.keys()
+    np.testing.assert_array_equal(read_run(old).t, read_run(whole).t)
+    for path in (old, record(tmp_path / "new.mcap")):
+        going_on = continuation(path, CHANNELS, now=52.0, wall_counts=False)
+        assert going_on.last_s == pytest.approx(50.0 + 0.02 * 59)
+        with RecordingWriter(path, facts=FACTS, channels=CHANNELS, continued=going_on) as again:
+            again.cycle(cycle(100))
+        assert read_run(path).t[-1] == pytest.approx(52.0)
+        with path.open("rb") as stream:
+            stamps = [message.log_time for _, _, message in make_reader(stream).iter_messages(topics=["/cycle"])]
+        assert (stamps[-1] - stamps[0]) * 1e-9 == pytest.approx(2.0)
 
 
 def chunk_ends(path: Path) -> list[tuple[int, int]]:

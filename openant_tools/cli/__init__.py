@@ -35,7 +35,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "servo": ("servo", "Robot", "Gains of a servo: registers as numbers of an MJCF, and back."),
     "comms": ("comms", "Robot", "The bus: scan, watch, measure."),
     "thermal": ("thermal", "Robot", "Heat: soak the robot, fit its heat, forecast shutdowns, compare."),
-    "rec": ("rec", "Data", "Recordings: info, repair, export, import."),
+    "rec": ("rec", "Data", "Recordings: info, repair, export, import, view."),
     "sysid": ("sysid", "Data", "Record excitations and fit a calibrated model to them."),
     "gap": ("gap", "Data", "How far a simulation is from its robot, and where."),
     "train": ("train", "Learning", "Train an agent to walk, in simulation."),

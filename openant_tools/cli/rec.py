@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,11 +21,13 @@ if TYPE_CHECKING:
 __all__ = ["rec"]
 
 RUN = click.Path(path_type=Path)
+#: what `rec export` makes → how its files end
+SUFFIXES = {"parquet": ".parquet", "csv": ".csv", "foxglove": ".foxglove.mcap", "rrd": ".rrd"}
 
 
 @click.group()
 def rec() -> None:
-    """Recordings: info, repair, export, import.
+    """Recordings: info, repair, export, import, view.
 
     A RUN is a native recording (NAME.mcap, which survives a kill or a power cut) or a table (NAME.parquet or NAME.csv
     with its facts in NAME.json), so that logs of other software can be used everywhere.
@@ -93,9 +97,9 @@ def repair(run: Path, out: Path | None) -> None:
             click.echo(f"the torn file is kept as {done.original}")
 
 
-@rec.command(short_help="Write a run as a table (parquet, csv).")
+@rec.command(short_help="Write a run as a table, or for Foxglove and Rerun.")
 @click.argument("runs", type=RUN, nargs=-1, required=True, metavar="RUN...")
-@click.option("--to", "kind", type=click.Choice(["parquet", "csv"]), default="parquet", show_default=True)
+@click.option("--to", "kind", type=click.Choice(list(SUFFIXES)), default="parquet", show_default=True)
 @click.option(
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
@@ -103,15 +107,96 @@ def repair(run: Path, out: Path | None) -> None:
     metavar="DIR",
     help="The folder to write to.",
 )
-def export(runs: tuple[Path, ...], kind: str, out: Path) -> None:
-    """Write RUN as a table: DIR/NAME.parquet (or .csv) in SI units, with its facts in DIR/NAME.json."""
+@click.option(
+    "--model", type=RUN, metavar="M.xml", help="The robot that viewers draw. Default: the run's own, else its robot's."
+)
+def export(runs: tuple[Path, ...], kind: str, out: Path, model: Path | None) -> None:
+    """Write RUN into DIR, in SI units.
+
+    \b
+      parquet, csv   NAME.parquet or NAME.csv, a table, with its facts in NAME.json
+      foxglove       NAME.foxglove.mcap: joint states, transforms, the robot, IMU, tracker, events and findings
+      rrd            NAME.rrd: the same for Rerun
+    """
+    if kind in ("foxglove", "rrd"):
+        for name in runs:
+            _for_viewers(name, kind, out, model)
+        return
     from openant_tools.recording.tables import read_run, write_table
 
+    if model is not None:
+        raise BadInput("--model is what viewers draw", remedy="add --to foxglove or --to rrd")
     for name in runs:
         run = read_run(name, need=())
-        path = out / f"{run.name}.{kind}"
+        path = out / f"{run.name}{SUFFIXES[kind]}"
         write_table(run, path)
         click.echo(f"{path}: {len(run.t)} rows, {len(run.columns)} columns; facts in {path.with_suffix('.json').name}")
+
+
+def _for_viewers(name: Path, kind: str, out: Path, model: Path | None) -> None:
+    from openant_tools.exchange.source import read_source
+
+    source = read_source(name, model)
+    path = out / f"{source.run.name}{SUFFIXES[kind]}"
+    if kind == "foxglove":
+        from openant_tools.exchange.foxglove_file import write_foxglove
+
+        what = f"{write_foxglove(source, path)} messages"
+    else:
+        from openant_tools.exchange.rerun_file import log_source, rerun_stream
+
+        stream = rerun_stream(source.run.name, path)
+        log_source(stream, source)
+        stream.disconnect()
+        what = f"{len(source.run.t)} rows"
+    drawn = "" if source.scene is not None else "; the robot is not drawn, since nobody names its model → --model M.xml"
+    click.echo(f"{path}: {what}{drawn}")
+
+
+@rec.command(short_help="Open a run in Rerun: the robot, and its simulation over it.")
+@click.argument("run", type=RUN)
+@click.option("--model", type=RUN, metavar="M.xml", help="Default: the run's own, else its robot's.")
+@click.option(
+    "--effects",
+    type=RUN,
+    metavar="FILE.toml",
+    help="What acts beside the model. Default: the robot's, where the model is its own.",
+)
+@click.option("--full", is_flag=True, help="Simulate from the run's start, instead of anew every half second.")
+@click.option("--out", type=RUN, metavar="FILE.rrd", help="Write a file for Rerun instead of opening it.")
+def view(run: Path, model: Path | None, effects: Path | None, full: bool, out: Path | None) -> None:
+    """Open RUN in Rerun: the measured robot, the simulated one over it in orange, and the gap of each joint as a curve."""
+    from openant_tools.cli.runs import checked, effects_of
+    from openant_tools.exchange.rerun_file import log_gap, log_source, rerun_stream
+    from openant_tools.exchange.source import read_source
+    from openant_tools.gap.measure import measure
+    from openant_tools.model.gap import HORIZON_S
+
+    if out is not None and out.suffix != ".rrd":
+        raise BadInput("a file for Rerun is .rrd", where=out, remedy="name it NAME.rrd")
+    source = read_source(run, model)
+    if source.scene is None:
+        raise BadInput("nobody names the model of this robot", where=run, remedy="add --model M.xml")
+    path, folder = source.scene.plant.path, None if source.folder is None else source.folder.path
+    entries = effects_of([source.run], path, model, folder, effects)
+    joints = source.scene.plant.joints
+    (checked_run,) = checked([source.run], path, joints, entries)
+    played = measure([checked_run], path, joints, None if full else HORIZON_S, entries[0]).played[0]
+    if out is None:
+        _need_screen()
+    stream = rerun_stream(source.run.name, out)
+    log_source(stream, source)
+    log_gap(stream, source, dict(zip(joints, played.simulated["pos"].T, strict=True)))
+    stream.disconnect()
+    if out is not None:
+        click.echo(f"{out}: open it with `rerun {out}`")
+
+
+def _need_screen() -> None:
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise BadInput(
+            "there is no screen here to open a window on", remedy="add --out FILE.rrd, and open that where there is one"
+        )
 
 
 @rec.command(name="import", short_help="Make a recording of a table, or tables of a LeRobot dataset.")

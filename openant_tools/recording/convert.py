@@ -56,8 +56,9 @@ def import_run(run: Run, path: str | Path, *, progress: Callable[[float], None] 
     unfinished = path.with_name(f".{path.stem}.part.mcap")
     try:
         with RecordingWriter(
-            unfinished, facts=run.facts_at(path.parent), channels=channels, telemetry=telemetry, overwrite=True
-        ) as writer:
+            unfinished, facts=run.facts_at(path.parent), channels=channels, telemetry=telemetry, overwrite=True,
+            clock=lambda: float(run.t[0]),
+        ) as writer:  # fmt: skip
             _write_rows(run, list(extra), telemetry, writer, progress or (lambda share: None))
         os.replace(unfinished, path)
     finally:

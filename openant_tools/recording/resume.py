@@ -68,7 +68,8 @@ def continuation(path: str | Path, channels: Sequence[ServoChannel], now: float,
             remedy="record under another name",
         )
     rows = [stamp for topic, stamp, _ in messages if topic == "/cycle"]
-    last = max(rows, default=0) * 1e-9
+    offset = int(content.get("stamp_offset_ns", 0))
+    last = (max(rows) - offset) * 1e-9 if rows else 0.0
     started = content["started"]
     shift = 0.0
     if wall_counts:
@@ -78,4 +79,4 @@ def continuation(path: str | Path, channels: Sequence[ServoChannel], now: float,
             shift = expected - now
     if now + shift <= last:
         shift = last + UNKNOWN_GAP_S - now
-    return Continued(metadata, tuple(messages), shift, last)
+    return Continued(metadata, tuple(messages), shift, last, offset)

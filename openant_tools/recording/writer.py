@@ -68,12 +68,14 @@ class Continued:
         metadata: its metadata record, as it stands. messages: (topic, ns, bytes) of all that is whole.
         shift_s: added to every time to come, so that the recording has one time axis.
         last_s: time of its last row.
+        stamp_offset_ns: what its time stamps lie after the clock of its rows; 0 where nobody wrote it down.
     """
 
     metadata: Mapping[str, str]
     messages: Sequence[tuple[str, int, bytes]]
     shift_s: float
     last_s: float
+    stamp_offset_ns: int = 0
 
 
 class RecordingWriter:
@@ -123,6 +125,8 @@ class RecordingWriter:
         self._kept_t: float | None = None
         self._kept = 0
         self._shift = 0.0 if continued is None else continued.shift_s
+        #: ns that are added to a time on the clock of `t` for the file's own time stamps: the wall clock at the start
+        self._stamp_offset = 0 if continued is None else continued.stamp_offset_ns
         # What is gone on with is copied beside itself, and replaced when all of it is on the disk.
         place = self.path if continued is None else self.path.with_name(f".{self.path.name}.resumed")
         try:
@@ -245,6 +249,9 @@ class RecordingWriter:
         continued: Continued | None = None,
     ) -> None:
         self._writer.start(profile=PROFILE, library=f"openant-tools {importlib.metadata.version('openant-tools')}")
+        wall, clock = datetime.now(UTC), self._clock()
+        if continued is None:
+            self._stamp_offset = time_ns(wall) - round(clock * 1e9)
         content = json.dumps(
             self._telemetry.as_json()
             | {
@@ -252,7 +259,8 @@ class RecordingWriter:
                 "facts": json.loads(facts_to_json(facts)),
                 "registers": {joint: dict(table) for joint, table in registers.items()},
                 "config": config,
-                "started": {"wall": datetime.now(UTC).isoformat(timespec="milliseconds"), "clock": self._clock()},
+                "started": {"wall": wall.isoformat(timespec="milliseconds"), "clock": clock},
+                "stamp_offset_ns": self._stamp_offset,
             },
             ensure_ascii=False,
         )
@@ -295,7 +303,7 @@ class RecordingWriter:
                     if kind in encode:
                         if clean:
                             due, clean = time.monotonic() + SYNC_PERIOD, False
-                        stamp = max(0, round(t * 1e9))
+                        stamp = max(0, round(t * 1e9) + self._stamp_offset)
                         channel = self._channel_ids[_CYCLE if kind == _ROW else kind]
                         self._writer.add_message(channel, stamp, encode[kind](t, item), stamp)
                         if kind in (_CYCLE, _ROW):
@@ -342,6 +350,11 @@ _EVENT_SCHEMA = json.dumps(
         "required": ["t", "kind"],
     }
 ).encode()
+
+
+def time_ns(wall: datetime) -> int:
+    """Nanoseconds since 1970 of a wall clock, as MCAP counts them."""
+    return round(wall.timestamp() * 1e6) * 1000
 
 
 def _sync_folder(path: Path) -> None:
