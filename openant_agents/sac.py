@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from openant_agents.adam import Adam
 from openant_agents.by_hand import Gradients, acting, flatten, squashed
 from openant_agents.runs import CurvePoint, Run, load_checkpoint, making_sense, read_facts
 from openant_agents.training import (
@@ -249,14 +250,6 @@ class Autograd:
         return result
 
 
-def _adam(*weights_and_steps: tuple[Tensor, float]) -> torch.optim.Adam:
-    groups = [{"params": [weights], "lr": step} for weights, step in weights_and_steps]
-    try:
-        return torch.optim.Adam(groups, fused=True)
-    except RuntimeError:  # torch before 2.4 has the fused form on graphics cards only
-        return torch.optim.Adam(groups)
-
-
 class Sac:
     """Actor, critics, their targets and the entropy's weight, with the update that ties them.
 
@@ -298,8 +291,8 @@ class Sac:
         self.target_entropy = -float(actions)
         self.policy, self._critic_weights = flatten(self.actor), flatten(self.critics)
         self._target_weights = flatten(self.targets)
-        self.critic_optimiser = _adam((self._critic_weights, settings.critic_step))
-        self.actor_optimiser = _adam((self.policy, settings.actor_step), (self.log_alpha, settings.entropy_step))
+        self.critic_optimiser = Adam((self._critic_weights, settings.critic_step))
+        self.actor_optimiser = Adam((self.policy, settings.actor_step), (self.log_alpha, settings.entropy_step))
         self.replay = Replay(observations, actions, settings.buffer)
         self.updates = 0
         self._critic_loss = torch.zeros(())

@@ -120,8 +120,11 @@ class Robot:
 
 @contextlib.contextmanager
 def robot(folder: Path, *, sees: bool = False, kit: str = "standard", **table: Any) -> Iterator[Robot]:
-    """A virtual robot of a scenario's tables, in stepped time, served by a thread of this process."""
-    server = assemble(parse_scenario(table), clock="stepped", camera=sees)
+    """A virtual robot of a scenario's tables, in stepped time, served by a thread of this process.
+
+    Its mechanics are left out while it stands still, unless the tables say otherwise.
+    """
+    server = assemble(parse_scenario({"clock": {"doze": True}, **table}), clock="stepped", camera=sees)
     stop = threading.Event()
     thread = threading.Thread(target=server.run, args=(stop.is_set,))
     thread.start()

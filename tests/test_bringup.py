@@ -9,19 +9,18 @@ import time
 from pathlib import Path
 
 import pytest
-from builder import RUBS, SMALL_PICTURES, robot
+from builder import robot
 
 from openant_tools.bringup.passport import write_passport
 from openant_tools.bringup.relay import relayed
 from openant_tools.bringup.virtual_box import virtual_box
 from openant_tools.bringup.walk import WALK, do, standing, step, walk
-from openant_tools.cli import main
 from openant_tools.cli.calib import calib
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.procedure.finding import Finding, keep
 from openant_tools.procedure.step import Answer, Declined, Event, Intent, Progress, Say
-from openant_tools.robot.folder import RobotFolder, create_robot
+from openant_tools.robot.folder import create_robot
 
 TITLES = (
     "Connect", "Emergency stop", "Motor IDs", "Centring", "Leg by leg", "Inventory", "Zeros and directions", "Observation bounds",
@@ -284,33 +283,3 @@ def test_a_virtual_robot_does_not_outlive_who_started_it(tmp_path):
     while control.exists():  # it takes its folder away when it ends
         assert time.monotonic() < give_up
         time.sleep(0.05)
-
-
-@pytest.mark.minutes
-@pytest.mark.timeout(1800)
-def test_from_loose_motors_to_a_passport_and_on_to_learning(tmp_path, brisk, capfd):
-    ant, report, box = tmp_path / "ant", tmp_path / "walk.json", tmp_path / "box.toml"
-    box.write_text(f'[robot]\nsetup = "loose"\n{SMALL_PICTURES}{RUBS}')
-    # In this process, where motions can be short.
-    with pytest.raises(SystemExit) as end:
-        main(["bringup", "--virtual", str(box), "--robot", str(ant), "--yes", "--json", str(report)])
-    assert end.value.code == 0, "".join(capfd.readouterr())[-4000:]
-    walked = json.loads(report.read_text())
-    assert walked["ok"]
-    assert {now["state"] for now in walked["steps"].values()} == {"ok"}
-    for name in ("robot.toml", "calibrated.xml", "journal.jsonl", "passport.html", "passport.md"):
-        assert (ant / name).is_file()
-    assert RobotFolder.at(ant).config().model == "calibrated.xml"
-    assert "no" not in {
-        cell.strip() for line in (ant / "passport.md").read_text().splitlines() for cell in line.split("|")
-    }
-    again = openant("bringup", "--virtual", "--robot", ant, "--yes", timeout=120)
-    assert again.returncode == 0
-    assert "1/15" not in again.stdout  # what stands is not done again
-    pytest.importorskip("torch")
-    # On the bus a step takes the bus's time: enough of them to see that it walks, records and learns from this folder.
-    runs = {"sim": ("--steps", "1000"), "virtual": ("--steps", "20", "--env", "hardware", "--virtual", "--yes")}
-    for run, how in runs.items():
-        trained = openant("train", "sac", "--robot", ant, *how, "--out", ant / "runs" / run)
-        assert trained.returncode == 0, trained.stderr[-2000:]
-        assert (ant / "runs" / run / "learning_curve.csv").is_file()

@@ -46,6 +46,20 @@ def openant(*arguments: str | Path, cwd: Path | None = None, largest_file: int |
     )  # fmt: skip
 
 
+@pytest.fixture
+def within(capfd: pytest.CaptureFixture[str]) -> Callable[..., Result]:
+    """Run a command to its end in this process: what it says and how it ends are the same, and nothing is loaded anew."""
+
+    def run(*arguments: str | Path) -> Result:
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main([str(one) for one in arguments])
+        assert isinstance(end.value.code, int)
+        return Result(arguments, end.value.code, *capfd.readouterr())
+
+    return run
+
+
 def refusal(result: Result) -> str:
     """The one line of a refusal: exit code 2, no result, no traceback; what it was about to do may stand before it."""
     assert result.returncode == 2, result.stderr
@@ -225,11 +239,17 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_a_fit_refuses_bad_input_in_one_line_and_leaves_nothing(
-    bench: Path, run: str, more: tuple[str, ...], said: tuple[str, ...]
+    bench: Path,
+    within: Callable[..., Result],
+    monkeypatch: pytest.MonkeyPatch,
+    run: str,
+    more: tuple[str, ...],
+    said: tuple[str, ...],
 ) -> None:
+    monkeypatch.chdir(bench)
     before = set(bench.rglob("*"))
     model = () if "--model" in more else ("--model", "arm.xml")
-    line = refusal(openant("sysid", "fit", run, *model, *more, "--out", "fit", cwd=bench))
+    line = refusal(within("sysid", "fit", run, *model, *more, "--out", "fit"))
     for words in said:
         assert words in line
     assert set(bench.rglob("*")) == before
@@ -256,9 +276,12 @@ def test_a_fit_without_model_and_robot_asks_for_one(bench: Path) -> None:
         (("demo", "--robot", "arm.xml"), "arm.xml"),
     ],
 )
-def test_other_commands_refuse_in_one_line_too(bench: Path, arguments: tuple[str, ...], said: str) -> None:
+def test_other_commands_refuse_in_one_line_too(
+    bench: Path, within: Callable[..., Result], monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], said: str
+) -> None:
+    monkeypatch.chdir(bench)
     before = set(bench.rglob("*"))
-    assert said in refusal(openant(*arguments, cwd=bench))
+    assert said in refusal(within(*arguments))
     assert set(bench.rglob("*")) == before
 
 

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 torch = pytest.importorskip("torch")
 
 import openant_env  # noqa: E402, F401
-from openant_agents import runs, sac  # noqa: E402
+from openant_agents import adam, runs, sac  # noqa: E402
 from openant_agents.curves import plot_curves  # noqa: E402
 from openant_agents.runs import CurvePoint, load_checkpoint, read_curve  # noqa: E402
 from openant_agents.sac import Actor, Replay, Sac, Settings, load_policy, train  # noqa: E402
@@ -127,6 +127,28 @@ def test_a_restored_replay_holds_every_row_where_it_was(capacity, count):
     assert len(again) == len(replay) == min(count, capacity)
     assert (again.rows[: len(again)] == replay.rows[: len(replay)]).all()
     assert kept[:, 0].tolist() == list(range(max(0, count - capacity), count))
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_steps_are_those_of_torchs_adam_whose_checkpoints_go_on(fused, monkeypatch):
+    monkeypatch.setattr(adam, "FUSED", fused)
+    ours, theirs = (
+        [torch.linspace(-1, 1, 50).requires_grad_(), torch.tensor(0.3, requires_grad=True)] for _ in range(2)
+    )
+    steps, random = (1e-3, 3e-4), torch.Generator().manual_seed(1)
+    mine = adam.Adam(*zip(ours, steps, strict=True))
+    model = torch.optim.Adam([{"params": [w], "lr": s} for w, s in zip(theirs, steps, strict=True)], fused=True)
+    for k in range(40):
+        for one, other in zip(ours, theirs, strict=True):
+            one.grad = other.grad = torch.randn(one.shape, generator=random)
+        if k == 20:
+            mine = adam.Adam(*zip(ours, steps, strict=True))
+            mine.load_state_dict(model.state_dict())
+        model.step()
+        with torch.inference_mode():
+            mine.step()
+        for one, other in zip(ours, theirs, strict=True):
+            torch.testing.assert_close(one, other, rtol=0 if fused else 1e-5, atol=0 if fused else 1e-6)
 
 
 def test_a_checkpoint_of_other_networks_or_versions_is_refused():

@@ -6,22 +6,29 @@ import asyncio
 import contextlib
 import json
 import math
+import subprocess
+import sys
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 from builder import RUBS, SMALL_PICTURES
 from walker import AGAIN, BY_ITSELF, Reply, Walker
 
-from openant_tools.bringup.walk import WALK, standing
+from openant_tools.bringup.virtual_box import virtual_box
+from openant_tools.bringup.walk import WALK, do, standing
+from openant_tools.cli import main
 from openant_tools.comms.clock import VirtualControl
+from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.journal import Journal
+from openant_tools.procedure.step import Step
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
 from openant_tools.tui.app import OpenAnt
 from openant_tools.tui.screens.walk import WalkScreen
-from openant_tools.virtual.process import virtual_robot
+from openant_tools.virtual.process import VIRTUAL_DEFAULT, virtual_robot
 
 WIDE = (120, 40)
 BLIND = "[camera]\npresent = false\n"
@@ -265,21 +272,70 @@ size = 0.03
 
 @pytest.mark.minutes
 @pytest.mark.timeout(1800)
-def test_the_whole_walk_by_its_screens_from_loose_motors_to_the_passport(tmp_path: Path, brisk: None) -> None:
+def test_the_whole_walk_from_loose_motors_to_the_passport_and_on_to_learning(
+    tmp_path: Path, brisk: None, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """By the command from the box to the built legs, where Ctrl-C ends it; from there by the screens; then it learns."""
+    folder, given, report = tmp_path / "ant", tmp_path / "box.toml", tmp_path / "walk.json"
+    given.write_text(f'[robot]\nsetup = "loose"\n[clock]\ndoze = true\n{SMALL_PICTURES}{RUBS}')
+
+    def bringup(source: str) -> tuple[object, str]:
+        with pytest.raises(SystemExit) as end:  # in this process, where motions can be short
+            main(["bringup", "--virtual", source, "--robot", str(folder), "--yes", "--json", str(report)])
+        return end.value.code, "".join(capfd.readouterr())
+
+    def interrupted(step: Step, *rest: Any) -> Finding:
+        if step.name == "inventory":
+            raise KeyboardInterrupt
+        return do(step, *rest)
+
+    with monkeypatch.context() as at_the_keyboard:
+        at_the_keyboard.setattr("openant_tools.bringup.walk.do", interrupted)
+        code, words = bringup(str(given))
+    assert code == 130, words[-4000:]
+    names = list(WALK)
+    built, rest = names[: names.index("inventory")], names[names.index("inventory") :]
+    states = {name: now.state for name, now in standing(RobotFolder.at(folder)).items()}
+    assert states == dict.fromkeys(built, "ok") | dict.fromkeys(rest, "todo"), words[-4000:]
+
     said = dict[str, str]()
 
     async def walk(walker: Walker) -> None:
-        said["connect"] = await walker.do("connect")
-        for name in list(WALK)[1:]:
+        said["inventory"] = await walker.do("inventory")
+        for name in rest[1:]:
             await walker.choose(f"Next: {WALK[name].title}")
             said[name] = await walker.begin()
 
-    with robot(tmp_path, f'[robot]\nsetup = "loose"\n{SMALL_PICTURES}{RUBS}') as ant:
+    with virtual_box(VIRTUAL_DEFAULT, folder) as box:  # what was written to its servos is still there
+        box.hands.resume(assembled=True)
+        addresses = {"bus": box.bus, "imu": box.imu, "camera": box.camera, "control": box.control}
+        ant = Robot(RobotFolder.at(folder), addresses, folder / "virtual-eeprom.json")
         ant.walk(walk, {"while the legs swing. For how long?": "0.2", "Soak for how long?": "1"})
-        states = {name: now.state for name, now in standing(ant.folder).items()}
-        failed = [name for name, state in states.items() if state != "ok"]
-        assert not failed, "\n".join(f"{name} {states[name]}: {said.get(name, '')[-3000:]}" for name in failed)
-        assert ant.folder.passport.is_file()
-        assert ant.folder.config().model == "calibrated.xml"
-        assert ant.folder.config().arena.centre_m == pytest.approx((0.75, -0.30), abs=0.03)
-        assert len(Journal(ant.folder.journal).open_entries()) >= 24
+        ant.remote.close()
+    states = {name: now.state for name, now in standing(ant.folder).items()}
+    failed = [name for name, state in states.items() if state != "ok"]
+    assert not failed, "\n".join(f"{name} {states[name]}: {said.get(name, '')[-3000:]}" for name in failed)
+    for name in ("robot.toml", "calibrated.xml", "journal.jsonl", "passport.html", "passport.md"):
+        assert (folder / name).is_file()
+    config = ant.folder.config()
+    assert config.model == "calibrated.xml"
+    assert config.arena.centre_m == pytest.approx((0.75, -0.30), abs=0.03)
+    assert len(Journal(ant.folder.journal).open_entries()) >= 24
+    page = (folder / "passport.md").read_text()
+    assert "no" not in {cell.strip() for line in page.splitlines() for cell in line.split("|")}
+
+    code, words = bringup("default")
+    assert code == 0, words[-4000:]
+    assert "1/15" not in words, "what stands is not done again"
+    walked = json.loads(report.read_text())
+    assert walked["ok"]
+    assert {now["state"] for now in walked["steps"].values()} == {"ok"}
+    pytest.importorskip("torch")
+    # On the bus a step takes the bus's time: enough of them to see that it walks, records and learns from this folder.
+    runs = {"sim": ("--steps", "200"), "virtual": ("--steps", "20", "--env", "hardware", "--virtual", "--yes")}
+    for run, how in runs.items():
+        command = [sys.executable, "-m", "openant_tools.cli", "train", "sac", "--robot", str(folder), *how]
+        out = folder / "runs" / run
+        trained = subprocess.run([*command, "--out", str(out)], capture_output=True, text=True, check=False)
+        assert trained.returncode == 0, trained.stderr[-2000:]
+        assert (out / "learning_curve.csv").is_file()

@@ -233,7 +233,7 @@ class World:
         It wakes on whatever the drives are told, and by itself once in DOZE_S, so that what creeps or warms is seen.
         """
         drives, dt = self.drives, self.settings.body.timestep_s
-        if drives.touched != self._touched or not drives.at_rest:
+        if drives.touched != self._touched or self._tilting is not None or not drives.at_rest:
             self._touched, self._rest_since = drives.touched, self._steps
             return False
         resting = (self._steps - self._rest_since) * dt
