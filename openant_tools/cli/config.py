@@ -111,8 +111,16 @@ def import_(file: Path, robot: Path | None, kit: str | None) -> None:
 @robot_option
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Default: print it.")
 @click.option("--grid", is_flag=True, help="Round zero offsets to multiples of 45°, as the platform's own maker does.")
-def export(robot: Path | None, out: Path | None, grid: bool) -> None:
-    """Write the configuration for the platform's own software (antNN.json, NN being the tag on the torso)."""
+@click.option("--to", "kind", type=click.Choice(["platform", "urdf"]), default="platform", show_default=True)
+def export(robot: Path | None, out: Path | None, grid: bool, kind: str) -> None:
+    """Write the configuration for the platform's own software (antNN.json, NN being the tag on the torso).
+
+    With --to urdf, the robot's calibrated model as a URDF, its meshes in `meshes/` beside it, and a card (NAME.md). What URDF
+    cannot hold stands in a comment at its top.
+    """
+    if kind == "urdf":
+        _export_urdf(robot, out, grid)
+        return
     from openant_tools.files import json_text, write_text
     from openant_tools.robot.folder import RobotFolder
     from openant_tools.robot.platform_config import export_notes, export_platform_config, imported_object
@@ -130,6 +138,22 @@ def export(robot: Path | None, out: Path | None, grid: bool) -> None:
             raise BadInput("would replace robot.toml itself", where=out, remedy="name a file antNN.json")
         write_text(out, text)
         click.echo(f"wrote {out}")
+
+
+def _export_urdf(robot: Path | None, out: Path | None, grid: bool) -> None:
+    from openant_tools.exchange.card import card
+    from openant_tools.exchange.urdf import write_urdf
+    from openant_tools.files import write_text
+    from openant_tools.robot.folder import RobotFolder
+
+    if out is None or out.suffix != ".urdf" or grid:
+        raise BadInput("a URDF is a file of its own", remedy="name it with --out NAME.urdf, without --grid")
+    folder = RobotFolder.at(robot_folder(robot))
+    model = folder.model_path()
+    missing = write_urdf(model, out)
+    notes = [f"URDF cannot hold {line}" for line in missing]
+    write_text(out.with_suffix(".md"), card(f"{out.name}, a URDF", folder, [f"`{model.name}`"], notes))
+    click.echo(f"wrote {out}; what it cannot hold ({len(missing)}) stands at its top; its card is {out.stem}.md")
 
 
 def _degrees(value: float) -> str:

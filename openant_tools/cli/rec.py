@@ -23,6 +23,8 @@ __all__ = ["rec"]
 RUN = click.Path(path_type=Path)
 #: what `rec export` makes → how its files end
 SUFFIXES = {"parquet": ".parquet", "csv": ".csv", "foxglove": ".foxglove.mcap", "rrd": ".rrd"}
+#: and those that become one dataset
+DATASETS = ("lerobot", "minari")
 
 
 @click.group()
@@ -97,9 +99,9 @@ def repair(run: Path, out: Path | None) -> None:
             click.echo(f"the torn file is kept as {done.original}")
 
 
-@rec.command(short_help="Write a run as a table, or for Foxglove and Rerun.")
+@rec.command(short_help="Write runs as tables, for Foxglove and Rerun, or as datasets.")
 @click.argument("runs", type=RUN, nargs=-1, required=True, metavar="RUN...")
-@click.option("--to", "kind", type=click.Choice(list(SUFFIXES)), default="parquet", show_default=True)
+@click.option("--to", "kind", type=click.Choice([*SUFFIXES, *DATASETS]), default="parquet", show_default=True)
 @click.option(
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
@@ -117,7 +119,20 @@ def export(runs: tuple[Path, ...], kind: str, out: Path, model: Path | None) -> 
       parquet, csv   NAME.parquet or NAME.csv, a table, with its facts in NAME.json
       foxglove       NAME.foxglove.mcap: joint states, transforms, the robot, IMU, tracker, events and findings
       rrd            NAME.rrd: the same for Rerun
+      lerobot        DIR is one LeRobot dataset (v3.0), an episode each RUN
+      minari         DIR is one Minari dataset; a RUN may be the folder of a training run (SAC), too
     """
+    if kind in DATASETS:
+        from openant_tools.exchange.lerobot_write import write_lerobot
+        from openant_tools.exchange.minari_write import write_minari
+
+        if model is not None:
+            raise BadInput("--model is what viewers draw", remedy="leave it out")
+        episodes, steps = (write_lerobot if kind == "lerobot" else write_minari)(runs, out)
+        click.echo(
+            f"{out}: {episodes} episodes, {steps} {'frames' if kind == 'lerobot' else 'steps'}; its card is README.md"
+        )
+        return
     if kind in ("foxglove", "rrd"):
         for name in runs:
             _for_viewers(name, kind, out, model)

@@ -18,8 +18,8 @@ __all__ = ["log_gap", "log_source", "rerun_stream"]
 
 Array = NDArray[np.float64]
 
-#: Okabe–Ito blue, as the measured robot is drawn in reports; the simulated one is orange
-SIMULATED_RGBA = (230, 159, 0, 150)
+#: Okabe–Ito orange; the simulated robot is drawn by its edges, so that the measured one is seen through it
+SIMULATED_RGBA = (230, 159, 0, 255)
 
 
 def rerun_stream(name: str, path: Path | None = None) -> Any:
@@ -83,7 +83,11 @@ def log_gap(stream: Any, source: Source, simulated: Mapping[str, Array]) -> None
                 blueprint.Vertical(
                     blueprint.TimeSeriesView(origin="gap", name="measured − simulated, rad"),
                     blueprint.TimeSeriesView(
-                        origin="joints", contents=[f"$origin/**/{name}" for name in ("cmd", "pos", "simulated")]
+                        origin="joints",
+                        contents=[
+                            f"$origin/{joint}/{signal}" for joint in simulated for signal in ("cmd", "pos", "simulated")
+                        ],
+                        name="commanded, measured, simulated, rad",
                     ),
                 ),
             )
@@ -116,8 +120,9 @@ def _robot(stream: Any, source: Source, root: str, scene: Scene, track: Track, r
     for k, body in enumerate(scene.bodies):
         for n, one in enumerate(body.shapes):
             colors = [rgba or [round(255 * part) for part in one.rgba]]
-            turned, fill = one.quaternion[[1, 2, 3, 0]], {"fill_mode": "solid"}
-            placed = {"quaternions": [turned], "colors": colors, **fill}
+            turned = one.quaternion[[1, 2, 3, 0]]
+            fill = "solid" if rgba is None else "majorwireframe"
+            placed = {"quaternions": [turned], "colors": colors, "fill_mode": fill}
             radius, half = float(one.size[0]), float(one.size[1])
             shape: Any
             if one.kind == "mesh":

@@ -89,12 +89,12 @@ class Source:
                 yield content
 
 
-def read_source(path: Path, model: Path | None = None, robot: Path | None = None) -> Source:
-    """The run at `path` with its robot.
+def read_source(path: Path, model: Path | None = None, *, draw: bool = True) -> Source:
+    """The run at `path` with its robot, which is the one in whose `recordings/` it lies.
 
     Args:
-        model: its MJCF; default: the one that it names, else that of the robot's folder in which it lies.
-        robot: the folder; default: the one in whose `recordings/` it lies.
+        model: its MJCF; default: the one that it names, else that of its robot's folder.
+        draw: whether anybody wants to see it.
 
     Raises:
         BadInput: the run or the model cannot be used.
@@ -102,12 +102,10 @@ def read_source(path: Path, model: Path | None = None, robot: Path | None = None
     path = find_run(path)
     recording = read_recording(path) if path.suffix == ".mcap" else None
     run = read_run(path, need=()) if recording is None else recording.run
-    place = robot if robot is not None else path.resolve().parent.parent
-    folder = RobotFolder.at(place) if (place / CONFIG_NAME).is_file() or robot is not None else None
-    if model is None:
-        model = own_model(run)
-    if model is None and folder is not None:
-        model = folder.model_path()
+    place = path.resolve().parent.parent
+    folder = RobotFolder.at(place) if (place / CONFIG_NAME).is_file() else None
+    if model is None and draw:
+        model = own_model(run) or (None if folder is None else folder.model_path())
     wall_ns = None
     if recording is not None:
         wall = datetime.fromisoformat(str(recording.started["wall"])).timestamp()
