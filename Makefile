@@ -10,7 +10,7 @@ DEMO   ?= demo-robot
 # two workers: what CI has, and any laptop
 PYTEST_ARGS ?= -n 2
 
-.PHONY: demo test lint types contracts pytest pictures tour clean
+.PHONY: demo test lint types contracts pytest ecosystem pictures tour clean
 
 demo: $(VENV)/.all
 	@$(BIN)/openant demo --robot $(DEMO)
@@ -43,6 +43,10 @@ $(VENV)/.dev: pyproject.toml constraints.txt
 	@$(PYTHON) -m venv $(VENV)
 	@$(INSTALL) -e '.[all,dev]'
 	@touch $@
+
+# docs/ecosystem.md: each peer in a throw-away environment of its own. Minutes a peer; goes on where it was stopped.
+ecosystem:
+	@$(PYTHON) benchmarks/ecosystem.py
 
 # docs/tour.md and its pictures: the terminal program itself, walked with a virtual robot.
 tour: $(VENV)/.all

@@ -22,6 +22,7 @@ from typing import Any
 import gymnasium
 import optuna
 import sqlalchemy
+from optuna.storages.journal import JournalFileBackend
 
 from openant_agents import sac, sarsa
 from openant_agents.training import Progress
@@ -89,9 +90,19 @@ class _Sum(gymnasium.Wrapper):  # type: ignore[misc]
         return result
 
 
+#: a file that machines append to; a path below the working directory, as of sqlite
+JOURNAL = "journal:///"
+
+
 def _storage(url: str) -> Any:
     if url.startswith("redis"):
-        return optuna.storages.get_storage(url)
+        raise BadInput(
+            "Optuna keeps no studies in Redis any more",
+            where=url,
+            remedy="use postgresql://…, sqlite:///tune.db, or journal:///tune.log on a disk that all machines see",
+        )
+    if url.startswith(JOURNAL):
+        return optuna.storages.JournalStorage(JournalFileBackend(url.removeprefix(JOURNAL)))
     with warnings.catch_warnings():
         # Signs of life have been called experimental since 2021.
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
@@ -107,7 +118,7 @@ def open_study(url: str, name: str, facts: Mapping[str, Any]) -> optuna.Study:
     """A study in a storage, begun or gone on with.
 
     Args:
-        url: of any storage of Optuna's, such as `sqlite:///tune.db`, `postgresql://…` or `redis://…`.
+        url: `sqlite:///tune.db`, `postgresql://…` or another database of SQLAlchemy's, or `journal:///tune.log`, a file.
         name: of the study.
         facts: agent, seeds, steps and environment: a study goes on only if they are the same.
 
@@ -121,7 +132,9 @@ def open_study(url: str, name: str, facts: Mapping[str, Any]) -> optuna.Study:
                 storage=_storage(url), study_name=name, direction="maximize", load_if_exists=True
             )
             break
-        except Exception as error:  # of SQLAlchemy, its drivers, redis: a dozen kinds without a common parent
+        except BadInput:
+            raise
+        except Exception as error:  # of SQLAlchemy and its drivers: a dozen kinds without a common parent
             if attempt + 1 < OPENINGS and any(isinstance(one, RACES) for one in (error, error.__cause__)):
                 time.sleep(random.uniform(0.1, 0.5))
                 continue

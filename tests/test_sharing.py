@@ -159,9 +159,13 @@ def episodes_of(root: Path) -> tuple[dict[str, Any], list[dict[str, np.ndarray]]
 
 def test_a_hardware_run_becomes_a_minari_dataset(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
-    assert code_of("rec", "export", walk(tmp_path, "one"), "--to", "minari", "--out", tmp_path / "set") == 0
-    metadata, (episode,) = episodes_of(tmp_path / "set")
-    assert metadata["total_steps"] == 79
+    runs = [walk(tmp_path, "one"), walk(tmp_path, "two", 10)]  # the second goes less far
+    assert code_of("rec", "export", *runs, "--to", "minari", "--out", tmp_path / "set") == 0
+    metadata, (episode, _) = episodes_of(tmp_path / "set")
+    assert metadata["total_steps"] == 79 + 9
+    space = json.loads(metadata["action_space"])
+    assert (episode["actions"] <= np.array(space["high"])).all()
+    assert (episode["actions"] >= np.array(space["low"])).all()
     assert metadata["action_names"] == ["cmd.hip", "cmd.knee"]
     assert episode["observations"].shape == (80, len(metadata["observation_names"]))
     np.testing.assert_allclose(episode["rewards"], 0.01, atol=1e-9)

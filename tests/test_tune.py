@@ -131,6 +131,10 @@ def test_from_the_command_line_with_a_kill_between(tmp_path, capsys, monkeypatch
     refused = [
         ((*words, "--steps", "7"), "searches something else: it differs in steps"),
         (("tune", "sarsa", "--kit", "standard", "--storage", "nowhere"), "the storage cannot be opened"),
+        (
+            ("tune", "sarsa", "--kit", "standard", "--storage", "redis://lab"),
+            "Optuna keeps no studies in Redis any more",
+        ),
         (("tune", "sarsa"), "there is no robot.toml here"),
         ((*train, "--out", "x", "--settings", "other.json"), "these are settings of sac, not of sarsa"),
         ((*train, "--out", "x", "--settings", "odd.json"), "sarsa has no such setting"),

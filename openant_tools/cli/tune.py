@@ -26,7 +26,7 @@ DEFAULTS: dict[str, tuple[dict[str, Any], int]] = {
 @kit_option
 @click.option(
     "--storage", default="sqlite:///tune.db", show_default=True, metavar="URL",
-    help="Any storage of Optuna's. Processes and machines that name the same share the work.",
+    help="Of Optuna: sqlite:///, postgresql://, journal:///FILE. Who names the same shares the work.",
 )  # fmt: skip
 @click.option("--study", "name", metavar="NAME", help="Default: the agent's name.")
 @click.option(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +70,9 @@ def write_minari(paths: Sequence[Path], out: Path) -> tuple[int, int]:
                 where=path,
                 remedy="export runs of one kind together",
             )
+        if names is not None:
+            low, high = np.minimum(names.bounds, here.bounds)[:, 0], np.maximum(names.bounds, here.bounds)[:, 1]
+            here = replace(here, bounds=np.array([low, high]).T)
         names, folder = here, folder or own
         episodes += found
         runs.append(f"`{path.name}`: {len(found)} episodes, {sum(len(one.rewards) for one in found)} steps")

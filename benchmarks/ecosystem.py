@@ -1,0 +1,213 @@
+"""`make ecosystem`: every peer in a throw-away environment of its own, one row each, and what became of it in docs/ecosystem.md.
+
+    python benchmarks/ecosystem.py                 rows that have no result of this day yet
+    python benchmarks/ecosystem.py sb3 minari      these, anew
+
+Each row installs this project and a peer the way a user would, runs one command against the peer's own code, and keeps what it said in
+build/ecosystem/rows.json: a run that was stopped goes on where it was. What cannot be installed here says so. With `uv`
+on the path it installs, in a third of pip's time; ECOSYSTEM_INSTALL holds further arguments for either.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+import venv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+BUILD = ROOT / "build" / "ecosystem"
+PAGE = ROOT / "docs" / "ecosystem.md"
+#: s for an installation, and for the command
+PATIENCE_S = int(os.environ.get("ECOSYSTEM_PATIENCE_S", "180"))
+PYTEST = ("pytest>=8,<9", "pytest-timeout", "hypothesis")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A peer.
+
+    Attributes:
+        what: is shown by it.
+        steps: installations in order; each a tuple of requirements, `.` being this project.
+        command: after `python`, in the root of this project.
+        versions: of these distributions the table says the version.
+        needs: a program without which it cannot be run.
+    """
+
+    what: str
+    steps: tuple[tuple[str, ...], ...]
+    command: tuple[str, ...]
+    versions: tuple[str, ...]
+    needs: str | None = None
+
+
+def peer(name: str) -> tuple[str, ...]:
+    return (f"benchmarks/peers/{name}.py",)
+
+
+def tests(*names: str) -> tuple[str, ...]:
+    return ("-m", "pytest", "-q", "-p", "no:cacheprovider", *names)
+
+
+ROWS = {
+    "platform-first": Row(
+        "the platform's `opencv-python`, then ours: windows stay", (("opencv-python",), (".",)), peer("opencv"),
+        ("opencv-python",), "xvfb-run",
+    ),
+    "ours-first": Row(
+        "ours, then the platform's `opencv-python`: windows come", ((".",), ("opencv-python",)), peer("opencv"),
+        ("opencv-python",), "xvfb-run",
+    ),
+    "sb3": Row(
+        "Stable-Baselines3 trains and evaluates", ((".", "stable-baselines3"),), ("examples/sb3.py",),
+        ("stable-baselines3", "torch", "gymnasium"),
+    ),
+    "torchrl": Row("TorchRL collects and checks specs", ((".", "torchrl"),), ("examples/torchrl_ant.py",), ("torchrl", "torch")),
+    "gymnasium": Row(
+        "Gymnasium's own checker on every id", ((".",),), peer("gymnasium_checker"), ("gymnasium", "mujoco-core")
+    ),
+    "minari": Row(
+        "Minari reads what `rec export --to minari` wrote", ((".[parquet]", "minari[arrow]", "pillow"),),
+        peer("minari_reads"), ("minari", "pyarrow"),
+    ),
+    "lerobot": Row(
+        "LeRobot's own dataset class reads what `--to lerobot` wrote", ((".[parquet]", "lerobot"),), peer("lerobot_reads"),
+        ("lerobot", "datasets", "torch"),
+    ),
+    "viewers": Row(
+        "Rerun and Foxglove read back what was exported", ((".", "rerun-sdk", "foxglove-sdk", *PYTEST),),
+        tests("tests/test_viewers.py"), ("rerun-sdk", "foxglove-sdk", "mcap"),
+    ),
+    "dynamixel-sdk": Row(
+        "the vendor's SDK on the virtual bus", ((".", *PYTEST),), tests("tests/test_vendor_sdk.py"), ("dynamixel-sdk",)
+    ),
+    "dask": Row(
+        "a Dask cluster of two workers diagnoses a blind set", ((".[dask,parquet]", *PYTEST),),
+        tests("tests/test_blind.py", "-k", "dask"), ("dask", "distributed"),
+    ),
+    "notebooks": Row(
+        "the notebooks of `examples/`, cell by cell", ((".[agents]",),), peer("notebooks"), ("torch", "mujoco-core", "matplotlib")
+    ),
+    "postgresql": Row(
+        "`openant tune` over a PostgreSQL server of Debian's", ((".[agents]", "psycopg2-binary"),), peer("postgresql"),
+        ("optuna", "psycopg2-binary"), "pg_lsclusters",
+    ),
+    "mujoco-3.17": Row(
+        "the oldest MuJoCo with `mujoco.batch`", ((".", *PYTEST), ("--reinstall" if shutil.which("uv") else "--force-reinstall", "--no-deps", "mujoco==3.17.0")),
+        tests("tests/test_rollout.py", "tests/test_plant.py", "tests/test_write_model.py", "tests/test_plain_mujoco.py"),
+        ("mujoco", "mujoco-core"),
+    ),
+}  # fmt: skip
+
+
+def run(name: str) -> dict[str, Any]:
+    """Make a row's environment, run its command, throw the environment away."""
+    row, place = ROWS[name], BUILD / name
+    shown = "python " + " ".join(row.command)
+    told: dict[str, Any] = {"date": datetime.date.today().isoformat(), "command": shown, "versions": ""}
+    if row.needs and shutil.which(row.needs) is None:
+        return told | {"result": f"not run: there is no `{row.needs}` here", "ok": None}
+    shutil.rmtree(place, ignore_errors=True)
+    uv = shutil.which("uv")
+    venv.create(place, with_pip=uv is None)
+    python = str(place / "bin" / "python")
+    install = (
+        [uv, "pip", "install", "-q", "--python", python]
+        if uv
+        else [python, "-m", "pip", "install", "-q", "--no-compile"]
+    )
+    install += shlex.split(os.environ.get("ECOSYSTEM_INSTALL", ""))
+    # Nothing of this checkout but what was installed; paths that a test starts commands from are the environment's.
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    environment["PATH"] = f"{place / 'bin'}{os.pathsep}{environment['PATH']}"
+    begun = time.monotonic()
+    try:
+        for step in row.steps:
+            words = [str(ROOT) + one[1:] if one == "." or one.startswith(".[") else one for one in step]
+            done = _run([*install, *words], environment, place)
+            if done.returncode:
+                return told | {"result": f"cannot be installed: {_last(done.stderr)}", "ok": None}
+        told["versions"] = _versions(python, row.versions)
+        done = _run([python, *row.command], environment, place)
+        said = _last(done.stdout if done.returncode == 0 else done.stderr) or _last(done.stdout)
+        return told | {
+            "result": said if done.returncode == 0 else f"{said} (exit code {done.returncode})",
+            "ok": done.returncode == 0,
+        }
+    except subprocess.TimeoutExpired as late:
+        what = "its installation" if "install" in late.cmd else "the command"
+        return told | {"result": f"not run: {what} took longer than {PATIENCE_S} s here", "ok": None}
+    finally:
+        told["seconds"] = round(time.monotonic() - begun)
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def _run(command: list[str], environment: dict[str, str], place: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )  # fmt: skip
+
+
+def _last(text: str) -> str:
+    lines = [line.strip() for line in text.splitlines() if line.strip() and "WARNING" not in line]
+    return lines[-1][:160].replace("|", "/") if lines else ""
+
+
+def _versions(python: str, names: tuple[str, ...]) -> str:
+    ask = (
+        "import importlib.metadata as m, sys\n"
+        "for n in sys.argv[1:]:\n"
+        "    try: print(n, m.version(n))\n"
+        "    except m.PackageNotFoundError: pass"
+    )
+    done = subprocess.run([python, "-c", ask, *names], capture_output=True, text=True, check=False)
+    return ", ".join(done.stdout.split("\n")).strip(", ")
+
+
+def page(rows: dict[str, dict[str, Any]]) -> str:
+    lines = [
+        "# Beside other software",
+        "",
+        "`make ecosystem` makes a throw-away environment for each peer, installs both the way a user would, and runs one command. What",
+        f"cannot be installed or run where it was made says so. Made on Python {platform.python_version()}, {platform.system()}.",
+        "",
+        "| what | version | command | result | date |",
+        "|---|---|---|---|---|",
+    ]
+    signs = {True: "✓", False: "✗", None: "–"}
+    for name, row in ROWS.items():
+        told = rows.get(name)
+        if told is None:
+            lines.append(f"| {row.what} | | `python {' '.join(row.command)}` | – not run yet | |")
+        else:
+            result = f"{signs[told['ok']]} {told['result']}"
+            lines.append(f"| {row.what} | {told['versions']} | `{told['command']}` | {result} | {told['date']} |")
+    return "\n".join([*lines, ""])
+
+
+def main() -> None:
+    BUILD.mkdir(parents=True, exist_ok=True)
+    kept = BUILD / "rows.json"
+    rows = json.loads(kept.read_text()) if kept.is_file() else {}
+    today = datetime.date.today().isoformat()
+    wanted = sys.argv[1:] or [name for name in ROWS if rows.get(name, {}).get("date") != today]
+    for name in wanted:
+        rows[name] = run(name)
+        print(name, rows[name], flush=True)
+        kept.write_text(json.dumps(rows, indent=2))
+        PAGE.write_text(page(rows), encoding="utf-8")
+    PAGE.write_text(page(rows), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
