@@ -7,8 +7,8 @@ BIN     = $(VENV)/bin
 INSTALL = $(BIN)/pip -qq --disable-pip-version-check --no-input install --root-user-action=ignore --no-compile -c constraints.txt
 unexport PYTHONDONTWRITEBYTECODE
 DEMO   ?= demo-robot
-# two workers: what CI has, and any laptop
-PYTEST_ARGS ?= -n 2
+# two workers: what CI has, and any laptop; each begins with a half of the files, so that few prepare the same
+PYTEST_ARGS ?= -n 2 --dist worksteal
 
 .PHONY: demo test lint types contracts pytest ecosystem pictures tour clean
 

@@ -55,7 +55,8 @@ Victim = Literal["command", "engine", "guardian", "guardian+engine"]
 #: s that a command may take to its first torque, on a machine that has much else to do
 BEGIN_S = 120.0
 
-STAND = "[camera]\npresent = false\n"
+#: while all stands still, its mechanics leave the processors to those who are watched here
+STAND = "[camera]\npresent = false\n[clock]\ndoze = true\n"
 LOOSE = f'{STAND}[robot]\nsetup = "loose"\n'
 NAMED = LOOSE + "".join(
     f'[[servo]]\njoint = "{joint.name}"\nid = {joint.id}\nbaud = 1000000\nreturn_delay_time = 0\n'

@@ -139,7 +139,6 @@ def test_one_wish_to_stop_ends_waiting_for_a_robot(tmp_path, learn):
         learn(Lost(0.0, stopped_at=(31,)), folder=tmp_path, steps=120, seed=0, settings=SMALL)
     assert len(rows(tmp_path)) == 30
     assert load_checkpoint(tmp_path)["transitions"] == 30
-    assert learn(Robot(0.0), folder=tmp_path, steps=60, seed=0, settings=SMALL).step == 60
 
 
 def rows_so_far(folder: Path) -> np.ndarray:

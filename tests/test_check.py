@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 from builder import Robot, robot
 
+from openant_tools.bringup import check as check_step
 from openant_tools.bringup.check import changed, check, loose, unjudged
 from openant_tools.calib.sweep import JointSweep, analyse, joint_sweep_of, sweep
 from openant_tools.calib.wires import engine_config
@@ -104,6 +105,11 @@ def known(tmp_path_factory):
     with robot(folder) as ant:
         keep_baseline(ant)
     return folder
+
+
+@pytest.fixture(autouse=True)
+def brief_twitch(monkeypatch):
+    monkeypatch.setattr(check_step, "TWITCH_S", 8.0)
 
 
 @pytest.mark.slow

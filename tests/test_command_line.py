@@ -402,7 +402,7 @@ def test_ctrl_c_in_training_saves_and_the_same_command_goes_on(
 def test_being_told_to_go_is_as_good_as_ctrl_c(
     bench: Path, tmp_path: Path, started: Callable[..., subprocess.Popen[str]], number: signal.Signals
 ) -> None:
-    process = started("virtual", "start", "--ready-file", tmp_path / "ant.json")
+    process = started("virtual", "start", "--no-camera", "--ready-file", tmp_path / "ant.json")
     wait_until((tmp_path / "ant.json").exists, process)
     process.send_signal(number)
     process.communicate(timeout=PATIENCE_S)

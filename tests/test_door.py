@@ -15,7 +15,18 @@ from pathlib import Path
 
 import click
 import pytest
-from killing import ELSEWHERE, OFF_S, WAYS, InLine, NotBegun, Victim, children, moving_commands, torque_after_kill
+from killing import (
+    ELSEWHERE,
+    OFF_S,
+    STAND,
+    WAYS,
+    InLine,
+    NotBegun,
+    Victim,
+    children,
+    moving_commands,
+    torque_after_kill,
+)
 
 from openant_tools.cli.hardware import may_move
 from openant_tools.comms.clock import VirtualControl
@@ -95,7 +106,7 @@ HOLDING = textwrap.dedent(
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="a suspended parent is seen by /proc")
 def test_suspension_and_a_lost_terminal_end_motion_first(tmp_path: Path) -> None:
-    (tmp_path / "stand.toml").write_text("[camera]\npresent = false\n")
+    (tmp_path / "stand.toml").write_text(STAND)
     with virtual_robot(str(tmp_path / "stand.toml"), clock="real", camera=False) as found:
         control = VirtualControl(str(found["control"]))
         ready = tmp_path / "ready.json"

@@ -280,7 +280,8 @@ def test_load_friction_of_another_simulation_is_found_unasked_and_written_beside
     assert any(re.search(both, note) for note in plain["notes"])
     assert re.search(both, (out / "report.html").read_text())
     # Said not to want them, nothing of theirs is left.
-    ran = CliRunner().invoke(fit, [*(str(word) for word in asked), "--no-effects"], standalone_mode=False)
+    ran = CliRunner().invoke(fit, [*(str(word) for word in asked), "--no-effects", "--kind", "stiffness"],
+                             standalone_mode=False)  # fmt: skip
     assert ran.exception is None
     assert sorted(file.name for file in out.iterdir()) == ["calibrated.xml", "fit.json", "report.html"]
 

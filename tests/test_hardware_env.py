@@ -21,7 +21,7 @@ from gymnasium.utils.env_checker import check_env
 from killing import FLOOR
 
 import openant_env  # noqa: F401
-from openant_env import hardware
+from openant_env import hardware, link
 from openant_env.link import engine_rate
 from openant_tools.cli import main
 from openant_tools.comms.clock import VirtualControl
@@ -116,7 +116,9 @@ def ready(scenario: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 @pytest.fixture(scope="module")
 def on_the_floor(ready: Path, folder: RobotFolder) -> Iterator[Walker]:
-    one = Walker(ready, folder, tag_patience_s=0.4)
+    with pytest.MonkeyPatch.context() as patch:  # half of the packets; what is recorded below has them all
+        patch.setattr(link, "ENGINE_HZ", 50.0)
+        one = Walker(ready, folder, tag_patience_s=0.4)
     try:
         yield one
     finally:

@@ -218,7 +218,7 @@ def test_runs_of_two_gains_are_one_servo(tmp_path: Path) -> None:
     # Left out in turn, a gain's only run is judged by the friction that the other gain's shows.
     assert "coulomb_friction.joint" in identify(runs[::2], files[8.0]).accepted
     # What an earlier fit wrote here would pass for a part of the next one.
-    write_fit(identify([runs[0]], files[8.0], [runs[1]]), out)
+    write_fit(identify([runs[0]], files[8.0], [runs[1]], kinds=["stiffness"]), out)
     assert sorted(path.name for path in out.glob("*.xml")) == ["calibrated.xml"]
 
 

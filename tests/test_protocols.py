@@ -393,7 +393,9 @@ def test_ctrl_c_leaves_torque_off_and_a_whole_recording(tmp_path: Path) -> None:
     out, ready = tmp_path / "run.mcap", tmp_path / "ready.json"
     cli = [sys.executable, "-m", "openant_tools.cli"]
     robot = subprocess.Popen(
-        [*cli, "virtual", "start", "--ready-file", str(ready)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [*cli, "virtual", "start", "--no-camera", "--ready-file", str(ready)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
     try:
         _wait(ready.is_file)

@@ -452,7 +452,7 @@ def owned(draw: st.DrawFn, text: str) -> str:
 
 
 @given(data=st.data())
-@settings(suppress_health_check=list(HealthCheck), max_examples=40, deadline=None)
+@settings(suppress_health_check=list(HealthCheck), max_examples=20, deadline=None)
 def test_whatever_the_owner_wrote_survives(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     folder = create_robot(tmp_path_factory.mktemp("owned") / "ant")
     text = data.draw(owned(folder.config_file.read_text(encoding="utf-8")))
@@ -492,7 +492,7 @@ def test_whatever_the_owner_wrote_survives(tmp_path_factory: pytest.TempPathFact
          "provenance", "provenance.motors", "schema", "platform"]
     ),
 )  # fmt: skip
-@settings(max_examples=300)
+@settings(max_examples=150)
 def test_no_value_anywhere_breaks_the_reader(junk: Any, path: str) -> None:
     document: dict[str, Any] = {
         "name": "a", "kit": "lite", "model": "m.xml", "bus": {}, "imu": {}, "timing": {}, "observation": {},

@@ -205,16 +205,14 @@ class SteppedClock:
         return self._t
 
     def sleep_until(self, t: float) -> None:
-        if any(line.written != self._settled[name] for name, line in self._lines.items()):
+        if t > self._t or self._unsettled:
             self._ask("advance", to=t)  # once what was written has had its effect
-        elif t > self._t:
-            self._take(self._control.ask("advance", to=t))
 
     def wait_readable(self, line: Line, deadline: float) -> bool:
         name = self._name(line)
-        if line.received >= self._sent[name] and (name == "bus" or deadline <= self._t):
-            # A servo answers at once or never: let all that it has to say arrive by one question. And who only looks
-            # is told what came while time moved.
+        if line.received >= self._sent[name] and name == "bus" and self._unsettled:
+            # A servo answers at once or never: let all that it has to say arrive by one question. Who only looks knows
+            # already what came while time moved.
             self._ask("settle")
         if line.received >= self._sent[name] and deadline > self._t:
             self._ask("wait", port=name, to=deadline)
@@ -240,6 +238,11 @@ class SteppedClock:
 
     def in_time(self, at: float, deadline: float) -> bool:
         return at <= deadline or (self._stood[0] <= deadline and at <= self._stood[1])
+
+    @property
+    def _unsettled(self) -> bool:
+        """Whether something has been written that has not had its effect yet."""
+        return any(line.written != self._settled[name] for name, line in self._lines.items())
 
     def _name(self, line: Line) -> str:
         return next(name for name, known in self._lines.items() if known is line)
