@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 
-__all__ = ["UNKNOWN", "decimals_of", "is_error", "number", "percent", "readable", "span"]
+__all__ = ["UNKNOWN", "decimals_of", "exact", "is_error", "number", "percent", "readable", "span"]
 
 UNKNOWN = "unknown"
 #: digits that count, of a number without an interval
@@ -96,13 +96,22 @@ def number(
     return f"{plus}{words}{_joined(unit)}{interval}"
 
 
-def span(low: float | None, high: float | None, unit: str = "", *, name: str = "") -> str:
-    """Two ends of a range, `-45 to 45°`."""
+def exact(value: float, unit: str = "") -> str:
+    """A number that somebody chose, which has the digits that he gave it: `0.5 s`."""
+    return f"{value:g}".replace("-", "−") + _joined(unit)
+
+
+def span(low: float | None, high: float | None, unit: str = "", *, name: str = "", decimals: int | None = None) -> str:
+    """Two ends of a range, `-45 to 45°`; arguments as those of `number`."""
     if low is None or high is None or not (math.isfinite(low) and math.isfinite(high)):
         return UNKNOWN
     factor, unit = readable(max(abs(low), abs(high)), unit, name)
     ends = [factor * low, factor * high]
     places = max(0 if float(end).is_integer() else min(2, decimals_of(end, None, unit)) for end in ends)
+    if places:  # a narrow range, such as that of an inertia, needs more
+        places = max(places, min(decimals_of(ends[1], 0.5 * abs(ends[1] - ends[0])), FINEST.get(unit, 6)))
+    if decimals is not None:
+        places = decimals
     return f"{_plain(ends[0], places)} to {_plain(ends[1], places)}{_joined(unit)}"
 
 

@@ -102,7 +102,7 @@ def test_the_command_tells_shows_and_writes(model: Path, tmp_path: Path) -> None
     told = json.loads((tmp_path / "g.json").read_text())
     assert told["signals"]["pos"]["gap"] > told["signals"]["pos"]["floor"]
     assert sum(place["share"] for place in told["where"] if place["signal"] == "pos") == pytest.approx(1.0)
-    assert "At its worst" in (tmp_path / "r" / "report.html").read_text()
+    assert "position is farthest off" in (tmp_path / "r" / "report.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openant_tools.report import Details, Figure, KeyFigure, Mark, Report, Table, Text, plots
+from openant_tools.report import Answer, Details, Figure, KeyFigure, KeyFigures, Mark, Report, Table, Text, plots
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 
@@ -68,9 +68,20 @@ def a_figure(points: int = 50) -> Any:
 
 def a_report() -> Report:
     return (
-        Report("Fit of ant12 & friends", "3 runs, `calibrated.xml`", made_by="openant sysid fit run.mcap")
+        Report(
+            "Fit of ant12 & friends",
+            "3 runs, `calibrated.xml`",
+            Answer(
+                "It leaves 12 % of the error.",
+                Figure(a_figure(), "The worst moment."),
+                "Of *use*.",
+                "Train.",
+                "good",
+                [KeyFigure("position gap", "0.021 rad", "0.083 rad before", "good")],
+            ),
+            made_by="openant sysid fit run.mcap",
+        )
         .section("Result")
-        .key_figures(KeyFigure("position gap", "0.021 rad", "0.083 rad before", "good"))
         .text("It **beats** the given model <everywhere>.\n\n- one\n- two\n  goes on")
         .table(["name", "value (N·m)"], [["a|b", 1.5], [Mark("rejected", "bad"), None]], "Parameters")
         .section("Pictures")
@@ -101,14 +112,28 @@ def test_a_report_opens_offline_and_is_sound(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
 
 
+def test_it_begins_with_its_answer_folds_the_rest_and_links_its_recording(tmp_path: Path) -> None:
+    (tmp_path / "my runs").mkdir()
+    recording = tmp_path / "my runs" / "run 1.mcap"
+    recording.touch()
+    report = a_report()
+    report.recordings = [recording, tmp_path / "gone.mcap"]
+    html = report.write(tmp_path / "page" / "report.html").read_text(encoding="utf-8")
+    order = ["<h1>", "It leaves 12", "The worst moment.", "position gap", "What it means", "What to do next",
+             "<details><summary><h2>Result</h2>", "Made from", "openant sysid fit run.mcap"]  # fmt: skip
+    assert [html.index(words) for words in order] == sorted(html.index(words) for words in order)
+    assert "Of <em>use</em>." in html
+    assert '<a href="./../my%20runs/run%201.mcap">run 1.mcap</a>, gone.mcap' in html
+
+
 def test_figures_follow_the_pages_ink_and_say_what_they_show() -> None:
     html = a_report().html()
     svg = html[html.index("<svg ") : html.index("</svg>")]
-    assert 'aria-label="Measured against simulated."' in svg
+    assert 'aria-label="The worst moment."' in svg
     assert "currentColor" in svg
     assert plots.INK not in svg
-    assert "position (rad)" in svg
-    assert "velocity (rad/s)" in svg
+    assert "position (°)" in svg
+    assert "velocity (°/s)" in svg
     assert "time (s)" in svg
 
 
@@ -128,18 +153,24 @@ def test_twins_in_markdown_and_json(tmp_path: Path) -> None:
     assert text.startswith("# Fit of ant12 & friends\n")
     assert "| a\\|b | 1.50 |" in text
     pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text)
-    assert len(pictures) == 3
+    assert len(pictures) == 4
     assert all((tmp_path / picture).read_bytes().startswith(b"\x89PNG") for picture in pictures)
     data = json.loads((tmp_path / "report.json").read_text())
-    assert data["sections"][0]["parts"][0]["figures"][0]["value"] == "0.021 rad"
-    assert data["sections"][0]["parts"][2]["rows"] == [["a|b", 1.5], [{"text": "rejected", "tone": "bad"}, None]]
+    assert data["verdict"] == "It leaves 12 % of the error."
+    assert data["answer"][2]["figures"][0]["value"] == "0.021 rad"
+    assert data["sections"][0]["parts"][1]["rows"] == [["a|b", 1.5], [{"text": "rejected", "tone": "bad"}, None]]
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.text(max_size=60), st.text(max_size=60))
 def test_no_text_can_break_the_page(words: str, cell: str) -> None:
-    report = Report(words, words).section(words).text(words).table([cell], [[cell], [Mark(cell, "warn")]], words)
-    report.key_figures(KeyFigure(words, cell, words)).add(Details(words, [Table([words], [[cell]])])).code(cell)
+    report = (
+        Report(words, words, Answer(words, None, words, words))
+        .section(words)
+        .text(words)
+        .table([cell], [[cell], [Mark(cell, "warn")]], words)
+    )
+    report.add(KeyFigures([KeyFigure(words, cell, words)])).add(Details(words, [Table([words], [[cell]])])).code(cell)
     Page(report.html())
 
 
@@ -164,9 +195,9 @@ def test_colours_are_told_apart_and_words_carry_the_tone_too() -> None:
 @pytest.mark.parametrize(
     ("signal", "label"),
     [
-        ("pos", "position (rad)"),
-        ("gyro.z", "turn rate z (rad/s)"),
-        ("base.yaw", "heading (rad)"),
+        ("pos", "position (°)"),
+        ("gyro.z", "turn rate z (°/s)"),
+        ("base.yaw", "heading (°)"),
         ("pwm", "duty (–)"),
         ("temp", "temperature (°C)"),
     ],
@@ -184,7 +215,7 @@ def test_a_full_disk_leaves_the_old_report(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OSError, match="No space left"):
-        Report("New").text("text").write(path)
+        Report("New", "", Answer("No.", None, "", "")).write(path)
     monkeypatch.undo()
     assert path.read_bytes() == before
     assert len(list(tmp_path.iterdir())) == 1

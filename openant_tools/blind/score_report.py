@@ -16,8 +16,10 @@ from openant_tools.blind.draw import ELSEWHERE, OUTSIDE, Answer, Drawn
 from openant_tools.blind.score import Row, Score, truth_in_words
 from openant_tools.blind.sizes import size_table
 from openant_tools.files import write_bytes, write_text
+from openant_tools.numbers import number, percent, span
 from openant_tools.procedure.intervals import wilson
-from openant_tools.report import KeyFigure, Report, plots
+from openant_tools.report import Answer as FirstScreen
+from openant_tools.report import Figure, KeyFigure, Report, plots
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -26,7 +28,9 @@ __all__ = ["score_report", "table_lines", "write_docs"]
 
 
 def _shown(row: Row, value: float) -> str:
-    return f"{value:.0f} s" if row.unit == "s" else f"{value:.2f}" if row.k is None else f"{100 * value:.0f} %"
+    if row.unit == "s":
+        return number(value, "s", decimals=0)
+    return number(value, decimals=2) if row.k is None else percent(value)
 
 
 def _cell(row: Row) -> str:
@@ -36,7 +40,7 @@ def _cell(row: Row) -> str:
     interval = ""
     if row.k is not None:
         low, high = wilson(row.k, row.n)
-        interval = f" ({100 * low:.0f} … {100 * high:.0f} %)"
+        interval = f" ({span(100 * low, 100 * high, '%', decimals=0)})"
     return f"{_shown(row, row.figure)}{interval} of {row.n}"
 
 
@@ -103,7 +107,7 @@ def confusion(found: Score) -> MatplotlibFigure:
         axes.text(
             column,
             row,
-            f"{table[row, column]:.0f}",
+            number(table[row, column], decimals=0),
             ha="center",
             va="center",
             fontsize=6,
@@ -182,17 +186,26 @@ def _drawn(found: Score) -> list[str]:
 
 def score_report(found: Score) -> Report:
     """Everything about how the diagnosis did."""
-    report = Report("The blind benchmark", _origin(found), made_by="openant gap blind score")
-    for maker, rows in found.makers.items():
-        measured = [(row, value) for row in rows if (value := row.figure) is not None]
-        report.key_figures(
-            *(
-                KeyFigure(f"{row.words}: {maker}", _shown(row, value), f"asked: {_asked(row, row.first)}")
-                for row, value in measured[:3]
-            )
-        )
+    rows = [row for mine in found.makers.values() for row in mine]
+    below = list(dict.fromkeys(row.words for row in rows if row.reached == "below"))
+    worst = "; ".join(f"{truth} taken for {said} ({count} times)" for truth, said, count in _worst(found)[:3])
+    answer = FirstScreen(
+        f"Below what is asked for first: {', '.join(below)}."
+        if below
+        else "Every figure reaches what is asked for first.",
+        Figure(confusion(found), "How often which verdict was given, by what was true."),
+        f"{len(found.failures)} of {len(found.cases)} robots were judged wrongly" + (f"; {worst}." if worst else "."),
+        "Look at every failure below, and ask the diagnosis for its evidence: `openant gap diagnose` on that robot's runs.",
+        "bad" if below else "good",
+        [
+            KeyFigure(f"{row.words}: {maker}", _shown(row, value), f"asked: {_asked(row, row.first)}")
+            for maker, mine in found.makers.items()
+            for row in [row for row in mine if row.figure is not None][:3]
+            if (value := row.figure) is not None
+        ],
+    )
+    report = Report("The blind benchmark", _origin(found), answer, made_by="openant gap blind score")
     report.section("Table").table(_columns(found), _table(found))
-    report.section("Confusions").figure(confusion(found), "How often which verdict was given, by what was true.")
     report.section("Probabilities").figure(
         reliability(found), "Every effect of every diagnosis; figures are counts, lines 95 % intervals."
     )

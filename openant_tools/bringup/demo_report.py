@@ -16,27 +16,21 @@ from numpy.typing import NDArray
 
 from openant_tools.bringup.demo import Demo
 from openant_tools.bringup.robot_picture import robot_picture
+from openant_tools.bringup.tracking import Moment, draw_moment, worst_moment
 from openant_tools.files import write_bytes
-from openant_tools.model.plant import Setup, load_plant
-from openant_tools.model.rollout import Rollouts
-from openant_tools.numbers import number
-from openant_tools.recording.run import Run
+from openant_tools.numbers import number, percent
 from openant_tools.recording.tables import read_run
-from openant_tools.report import KeyFigure, Mark, Picture, Report, Table, Text, plots
+from openant_tools.report import Answer, Figure, KeyFigure, Mark, Picture, Report, Table, Text, plots
 from openant_tools.report.parts import Tone
-from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.registers import PWM_FULL
 from openant_tools.virtual.scenario import load_scenario
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
-__all__ = ["Recovered", "compare", "gap_words", "speed", "spread", "truth", "write_report"]
+__all__ = ["Recovered", "compare", "gap_words", "speed", "spread", "truth", "walks", "write_report"]
 
 Array = NDArray[np.float64]
-
-#: s, shown around the moment at which the nominal model is worst
-WINDOW_S = 2.0
 
 #: kind of parameter → its name and unit on an axis, and what is shown: value × this, or None for value / data sheet
 KINDS: Mapping[str, tuple[str, str, float | None]] = {
@@ -131,7 +125,7 @@ def write_report(demo: Demo) -> dict[str, Any]:
     fit = json.loads((demo.fit / "fit.json").read_text(encoding="utf-8"))
     rows = compare(fit, truth(demo.scenario))
     run = read_run(demo.held_out[0])
-    moment = _worst_moment(run, demo.nominal, demo.fit / "calibrated.xml")
+    moment = worst_moment(run, demo.nominal, demo.fit / "calibrated.xml")
     curve = _curve(demo.training / "learning_curve.csv") if demo.learns else None
     walking = _walking(demo) if demo.learns else None
     picture, drawn_by = robot_picture(demo.fit / "calibrated.xml")
@@ -152,7 +146,6 @@ def write_report(demo: Demo) -> dict[str, Any]:
         else {key: walking[key] for key in ("starts", "seconds", "sampled", "likeliest")},
     }
 
-    report = Report("A virtual Open Ant, calibrated", _subtitle(demo), made_by=f"openant demo --robot {demo.folder}")
     keys = [
         KeyFigure(
             "held-out error",
@@ -169,18 +162,37 @@ def write_report(demo: Demo) -> dict[str, Any]:
         ),
     ]
     if walking is not None:
-        keys.append(KeyFigure("learned to walk at", speed(walking), f"{_minutes(curve)}; {spread(walking)}"))
-    report.key_figures(*keys)
+        keys.append(
+            KeyFigure(
+                "walks at" if walks(walking) else "does not walk yet",
+                speed(walking),
+                f"{_minutes(curve)}; {spread(walking)}",
+            )
+        )
+    ratio = after["gap_full_rad"] / before["gap_full_rad"]
+    overview = _keep(demo, "overview", _overview_figure(picture, demo.strip, moment, curve, walking))
+    answer = Answer(
+        f"The calibrated simulation leaves {percent(ratio)} of the data sheets' error"
+        + ("." if walking is None else f", and in it {_learned(walking)}."),
+        Figure(
+            overview,
+            f"The robot; the held-out motion around the moment at which the data sheets' model is worst, {moment.joint}"
+            + ("." if walking is None else "; and what it learned."),
+        ),
+        "What is wrong with this robot was found from its recordings alone: so would what is wrong with yours.",
+        "Begin with your own robot, `openant`; or play with this one: `openant --virtual`.",
+        "good" if ratio < 1 else "bad",
+        keys,
+    )
+    report = Report(
+        "A virtual Open Ant, calibrated", _subtitle(demo), answer, made_by=f"openant demo --robot {demo.folder}",
+        recordings=[demo.fitted, *demo.held_out],
+    )  # fmt: skip
     if picture is not None:
-        report.picture(picture, f"The calibrated model at its home pose, {drawn_by}.", "An Open Ant on its four legs")
         write_bytes(demo.pictures / "robot.png", picture)
     else:
-        report.text(drawn_by)
-    report.section("Measured against simulated")
-    report.figure(
-        _keep(demo, "gap", _gap_figure(moment)),
-        f"The held-out motion around the moment at which the data sheets' model is worst, {moment.joint}.",
-    )
+        report.section("Picture").text(drawn_by)
+    _keep(demo, "gap", _gap_figure(moment))
     report.section("What was found, and what is true").figure(
         _keep(demo, "settings", _settings_figure(rows)),
         "Every setting of the virtual robot, relative to its data sheet: what is true, and the fit's 95 % interval.",
@@ -210,7 +222,6 @@ def write_report(demo: Demo) -> dict[str, Any]:
             "it was still learning.",
         )
         report.text(_stood_still(walking))
-    _keep(demo, "overview", _overview_figure(picture, demo.strip, moment, curve, walking))
     report.section("The same by hand").code("\n".join(line for stage in demo.stages() for line in stage.command_lines))
     report.write(demo.report)
     return figures
@@ -238,58 +249,12 @@ def _minutes(curve: Array | None) -> str:
 # ---- figures ----
 
 
-@dataclass(frozen=True)
-class _Moment:
-    """A stretch of the held-out run for one joint: measured, and simulated by both models; rad against s."""
-
-    joint: str
-    t: Array
-    command: Array
-    measured: Array
-    nominal: Array
-    calibrated: Array
-
-
-def _worst_moment(run: Run, nominal: Path, calibrated: Path) -> _Moment:
-    simulated = []
-    for path in (nominal, calibrated):
-        plant = load_plant(path, JOINT_NAMES, Setup.STAND)
-        simulated.append(Rollouts(plant, [run])().pos[0])
-    measured = run.signal("pos", JOINT_NAMES)
-    squares = np.nan_to_num(measured - simulated[0]) ** 2
-    width = max(2, min(len(run.t), round(WINDOW_S / float(np.median(np.diff(run.t))))))
-    # Sums over every window, by differences of running sums.
-    sums = np.vstack([np.zeros(squares.shape[1]), np.cumsum(squares, axis=0)])
-    first, j = np.unravel_index(
-        int(np.argmax(sums[width:] - sums[:-width])), (len(run.t) - width + 1, len(JOINT_NAMES))
-    )
-    rows = slice(int(first), int(first) + width)
-    joint = JOINT_NAMES[int(j)]
-    return _Moment(
-        joint, run.t[rows] - run.t[0], run.column(f"cmd.{joint}")[rows], measured[rows, j],
-        simulated[0][rows, j], simulated[1][rows, j],
-    )  # fmt: skip
-
-
-def _gap_figure(moment: _Moment) -> MatplotlibFigure:
+def _gap_figure(moment: Moment) -> MatplotlibFigure:
     figure: MatplotlibFigure
     figure, (above, below) = plots.figure(2, 1, height=2.2, sharex=True)
-    _draw_gap(above, below, moment)
+    draw_moment(above, below, moment)
     plots.legend(above)
     return figure
-
-
-def _draw_gap(above: Any, below: Any, moment: _Moment) -> None:
-    with plots.style():
-        above.plot(moment.t, moment.command, color=plots.INK, linewidth=0.8, alpha=0.5, label="command")
-        above.plot(moment.t, moment.measured, color=plots.INK, linewidth=2.2, label="measured")
-        above.plot(moment.t, moment.nominal, "--", color=plots.VERMILLION, label="data sheets")
-        above.plot(moment.t, moment.calibrated, color=plots.BLUE, label="calibrated")
-        above.set_ylabel(plots.axis_label(moment.joint, "rad"))
-        below.plot(moment.t, 1e3 * (moment.measured - moment.nominal), "--", color=plots.VERMILLION)
-        below.plot(moment.t, 1e3 * (moment.measured - moment.calibrated), color=plots.BLUE)
-        below.set_ylabel(plots.axis_label("measured − simulated", "mrad"))
-        below.set_xlabel(plots.axis_label("time in run", "s"))
 
 
 def _learning_figure(curve: Array, walking: Mapping[str, Any]) -> MatplotlibFigure:
@@ -346,13 +311,13 @@ def _settings_figure(rows: Sequence[Recovered]) -> MatplotlibFigure:
 
 
 def _overview_figure(
-    picture: bytes | None, strip: Path, moment: _Moment, curve: Array | None, walking: Mapping[str, Any] | None
+    picture: bytes | None, strip: Path, moment: Moment, curve: Array | None, walking: Mapping[str, Any] | None
 ) -> MatplotlibFigure:
     """The demo in one picture: the robot, measured against simulated, learning and walking."""
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Canvas
     from matplotlib.image import imread
 
-    figure = Figure(figsize=(11.0, 5.0))
+    figure = Canvas(figsize=(11.0, 5.0))
     with plots.style():
         figure.set_layout_engine("constrained")
         left, right = np.ravel(np.asarray(figure.subfigures(1, 2, width_ratios=(1.0, 1.35))))
@@ -374,7 +339,7 @@ def _overview_figure(
             axes[0].imshow(imread(io.BytesIO(picture)))
         above, below = right.subplots(2, 1, sharex=True)
         above.set_title("A motion it was not fitted to")
-    _draw_gap(above, below, moment)
+    draw_moment(above, below, moment)
     plots.legend(above, loc="upper center", bbox_to_anchor=(0.5, -0.02))
     return figure
 
@@ -397,6 +362,23 @@ def _walking(demo: Demo) -> dict[str, Any]:
 def speed(walking: Mapping[str, Any]) -> str:
     """How fast it walks as it trained, in a word; every figure of the demo that says it is this one."""
     return f"{_cm_s(walking['sampled']['median'])} cm/s"
+
+
+#: m/s; below it a robot shuffles on the spot
+WALKS_M_S = 0.01
+
+
+def walks(walking: Mapping[str, Any]) -> bool:
+    """Whether it goes forward at all, as it trained."""
+    return bool(walking["sampled"]["median"] >= WALKS_M_S)
+
+
+def _learned(walking: Mapping[str, Any]) -> str:
+    return (
+        f"the robot learned to walk at {speed(walking)}"
+        if walks(walking)
+        else f"the robot does not walk yet ({speed(walking)})"
+    )
 
 
 def _cm_s(reward_m_s: float) -> str:

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from openant_tools.bringup.robot_picture import robot_picture
+from openant_tools.bringup.tracking import Moment, draw_moment, worst_moment
 from openant_tools.bringup.walk import WALK, standing
+from openant_tools.errors import BadInput
+from openant_tools.numbers import number, span
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Bench, Procedure, Progress
-from openant_tools.report import KeyFigure, Mark, Report
-from openant_tools.robot.folder import RobotFolder
+from openant_tools.recording.tables import read_run
+from openant_tools.report import Answer, Figure, KeyFigure, Mark, Part, Picture, Report, plots
+from openant_tools.robot.folder import NOMINAL_MODEL, RobotFolder
 from openant_tools.robot.joints import JOINTS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MatplotlibFigure
 
 __all__ = ["passport", "passport_step", "write_passport"]
 
@@ -58,24 +68,35 @@ def passport(folder: RobotFolder) -> Report:
     """The passport as a report."""
     config = folder.config()
     states = standing(folder)
-    report = Report(f"Passport of {config.name}", f"{config.kit} kit, in {folder.path.resolve()}", made_by=COMMAND)
-    report.section("How it stands")
-    figures = [
-        KeyFigure(
-            "steps done", f"{sum(now.state == 'ok' for n, now in states.items() if n != 'passport')} of {len(WALK) - 1}"
-        )
+    done = [name for name, now in states.items() if now.state == "ok" and name != "passport"]
+    open_ = [now.step.title for name, now in states.items() if now.state != "ok" and name != "passport"]
+    failed = any(now.state == "failed" for now in states.values())
+    problems = [
+        f"- {line if line.startswith(now.step.title) else f'{now.step.title}: {line}'}"
+        for now in states.values()
+        if now.finding
+        for line in now.finding.lines
     ]
-    gap = states["gap"].finding
-    if gap is not None:
-        values = {evidence.name: evidence.value for evidence in gap.evidence}
-        after = values.get("position gap, calibrated")
-        if after is not None:
-            figures.append(KeyFigure("simulation is off by", f"{1e3 * after:.1f} mrad", "joint positions, 0.5 s ahead"))
-    comms = states["comms"].finding
-    if comms is not None and "rate_hz" in comms.data:
-        figures.append(KeyFigure("bus", f"{comms.data['rate_hz']:.0f} cycles/s", "write and read of all servos"))
-    report.key_figures(*figures)
-    report.table(
+    left = ", ".join(open_[:4]) + (f" and {len(open_) - 4} more" if len(open_) > 4 else "")
+    train = f"openant train sac --robot {folder.path} --out {folder.runs / 'sac-1'}"
+    answer = Answer(
+        f"{config.name} is measured and calibrated: all {len(done)} steps say yes."
+        if not open_
+        else f"{len(done)} of {len(WALK) - 1} steps of {config.name} say yes; left: {left}.",
+        _portrait(folder),
+        f"Simulated and real robot read this folder: `{config.model}` is the model, `robot.toml` the rest."
+        + ("\n\n" + "\n".join(problems) if problems else ""),
+        f"Do {open_[0]}: `openant bringup --robot {folder.path}`."
+        if open_
+        else f"Train: `{train}`. Before every session: `openant check --robot {folder.path}`.",
+        "good" if not open_ else "bad" if failed else "warn",
+        _figures(folder),
+    )
+    report = Report(
+        f"Passport of {config.name}", f"{config.kit} kit, in {folder.path.resolve()}", answer, made_by=COMMAND,
+        recordings=_recordings(folder),
+    )  # fmt: skip
+    report.section("Step by step").table(
         ["step", "stands", "when (UTC)", "what was found"],
         [
             [
@@ -88,17 +109,11 @@ def passport(folder: RobotFolder) -> Report:
             if name != "passport"
         ],
     )
-    problems = [f"- {now.step.title}: {line}" for now in states.values() if now.finding for line in now.finding.lines]
-    if problems:
-        report.section("What to look at").text("\n".join(problems))
     _motors(report, folder)
     _sensors(report, folder)
     _observations(report, folder)
-    report.section("What it is good for").text(
-        f"Simulated and real robot read this folder: `{config.model}` is the model, `robot.toml` the rest."
-    )
-    report.code(
-        f"openant train sac --robot {folder.path} --out {folder.runs / 'sac-1'}\n"
+    report.section("Commands").code(
+        f"{train}\n"
         f"openant check --robot {folder.path}        # before every session\n"
         f"openant config export --robot {folder.path}   # for the platform's own software"
     )
@@ -118,6 +133,61 @@ def passport(folder: RobotFolder) -> Report:
     return report
 
 
+def _figures(folder: RobotFolder) -> list[KeyFigure]:
+    gap, comms = (standing(folder)[name].finding for name in ("gap", "comms"))
+    figures = []
+    after = next((e for e in gap.evidence if e.name == "position gap, calibrated"), None) if gap else None
+    if after is not None:
+        figures.append(KeyFigure("simulation is off by", after.words, "joint positions, 0.5 s ahead"))
+    if comms is not None and "rate_hz" in comms.data:
+        rate = number(comms.data["rate_hz"], decimals=0)
+        figures.append(KeyFigure("bus", f"{rate} cycles/s", "write and read of all servos"))
+    return figures
+
+
+def _recordings(folder: RobotFolder) -> list[Path]:
+    """Of which its values were made, each once."""
+    named = dict.fromkeys(entry.recording for entry in folder.config().provenance.values() if entry.recording)
+    return [folder.path / name for name in named]
+
+
+def _portrait(folder: RobotFolder) -> Part | None:
+    """The robot, and how it and its models move where that was recorded."""
+    from matplotlib.image import imread
+
+    moment = _tracking(folder)
+    picture, how = robot_picture(folder.model_path())
+    if moment is None:
+        return None if picture is None else Picture(picture, f"The robot's model at its home pose, {how}.")
+    figure: MatplotlibFigure
+    figure, axes = plots.figure(2, 2, height=2.0, width_ratios=[2, 3])
+    for place in axes[:, 0]:
+        place.axis("off")
+    if picture is not None:
+        whole = figure.add_subplot(axes[0, 0].get_gridspec()[:, 0])
+        whole.imshow(imread(io.BytesIO(picture)))
+        whole.axis("off")
+    axes[0, 1].sharex(axes[1, 1])
+    draw_moment(axes[0, 1], axes[1, 1], moment)
+    plots.legend(axes[0, 1], ncols=2, loc="lower right")
+    return Figure(
+        figure,
+        f"The robot's model at its home pose, {how}; and {moment.joint} on a motion that the fit did not see, where the data sheets' "
+        "model is worst.",
+    )
+
+
+def _tracking(folder: RobotFolder) -> Moment | None:
+    identified = standing(folder)["identify"].finding
+    held_out = identified.data.get("held_out", []) if identified else []
+    if not held_out:
+        return None
+    try:
+        return worst_moment(read_run(folder.path / held_out[0]), folder.path / NOMINAL_MODEL, folder.model_path())
+    except BadInput:  # a recording or model that was moved away costs the picture, not the passport
+        return None
+
+
 def _motors(report: Report, folder: RobotFolder) -> None:
     config, states = folder.config(), standing(folder)
     inventory, bounds = states["inventory"].finding, states["bounds"].finding
@@ -134,34 +204,36 @@ def _motors(report: Report, folder: RobotFolder) -> None:
                 motor.model,
                 str(eeprom.get(joint, {}).get("firmware_version", "")),
                 "+" if motor.direction > 0 else "−",
-                f"{math.degrees(motor.zero_offset_rad):.1f}",
-                f"{math.degrees(motor.min_rad):.0f} … {math.degrees(motor.max_rad):.0f}",
-                "" if sweep.get("friction_nm") is None else f"{sweep['friction_nm']:.3f}",
+                number(motor.zero_offset_rad, "rad", decimals=1),
+                span(motor.min_rad, motor.max_rad, "rad"),
+                "" if sweep.get("friction_nm") is None else number(sweep["friction_nm"], "N·m", decimals=3),
             ]
         )
     report.section("Joints").table(
-        ["joint", "where", "id", "servo", "firmware", "way", "zero (°)", "limits (°)", "friction (N·m)"], rows
+        ["joint", "where", "id", "servo", "firmware", "way", "zero", "limits", "friction"], rows
     )
 
 
 def _sensors(report: Report, folder: RobotFolder) -> None:
     config = folder.config()
     imu, camera = config.imu, config.camera
-    mounted = math.degrees(math.sqrt(sum(x * x for x in imu.mounting_rad)))
+    mounted = math.sqrt(sum(x * x for x in imu.mounting_rad))
+    arena = standing(folder)["arena"].finding
+    late = camera.latency_s if camera.latency_s is not None else arena.data.get("latency_s") if arena else None
+    missing = "not measured"
     report.section("Sensors").table(
-        ["what", "value", "unit"],
+        ["what", "value"],
         [
-            ["IMU: counts per g", f"{imu.acc_counts_per_g:.0f}" if imu.acc_counts_per_g else "not measured", ""],
-            ["IMU: counts per °/s", f"{imu.gyro_counts_per_dps:.4g}", ""],
-            ["IMU: mounted at", f"{mounted:.1f}", "°"],
-            ["IMU: gyro bias", " ".join(f"{x:+.4f}" for x in imu.gyro_bias_rad_s), "rad/s"],
-            ["camera: diagonal field of view", f"{math.degrees(camera.fov_diagonal_rad):.1f}", "°"],
-            ["camera: latency", "not measured" if camera.latency_s is None else f"{1e3 * camera.latency_s:.0f}", "ms"],
-            ["tags: origin, body", f"{camera.origin_tag_id}, {camera.body_tag_id}", ""],
+            ["IMU: counts per g", number(imu.acc_counts_per_g) if imu.acc_counts_per_g else missing],
+            ["IMU: counts per °/s", number(imu.gyro_counts_per_dps)],
+            ["IMU: mounted at", number(mounted, "rad", decimals=1)],
+            ["IMU: gyro bias", " ".join(number(x, "rad/s", sign=True, decimals=2) for x in imu.gyro_bias_rad_s)],
+            ["camera: diagonal field of view", number(camera.fov_diagonal_rad, "rad")],
+            ["camera: latency", missing if late is None else number(late, "s")],
+            ["tags: origin, body", f"{camera.origin_tag_id}, {camera.body_tag_id}"],
             [
                 "tags: edge of origin, body",
-                f"{1e3 * camera.origin_tag_size_m:.1f}, {1e3 * camera.body_tag_size_m:.1f}",
-                "mm",
+                " and ".join(number(x, "m") for x in (camera.origin_tag_size_m, camera.body_tag_size_m)),
             ],
         ],
     )
@@ -172,7 +244,8 @@ def _observations(report: Report, folder: RobotFolder) -> None:
     if not config.observation:
         return
     report.section("Observations").table(
-        ["observation", "lowest", "highest"], [[name, low, high] for name, (low, high) in config.observation.items()]
+        ["observation", "lowest to highest"],
+        [[name, span(low, high, plots.signal_unit(name))] for name, (low, high) in config.observation.items()],
     )
     bounds = standing(folder)["bounds"].finding
     picture = folder.path / str(bounds.data.get("picture", "")) if bounds else folder.path

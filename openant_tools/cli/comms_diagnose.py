@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from openant_tools.cli.options import json_option, report_option, robot_option
+from openant_tools.cli.options import json_option, report_option, robot_option, write_report
 
 __all__ = ["diagnose", "timing"]
 
@@ -68,7 +68,7 @@ def diagnose(
     if effects_file:
         write_text(effects_file, effects_toml(found))
     if report:
-        click.echo(f"wrote {dropouts_report(found).write_folder(report)}", err=True)
+        write_report(dropouts_report(found), report, runs)
     if keep:
         from openant_tools.cli.hardware import robot_of
 
@@ -112,4 +112,4 @@ def timing(run: Path, picture: Path | None, json_file: Path | None, report: Path
         figure.set_facecolor("white")
         write_bytes(picture, plots.as_png(figure))
     if report:
-        click.echo(f"wrote {timing_report(found).write_folder(report)}", err=True)
+        write_report(timing_report(found), report, [run])

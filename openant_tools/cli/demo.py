@@ -103,7 +103,7 @@ def _bar(console: Console, line: str) -> Iterator[Callable[[str, float], None]]:
 
 def _print(whole: Any, figures: dict[str, Any]) -> None:
     robot = whole.folder
-    from openant_tools.bringup.demo_report import gap_words, speed, spread
+    from openant_tools.bringup.demo_report import gap_words, speed, spread, walks
 
     before, after, floor = (gap_words(figures[name]) for name in ("gap_before_rad", "gap_after_rad", "floor_rad"))
     click.echo(
@@ -111,7 +111,8 @@ def _print(whole: Any, figures: dict[str, Any]) -> None:
         f"{figures['settings_determined']} settings recovered within their intervals"
     )
     if figures["walking"] is not None:
-        click.echo(f"walks at {speed(figures['walking'])} ({spread(figures['walking'])})")
+        found = figures["walking"]
+        click.echo(f"{'walks at' if walks(found) else 'does not walk yet:'} {speed(found)} ({spread(found)})")
     rows = [
         (whole.report, "everything at a glance; opens in any browser, offline"),
         (robot / "robot.toml", "the robot, and where each value came from"),

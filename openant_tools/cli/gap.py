@@ -8,7 +8,7 @@ import click
 
 from openant_tools.cli.gap_blind import blind
 from openant_tools.cli.gap_diagnose import apply, diagnose, next_experiment, prepare
-from openant_tools.cli.options import joint_option, json_option, model_option, report_option, robot_option
+from openant_tools.cli.options import joint_option, json_option, model_option, report_option, robot_option, write_report
 from openant_tools.cli.runs import checked, effects_of, model_of, read_runs
 
 __all__ = ["gap"]
@@ -90,5 +90,5 @@ def measure(
     if json_file:
         write_text(json_file, json_text(found.as_json()))
     if report:
-        click.echo(f"wrote {gap_report(found).write_folder(report)}", err=True)
+        write_report(gap_report(found), report, runs)
     return 1 if found.doubt else 0

@@ -19,7 +19,7 @@ from openant_tools.cli.blind_sets import (
     seed_option,
     set_argument,
 )
-from openant_tools.cli.options import Number, json_option, out_option, report_option
+from openant_tools.cli.options import Number, json_option, out_option, report_option, write_report
 from openant_tools.cli.progress import progress_bar
 from openant_tools.errors import BadInput
 
@@ -192,7 +192,7 @@ def score(
     if json_file:
         write_text(json_file, json_text(found.as_json()))
     if report:
-        click.echo(f"wrote {score_report(found).write_folder(report)}", err=True)
+        write_report(score_report(found), report, folders)
     if docs:
         write_docs(found, docs)
         click.echo(f"wrote {docs}", err=True)

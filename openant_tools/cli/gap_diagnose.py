@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.options import joint_option, json_option, report_option, robot_option
+from openant_tools.cli.options import joint_option, json_option, report_option, robot_option, write_report
 from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.runs import checked, model_of, read_runs
 
@@ -85,13 +85,13 @@ def diagnose(
         found = diagnosed(recordings, given, hold_out=held_out, joints=joints or None, prior=prior, progress=tell)
         if json_file:
             write_text(json_file, json_text(found.as_json()))
-        written = None
+        page = None
         if report:
             tell(1.0, "writing the report")
-            written = diagnosis_report(found, recordings, held_out, given).write_folder(report)
+            page = diagnosis_report(found, recordings, held_out, given)
     _print(found)
-    if written:
-        click.echo(f"wrote {written}", err=True)
+    if report and page:
+        write_report(page, report, [*runs, *hold_out])
 
 
 @click.command()

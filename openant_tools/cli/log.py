@@ -8,13 +8,14 @@ from __future__ import annotations
 import logging
 import logging.handlers
 import os
+import shlex
 import sys
 from pathlib import Path
 from typing import Any, TextIO
 
 import click
 
-__all__ = ["FILE", "begin", "is_quiet", "log_options", "state_folder"]
+__all__ = ["FILE", "begin", "command_line", "is_quiet", "log_options", "state_folder"]
 
 FILE = "openant.log"
 LARGEST, KEPT = 1_000_000, 3
@@ -23,6 +24,7 @@ _LEVELS = {-1: logging.ERROR, 0: logging.WARNING, 1: logging.INFO, 2: logging.DE
 
 _stderr: logging.Handler | None = None
 _level = 0
+_argv: list[str] = []
 
 
 class _Stderr(logging.StreamHandler[TextIO]):
@@ -44,7 +46,8 @@ def state_folder() -> Path:
 
 def begin(argv: list[str]) -> None:
     """Take the log up, once a process; a state folder that cannot be written to costs the file, never the command."""
-    global _stderr, _level
+    global _stderr, _level, _argv
+    _argv = argv
     root = logging.getLogger()
     for handler in [one for one in root.handlers if one.get_name() == FILE]:
         root.removeHandler(handler)
@@ -69,6 +72,11 @@ def begin(argv: list[str]) -> None:
     for name in OURS:
         logging.getLogger(name).setLevel(logging.INFO)
     logging.getLogger("openant_tools").info("openant %s", " ".join(argv))
+
+
+def command_line() -> str:
+    """This process's command as a shell takes it; `openant` alone where it began otherwise."""
+    return shlex.join(["openant", *_argv])
 
 
 def is_quiet() -> bool:

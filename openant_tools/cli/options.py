@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from openant_tools.errors import BadInput
 
+if TYPE_CHECKING:
+    from openant_tools.report import Report
+
 __all__ = [
     "MINUTES", "POSITIVE", "SECONDS", "Number", "driver_option", "joint_option", "json_option", "model_option", "out_option", "rate_option", "report_option", "robot_folder",
-    "robot_option", "seconds_option", "tie_option",
+    "robot_option", "seconds_option", "tie_option", "write_report",
 ]  # fmt: skip
 
 
@@ -70,6 +74,18 @@ report_option = click.option(
     metavar="DIR",
     help="Write a report that opens offline.",
 )
+
+
+def write_report(report: Report, folder: Path, recordings: Sequence[Path] = ()) -> None:
+    """Write a report with the command that makes it and links to what it was made from; says where it lies."""
+    from openant_tools.cli.log import command_line
+
+    made_by = command_line()
+    report.made_by = made_by if " " in made_by else report.made_by
+    report.recordings = tuple(recordings) or report.recordings
+    click.echo(f"wrote {report.write_folder(folder)}", err=True)
+
+
 out_option = click.option("--out", type=click.Path(path_type=Path), required=True, metavar="PATH", help="What to make.")
 #: commands a second; a bus of eight servos at 1 Mbaud manages about 300
 rate_option = click.option(

@@ -12,11 +12,12 @@ import click
 from openant_tools.cli.eval import STARTS_IN_SIMULATION, STARTS_ON_A_ROBOT
 from openant_tools.cli.hardware import Moving
 from openant_tools.cli.learning import need_agents
-from openant_tools.cli.options import SECONDS, json_option, report_option
+from openant_tools.cli.options import SECONDS, json_option, report_option, write_report
 from openant_tools.errors import BadInput
 
 if TYPE_CHECKING:
     from openant_agents.ranking import Measured
+    from openant_tools.report import Report
 
 __all__ = ["policies"]
 
@@ -166,7 +167,7 @@ def rank(
     if report is not None:
         picture = report / "ranking.png"
         draw_ranking(names, on_robot, simulated, found, [one.policy for one in flags], picture)
-        click.echo(f"wrote {picture}", err=True)
+        write_report(_page(picture, found, [one.words for one in flags]), report, [folder])
     if json_file is not None:
         answer = {
             "schema": "openant.ranking/1",
@@ -201,6 +202,38 @@ def _print(names: list[str], real: Mapping[str, Any], simulated: Mapping[str, An
             f" rank violation {100 * v.value:.1f} cm/s, regret {100 * r.value:.1f} cm/s"
             f" ({100 * one.regret_share:.0f} %): its best is number {one.best_is} of {one.policies} on the robot"
         )
+
+
+def _page(picture: Path, found: Mapping[str, Any], flags: list[str]) -> Report:
+    """The ranking as a report."""
+    from openant_tools.numbers import number, percent
+    from openant_tools.report import Answer, Picture, Report
+
+    def words(one: Any, factor: float = 1.0, unit: str = "") -> str:
+        return number(factor * one.value, unit, factor * one.low, factor * one.high)
+
+    best, agreed = max(found.items(), key=lambda item: item[1].spearman.value)
+    told = agreed.spearman.low > 0
+    answer = Answer(
+        f"{best} ranks {agreed.policies} policies most as the robot does (Spearman {words(agreed.spearman)})."
+        if told
+        else f"Of {agreed.policies} policies, no simulation is known to rank them as the robot does.",
+        Picture(picture, "Each policy's reward in a simulation and on the robot, with a standard error."),
+        f"Choosing by {best} costs {words(agreed.regret_m_s, 100, 'cm/s')} of reward: its best is number {agreed.best_is} on the robot."
+        + "".join(f"\n\nPerhaps an exploit of the simulation: {line}" for line in flags),
+        f"Choose policies by {best}."
+        if told
+        else "Play more policies on the robot, or calibrate: `openant sysid fit`.",
+        "good" if told else "warn",
+    )
+    return Report("Ranking of policies", ", ".join(found), answer).section("Figures").table(
+        ["simulation", "Spearman", "Kendall", "rank violation", "regret", "of the best"],
+        [
+            [name, words(one.spearman), words(one.kendall), words(one.rank_violation_m_s, 100, "cm/s"),
+             words(one.regret_m_s, 100, "cm/s"), percent(one.regret_share)]
+            for name, one in found.items()
+        ],
+    )  # fmt: skip
 
 
 def _simulations(given: tuple[str, ...]) -> dict[str, str]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from openant_tools.cli.hardware import Moving, engine_config, may_move, port_option, robot_of, yes_option
-from openant_tools.cli.options import POSITIVE, SECONDS, Number, json_option, report_option, robot_option
+from openant_tools.cli.options import POSITIVE, SECONDS, Number, json_option, report_option, robot_option, write_report
 from openant_tools.cli.virtual_for_command import virtual_option
 
 if TYPE_CHECKING:
@@ -308,7 +308,7 @@ def _show_stiffness(finding: Finding, report: Path | None) -> None:
     if report:
         from openant_tools.sysid.bench.report import stiffness_report
 
-        click.echo(f"wrote {stiffness_report(finding).write_folder(report)}", err=True)
+        write_report(stiffness_report(finding), report)
     for reading in finding.data["servo_readings"]:
         click.echo(
             f"{reading['deflection_rad']:.3f} rad pressed: error {reading['error_rad']:.4f} rad, "

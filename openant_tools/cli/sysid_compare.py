@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from openant_tools.cli.options import json_option, report_option, robot_option
+from openant_tools.cli.options import json_option, report_option, robot_option, write_report
 
 __all__ = ["compare"]
 
@@ -61,5 +61,5 @@ def compare(a: str, b: str, robot: Path | None, json_file: Path | None, report: 
     if report:
         from openant_tools.sysid.compare_report import comparison_report
 
-        click.echo(f"wrote {comparison_report(result).write_folder(report)}", err=True)
+        write_report(comparison_report(result), report, [Path(a), Path(b)])
     return 1 if result.changed else 0

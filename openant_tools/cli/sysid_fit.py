@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.options import model_option, report_option, robot_folder, robot_option, tie_option
+from openant_tools.cli.options import model_option, report_option, robot_folder, robot_option, tie_option, write_report
 from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.runs import read_runs, say
 
@@ -126,11 +126,11 @@ def fit(
         )
         progress("writing the report", 1.0)
         written = sysid.report(found, out, robot=None if folder is None else folder.path)
-        if report is not None:
-            written.append(fit_report(found).write_folder(report))
-        if report is not None and found.with_effects:
-            written.append(fit_report(found.with_effects).write_folder(report / WITH_EFFECTS))
 
+    if report is not None:
+        write_report(fit_report(found), report)
+        if found.with_effects:
+            write_report(fit_report(found.with_effects), report / WITH_EFFECTS)
     click.echo(sysid.summary(replace(found, notes=tuple(note for note in found.notes if note not in told))))
     accepted = found.accepted or found.with_effects
     if not accepted:

@@ -16,6 +16,7 @@ from openant_tools.cli.options import (
     robot_option,
     seconds_option,
     tie_option,
+    write_report,
 )
 from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, protocols_of, setup_option
@@ -176,7 +177,7 @@ def plan(
     if json_file is not None:
         write_text(json_file, json_text(result.as_json()))
     if report is not None:
-        click.echo(f"wrote {plan_report(result).write_folder(report)}", err=True)
+        write_report(plan_report(result), report, [model])
     return 1 if result.objections else 0
 
 

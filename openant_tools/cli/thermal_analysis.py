@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from openant_tools.cli.options import Number, json_option, report_option, robot_option
+from openant_tools.cli.log import command_line
+from openant_tools.cli.options import Number, json_option, report_option, robot_option, write_report
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
@@ -44,9 +44,10 @@ def fit(
 
     Exit code 1: the fit of the first part misses the later one by more than 2 K.
     """
+    from openant_tools.numbers import number
     from openant_tools.thermal.finding import BELIEVED_K
+    from openant_tools.thermal.fit import PARAMETER_WORDS, held_out
     from openant_tools.thermal.fit import fit as fit_runs
-    from openant_tools.thermal.fit import held_out
     from openant_tools.thermal.forecast import forecast as look_ahead
     from openant_tools.thermal.forecast import rest_advice
 
@@ -58,9 +59,8 @@ def fit(
     for one in found.estimates:
         if one.name in SHOWN:
             mark = "" if one.informed > 0.5 else "  mostly believed before"
-            click.echo(
-                f"{one.joint or 'all':9} {one.name:12} {one.value:8.3g}  [{one.low:.3g}, {one.high:.3g}] {one.unit:4}{mark}"
-            )
+            value = number(one.value, one.unit, one.low, one.high)
+            click.echo(f"{one.joint or 'all':9} {PARAMETER_WORDS[one.name]:55} {value}{mark}")
     click.echo(
         f"crossings missed by {float(max(found.residual_k)):.2f} K rms at the worst joint; slow disturbance "
         f"{found.disturbance_k:g} K over {found.disturbance_s / 60:.0f} min"
@@ -84,18 +84,19 @@ def fit(
             "glitches": dict(zip(inputs[-1].joints, map(int, inputs[-1].glitches), strict=True)),
             "known": found.known.as_json(),
         })  # fmt: skip
-    if report is not None:
+    folder = _folder(robot)
+    then = found.at(inputs[-1].loaded_s)
+    told = look_ahead(then, from_cold=True) if report is not None or folder is not None else None
+    if report is not None and told is not None:
         from openant_tools.thermal.report import fit_report
 
-        click.echo(f"wrote {fit_report(found, inputs, held, _command()).write_folder(report)}", err=True)
-    folder = _folder(robot)
-    if folder is not None:
+        write_report(fit_report(found, told, inputs, held), report, runs)
+    if folder is not None and told is not None:
         from openant_tools.procedure.finding import keep
         from openant_tools.thermal.finding import thermal_finding
 
-        then = found.at(inputs[-1].loaded_s)
         finding = thermal_finding(
-            then, look_ahead(then, from_cold=True), command=_command(), recording=folder.relative(runs[-1]), held=held,
+            then, told, command=command_line(), recording=folder.relative(runs[-1]), held=held,
             rest=rest_advice(then), warning=_warning(folder),
         )  # fmt: skip
         click.echo(f"wrote {keep(finding, folder, folder.relative(runs[-1]))}", err=True)
@@ -210,8 +211,7 @@ def forecast(
         from openant_tools.thermal.report import forecast_report
 
         shown = None if at_min is None or from_cold else inputs
-        page = forecast_report(found, told, rest.words, _command(), shown).write_folder(report)
-        click.echo(f"wrote {page}", err=True)
+        write_report(forecast_report(found, told, rest.words, shown), report, [run])
     return 1 if any(one.probability > 0.5 for one in told.joints) else 0
 
 
@@ -280,8 +280,7 @@ def compare(
     if report is not None:
         from openant_tools.thermal.report import compare_report
 
-        page = compare_report(differences, str(a), str(b), _command()).write_folder(report)
-        click.echo(f"wrote {page}", err=True)
+        write_report(compare_report(differences, a.name, b.name), report, [a, b])
     return 0
 
 
@@ -342,7 +341,7 @@ def _keep_rules(folder: RobotFolder, rules: dict[str, dict[str, float]], run: Pa
         click.echo("no servo needs derating under this load; robot.toml is left as it is", err=True)
         return
     now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
-    source = Provenance("forecast", _command(), folder.relative(run), now)
+    source = Provenance("forecast", command_line(), folder.relative(run), now)
     values = {f"derating.{joint}.{key}": value for joint, rule in rules.items() for key, value in rule.items()}
     folder.update(values, provenance={f"derating.{joint}": source for joint in rules})
     click.echo(f"wrote {folder.config_file}", err=True)
@@ -367,7 +366,3 @@ def _write(path: Path, content: dict[str, Any]) -> None:
     from openant_tools.files import json_text, write_text
 
     write_text(path, json_text(content))
-
-
-def _command() -> str:
-    return " ".join(["openant", *sys.argv[1:]])

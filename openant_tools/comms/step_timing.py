@@ -21,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number, percent
 from openant_tools.recording.run import Run
-from openant_tools.report import Report, plots
+from openant_tools.report import Answer, Figure, Report, plots
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as MatplotlibFigure
 
 __all__ = ["Part", "StepTiming", "step_timing", "timing_figure", "timing_report"]
 
@@ -36,6 +37,8 @@ WRITE_BYTES, WRITE_BYTES_A_SERVO = 14, 5
 FEWEST_STEPS = 5
 #: s; pauses longer than this many median steps belong to no step
 PAUSE = 10.0
+#: of the step, beyond which computing or jitter is worth a warning
+COMPUTING_SHARE, JITTER_SHARE = 0.25, 0.1
 _COLOURS = {
     "command": plots.VERMILLION, "wait": plots.SKY, "read": plots.BLUE, "observe": plots.GREEN, "decide": plots.ORANGE,
     "observe and decide": plots.ORANGE,
@@ -103,8 +106,8 @@ class StepTiming:
     def table(self) -> list[list[str]]:
         """Rows of words: part, mean, jitter, median, 99 of 100, longest, share."""
         return [
-            [one.name, *(f"{1e3 * value:.2f}" for value in (one.mean, one.jitter, one.median, one.p99, one.longest)),
-             f"{one.share:.1%}"]
+            [one.name, *(number(1e3 * value, decimals=2) for value in (one.mean, one.jitter, one.median, one.p99, one.longest)),
+             percent(one.share, decimals=1)]
             for one in (*self.parts, self.step, self.action_to_observation)
         ]  # fmt: skip
 
@@ -207,9 +210,9 @@ def _new_commands(run: Run, cmd: Array) -> NDArray[np.int64]:
     return np.flatnonzero(changed & known)
 
 
-def timing_figure(found: StepTiming) -> Figure:
+def timing_figure(found: StepTiming) -> MatplotlibFigure:
     """The mean step as one bar, and how each part scatters."""
-    figure: Figure
+    figure: MatplotlibFigure
     figure, axes = plots.figure(2, height=2.2, gridspec_kw={"height_ratios": [1, 2]})
     order = ["wait", "read", "observe", "decide", "observe and decide", "command"]
     parts = sorted(found.parts, key=lambda part: order.index(part.name))
@@ -217,7 +220,9 @@ def timing_figure(found: StepTiming) -> Figure:
     for part in parts:
         axes[0].barh(0, 1e3 * part.mean, left=1e3 * at, color=_COLOURS[part.name], label=part.name, height=0.6)
         if part.share > 0.06:
-            axes[0].text(1e3 * (at + part.mean / 2), 0, f"{1e3 * part.mean:.1f}", ha="center", va="center", fontsize=8)
+            axes[0].text(
+                1e3 * (at + part.mean / 2), 0, number(1e3 * part.mean, decimals=1), ha="center", va="center", fontsize=8
+            )
         at += part.mean
     axes[0].set_yticks([])
     axes[0].set_ylim(-0.5, 0.5)
@@ -233,17 +238,36 @@ def timing_figure(found: StepTiming) -> Figure:
 
 def timing_report(found: StepTiming) -> Report:
     """Picture, table, and what they say."""
-    report = Report("Step timing", found.name, made_by="openant comms timing")
-    report.text(sentence(found))
-    report.section("Where the time goes").figure(timing_figure(found), "The mean step, and the spread of its parts.")
-    return report.table(COLUMNS, found.table())
+    late, jitter = found.computing_share > COMPUTING_SHARE, found.step.jitter > JITTER_SHARE * found.step.mean
+    means = "What the agent sees is as old as it looks" + (
+        ", but its own computing takes much of the step." if late else "."
+    )
+    means = means if not jitter else "Steps differ in length: what was learned with even steps meets uneven ones."
+    then = "Nothing: the steps are even, and the robot is seen in time."
+    if jitter:
+        then = "Find who holds the loop up: `openant comms diagnose` on the same recording."
+    elif late:
+        then = (
+            "Let the agent decide faster (a smaller network, fewer threads), or train with this delay (`action_delay`)."
+        )
+    answer = Answer(
+        sentence(found),
+        Figure(timing_figure(found), "The mean step, and the spread of its parts."),
+        means, then, "warn" if late or jitter else "good",
+    )  # fmt: skip
+    report = Report("Step timing", found.name, answer, made_by="openant comms timing")
+    return report.section("Every part").table(COLUMNS, found.table())
 
 
 def sentence(found: StepTiming) -> str:
     """What matters, in words."""
     shown = found.action_to_observation
     return (
-        f"{found.steps} steps of {1e3 * found.step.mean:.1f} ms (jitter {1e3 * found.step.jitter:.2f} ms). "
-        f"What an action does is seen {1e3 * shown.mean:.1f} ms after it left (jitter {1e3 * shown.jitter:.2f} ms); "
-        f"the agent's own computing takes {found.computing_share:.1%} of the step from that."
+        f"{found.steps} steps of {_ms(found.step.mean, 1)} (jitter {_ms(found.step.jitter, 2)}). "
+        f"What an action does is seen {_ms(shown.mean, 1)} after it left (jitter {_ms(shown.jitter, 2)}); "
+        f"the agent's own computing takes {percent(found.computing_share, decimals=1)} of the step from that."
     )
+
+
+def _ms(value_s: float, places: int) -> str:
+    return f"{number(1e3 * value_s, decimals=places)} ms"

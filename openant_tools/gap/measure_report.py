@@ -9,7 +9,8 @@ import numpy as np
 
 from openant_tools.gap.measure import UNITS, Measurement
 from openant_tools.gap.regime import Regime
-from openant_tools.report import KeyFigure, Report, plots
+from openant_tools.numbers import exact, number, percent
+from openant_tools.report import Answer, Figure, KeyFigure, Report, plots
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -28,26 +29,44 @@ def sentence(found: Measurement) -> str:
     if not found.places or found.excess("pos") == 0:
         return "The gap lies within what no model could beat: nothing here is to be explained."
     first = next(place for place in found.places if place.signal == "pos")
+    off, floor = (number(one["pos"], "rad", name="gap") for one in (found.gaps, found.floors))
+    part = "most of it" if first.share > 0.5 else "the largest part of it"
     return (
-        f"The simulation is off by {1e3 * found.gaps['pos']:.2f} mrad (floor {1e3 * found.floors['pos']:.2f}); most of it, "
-        f"{100 * first.share:.0f} %, at {first.joint} while {first.regime.words}."
+        f"The simulation is off by {off} (floor {floor}); {part}, {percent(first.share)}, at {first.joint} while "
+        f"{first.regime.words}."
     )
 
 
 def gap_report(found: Measurement) -> Report:
     """Everything about where the gap lies."""
-    horizon = "full runs" if found.horizon_s is None else f"re-initialised every {found.horizon_s:g} s"
-    report = Report(
-        "The gap", f"{found.model.name} · {', '.join(p.run.name for p in found.played)}", made_by="openant gap measure"
-    )
-    report.text(f"**{sentence(found)}**")
-    if found.effects:
-        report.text(f"Beside the model act: {', '.join(dict.fromkeys(name for name, _ in found.effects))}.")
-    report.key_figures(
-        *(
-            KeyFigure(_NAMES[signal], f"{value:.4g} {UNITS[signal]}", f"floor {found.floors[signal]:.2g}; {horizon}")
+    horizon = "full runs" if found.horizon_s is None else f"re-initialised every {exact(found.horizon_s, 's')}"
+    nothing = not found.doubt and (not found.places or found.excess("pos") == 0)
+    answer = Answer(
+        sentence(found),
+        Figure(
+            worst(found), "Measured and simulated around the moment at which position is farthest off, and the command."
+        ),
+        "Nothing that was measured here is to be believed until repeats of one motion agree."
+        if found.doubt
+        else "A better model could not be told from this one with these runs."
+        if nothing
+        else "A policy that is trained in this simulation meets a robot that moves otherwise, above all there.",
+        "Record the same motion twice with nothing changed in between, and measure again."
+        if found.doubt
+        else "Train on it; measure again with motions of another kind."
+        if nothing
+        else "Fit the model (`openant sysid fit`), or ask for the cause: `openant gap diagnose` on the same runs.",
+        "bad" if found.doubt else "good" if nothing else "",
+        [
+            KeyFigure(_NAMES[signal], _shown(signal, value), f"floor {_shown(signal, found.floors[signal])}; {horizon}")
             for signal, value in found.gaps.items()
-        )
+        ],
+    )
+    report = Report(
+        "The gap",
+        f"{found.model.name} · {', '.join(p.run.name for p in found.played)}",
+        answer,
+        made_by="openant gap measure",
     )
     report.section("Where").figure(
         shares(found),
@@ -55,23 +74,26 @@ def gap_report(found: Measurement) -> Report:
         "are shared out, so that all add to 100 %.",
     )
     report.table(
-        ["signal", "joint", "while", "share", "gap", "unit", "seconds"],
+        ["signal", "joint", "while", "share", "gap", "for"],
         [
-            [place.signal, place.joint, place.regime.words, f"{100 * place.share:.1f} %", f"{place.gap:.4g}",
-             UNITS[place.signal], f"{place.seconds:.1f}"]
+            [_NAMES[place.signal], place.joint, place.regime.words, percent(place.share, decimals=1),
+             _shown(place.signal, place.gap), number(place.seconds, "s", decimals=1)]
             for place in found.places
             if place.share >= 0.005
         ],
     )  # fmt: skip
-    report.section("At its worst").figure(
-        worst(found), "Measured and simulated around the moment at which position is farthest off, and the command."
-    )
+    acting = ", ".join(dict.fromkeys(name for name, _ in found.effects))
     report.section("How it was measured").text(
         f"Each run is simulated from its measured state with its own commands, {horizon}. The floor comes from "
         f"{'repeats of the same commands' if found.from_repeats else _sensors(found)}. "
         "The gap is the root mean square of measured minus simulated over all joints and samples."
+        + (f" Beside the model act: {acting}." if acting else "")
     )
     return report
+
+
+def _shown(signal: str, value: float) -> str:
+    return number(value, UNITS[signal], name="gap" if signal == "pos" else "")
 
 
 def shares(found: Measurement) -> MatplotlibFigure:
@@ -92,7 +114,7 @@ def shares(found: Measurement) -> MatplotlibFigure:
         axes.text(
             column,
             row,
-            f"{value:.0f}",
+            number(value, decimals=0),
             ha="center",
             va="center",
             fontsize=8,
@@ -119,9 +141,17 @@ def worst(found: Measurement) -> MatplotlibFigure:
     figure, axes = plots.figure(height=2.6)
     start = t[0]
     command = one.run.signal("cmd", found.joints)[near, j]
-    axes.step(t[near] - start, command, where="post", color=plots.INK, lw=0.8, alpha=0.6, label="command")
-    axes.plot(t[near] - start, one.measured["pos"][near, j], color=plots.BLUE, label="measured")
-    axes.plot(t[near] - start, one.simulated["pos"][near, j], color=plots.VERMILLION, ls="--", label="simulated")
+    axes.step(
+        t[near] - start, plots.DEGREES * command, where="post", color=plots.INK, lw=0.8, alpha=0.6, label="command"
+    )
+    axes.plot(t[near] - start, plots.DEGREES * one.measured["pos"][near, j], color=plots.BLUE, label="measured")
+    axes.plot(
+        t[near] - start,
+        plots.DEGREES * one.simulated["pos"][near, j],
+        color=plots.VERMILLION,
+        ls="--",
+        label="simulated",
+    )
     axes.set_xlabel(plots.signal_label("t"))
     axes.set_ylabel(plots.signal_label("pos"))
     axes.set_title(f"{found.joints[j]}, {one.run.name}", loc="left", fontsize=10, fontweight="bold")
@@ -131,5 +161,5 @@ def worst(found: Measurement) -> MatplotlibFigure:
 
 def _sensors(found: Measurement) -> str:
     late = found.stamp_error_s
-    stamps = f" and time stamps that are off by {1e3 * late:.2g} ms" if late else ""
+    stamps = f" and time stamps that are off by {number(late, 's')}" if late else ""
     return f"the resolution and noise of the sensors{stamps} (record repeats for a better one)"

@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.apply import robot_of
-from openant_tools.gap.diagnosis import NONE, UNEXPLAINED, Diagnosis, Found
+from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.words import closed, rest_words, sentence, standing, what_next, where_words
 from openant_tools.model.gap import HORIZON_S
 from openant_tools.model.of_run import plants_of
 from openant_tools.model.rollout import Rollouts
+from openant_tools.numbers import exact, number, percent
 from openant_tools.recording.run import Run
-from openant_tools.report import KeyFigure, Report, Table, plots
+from openant_tools.report import Answer, Figure, KeyFigure, Report, Table, plots
 from openant_tools.robot.joints import JOINTS
 from openant_tools.sysid.identify import joints_in_common
 
@@ -45,27 +46,32 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
     Args:
         runs, held_out: those that were diagnosed. model: the MJCF.
     """
-    report = Report(
-        "Diagnosis of the gap", f"{model.name} · {', '.join(run.name for run in (*runs, *held_out))}",
-        made_by="openant gap diagnose",
-    )  # fmt: skip
-    report.text(f"**{sentence(found)}**")
     gap, share = found.gap, closed(found)
     healthy = found.verdict == NONE
-    report.key_figures(
-        KeyFigure("verdict", found.verdict, f"confidence {100 * found.confidence:.0f} %", "good" if healthy else ""),
-        KeyFigure("gap before", f"{1e3 * gap['before']:.2f} mrad", "the model as given"),
-        KeyFigure("gap after", f"{1e3 * gap['after']:.2f} mrad", "the improved model"),
-        KeyFigure("floor", f"{1e3 * gap['floor']:.2f} mrad", "what no model could beat"),
-        KeyFigure("closed", f"{100 * share:.0f} %", "of the excess, on held-out runs", "good" if share > 0.7 else ""),
+    left = f" {rest_words(found)}" if found.rest and found.verdict != UNEXPLAINED else ""  # there the verdict says it
+    answer = Answer(
+        sentence(found),
+        Figure(
+            worst(found, held_out or runs, model),
+            f"Measured and simulated around the moment at which the given model is farthest off, re-initialised every "
+            f"{exact(HORIZON_S, 's')}; of {'the held-out runs' if held_out else 'all runs'}.",
+        ),
+        _meaning(found) + left,
+        what_next(found),
+        "good" if healthy or share > 0.7 else "warn",
+        (
+            KeyFigure("gap before", _error(gap["before"]), "the model as given"),
+            KeyFigure("gap after", _error(gap["after"]), "the improved model"),
+            KeyFigure("floor", _error(gap["floor"]), "what no model could beat"),
+            KeyFigure("closed", percent(share), "of the excess, on held-out runs"),
+        ),
     )
-    report.figure(
-        worst(found, held_out or runs, model),
-        f"Measured and simulated around the moment at which the given model is farthest off, re-initialised every "
-        f"{HORIZON_S:g} s; of {'the held-out runs' if held_out else 'all runs'}.",
-    )
+    report = Report(
+        "Diagnosis of the gap", f"{model.name} · {', '.join(run.name for run in (*runs, *held_out))}", answer,
+        made_by="openant gap diagnose",
+    )  # fmt: skip
     if found.where:
-        report.figure(
+        report.section("Where it lies").figure(
             places(found),
             "Where the excess gap of the given model lies, largest first, and what the improved model leaves of it; on a walking "
             "robot also by joint from above.",
@@ -75,7 +81,7 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
         report.section("Why not something else").table(
             ["effect", "where", "present", "closes alone", "why not"],
             [
-                [one.effect, where_words(one.joints), f"{100 * one.probability:.0f} %", _percent(one.gap_closed), standing(found, one)]
+                [one.effect, where_words(one.joints), percent(one.probability), _percent(one.gap_closed), standing(found, one)]
                 for one in runners_up
             ],
         )  # fmt: skip
@@ -87,11 +93,21 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
                 for one in found.sensors
             ],
         )  # fmt: skip
-    if found.rest and found.verdict != UNEXPLAINED:  # there the verdict says it
-        report.text(rest_words(found))
-    report.section("What next").text(what_next(found))
     _details(report, found)
     return report
+
+
+def _meaning(found: Diagnosis) -> str:
+    """What the verdict is good for."""
+    if found.verdict == NONE:
+        return "The simulation is as good as robots of one build are alike."
+    if found.verdict in (AMBIGUOUS, UNEXPLAINED):
+        return "Do not build one of these causes into the model yet: another experiment decides first."
+    return "With it in the model the simulation moves as the robot does, as far as the gap is closed."
+
+
+def _error(rad: float) -> str:
+    return number(rad, "rad", name="gap")
 
 
 def _details(report: Report, found: Diagnosis) -> None:
@@ -107,7 +123,7 @@ def _details(report: Report, found: Diagnosis) -> None:
         Table(
             ["effect", "where", "present", "closes alone", "interval", "parameters", "MuJoCo carries it"],
             [
-                [one.effect, where_words(one.joints), f"{100 * one.probability:.1f} %", _percent(one.gap_closed),
+                [one.effect, where_words(one.joints), percent(one.probability, decimals=1), _percent(one.gap_closed),
                  f"{_percent(one.gap_closed_low)} … {_percent(one.gap_closed_high)}", _parameters(one), one.native]
                 for one in found.effects
             ],
@@ -177,7 +193,7 @@ def _leg_map(axes: Axes, found: Diagnosis) -> None:
                 linewidth=2.0 if name in named else 0.6, zorder=2,
             )  # fmt: skip
             axes.annotate(
-                f"{name}\n{100 * share[name]:.0f} %", (x, y), xytext=(-left * (6 + 10 * math.sqrt(share[name])), 0), textcoords="offset points",
+                f"{name}\n{percent(share[name])}", (x, y), xytext=(-left * (6 + 10 * math.sqrt(share[name])), 0), textcoords="offset points",
                 ha="right" if left > 0 else "left", va="center", fontsize=7,
             )  # fmt: skip
     axes.scatter([0], [0], s=500, color=plots.INK, alpha=0.25, zorder=1)
@@ -238,12 +254,18 @@ def worst(found: Diagnosis, runs: Sequence[Run], model: Path) -> MatplotlibFigur
     figure, axes = plots.figure(height=2.8)
     since = t[near] - t[0]
     axes.step(
-        since, run.signal("cmd", joints)[near, j], where="post", color=plots.INK, lw=0.8, alpha=0.6, label="command"
+        since,
+        plots.DEGREES * run.signal("cmd", joints)[near, j],
+        where="post",
+        color=plots.INK,
+        lw=0.8,
+        alpha=0.6,
+        label="command",
     )
-    axes.plot(since, run.signal("pos", joints)[near, j], color=plots.BLUE, label="measured")
-    axes.plot(since, both[0][near, j], color=plots.VERMILLION, ls="--", label="given model")
+    axes.plot(since, plots.DEGREES * run.signal("pos", joints)[near, j], color=plots.BLUE, label="measured")
+    axes.plot(since, plots.DEGREES * both[0][near, j], color=plots.VERMILLION, ls="--", label="given model")
     if selected or found.calibration:
-        axes.plot(since, both[1][near, j], color=plots.GREEN, ls="-.", label="improved model")
+        axes.plot(since, plots.DEGREES * both[1][near, j], color=plots.GREEN, ls="-.", label="improved model")
     axes.set_xlabel(plots.signal_label("t"))
     axes.set_ylabel(plots.signal_label("pos"))
     axes.set_title(f"{joints[j]}, {run.name}", loc="left", fontsize=10, fontweight="bold")
@@ -256,7 +278,7 @@ def _joints(words: str | Sequence[str]) -> tuple[str, ...] | str:
 
 
 def _percent(value: float | None) -> str | None:
-    return None if value is None else f"{100 * value:.0f} %".replace("-", "−")
+    return None if value is None else percent(value)
 
 
 def _parameters(one: Found) -> str:

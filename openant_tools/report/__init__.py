@@ -1,8 +1,8 @@
 """Reports that open offline: one HTML file with its pictures in it, and Markdown and JSON of the same content."""
 
-from openant_tools.report.document import Report
+from openant_tools.report.document import Answer, Report
 from openant_tools.report.parts import Code, Details, Figure, KeyFigure, KeyFigures, Mark, Part, Picture, Table, Text
 
 __all__ = [
-    "Code", "Details", "Figure", "KeyFigure", "KeyFigures", "Mark", "Part", "Picture", "Report", "Table", "Text",
+    "Answer", "Code", "Details", "Figure", "KeyFigure", "KeyFigures", "Mark", "Part", "Picture", "Report", "Table", "Text",
 ]  # fmt: skip

@@ -14,12 +14,25 @@ from string import Template
 from typing import TYPE_CHECKING, Any
 
 from openant_tools.files import json_text, write_bytes, write_text
-from openant_tools.report.parts import Code, Details, Figure, KeyFigure, KeyFigures, Part, Picture, Table, Text
+from openant_tools.report.parts import (
+    Code,
+    Details,
+    Figure,
+    Files,
+    KeyFigure,
+    KeyFigures,
+    Part,
+    Picture,
+    Table,
+    Text,
+    Tone,
+    Verdict,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
-__all__ = ["Report", "Section"]
+__all__ = ["Answer", "Report", "Section"]
 
 _PAGE = Template("""<!DOCTYPE html>
 <html lang="en">
@@ -41,8 +54,10 @@ $sections
 <footer>$footer</footer>
 </main>
 <script>
-// On paper nothing can be unfolded, so everything is.
+// On paper nothing can be unfolded, so everything is; and who follows a link to a folded section wants to read it.
 addEventListener("beforeprint", () => document.querySelectorAll("details").forEach(d => d.open = true));
+const unfold = () => { const d = document.querySelector((location.hash || "#none") + " > details"); if (d) d.open = true; };
+addEventListener("hashchange", unfold); unfold();
 </script>
 </body>
 </html>
@@ -57,26 +72,61 @@ class Section:
     parts: list[Part] = field(default_factory=list)
 
 
-class Report:
-    """Builds a report part by part; every method returns the report, so that calls can be chained.
+@dataclass(frozen=True)
+class Answer:
+    """What a report's first screen says, always in this order.
 
-        Report("Fit of ant12", "stand protocol, 3 runs").section("Result").key_figures(
-            KeyFigure("position gap", "0.021 rad", "0.083 before", "good")
-        ).figure(figure, "Held-out run, measured and simulated").write(folder / "report.html")
+    Attributes:
+        verdict: one sentence. tone: how that stands.
+        picture: the one picture that shows it; None where it cannot be drawn here.
+        figures: the numbers to take away.
+        means: what it means for the builder. then: what to do next. Both as `Text`.
+    """
+
+    verdict: str
+    picture: Part | None
+    means: str
+    then: str
+    tone: Tone = ""
+    figures: Sequence[KeyFigure] = ()
+
+    @property
+    def parts(self) -> list[Part]:
+        found = [Verdict(self.verdict, self.tone), self.picture, KeyFigures(self.figures) if self.figures else None]
+        found += [Text(f"**What it means.** {self.means}") if self.means else None]
+        found += [Text(f"**What to do next.** {self.then}") if self.then else None]
+        return [part for part in found if part is not None]
+
+
+class Report:
+    """A report begins with its answer; what is added to it are details, folded section by section.
+
+        Report("Fit of ant12", "stand protocol, 3 runs", Answer(
+            "The model leaves 12 % of the error.", Figure(figure, "Held-out run, measured and simulated"), "…", "…", "good"
+        )).section("What was found").table(columns, rows).write(folder / "report.html")
 
     Args:
         title, subtitle: of the whole report.
+        answer: its first screen.
         made_by: the command that made it, for the foot.
+        recordings: what it was made from, linked there.
     """
 
-    def __init__(self, title: str, subtitle: str = "", *, made_by: str = "") -> None:
+    def __init__(
+        self, title: str, subtitle: str, answer: Answer, *, made_by: str = "", recordings: Sequence[str | Path] = ()
+    ) -> None:
         self.title = title
         self.subtitle = subtitle
+        self.answer = answer
         self.sections: list[Section] = []
+        self.made_by = made_by
+        self.recordings = tuple(recordings)
+
+    def _foot(self, folder: Path | None) -> list[Part]:
         when = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
-        self._footer = f"Made by openant-tools {version('openant-tools')} on {when}"
-        if made_by:
-            self._footer += f" with `{made_by}`"
+        with_ = f" with `{self.made_by}`" if self.made_by else ""
+        foot: list[Part] = [Text(f"Made by openant-tools {version('openant-tools')} on {when}{with_}")]
+        return [Files("Made from", self.recordings, folder), *foot] if self.recordings else foot
 
     def section(self, title: str) -> Report:
         """Begin a section; what is added next belongs to it."""
@@ -98,10 +148,6 @@ class Report:
         """Add commands or file content."""
         return self.add(Code(text))
 
-    def key_figures(self, *figures: KeyFigure) -> Report:
-        """Add a row of numbers to take away."""
-        return self.add(KeyFigures(figures))
-
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[object]], caption: str = "") -> Report:
         """Add a table; see `Table`."""
         return self.add(Table(columns, rows, caption))
@@ -118,25 +164,29 @@ class Report:
         """Add parts that stay folded until asked for."""
         return self.add(Details(summary, parts))
 
-    def html(self) -> str:
-        """The report as one HTML page with nothing outside it."""
+    def html(self, folder: Path | None = None) -> str:
+        """The report as one HTML page with nothing outside it.
+
+        Args:
+            folder: where the page will lie, from which its recordings are linked.
+        """
         style = files("openant_tools.report").joinpath("style.css").read_text(encoding="utf-8")
-        contents, sections = [], []
+        contents, sections = [], [f'<section id="answer">{_inside(self.answer.parts, "f0")}</section>']
         for number, section in enumerate(self.sections, 1):
             anchor = f"s{number}-{re.sub(r'[^a-z0-9]+', '-', section.title.lower()).strip('-')}".rstrip("-")
-            heading = ""
+            inside = _inside(section.parts, f"f{number}")
             if section.title:
-                contents.append(f'<li><a href="#{anchor}">{escape(section.title)}</a></li>')
-                heading = f"<h2>{escape(section.title)}</h2>"
-            inside = "\n".join(part.html(f"f{number}-{k}") for k, part in enumerate(section.parts, 1))
-            sections.append(f'<section id="{anchor}">{heading}\n{inside}\n</section>')
+                title = escape(section.title)
+                contents.append(f'<li><a href="#{anchor}">{title}</a></li>')
+                inside = f"<details><summary><h2>{title}</h2></summary>\n{inside}\n</details>"
+            sections.append(f'<section id="{anchor}">{inside}</section>')
         return _PAGE.substitute(
             title=escape(self.title),
             subtitle=Text(self.subtitle).html("subtitle") if self.subtitle else "",
             style=style,
             contents="".join(contents),
             sections="\n".join(sections),
-            footer=Text(self._footer).html("footer"),
+            footer=_inside(self._foot(folder), "foot"),
         )
 
     def as_json(self) -> dict[str, Any]:
@@ -144,7 +194,10 @@ class Report:
         return {
             "title": self.title,
             "subtitle": self.subtitle,
-            "made": self._footer,
+            "verdict": self.answer.verdict,
+            "made_by": self.made_by,
+            "recordings": [str(path) for path in self.recordings],
+            "answer": [part.json() for part in self.answer.parts],
             "sections": [
                 {"title": section.title, "parts": [part.json() for part in section.parts]} for section in self.sections
             ],
@@ -152,37 +205,36 @@ class Report:
 
     def write(self, path: str | Path) -> Path:
         """Write the HTML page to `path`, whole or not at all."""
-        write_text(path, self.html())
+        write_text(path, self.html(Path(path).parent))
         return Path(path)
 
     def write_markdown(self, path: str | Path) -> Path:
         """Write the Markdown to `path`, its pictures into a folder of the same name beside it."""
         path = Path(path)
-        pictures = f"{path.stem}-figures"
-
-        def save(name: str, data: bytes) -> str:
-            write_bytes(path.parent / pictures / name, data)
-            return f"{pictures}/{name}"
-
-        write_text(path, self._markdown(save))
+        write_text(path, self._markdown(path.parent, f"{path.stem}-figures"))
         return path
 
     def write_folder(self, folder: str | Path) -> Path:
         """Write report.html, report.md with figures/, and report.json into `folder`; returns the HTML's path."""
         folder = Path(folder)
-
-        def save(name: str, data: bytes) -> str:
-            write_bytes(folder / "figures" / name, data)
-            return f"figures/{name}"
-
-        write_text(folder / "report.md", self._markdown(save))
+        write_text(folder / "report.md", self._markdown(folder, "figures"))
         write_text(folder / "report.json", json_text(self.as_json()))
         return self.write(folder / "report.html")
 
-    def _markdown(self, save: Any) -> str:
+    def _markdown(self, folder: Path, pictures: str) -> str:
+        def save(name: str, data: bytes) -> str:
+            write_bytes(folder / pictures / name, data)
+            return f"{pictures}/{name}"
+
         blocks = [f"# {self.title}"] + ([self.subtitle] if self.subtitle else [])
+        blocks += [part.markdown(f"f0-{k}", save) for k, part in enumerate(self.answer.parts, 1)]
         for number, section in enumerate(self.sections, 1):
             if section.title:
                 blocks.append(f"## {section.title}")
             blocks += [part.markdown(f"f{number}-{k}", save) for k, part in enumerate(section.parts, 1)]
-        return "\n\n".join([*blocks, f"*{self._footer}*"]) + "\n"
+        blocks += [part.markdown("foot", save) for part in self._foot(folder)]
+        return "\n\n".join(blocks) + "\n"
+
+
+def _inside(parts: Sequence[Part], key: str) -> str:
+    return "\n".join(part.html(f"{key}-{k}") for k, part in enumerate(parts, 1))

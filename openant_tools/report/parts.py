@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import base64
 import math
+import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
+from urllib.parse import quote
 
 from openant_tools.numbers import number
 from openant_tools.report import plots
@@ -18,8 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
 __all__ = [
-    "Code", "Details", "Figure", "KeyFigure", "KeyFigures", "Mark", "Part", "Picture", "SavePicture", "Table", "Text",
-    "Tone",
+    "Code", "Details", "Figure", "Files", "KeyFigure", "KeyFigures", "Mark", "Part", "Picture", "SavePicture", "Table",
+    "Text", "Tone", "Verdict",
 ]  # fmt: skip
 
 #: What a value says: all is well, look here, this is bad, or nothing.
@@ -57,8 +59,55 @@ class Mark:
 
 
 @dataclass(frozen=True)
+class Verdict:
+    """The sentence that a report is opened for."""
+
+    text: str
+    tone: Tone = ""
+
+    def html(self, key: str) -> str:
+        return f'<p class="verdict {self.tone}">{_inline(self.text)}</p>'
+
+    def markdown(self, key: str, save: SavePicture) -> str:
+        return f"**{self.text}**"
+
+    def json(self) -> dict[str, Any]:
+        return {"kind": "verdict", **vars(self)}
+
+
+@dataclass(frozen=True)
+class Files:
+    """Links to files, as seen from the folder in which the page lies; without a folder their names alone."""
+
+    words: str
+    paths: Sequence[str | Path]
+    folder: Path | None = None
+
+    def html(self, key: str) -> str:
+        return f"<p>{escape(self.words)} " + ", ".join(map(self._link, self.paths)) + "</p>"
+
+    def _link(self, path: str | Path) -> str:
+        name = escape(Path(path).name)
+        return (
+            name
+            if self.folder is None or not Path(path).exists()
+            else f'<a href="{escape(self._address(path), quote=True)}">{name}</a>'
+        )
+
+    def markdown(self, key: str, save: SavePicture) -> str:
+        names = ", ".join(f"[{Path(path).name}]({self._address(path)})" for path in self.paths)
+        return f"{self.words} {names}"
+
+    def json(self) -> dict[str, Any]:
+        return {"kind": "files", "files": [str(path) for path in self.paths]}
+
+    def _address(self, path: str | Path) -> str:
+        return "./" + quote(Path(os.path.relpath(path, self.folder or Path())).as_posix())
+
+
+@dataclass(frozen=True)
 class Text:
-    """Paragraphs, parted by empty lines; lines that start with `- ` are a list; `code`, **bold** and [links](url)."""
+    """Paragraphs, parted by empty lines; lines that start with `- ` are a list; `code`, **bold**, *em* and [links](url)."""
 
     text: str
 
@@ -124,7 +173,9 @@ class KeyFigures:
         boxes = []
         for figure in self.figures:
             note = f"<span class=note>{_inline(figure.note)}</span>" if figure.note else ""
-            value = f"<b>{escape(figure.value)}</b>"
+            value, interval, rest = figure.value.partition(" (")
+            small = f" <small>{escape((interval + rest).strip())}</small>" if interval else ""
+            value = f"<b>{escape(value)}{small}</b>"
             boxes.append(f'<div class="key {figure.tone}"><span>{escape(figure.label)}</span>{value}{note}</div>')
         return f"<div class=keys>{''.join(boxes)}</div>"
 
@@ -268,14 +319,15 @@ class Details:
 
 
 def _inline(text: str) -> str:
-    """Escaped text with `code`, **bold** and [links](url); code is left as it is inside."""
+    """Escaped text with `code`, **bold**, *em* and [links](url); code is left as it is inside."""
     out = []
     for k, piece in enumerate(re.split(r"`([^`]+)`", text)):
-        safe = escape(piece)
+        safe = escape(re.sub(r"(?<=\d) (?=%)", "\u00a0", piece))
         if k % 2:
             out.append(f"<code>{safe}</code>")
             continue
         safe = re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", safe)
+        safe = re.sub(r"\*(\S(?:[^*]*[^*\s])?)\*", r"<em>\1</em>", safe)
         out.append(_LINK.sub(r'<a href="\2">\1</a>', safe))
     return "".join(out)
 

@@ -12,18 +12,21 @@ Plots are made without pyplot, so that nothing needs a display and nothing is sh
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
+
+from openant_tools.numbers import readable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = [
-    "BLUE", "CYCLE", "GREEN", "INK", "ORANGE", "PURPLE", "SIGNAL_LABELS", "SKY", "VERMILLION", "YELLOW", "as_png",
-    "as_svg", "axis_label", "figure", "legend", "signal_label", "style",
+    "BLUE", "CYCLE", "DEGREES", "GREEN", "INK", "ORANGE", "PURPLE", "SIGNAL_LABELS", "SKY", "VERMILLION", "YELLOW", "as_png",
+    "as_svg", "axis_label", "figure", "legend", "signal_label", "signal_unit", "style",
 ]  # fmt: skip
 
 # Okabe and Ito's palette (https://jfly.uni-koeln.de/color/): eight colours that all kinds of eyes tell apart.
@@ -34,6 +37,8 @@ INK = "#1c1d1e"
 #: Order of lines; yellow comes last, since it is faint on white.
 CYCLE = (BLUE, VERMILLION, GREEN, ORANGE, SKY, PURPLE, YELLOW)
 
+#: by what an angle in rad is multiplied to be drawn
+DEGREES = math.degrees(1)
 #: in, width of a figure as wide as a report's text
 WIDTH = 8.0
 
@@ -118,8 +123,14 @@ def axis_label(name: str, unit: str) -> str:
 def signal_label(signal: str) -> str:
     """The label of an axis that shows a signal or column of a run, such as `pos` or `gyro.z`."""
     kind, _, axis = signal.partition(".")
-    name, unit = ("heading", "rad") if signal == "base.yaw" else SIGNAL_LABELS.get(kind, (kind, ""))
-    return axis_label(f"{name} {axis}" if axis in ("x", "y", "z") else name, unit)
+    name = "heading" if signal == "base.yaw" else SIGNAL_LABELS.get(kind, (kind, ""))[0]
+    unit = signal_unit(signal)
+    return axis_label(f"{name} {axis}" if axis in ("x", "y", "z") else name, readable(1.0, unit)[1])
+
+
+def signal_unit(signal: str) -> str:
+    """The unit that files have a signal or column of a run in."""
+    return "rad" if signal == "base.yaw" else SIGNAL_LABELS.get(signal.partition(".")[0], ("", ""))[1]
 
 
 def legend(axes: Axes, **options: Any) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from openant_tools.report import KeyFigure, Mark, Report, plots
+from openant_tools.numbers import number, readable
+from openant_tools.report import Answer, Figure, KeyFigure, Mark, Report, plots
 from openant_tools.report.parts import Tone
 from openant_tools.sysid.compare import FAMILY_ERROR, Change, Comparison, Estimate
 
@@ -22,42 +23,44 @@ _APART = 0.17
 
 def comparison_report(result: Comparison) -> Report:
     """What a reader needs to decide whether the robot is still the one that was identified."""
-    report = Report("Comparison", f"A: {result.a.name} · B: {result.b.name}", made_by="openant sysid compare")
-    report.text(f"**{result.sentence}**")
     surest = max(result.compared, key=lambda change: -change.p, default=None)
-    report.key_figures(
-        KeyFigure(
-            "changed",
-            str(len(result.changed)),
-            f"of {len(result.compared)} compared",
-            "bad" if result.changed else "good",
+    figures = [KeyFigure("changed", str(len(result.changed)), f"of {len(result.compared)} compared")]
+    if surest is not None:
+        figures.append(KeyFigure("surest difference", surest.name, f"by chance alone: p {_chance(surest.p_holm)}"))
+    where = ", ".join(result.joints_changed) or "the robot"
+    answer = Answer(
+        result.sentence,
+        Figure(
+            dots(_telling(result)),
+            "Dots are values, bars their 95 % intervals; what changed beyond chance has its name in bold with a star. Hollow dots "
+            "are no statement of the data.",
         ),
-        KeyFigure(
-            "surest difference",
-            "–" if surest is None else surest.name,
-            "" if surest is None else f"p = {surest.p_holm:.2g} after Holm",
-        ),
+        "A model and a policy that were made for A meet another robot in B."
+        if result.changed
+        else "A model of A holds for B, as far as these data tell.",
+        f"Look at {where}: horn, screws, gears, cable. If it is to stay so, fit anew (`openant sysid fit`) and train on that model."
+        if result.changed
+        else "Go on with the model that you have; record and fit again after a repair, or in some months.",
+        "bad" if result.changed else "good",
+        figures,
     )
-    report.section("Side by side").figure(
-        dots(result.changes),
-        "Dots are values, bars their 95 % intervals; what changed beyond chance has its name in bold with a star. Hollow dots "
-        "are no statement of the data.",
-    )
-    report.table(
-        ["parameter", "A", "B", "B − A", "from", "to", "unit", "p (Holm)", "verdict"],
+    report = Report("Comparison", f"A: {result.a.name} · B: {result.b.name}", answer, made_by="openant sysid compare")
+    report.section("Every parameter").table(
+        ["parameter", "A", "B", "B − A (95 % interval)", "p (Holm)", "verdict"],
         [
             [
-                change.name, change.a.value, change.b.value, change.difference, change.low, change.high, change.unit,
-                change.p_holm, Mark(change.status, _TONE[change.status]),
+                change.name, number(change.a.value, change.unit), number(change.b.value, change.unit),
+                number(change.difference, change.unit, change.low, change.high, sign=True), _chance(change.p_holm),
+                Mark(change.status, _TONE[change.status]),
             ]
             for change in result.changes
         ],
     )  # fmt: skip
     report.text(
-        "**From** and **to** are the ends of the difference's 95 % interval. **p (Holm)** is the probability of such a difference by "
-        f"chance, adjusted for all that were compared: at {FAMILY_ERROR:g}, one comparison in twenty calls anything changed "
-        "where nothing has."
+        "**p (Holm)** is the probability of such a difference by chance, adjusted for all that were compared: at "
+        f"{number(FAMILY_ERROR)}, one comparison in twenty calls anything changed where nothing has."
     )
+    report.figure(dots(result.changes), "The same of all parameters.")
     remarks = [
         *result.notes,
         *dict.fromkeys(f"{change.name}: {change.why}." for change in result.changes if change.why),
@@ -68,6 +71,17 @@ def comparison_report(result: Comparison) -> Report:
     if remarks:
         report.section("Remarks").text("\n".join(f"- {remark}" for remark in remarks))
     return report
+
+
+def _telling(result: Comparison) -> Sequence[Change]:
+    """The kinds of parameters of which one changed; else that of the surest difference."""
+    shown = result.changed or sorted(result.compared, key=lambda change: change.p)[:1] or result.changes
+    kinds = {change.kind for change in shown}
+    return [change for change in result.changes if change.kind in kinds]
+
+
+def _chance(p: float) -> str:
+    return "below 0.001" if p < 1e-3 else number(p, decimals=3)
 
 
 def dots(changes: Sequence[Change]) -> MatplotlibFigure:
@@ -87,6 +101,7 @@ def dots(changes: Sequence[Change]) -> MatplotlibFigure:
 
 
 def _panel(axis: Axes, kind: str, group: Sequence[Change]) -> None:
+    factor, unit = readable(max(abs(change.a.value) for change in group), group[0].unit)
     with plots.style():
         for row, change in enumerate(group):
             for estimate, at, colour, marker, label in (
@@ -95,7 +110,7 @@ def _panel(axis: Axes, kind: str, group: Sequence[Change]) -> None:
             ):
                 below, above = _bars(estimate)
                 axis.errorbar(
-                    estimate.value, at, xerr=[[below], [above]], fmt=marker, color=colour, capsize=2,
+                    factor * estimate.value, at, xerr=[[factor * below], [factor * above]], fmt=marker, color=colour, capsize=2,
                     markerfacecolor="none" if change.status == "not comparable" else colour,
                     label=label if row == 0 else None,
                 )  # fmt: skip
@@ -105,7 +120,7 @@ def _panel(axis: Axes, kind: str, group: Sequence[Change]) -> None:
                 text.set_fontweight("bold")
         axis.set_ylim(len(group) - 0.5, -0.5)
         axis.set_ylabel("joint" if any("." in change.name for change in group) else "")
-        axis.set_xlabel(plots.axis_label(kind.replace("_", " "), group[0].unit))
+        axis.set_xlabel(plots.axis_label(kind.replace("_", " "), unit))
 
 
 def _row_name(change: Change) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from openant_tools.model.gap import HORIZON_S, gap, share_closed
 from openant_tools.model.rollout import Rollouts
+from openant_tools.numbers import exact, number, percent, span
 from openant_tools.recording.run import Run
-from openant_tools.report import Details, Figure, KeyFigure, Mark, Part, Report, plots
+from openant_tools.report import Answer, Figure, KeyFigure, Mark, Report, plots
 from openant_tools.report.parts import Tone
 from openant_tools.sysid.data_sheet import data_sheet_model
 from openant_tools.sysid.dataset import Dataset
@@ -30,6 +31,8 @@ Array = NDArray[np.float64]
 HORIZONS_S = (0.1, 0.2, 0.5, 1.0, 2.0)
 #: correlations beyond this are worth a line
 STRONG = 0.7
+#: and so many of them are shown
+STRONGEST = 12
 #: seconds shown around the worst moment of a joint
 WINDOW_S = 3.0
 
@@ -55,58 +58,79 @@ VERDICTS = """
 def fit_report(result: Identification) -> Report:
     """Everything a reader needs to decide whether to use the calibrated model."""
     closed = share_closed(result.before.full, result.after.full, result.floor)
+    moments = [moment for data in result.held_out for moment in _moments(result, data)]
+    worst = max(moments, key=lambda moment: moment.before)
+    wanted: dict[str, list[str]] = {}
+    for value in result.values:
+        if value.record_next:
+            wanted.setdefault(value.record_next, []).append(f"{value.name} ({value.words})")
+    answer = Answer(
+        _sentence(result),
+        Figure(
+            worst.figure,
+            f"Held-out run {worst.run}, {worst.joint}, around the moment at which the given model is worst.",
+        ),
+        f"{_changes(result)} Held-out runs had no part in the fit; what two plays of one motion differ by, no model can beat."
+        if not result.in_turn
+        else f"{_changes(result)} Each run was judged by a model that was fitted without it.",
+        _then(result, wanted),
+        "bad" if not result.accepted else "good" if closed > 0.5 else "warn",
+        (
+            KeyFigure("held-out error, full run", _change(result.before.full, result.after.full), "given → calibrated"),
+            KeyFigure(
+                f"held-out error, {exact(HORIZON_S, 's')}",
+                _change(result.before.horizon, result.after.horizon),
+                "re-initialised from measurement",
+            ),
+            KeyFigure("floor", _error(result.floor), "what no model could beat"),
+            KeyFigure("excess gap closed", percent(closed) if math.isfinite(closed) else "–", "on held-out runs"),
+        ),
+    )
     report = Report(
-        "System identification", f"{result.model.name} · {', '.join(_names(result))}", made_by="openant sysid fit"
+        "System identification", f"{result.model.name} · {', '.join(_names(result))}", answer, made_by="openant sysid fit",
+        recordings=[run.path for data in result.datasets for run in data.runs if run.path],
+    )  # fmt: skip
+    report.section("What was found").table(
+        ["parameter", "given", "value", "95 % interval", "verdict"], [_row(value) for value in result.values]
     )
-    report.text(_sentence(result))
-    report.key_figures(
-        KeyFigure("held-out error, full run", _change(result.before.full, result.after.full), "given → calibrated"),
-        KeyFigure(
-            f"held-out error, {HORIZON_S:g} s",
-            _change(result.before.horizon, result.after.horizon),
-            "re-initialised from measurement",
-        ),
-        KeyFigure("floor", f"{1e3 * result.floor:.2f} mrad", "what no model could beat"),
-        KeyFigure(
-            "excess gap closed",
-            f"{100 * closed:.0f} %" if math.isfinite(closed) else "–",
-            "on held-out runs",
-            "good" if closed > 0.5 else "warn",
-        ),
-    )
-    report.section("How far").figure(
+    report.text(VERDICTS)
+    for note in result.notes:
+        report.text(note)
+    if wanted:
+        report.section("What to record next").table(
+            ["protocol", "it would settle"], [[what, ", ".join(names)] for what, names in wanted.items()]
+        )
+    report.section("Measured against simulated, joint by joint")
+    for moment in moments:
+        report.details(
+            f"{moment.joint}: {_change(moment.before, moment.after)} over full runs",
+            Figure(moment.figure, f"{moment.run}, where the given model is worst."),
+        )
+    report.section("How far it looks ahead").figure(
         _error_against_horizon(result),
         "Root mean square error of joint positions on held-out runs, re-initialised from measurement every so often. "
         "The model is better where its line is lower; a full run never re-initialises. Where the runs name their servos, the "
         "third line is the given model with what their data sheet and registers say of stiffness, damping and torque limit.",
     )
-    report.section("What was found").table(
-        ["parameter", "given", "value", "95 % interval", "unit", "verdict"], [_row(value) for value in result.values]
-    )
-    report.text(VERDICTS)
-    for note in result.notes:
-        report.text(note)
-    wanted: dict[str, list[str]] = {}
-    for value in result.values:
-        if value.record_next:
-            wanted.setdefault(value.record_next, []).append(f"{value.name} ({value.words})")
-    if wanted:
-        report.section("What to record next").table(
-            ["protocol", "it would settle"], [[what, ", ".join(names)] for what, names in wanted.items()]
-        )
     _correlations(report, result)
-    report.section("Measured against simulated")
-    for data in result.held_out:
-        report.add(*_joints(result, data))
     report.section("How it was judged").text(
         "The gap is the root mean square of measured minus simulated position over all joints and samples. Simulations start from "
         f"the measured state and play the run's own commands. {_judged(result)}"
     )
     report.table(
-        ["joint", "residual (mrad)", "it remembers itself for (s)"],
-        [[j, f"{1e3 * result.noise[j]:.2f}", f"{result.correlation_s[j]:.3f}"] for j in result.joints],
+        ["joint", "residual", "it remembers itself for"],
+        [[j, _error(result.noise[j]), number(result.correlation_s[j], "s")] for j in result.joints],
     )
     return report
+
+
+def _then(result: Identification, wanted: dict[str, list[str]]) -> str:
+    if not result.accepted:
+        return "Ask what explains the error: `openant gap diagnose`" + (
+            f"; and record {next(iter(wanted))}, which would settle more." if wanted else "."
+        )
+    more = f" To settle {', '.join(next(iter(wanted.values()))[:3])}, record {next(iter(wanted))}." if wanted else ""
+    return f"Train on the calibrated model; what it does not explain, `openant gap diagnose` looks for.{more}"
 
 
 def _correlations(report: Report, result: Identification) -> None:
@@ -116,28 +140,15 @@ def _correlations(report: Report, result: Identification) -> None:
     deviation = np.sqrt(np.diag(result.covariance))
     correlation = result.covariance / np.outer(deviation, deviation)
     names = [value.name for value in result.values]
-    section = report.section("Correlations").figure(
-        _matrix(correlation, names),
-        "How the errors of two values go together: where a square is strong, the data fix a combination of the two better "
-        "than either.",
-    )
     upper = np.argwhere(np.triu(np.abs(correlation) > STRONG, 1))
-    if len(upper):
-        pairs = sorted(upper.tolist(), key=lambda pair: -abs(correlation[pair[0], pair[1]]))
-        rows = [[names[a], names[b], f"{correlation[a, b]:+.2f}"] for a, b in pairs[:12]]
-        section.table(["value", "goes with", "correlation"], rows)
-
-
-def _matrix(correlation: Array, names: Sequence[str]) -> MatplotlibFigure:
-    figure: MatplotlibFigure
-    size = max(3.0, 0.16 * len(names) + 1.8)
-    figure, axes = plots.figure(height=size)
-    image = axes.imshow(correlation, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
-    ticks = range(len(names))
-    axes.set_xticks(ticks, names, rotation=90, fontsize=6)
-    axes.set_yticks(ticks, names, fontsize=6)
-    figure.colorbar(image, ax=axes, label="correlation (1)", shrink=0.7)
-    return figure
+    pairs = sorted(upper.tolist(), key=lambda pair: -abs(correlation[pair[0], pair[1]]))[:STRONGEST]
+    if not pairs:
+        return
+    report.section("Values that go together").table(
+        ["value", "goes with", "correlation"],
+        [[names[a], names[b], number(correlation[a, b], sign=True, decimals=2)] for a, b in pairs],
+        "The errors of two values go together: the data fix a combination of the two better than either.",
+    )
 
 
 def _judged(result: Identification) -> str:
@@ -158,27 +169,27 @@ def _names(result: Identification) -> list[str]:
 
 def _sentence(result: Identification) -> str:
     if not result.accepted:
-        return "**Nothing that was fitted beats the given model on held-out runs, so the model is returned as it was.**"
+        return "Nothing that was fitted beats the given model on held-out runs, so the model is returned as it was."
+    return f"The calibrated model leaves {percent(result.after.full / result.before.full)} of the given model's error on held-out runs."
+
+
+def _changes(result: Identification) -> str:
     kinds = dict.fromkeys(name.partition(".")[0].replace("_", " ") for name in result.accepted)
-    return (
-        f"**The calibrated model leaves {100 * result.after.full / result.before.full:.0f} % of the given model's error on "
-        f"held-out runs.** It changes {', '.join(kinds)}."
-    )
+    return f"It changes {', '.join(kinds)}." if kinds else "Every value stays as it was given."
 
 
 def _change(before: float, after: float) -> str:
-    return f"{1e3 * before:.2f} → {1e3 * after:.2f} mrad"
+    return f"{_error(before).removesuffix(' mrad')} → {_error(after)}"
+
+
+def _error(rad: float) -> str:
+    return number(rad, "rad", name="error")
 
 
 def _row(value: Value) -> list[object]:
-    return [
-        value.name,
-        f"{value.given:.4g}",
-        f"{value.value:.4g}",
-        value.interval,
-        value.unit,
-        Mark(value.words, _TONE[value.verdict]),
-    ]
+    interval = "–" if value.low is None or value.high is None else span(value.low, value.high, value.unit)
+    mark = Mark(value.words, _TONE[value.verdict])
+    return [value.name, number(value.given, value.unit), number(value.value, value.unit), interval, mark]
 
 
 def _error_against_horizon(result: Identification) -> MatplotlibFigure:
@@ -214,7 +225,7 @@ def _error_against_horizon(result: Identification) -> MatplotlibFigure:
             axes.plot(x, by_sheet, "^-.", label="data sheet and registers")
         axes.plot(x, calibrated, "o-", label="calibrated model")
         axes.axhline(1e3 * result.floor, linestyle=":", color=plots.INK, label="floor")
-        axes.set_xticks(x, [f"{horizon:g}" for horizon in horizons] + ["full run"])
+        axes.set_xticks(x, [exact(horizon) for horizon in horizons] + ["full run"])
         axes.set_xlabel(plots.axis_label("re-initialised every", "s"))
         axes.set_ylabel(plots.axis_label("held-out error", "mrad"))
         axes.set_ylim(bottom=0)
@@ -227,31 +238,43 @@ def _simulated(result: Identification, data: Dataset, rollouts: Rollouts) -> Arr
     return data.simulate(result.parameters, [np.zeros(len(result.parameters)), result.u], rollouts).pos
 
 
-def _joints(result: Identification, data: Dataset) -> Sequence[Part]:
-    """For each joint, the worst moment of the given model: command, measured, and both simulations, with the error below."""
+@dataclass(frozen=True)
+class _Moment:
+    """The worst moment of the given model at one joint; the errors are over full runs, rad."""
+
+    joint: str
+    run: str
+    before: float
+    after: float
+    figure: MatplotlibFigure
+
+
+def _moments(result: Identification, data: Dataset) -> Sequence[_Moment]:
+    """For each joint command, measured, and both simulations, with the error below."""
     pos = _simulated(result, data, data.full)
-    parts: list[Part] = []
+    moments = []
     for j, joint in enumerate(data.plant.joints):
         run, rows = _worst(data, data.measured[:, j] - pos[0, :, j])
         t = run.t[rows] - run.t[0]
         part = data.full.rows[data.runs.index(run)]
         at = np.arange(part.start, part.stop)[rows]
+        measured, given, calibrated = data.measured[at, j], pos[0, at, j], pos[1, at, j]
         figure, (above, below) = plots.figure(2, 1, height=1.8, sharex=True)
         with plots.style():
-            above.plot(t, run.column(f"cmd.{joint}")[rows], color=plots.INK, linewidth=0.8, alpha=0.6, label="command")
-            above.plot(t, data.measured[at, j], color=plots.GREEN, label="measured")
-            above.plot(t, pos[0, at, j], "--", color=plots.ORANGE, label="given model")
-            above.plot(t, pos[1, at, j], color=plots.BLUE, label="calibrated")
-            above.set_ylabel(plots.axis_label(joint, "rad"))
-            below.plot(t, 1e3 * (data.measured[at, j] - pos[0, at, j]), "--", color=plots.ORANGE)
-            below.plot(t, 1e3 * (data.measured[at, j] - pos[1, at, j]), color=plots.BLUE)
+            command = plots.DEGREES * run.column(f"cmd.{joint}")[rows]
+            above.plot(t, command, color=plots.INK, linewidth=0.8, alpha=0.6, label="command")
+            above.plot(t, plots.DEGREES * measured, color=plots.GREEN, label="measured")
+            above.plot(t, plots.DEGREES * given, "--", color=plots.ORANGE, label="given model")
+            above.plot(t, plots.DEGREES * calibrated, color=plots.BLUE, label="calibrated")
+            above.set_ylabel(plots.axis_label(joint, "°"))
+            below.plot(t, 1e3 * (measured - given), "--", color=plots.ORANGE)
+            below.plot(t, 1e3 * (measured - calibrated), color=plots.BLUE)
             below.set_ylabel(plots.axis_label("error", "mrad"))
             below.set_xlabel(plots.axis_label("time in run", "s"))
         plots.legend(above)
-        before, after = (1e3 * gap(data.measured[:, j], pos[v, :, j]) for v in (0, 1))
-        shown = Figure(figure, f"{run.name}, where the given model is worst.")
-        parts.append(Details(f"{joint}: {before:.2f} → {after:.2f} mrad over full runs", (shown,)))
-    return parts
+        before, after = (gap(data.measured[:, j], pos[v, :, j]) for v in (0, 1))
+        moments.append(_Moment(joint, run.name, before, after, figure))
+    return moments
 
 
 def _worst(data: Dataset, error: Array) -> tuple[Run, slice]:

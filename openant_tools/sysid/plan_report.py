@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from openant_tools.report import KeyFigure, Mark, Report, plots
+from openant_tools.numbers import exact, number, percent, span
+from openant_tools.report import Answer, Figure, KeyFigure, Mark, Report, plots
 from openant_tools.report.parts import Tone
 from openant_tools.sysid.forecast import NEAR_M, Forecast
 from openant_tools.sysid.plan import Expectation, Plan
@@ -34,38 +34,55 @@ VERDICTS = """
 def plan_report(plan: Plan) -> Report:
     """What a reader needs to decide whether to play it."""
     first = plan.forecasts[0].protocol
-    report = Report("Plan of recordings", f"{plan.asked.model.name} · {first.name}", made_by="openant sysid plan")
     objections = plan.objections
     good = sum(one.verdict == "identified" for one in plan.expectations)
-    report.text(
-        f"**Do not play it: {'; '.join(objections)}.**"
-        if objections
-        else f"**{good} of {len(plan.expectations)} parameters will be identified.** {first.words[:1].upper()}{first.words[1:]}."
-    )
     busiest = max((peak for one in plan.forecasts for peak in one.peaks), key=lambda peak: peak.saturated)
     nearest = min(plan.forecasts, key=lambda one: one.clearance_m)
-    report.key_figures(
-        KeyFigure("identified", f"{good} of {len(plan.expectations)}", "parameters", "good" if good else "bad"),
-        KeyFigure("time", f"{plan.seconds:.0f} s", f"in {len(plan.forecasts)} recordings"),
-        KeyFigure("at the torque limit", f"{100 * busiest.saturated:.0f} %", f"of the time, {busiest.joint}"),
-        KeyFigure(
-            "nearest to itself",
-            f"{1e3 * nearest.clearance_m:.0f} mm" if nearest.clearance_m < NEAR_M else f"> {1e3 * NEAR_M:.0f} mm",
-            " and ".join(nearest.nearest),
-            "bad" if nearest.clearance_m < 0 else "",
+    open_ = [one.name for one in plan.expectations if one.verdict != "identified"]
+    near = number(min(nearest.clearance_m, NEAR_M), "m", decimals=0)
+    answer = Answer(
+        f"Do not play it: {'; '.join(objections)}."
+        if objections
+        else f"It may be played, and will identify {good} of {len(plan.expectations)} parameters in {number(plan.seconds, 's', decimals=0)}.",
+        Figure(
+            expected_shares(plan.expectations),
+            "The width of each expected 95 % interval as a share of the prior's: 100 % is what is known today. One dot a joint.",
+        ),
+        f"{first.words[:1].upper()}{first.words[1:]}. "
+        + (
+            f"Not settled by it: {', '.join(open_[:6])}{' …' if len(open_) > 6 else ''}."
+            if open_
+            else "It settles everything."
+        ),
+        "Choose another protocol or smaller limits, and plan again."
+        if objections
+        else "Put the robot on its stand and record it: `openant sysid record`, with the same protocol or `--plan`.",
+        "bad" if objections or not good else "good",
+        (
+            KeyFigure("at the torque limit", percent(busiest.saturated), f"of the time, {busiest.joint}"),
+            KeyFigure(
+                "nearest to itself",
+                near if nearest.clearance_m < NEAR_M else f"more than {near}",
+                " and ".join(nearest.nearest),
+                "bad" if nearest.clearance_m < 0 else "",
+            ),
+            KeyFigure(
+                "time",
+                number(plan.seconds, "s", decimals=0),
+                f"in {len(plan.forecasts)} recording{'s' if len(plan.forecasts) > 1 else ''}",
+            ),
         ),
     )
-    report.section("What will be known").figure(
-        expected_shares(plan.expectations),
-        "The width of each expected 95 % interval as a share of the prior's: 1 is what is known today. One dot a joint.",
+    report = Report(
+        "Plan of recordings", f"{plan.asked.model.name} · {first.name}", answer, made_by="openant sysid plan"
     )
-    report.table(
-        ["parameter", "expected", "from", "to", "prior from", "prior to", "unit", "verdict", "tied to"],
+    report.section("What will be known").table(
+        ["parameter", "expected (95 % interval)", "known today", "verdict", "tied to"],
         [
             [
-                one.name, one.nominal, one.low, one.high, one.prior_low, one.prior_high, one.unit,
+                one.name, number(one.nominal, one.unit, one.low, one.high), span(one.prior_low, one.prior_high, one.unit),
                 Mark(one.verdict, _TONE[one.verdict]),
-                f"{one.tied_to} ({one.correlation:+.2f})" if one.tied_to else "",
+                f"{one.tied_to} ({number(one.correlation, sign=True, decimals=2)})" if one.tied_to else "",
             ]
             for one in plan.expectations
         ],
@@ -73,9 +90,9 @@ def plan_report(plan: Plan) -> Report:
     residual = plan.asked.residual
     report.text(
         VERDICTS
-        + f"\nExpected if a fit leaves {1e3 * residual.rad:g} mrad that last for {residual.memory_s:g} s on the stand, and "
-        f"{1e3 * residual.floor_rad:g} mrad for {residual.floor_memory_s:g} s on the floor. **tied to** names the parameter of the "
-        f"largest correlation, where that is {TIED:g} or more."
+        + f"\nExpected if a fit leaves {_error(residual.rad)} that last for {exact(residual.memory_s, 's')} on the stand, and "
+        f"{_error(residual.floor_rad)} for {exact(residual.floor_memory_s, 's')} on the floor. **tied to** names the parameter of "
+        f"the largest correlation, where that is {number(TIED)} or more."
     )
     for note in plan.notes:
         report.text(note)
@@ -85,12 +102,12 @@ def plan_report(plan: Plan) -> Report:
     report.section("How hard it is")
     for one in plan.forecasts:
         report.table(
-            ["joint", "speed (rad/s)", "no-load (rad/s)", "torque (N·m)", "limit (N·m)", "rms (N·m)", "at the limit", "from (rad)", "to (rad)"],
+            ["joint", "speed", "at most, unloaded", "torque", "limit", "rms torque", "at the limit", "range"],
             [
                 [
-                    peak.joint, f"{peak.speed_rad_s:.2f}", _number(peak.no_load_rad_s), f"{peak.torque_nm:.2f}",
-                    _number(peak.limit_nm), f"{peak.rms_nm:.2f}", f"{100 * peak.saturated:.0f} %", f"{peak.low_rad:.2f}",
-                    f"{peak.high_rad:.2f}",
+                    peak.joint, number(peak.speed_rad_s, "rad/s", decimals=0), number(peak.no_load_rad_s, "rad/s", decimals=0),
+                    number(peak.torque_nm, "N·m", decimals=2), number(peak.limit_nm, "N·m", decimals=2),
+                    number(peak.rms_nm, "N·m", decimals=2), percent(peak.saturated), span(peak.low_rad, peak.high_rad, "rad"),
                 ]
                 for peak in one.peaks
             ],
@@ -99,15 +116,15 @@ def plan_report(plan: Plan) -> Report:
     return report
 
 
-def _number(value: float) -> str:
-    return f"{value:.2f}" if math.isfinite(value) else "–"
+def _error(rad: float) -> str:
+    return number(rad, "rad", name="residual")
 
 
 def _played(one: Forecast) -> str:
-    heading = f", turned by {math.degrees(one.protocol.heading_rad):.0f}°" if one.protocol.heading_rad else ""
-    words = f"On the {one.protocol.setup}{heading}, {one.protocol.seconds:.0f} s."
+    heading = f", turned by {number(one.protocol.heading_rad, 'rad', decimals=0)}" if one.protocol.heading_rad else ""
+    words = f"On the {one.protocol.setup}{heading}, {number(one.protocol.seconds, 's', decimals=0)}."
     if one.protocol.setup == "floor":
-        words += f" It leans by {math.degrees(one.lean_rad):.0f}° and goes {100 * one.travel_m:.0f} cm at most."
+        words += f" It leans by {number(one.lean_rad, 'rad', decimals=0)} and goes {number(100 * one.travel_m, 'cm', decimals=0)} at most."
     return words
 
 
@@ -129,7 +146,8 @@ def expected_shares(expectations: Sequence[Expectation]) -> MatplotlibFigure:
         axes.set_yticks(range(len(kinds)), [kind.replace("_", " ") for kind in kinds])
         axes.invert_yaxis()
         axes.axvline(1.0, linestyle=":", color=plots.INK)
-        axes.set_xlabel(plots.axis_label("expected interval / prior interval", "1"))
+        axes.xaxis.set_major_formatter(lambda share, _: percent(share, decimals=1 if share < 0.01 else 0))
+        axes.set_xlabel("expected interval, of what is known today (%)")
         axes.set_ylabel("parameter")
     plots.legend(axes)
     return figure
@@ -143,8 +161,9 @@ def timeline(one: Forecast) -> MatplotlibFigure:
     figure, all_axes = plots.figure(len(shown), 1, height=1.7, sharex=True, squeeze=False)
     with plots.style():
         for axes, joint in zip(all_axes[:, 0], shown, strict=True):
-            axes.plot(run.t, run.column(f"cmd.{joint}"), color=plots.INK, linewidth=0.8, alpha=0.6, label="command")
-            axes.plot(run.t, run.column(f"pos.{joint}"), color=plots.BLUE, label="simulated")
+            command, simulated = (plots.DEGREES * run.column(f"{signal}.{joint}") for signal in ("cmd", "pos"))
+            axes.plot(run.t, command, color=plots.INK, linewidth=0.8, alpha=0.6, label="command")
+            axes.plot(run.t, simulated, color=plots.BLUE, label="simulated")
             off = run.signal("torque", [joint], default=1.0)[:, 0] == 0
             if off.any():
                 low, high = axes.get_ylim()
@@ -152,7 +171,7 @@ def timeline(one: Forecast) -> MatplotlibFigure:
                     run.t, low, high, where=off, color=plots.ORANGE, alpha=0.25, linewidth=0, label="torque off"
                 )
                 axes.set_ylim(low, high)
-            axes.set_ylabel(plots.axis_label(joint, "rad"))
+            axes.set_ylabel(plots.axis_label(joint, "°"))
             for start in one.protocol.starts():
                 axes.axvline(start, color=plots.INK, linewidth=0.6, alpha=0.4)
         bottom = all_axes[-1, 0]

@@ -71,6 +71,13 @@ PRIORS: Mapping[str, Prior] = {
 LEG_PRIOR = Prior(0.03, 0.8, 0.8, "W/K", "hip to knee of one leg")
 EXPONENT_PRIOR = Prior(0.12, 0.10, 0.0, "1", "power by which the air takes more than in proportion", log=False)
 GEAR_PRIOR = Prior(0.5, 0.25, 0.0, "1", "share of the gear's power that stays in the servo", log=False)
+#: name → what it is, for people
+PARAMETER_WORDS: Mapping[str, str] = {
+    **{name: prior.words for name, prior in PRIORS.items()},
+    "leg_w_k": LEG_PRIOR.words, "exponent": EXPONENT_PRIOR.words, "gear": GEAR_PRIOR.words, "room_c": "temperature of the room",
+    "start_k": "case at the start, over its first reading", "start_winding_k": "winding at the start, over its case",
+    "held_w": "heat of a pose whose load nobody logged",
+}  # fmt: skip
 #: A thermometer on the wall, and a guess from the coldest servo.
 ROOM_KNOWN_K, ROOM_GUESSED_K, ROOM_BELOW_K = 1.0, 3.5, 1.5
 #: At a run's start: the case against its first reading, the winding against the case (K).

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from openant_tools.report import KeyFigure, Mark, Report, plots
+from openant_tools.numbers import number, percent
+from openant_tools.report import Answer, Figure, KeyFigure, Mark, Report, plots
 from openant_tools.report.parts import Tone
-from openant_tools.thermal.compare import Difference
+from openant_tools.thermal.compare import ROOM_C, Difference
 from openant_tools.thermal.finding import BELIEVED_K
-from openant_tools.thermal.fit import Fit, HeldOut
+from openant_tools.thermal.fit import PARAMETER_WORDS, Fit, HeldOut
 from openant_tools.thermal.forecast import HORIZON_S, Forecast, Interval
 from openant_tools.thermal.inputs import Inputs
 
@@ -37,7 +38,7 @@ def temperature_picture(found: Fit, run: Inputs, *, split_s: float | None = None
     low, high = np.quantile(case, [0.025, 0.975], axis=0)
     minutes = run.edges[1:] / 60
     figure: MatplotlibFigure
-    figure, axes = plots.figure(rows, min(2, len(run.joints)), height=1.8, sharex=True, sharey=True, squeeze=False)
+    figure, axes = plots.figure(rows, min(2, len(run.joints)), height=1.45, sharex=True, sharey=True, squeeze=False)
     top = float(np.nanmax(run.readings))
     with plots.style():
         for k, joint in enumerate(run.joints):
@@ -107,72 +108,137 @@ def _shown_min(told: Forecast, run: Inputs | None, now: float) -> float:
     return min(max(wanted, past, 20.0), SHOWN_MIN)
 
 
-def fit_report(found: Fit, runs: Sequence[Inputs], held: HeldOut | None, command: str) -> Report:
-    """What a reader needs to believe the model: the later part first, then the curves, then the numbers."""
-    report = Report("Heat", ", ".join(run.name for run in runs), made_by=command)
-    if held is not None:
-        good: Tone = "good" if held.rms_k < BELIEVED_K else "bad"
-        report.key_figures(
-            KeyFigure("later part missed by", f"{held.rms_k:.2f} K", f"rms from {held.from_s / 60:.0f} min on", good),
-            KeyFigure("worst", f"{held.worst_k:.1f} K", held.worst),
-            KeyFigure("inside the 95 % band", f"{held.within:.0%}", "of what was read there"),
-        )
-    last = runs[-1]
-    report.section("Temperatures").figure(
-        temperature_picture(found, last),
-        "Dots: means of what the servo reads, whole °C. Line and band: the two-node model and where it believes the case to be "
-        "(95 %, the slow disturbance included).",
+def fit_report(found: Fit, told: Forecast, runs: Sequence[Inputs], held: HeldOut | None) -> Report:
+    """Whether a servo shuts down under this load, what was read beside the model, and how far to believe it.
+
+    Args:
+        told: what would come of the last run's load from cold.
+    """
+    figures, means = (
+        [_first_figure(told)],
+        "The run is too short to hold a part of it back, so nothing has judged this model.",
     )
+    believed = held is not None and held.rms_k < BELIEVED_K
+    if held is not None:
+        figures += [
+            KeyFigure(
+                "later part missed by", number(held.rms_k, "K", decimals=2),
+                f"rms from {number(held.from_s / 60, decimals=0)} min on", "good" if believed else "bad",
+            ),
+            KeyFigure("worst", number(held.worst_k, "K", decimals=1), held.worst),
+        ]  # fmt: skip
+        means = (
+            "Fitted to the first part of the run, the model foretells the later one: its forecasts can be planned with."
+            if believed
+            else f"Fitted to the first part of the run, the model misses the later one by more than {number(BELIEVED_K, 'K')}: do "
+            "not plan with it."
+        )
+    answer = Answer(
+        _shutdown(told),
+        Figure(
+            temperature_picture(found, runs[-1]),
+            "Dots: means of what the servo reads, whole °C. Line and band: the two-node model and where it believes the case to be "
+            "(95 %, the slow disturbance included).",
+        ),
+        means,
+        "Ask what another load or a rest would do: `openant thermal forecast`."
+        if believed
+        else "Record a longer soak (`openant thermal soak`), in a room without draughts.",
+        _shutdown_tone(told),
+        figures,
+    )
+    report = Report("Heat", ", ".join(run.name for run in runs), answer)
     report.section("Parameters").table(
-        ["joint", "parameter", "value", "low", "high", "unit", "by the run"],
+        ["joint", "parameter", "value (95 % interval)", "by the run"],
         [
-            [one.joint or "all", one.name, one.value, one.low, one.high, one.unit,
-             Mark(f"{one.informed:.0%}", "good" if one.informed > 0.5 else "")]
+            [one.joint or "all", PARAMETER_WORDS.get(one.name, one.name), number(one.value, one.unit, one.low, one.high),
+             Mark(percent(one.informed), "good" if one.informed > 0.5 else "")]
             for one in found.estimates
         ],
-        "Intervals are 95 %. By the run: how much of what was uncertain before it has taken away; with little, the value is "
-        "what was believed of such servos anyhow.",
+        "By the run: how much of what was uncertain before it has taken away; with little, the value is what was believed of "
+        "such servos anyhow.",
     )  # fmt: skip
     report.text(
-        f"What no two-node model explains was about {found.disturbance_k:g} K, with a memory of "
-        f"{found.disturbance_s / 60:.0f} min; crossings were left by "
-        f"{np.nanmax(found.residual_k):.2f} K at most (rms a joint). Telemetry errors taken out: {int(found.inputs.glitches.sum())}."
+        f"What no two-node model explains was about {number(found.disturbance_k, 'K')}, with a memory of "
+        f"{number(found.disturbance_s / 60, decimals=0)} min; crossings were left by "
+        f"{number(float(np.nanmax(found.residual_k)), 'K', decimals=2)} at most (rms a joint). Telemetry errors taken out: "
+        f"{int(found.inputs.glitches.sum())}."
     )
     return report
 
 
-def forecast_report(found: Fit, told: Forecast, rest: str, command: str, run: Inputs | None = None) -> Report:
-    """When each servo shuts down under this load, and what it could bear."""
-    report = Report("Thermal forecast", f"{found.inputs.name}, {told.load.words}", made_by=command)
-    first = told.first
-    report.text(f"**{first.words if first else 'No servo comes to its limit.'}** Advice: {rest}.")
-    report.section("What comes").figure(
-        forecast_picture(found, told, run=run),
-        "Dots: what was read; dotted line: now. The fan holds the parameters' and the room's uncertainty and how the load varies.",
+def _shutdown(told: Forecast) -> str:
+    """Will it shut down, and when?"""
+    if told.first is not None:
+        return f"Under this load {told.first.words}, and shuts down."
+    nearest = min(told.joints, key=lambda one: one.limit_c - one.settles_c.value)
+    settles = number(nearest.settles_c.value, "°C", nearest.settles_c.low, nearest.settles_c.high)
+    return (
+        f"No servo shuts down under this load: {nearest.joint}, the nearest to its limit of {number(nearest.limit_c, '°C')}, "
+        f"settles at {settles}."
     )
+
+
+def _shutdown_tone(told: Forecast) -> Tone:
+    likely = max(one.probability for one in told.joints)
+    return "bad" if likely > 0.5 else "warn" if likely > 0.05 else "good"
+
+
+def _first_figure(told: Forecast) -> KeyFigure:
+    first = told.first
+    if first is None:
+        return KeyFigure("shuts down", "never", "within 8 hours of this load", "good")
+    return KeyFigure("shuts down after", _minutes(first.seconds_to_limit), first.joint, _shutdown_tone(told))
+
+
+def forecast_report(found: Fit, told: Forecast, rest: str, run: Inputs | None = None) -> Report:
+    """When each servo shuts down under this load, and what it could bear."""
+    likely = max(told.joints, key=lambda one: one.probability)
+    answer = Answer(
+        _shutdown(told),
+        Figure(
+            forecast_picture(found, told, run=run),
+            "Dots: what was read; dotted line: now. The fan holds the uncertainty of parameters and room, and how the load varies.",
+        ),
+        f"A servo that shuts down lets its leg fall until it is rebooted. Within 8 hours of this load {likely.joint} does with a "
+        f"probability of {percent(likely.probability)}.",
+        f"{rest[:1].upper()}{rest[1:]}.",
+        _shutdown_tone(told),
+        [_first_figure(told)],
+    )
+    report = Report("Thermal forecast", f"{found.inputs.name}, {told.load.words}", answer)
     report.section("Joints").table(
-        ["joint", "now °C", "limit °C", "min to the limit", "settles at °C", "for ever N·m", "an hour N·m"],
+        ["joint", "now", "limit", "reaches it after", "settles at", "holds for ever", "holds an hour"],
         [
-            [one.joint, one.temperature_c, one.limit_c, _interval(one.seconds_to_limit, 1 / 60), _interval(one.settles_c),
-             _interval(one.continuous_torque_nm), _interval(one.hour_torque_nm)]
+            [one.joint, number(one.temperature_c, "°C", decimals=0), number(one.limit_c, "°C"), _minutes(one.seconds_to_limit),
+             _interval(one.settles_c, "°C"), _interval(one.continuous_torque_nm, "N·m"), _interval(one.hour_torque_nm, "N·m")]
             for one in told.joints
         ],
-        "95 % intervals in brackets. For ever: the torque at standstill that keeps the case just below the limit.",
+        "95 % intervals in brackets. Holds for ever: the torque at standstill that keeps the case just below the limit.",
     )  # fmt: skip
     return report
 
 
-def _interval(interval: Interval | None, scale: float = 1.0) -> str:
+def _interval(interval: Interval | None, unit: str) -> str:
+    return "–" if interval is None else number(interval.value, unit, interval.low, interval.high)
+
+
+def _minutes(interval: Interval | None) -> str:
+    """Until a shutdown; an end beyond the horizon is open."""
     if interval is None:
         return "–"
-    high = "open" if interval.high >= HORIZON_S else f"{interval.high * scale:.3g}"
-    value = "open" if interval.value >= HORIZON_S else f"{interval.value * scale:.3g}"
-    return f"{value} [{interval.low * scale:.3g}, {high}]"
+    if interval.high < HORIZON_S:
+        return number(interval.value / 60, "min", interval.low / 60, interval.high / 60)
+    least = number(interval.low / 60, "min", decimals=0)
+    return (
+        f"{least} or more"
+        if interval.value >= HORIZON_S
+        else f"{number(interval.value / 60, 'min', decimals=0)} (from {least}, open)"
+    )
 
 
-def compare_report(differences: Sequence[Difference], a: str, b: str, command: str) -> Report:
+def compare_report(differences: Sequence[Difference], a: str, b: str) -> Report:
     """Where each servo settles in both, and the difference."""
-    report = Report("Two soaks", f"A: {a} · B: {b}", made_by=command)
     figure, axes = plots.figure(1, 1, height=0.6 + 0.35 * len(differences))
     with plots.style():
         rows = np.arange(len(differences))[::-1]
@@ -184,14 +250,31 @@ def compare_report(differences: Sequence[Difference], a: str, b: str, command: s
         axes.set_yticks(rows, [one.joint for one in differences])
         axes.set_xlabel(plots.axis_label("B − A: where it settles", "K"))
         axes.set_ylabel("joint")
-    report.section("Difference").figure(
-        figure, "Under one and the same torque in a room of 25 °C; bars are 95 % intervals."
+    certain = [one for one in differences if one.certain]
+    words = "; ".join(
+        f"{one.joint} settles {number(abs(one.difference_k.value), 'K', *sorted((abs(one.difference_k.low), abs(one.difference_k.high))))} "
+        f"{'hotter' if one.difference_k.value > 0 else 'cooler'}"
+        for one in certain
+    )  # fmt: skip
+    answer = Answer(
+        f"Under one torque in one room B differs from A: {words}."
+        if certain
+        else f"Whether B is cooler or hotter than A, these two soaks cannot tell, at none of {len(differences)} joints.",
+        Figure(figure, f"Under one and the same torque in a room of {number(ROOM_C, '°C')}; bars are 95 % intervals."),
+        "Rooms and loads are taken out; what is left is the servo, its heat sink, its friction, the air around it."
+        if certain
+        else "The intervals hold what either soak leaves open; a difference smaller than they are would not be seen.",
+        "Where B is cooler, keep what was changed; where it is hotter, look at heat sink, screws and cable."
+        if certain
+        else "Soak both longer, or with more torque: `openant thermal soak`.",
+        "" if certain else "warn",
     )
-    report.table(
-        ["joint", "torque N·m", "A °C", "B °C", "B − A K", "time constant B − A s"],
+    report = Report("Two soaks", f"A: {a} · B: {b}", answer)
+    report.section("Joints").table(
+        ["joint", "torque", "A", "B", "B − A", "time constant, B − A"],
         [
-            [one.joint, one.torque_nm, _interval(one.a_c), _interval(one.b_c),
-             Mark(_interval(one.difference_k), "good" if one.certain else ""), _interval(one.time_constant_s)]
+            [one.joint, number(one.torque_nm, "N·m"), _interval(one.a_c, "°C"), _interval(one.b_c, "°C"),
+             Mark(_interval(one.difference_k, "K"), "good" if one.certain else ""), _interval(one.time_constant_s, "s")]
             for one in differences
         ],
     )  # fmt: skip

@@ -18,6 +18,7 @@ from openant_tools.comms.dropouts.causes import CAUSES, OTHERWISE, Cause, Spread
 from openant_tools.comms.dropouts.episodes import cables
 from openant_tools.comms.dropouts.log import read_log
 from openant_tools.comms.dropouts.measures import Measures, measure
+from openant_tools.numbers import percent
 from openant_tools.recording.run import Run
 
 __all__ = ["SCHEMA", "DropoutDiagnosis", "Suspect", "Why", "diagnose_dropouts"]
@@ -323,5 +324,5 @@ def _sentence(verdict: str, best: Suspect, measures: Measures, tied: Sequence[st
     place = (
         "" if best.where[:1] in ((), ("all",), ("host",), ("adapter",), ("supply",)) else f" at {', '.join(best.where)}"
     )
-    words = f"{count}: {CAUSES[best.cause].words}{place} ({best.probability:.0%})"
+    words = f"{count}: {CAUSES[best.cause].words}{place} ({percent(best.probability)})"
     return words + (f", or {CAUSES[tied[1]].words}" if len(tied) > 1 else "")

@@ -8,10 +8,11 @@ import numpy as np
 
 from openant_tools.comms.dropouts.diagnose import LISTED, DropoutDiagnosis
 from openant_tools.comms.dropouts.log import WORDS
-from openant_tools.report import KeyFigure, Report, plots
+from openant_tools.numbers import number, percent
+from openant_tools.report import Answer, Figure, KeyFigure, Report, plots
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as MatplotlibFigure
 
 __all__ = ["dropouts_report", "loss_figure"]
 
@@ -21,65 +22,92 @@ _COLOURS = {
 }  # fmt: skip
 
 
-def loss_figure(found: DropoutDiagnosis) -> Figure:
-    """Losses by servo over time, with the supply and the host's lateness below."""
+def loss_figure(found: DropoutDiagnosis) -> MatplotlibFigure:
+    """Over time: losses by servo, or how long answers took where nothing was lost; the supply and the host's lateness, if logged."""
     log = found.measures.log
-    figure: Figure
-    figure, axes = plots.figure(3, height=1.9, sharex=True)
-    for code, word in enumerate(WORDS):
-        rows, joints = np.nonzero(log.word == code) if code else (np.zeros(0, int), np.zeros(0, int))
-        if len(rows):
-            axes[0].plot(log.t[rows], joints, "|", color=_COLOURS[word], markersize=6, label=word, rasterized=True)
-    axes[0].set_yticks(range(len(log.joints)), log.joints)
-    axes[0].set_ylim(len(log.joints) - 0.5, -0.5)
-    axes[0].set_ylabel("lost of (–)")
-    if log.lossy.any():
-        plots.legend(axes[0])
-    if np.isfinite(log.volt).any():
+    lossy, answered, supply = log.lossy.any(), np.isfinite(log.rtt).any(), np.isfinite(log.volt).any()
+    figure: MatplotlibFigure
+    figure, all_axes = plots.figure(1 + bool(lossy or answered) + bool(supply), height=1.9, sharex=True, squeeze=False)
+    axes = list(all_axes[:, 0])
+    if lossy:
+        first = axes.pop(0)
+        for code, word in enumerate(WORDS[1:], 1):
+            rows, joints = np.nonzero(log.word == code)
+            if len(rows):
+                first.plot(log.t[rows], joints, "|", color=_COLOURS[word], markersize=6, label=word, rasterized=True)
+        first.set_yticks(range(len(log.joints)), log.joints)
+        first.set_ylim(len(log.joints) - 0.5, -0.5)
+        first.set_ylabel("lost of")
+        plots.legend(first)
+    elif answered:
+        first = axes.pop(0)
+        first.plot(log.t, 1e3 * np.nanmax(np.nan_to_num(log.rtt), axis=1), color=plots.GREEN, lw=0.8)
+        first.set_ylim(bottom=0)
+        first.set_ylabel(plots.axis_label("slowest answer", "ms"))
+    if supply:
         low = np.nanmin(np.where(np.isfinite(log.volt), log.volt, np.inf), axis=1)
-        axes[1].plot(log.t, np.where(np.isfinite(low), low, np.nan), color=plots.BLUE, lw=0.8)
-    axes[1].set_ylabel(plots.axis_label("lowest supply", "V"))
+        axes[0].plot(log.t, np.where(np.isfinite(low), low, np.nan), color=plots.BLUE, lw=0.8)
+        axes[0].set_ylabel(plots.axis_label("lowest supply", "V"))
     late = log.wake if np.isfinite(log.wake).any() else np.diff(log.t, prepend=log.t[0]) - log.period_s
-    axes[2].plot(log.t, late * 1e3, color=plots.VERMILLION, lw=0.8)
-    axes[2].set_ylabel(plots.axis_label("loop late", "ms"))
-    axes[2].set_xlabel(plots.signal_label("t"))
+    axes[-1].plot(log.t, late * 1e3, color=plots.VERMILLION, lw=0.8)
+    axes[-1].set_ylabel(plots.axis_label("loop late", "ms"))
+    axes[-1].set_xlabel(plots.signal_label("t"))
     return figure
 
 
 def dropouts_report(found: DropoutDiagnosis) -> Report:
-    """Verdict, evidence, and every episode."""
-    log = found.measures.log
-    report = Report("The bus", ", ".join(log.names), made_by="openant comms diagnose")
+    """Verdict, what was lost when, remedy; then every cause, its evidence and every episode."""
+    log, best = found.measures.log, found.suspects[0]
     lost, asked = int(log.lost.sum()), int(log.answers.sum())
-    report.key_figures(
-        KeyFigure("verdict", found.verdict, found.what),
-        KeyFigure("lost", f"{lost / max(1, asked):.2%}", f"{lost} of {asked} answers"),
-        KeyFigure("watched", f"{log.seconds:.0f} s", f"{len(log.t)} reads"),
+    shows = "What was lost of whom" if lost else "How long the slowest answer took"
+    named = found.verdict not in ("none", "unknown")
+    then = f"{best.remedy}.\n\nTo make sure: {found.next_test}." if named else f"{found.next_test}."
+    then = then[:1].upper() + then[1:]
+    answer = Answer(
+        f"{found.what[:1].upper()}{found.what[1:]}.",
+        Figure(loss_figure(found), f"{shows}, the supply where it was logged, and how late the loop was."),
+        _meaning(found, lost, asked),
+        then if found.next_test else "Nothing. Ask again after cables were moved, and with the legs in motion.",
+        "good" if found.healthy_bus else "bad" if named else "warn",
+        (
+            KeyFigure("lost", percent(lost / max(1, asked), decimals=2), f"{lost} of {asked} answers"),
+            KeyFigure("watched", number(log.seconds, "s", decimals=0), f"{len(log.t)} reads"),
+        ),
     )
-    if found.next_test:
-        report.text(f"Next: {found.next_test}.")
-    report.section("When").figure(loss_figure(found), "What was lost of whom, the supply, and how late the loop was.")
+    report = Report("The bus", ", ".join(log.names), answer, made_by="openant comms diagnose")
     rows = [
         [
             one.cause,
             ", ".join(one.where),
-            f"{one.probability:.2f}",
+            percent(one.probability),
             "; ".join(w.words for w in one.evidence if w.nats > 0),
         ]
         for one in found.suspects
     ]
-    report.section("Causes").table(["cause", "where", "probability", "what speaks for it"], rows)
-    best = found.suspects[0]
-    if found.verdict not in ("none", "unknown"):
-        against = [[why.words, f"{why.nats:+.1f}"] for why in best.evidence]
-        report.section("Evidence").text(f"For and against {best.cause}, in nats.").table(["seen", "nats"], against)
-        report.section("What to do").text(f"{best.remedy}.\n\nTo make sure: {found.next_test}.")
+    rows.append(["nothing wrong", "", percent(found.healthy), ""])
+    rows.append(["something that has no name here", "", percent(found.unknown), ""])
+    report.section("Causes considered").table(["cause", "where", "probability", "what speaks for it"], rows)
+    if named:
+        against = [[why.words, number(why.nats, sign=True, decimals=1)] for why in best.evidence]
+        report.section("Evidence").table(["seen", "nats"], against, f"For (+) and against (−) {best.cause}.")
     shown = [
-        [f"{one.from_s:.2f}", f"{one.to_s - one.from_s:.2f}", str(one.stop - one.start),
+        [number(one.from_s, decimals=2), number(one.to_s - one.from_s, decimals=2), str(one.stop - one.start),
          ", ".join(log.joints[k] for k in one.joints), ", ".join(one.words)]
         for one in found.measures.episodes[:LISTED]
     ]  # fmt: skip
     if shown:
         words = f"{len(found.measures.episodes)} in all." if len(found.measures.episodes) > LISTED else ""
-        report.section("Episodes").text(words).table(["t (s)", "for (s)", "reads", "servos", "how"], shown)
+        report.section("Episodes").table(["t (s)", "for (s)", "reads", "servos", "how"], shown, words)
     return report
+
+
+def _meaning(found: DropoutDiagnosis, lost: int, asked: int) -> str:
+    """What it does to the robot."""
+    if not lost and asked:
+        # Nothing in n trials: the rate lies below 3 / n with 95 % (the rule of three).
+        rare = f"With 95 % certainty fewer than one answer in {max(1, asked // 3)} is lost."
+        return rare if found.healthy_bus else f"{rare} But the times of the loop are not as they should be."
+    if found.healthy_bus:
+        return "So rare a loss harms nobody: the agent sees a value that is one step old."
+    share = percent(lost / max(1, asked), decimals=2)
+    return f"Of each servo's answers {share} are missing; where one is, the agent acts on an old angle."

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from openant_tools.numbers import number
 from openant_tools.procedure.finding import Finding
-from openant_tools.report import KeyFigure, Report, plots
+from openant_tools.report import Answer, Figure, KeyFigure, Report, plots
 from openant_tools.robot.servo import servo_model
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2
 from openant_tools.sysid.bench.stiffness import DIVISORS
@@ -20,29 +21,25 @@ __all__ = ["stiffness_report"]
 
 def stiffness_report(finding: Finding) -> Report:
     """The report of a finding that `stiffness_finding` made."""
-    report = Report("Stiffness on the bench", finding.data["joint"], made_by=finding.command)
-    report.text(f"**{finding.what}**" + (f"\n\n{finding.next_action}" if finding.next_action else ""))
-    report.key_figures(
-        *(
-            KeyFigure(e.name, f"{e.value:.2f} {'' if e.unit == '1' else e.unit}", _interval(e.low, e.high))
-            for e in finding.evidence
-            if e.value is not None and "divisor 1" not in e.name and "divisor 2" not in e.name
-        )
+    shown = [
+        e for e in finding.evidence if e.value is not None and "divisor 1" not in e.name and "divisor 2" not in e.name
+    ]
+    answer = Answer(
+        finding.what,
+        Figure(
+            _lines(finding),
+            "Torque over position error. Dots are readings, by the scale (grams times lever arm) and by the servo (Present PWM "
+            "times the data sheet's stall torque). Lines are what the register's formula gives with either P divisor.",
+        ),
+        " ".join((*finding.unsure, *finding.problems)) or "So stiffly the joint pulls towards its goal, and so the model should.",
+        finding.next_action or "Fit the robot with it: `openant sysid fit --robot` begins from what was measured.",
+        "good" if finding.ok else "bad" if finding.ok is False else "warn",
+        [KeyFigure(e.name, e.words) for e in shown],
+    )  # fmt: skip
+    report = Report("Stiffness on the bench", finding.data["joint"], answer, made_by=finding.command)
+    return report.section("Evidence").table(
+        ["quantity", "value (95 % interval)", "source"], [[e.name, e.words, e.source] for e in finding.evidence]
     )
-    report.section("Readings").figure(
-        _lines(finding),
-        "Torque over position error. Dots are readings, by the scale (grams times lever arm) and by the servo (Present PWM "
-        "times the data sheet's stall torque). Lines are what the register's formula gives with either P divisor.",
-    )
-    report.section("Evidence").table(
-        ["quantity", "value", "from", "to", "unit", "source"],
-        [[e.name, e.value, e.low, e.high, e.unit, e.source] for e in finding.evidence],
-    )
-    return report
-
-
-def _interval(low: float | None, high: float | None) -> str:
-    return "" if low is None or high is None else f"{low:.2f} to {high:.2f}"
 
 
 def _lines(finding: Finding) -> MatplotlibFigure:
@@ -60,23 +57,28 @@ def _lines(finding: Finding) -> MatplotlibFigure:
     with plots.style():
         for divisor, style in zip(DIVISORS, ("--", ":"), strict=True):
             axes.plot(
-                reach, formula[divisor] * reach, style, color=plots.INK, linewidth=1, label=f"divisor {divisor:.0f}"
+                1e3 * reach,
+                formula[divisor] * reach,
+                style,
+                color=plots.INK,
+                linewidth=1,
+                label=f"divisor {number(divisor)}",
             )
         limit = stall * data["pwm_limit"]
         axes.axhline(limit, color=plots.ORANGE, linewidth=1, label="torque at the PWM limit")
         if weighings:
             torque = [w["grams"] * 1e-3 * GRAVITY_M_S2 * data["arm_m"] for w in weighings]
-            axes.plot(x, torque, "o", color=plots.BLUE, label="scale")
+            axes.plot([1e3 * at for at in x], torque, "o", color=plots.BLUE, label="scale")
         if readings:
             axes.plot(
-                [r["error_rad"] for r in readings],
+                [1e3 * r["error_rad"] for r in readings],
                 [r["duty"] * stall for r in readings],
                 "s",
                 color=plots.VERMILLION,
                 markerfacecolor="none",
                 label="servo",
             )
-        axes.set_xlabel(plots.axis_label("position error" if readings else "deflection of the goal", "rad"))
+        axes.set_xlabel(plots.axis_label("position error" if readings else "deflection of the goal", "mrad"))
         axes.set_ylabel(plots.axis_label("torque", "N·m"))
     plots.legend(axes)
     return figure
