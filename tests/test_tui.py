@@ -42,7 +42,9 @@ from openant_tools.tui.feeds import History, ReplayFeed
 from openant_tools.tui.leg_map import REST_S
 from openant_tools.tui.marks import plain
 from openant_tools.tui.page import Page
+from openant_tools.tui.process import Process
 from openant_tools.tui.screens import settings
+from openant_tools.tui.screens.gap import GapScreen
 from openant_tools.tui.screens.live import LiveScreen
 from openant_tools.tui.screens.step import StepScreen
 from openant_tools.tui.screens.walk import WalkScreen
@@ -746,6 +748,7 @@ def test_training_on_the_robot_asks_before_it_moves_and_the_stop_key_reaches_it(
             await _go(pilot, "learn")
             for answer in ("down", "enter"):
                 chooser = app.screen.query_one("#choices", Choices)
+                chooser.focus()
                 chooser.highlighted = next(k for k, line in enumerate(chooser.options) if line.id == "sac robot")
                 await pilot.press("enter")
                 assert "inside the circle, facing its reward" in screen_text(app)
@@ -755,6 +758,43 @@ def test_training_on_the_robot_asks_before_it_moves_and_the_stop_key_reaches_it(
             assert told == ["start robot", "stop"]
 
     asyncio.run(look())
+
+
+def test_what_was_learned_is_evaluated_played_compared_and_diagnosed_from_its_screen(
+    robot: RobotFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = list[str]()
+    monkeypatch.setattr(Process, "start", lambda self: told.append(self.command))
+    run = robot.runs / "sac-0"
+    (run / "recordings").mkdir(parents=True)
+    (run / "learning_curve.csv").write_text("step,seconds,average_reward_m_s\n100,12.0,-0.023\n")
+    for name in ("a", "b"):
+        (run / "recordings" / f"{name}.mcap").touch()
+    os.utime(run / "recordings" / "a.mcap", (1, 1))
+
+    async def look() -> None:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(80, 24)) as pilot:
+            await _go(pilot, "learn")
+            await pilot.pause()
+            assert "sac-0  does not walk yet (−2.3 cm/s)" in screen_text(app)
+            chooser = app.screen.query_one("#choices", Choices)
+            chooser.focus()
+            for id_ in ("evaluate", "compare", "play"):
+                chooser.highlighted = next(k for k, line in enumerate(chooser.options) if line.id == id_)
+                await pilot.press("enter")
+            assert "inside the circle, facing its reward" in screen_text(app), "what moves asks"
+            await pilot.press("escape", "d")
+            await pilot.pause()
+            assert isinstance(app.screen, GapScreen)
+
+    asyncio.run(look())
+    there = f"--robot {robot.path}"
+    assert told[:2] == [
+        f"openant eval {run} --env sim {there}",
+        f"openant policies play --policies {robot.runs} --on {robot.path} --json {robot.runs / 'compared.json'}",
+    ]
+    assert told[2].startswith(f"openant gap diagnose {run / 'recordings' / 'b.mcap'} {there} --json ")
 
 
 def test_training_is_the_command_that_one_would_type(robot: RobotFolder) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.bringup.demo import Demo
+from openant_tools.bringup.gait import walks, walks_at
 from openant_tools.bringup.robot_picture import robot_picture
 from openant_tools.bringup.tracking import Moment, draw_moment, worst_moment
 from openant_tools.files import write_bytes
@@ -28,7 +29,7 @@ from openant_tools.virtual.scenario import load_scenario
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
-__all__ = ["Recovered", "compare", "gap_words", "speed", "spread", "truth", "walks", "write_report"]
+__all__ = ["Recovered", "compare", "gap_words", "speed", "spread", "truth", "write_report"]
 
 Array = NDArray[np.float64]
 
@@ -164,7 +165,7 @@ def write_report(demo: Demo) -> dict[str, Any]:
     if walking is not None:
         keys.append(
             KeyFigure(
-                "walks at" if walks(walking) else "does not walk yet",
+                "walks at" if walks(walking["sampled"]["median"]) else "does not walk yet",
                 speed(walking),
                 f"{_minutes(curve)}; {spread(walking)}",
             )
@@ -173,7 +174,7 @@ def write_report(demo: Demo) -> dict[str, Any]:
     overview = _keep(demo, "overview", _overview_figure(picture, demo.strip, moment, curve, walking))
     answer = Answer(
         f"The calibrated simulation leaves {percent(ratio)} of the data sheets' error"
-        + ("." if walking is None else f", and in it {_learned(walking)}."),
+        + ("." if walking is None else f", and in it the robot {walks_at(walking['sampled']['median'])}."),
         Figure(
             overview,
             f"The robot; the held-out motion around the moment at which the data sheets' model is worst, {moment.joint}"
@@ -362,23 +363,6 @@ def _walking(demo: Demo) -> dict[str, Any]:
 def speed(walking: Mapping[str, Any]) -> str:
     """How fast it walks as it trained, in a word; every figure of the demo that says it is this one."""
     return f"{_cm_s(walking['sampled']['median'])} cm/s"
-
-
-#: m/s; below it a robot shuffles on the spot
-WALKS_M_S = 0.01
-
-
-def walks(walking: Mapping[str, Any]) -> bool:
-    """Whether it goes forward at all, as it trained."""
-    return bool(walking["sampled"]["median"] >= WALKS_M_S)
-
-
-def _learned(walking: Mapping[str, Any]) -> str:
-    return (
-        f"the robot learned to walk at {speed(walking)}"
-        if walks(walking)
-        else f"the robot does not walk yet ({speed(walking)})"
-    )
 
 
 def _cm_s(reward_m_s: float) -> str:

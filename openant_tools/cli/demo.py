@@ -103,7 +103,8 @@ def _bar(console: Console, line: str) -> Iterator[Callable[[str, float], None]]:
 
 def _print(whole: Any, figures: dict[str, Any]) -> None:
     robot = whole.folder
-    from openant_tools.bringup.demo_report import gap_words, speed, spread, walks
+    from openant_tools.bringup.demo_report import gap_words, spread
+    from openant_tools.bringup.gait import walks_at
 
     before, after, floor = (gap_words(figures[name]) for name in ("gap_before_rad", "gap_after_rad", "floor_rad"))
     click.echo(
@@ -112,7 +113,7 @@ def _print(whole: Any, figures: dict[str, Any]) -> None:
     )
     if figures["walking"] is not None:
         found = figures["walking"]
-        click.echo(f"{'walks at' if walks(found) else 'does not walk yet:'} {speed(found)} ({spread(found)})")
+        click.echo(f"it {walks_at(found['sampled']['median'])}; {spread(found)}")
     rows = [
         (whole.report, "everything at a glance; opens in any browser, offline"),
         (robot / "robot.toml", "the robot, and where each value came from"),

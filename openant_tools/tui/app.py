@@ -406,6 +406,16 @@ class OpenAnt(App[int]):
         if self.session.feed is None and self._running_step is None:
             self._in_background("connecting, torque off", self.session.connect, lambda: None)
 
+    def diagnose(self, recording: Path) -> None:
+        """Have a recording diagnosed, on the screen of the gap."""
+
+        def begin() -> None:
+            if isinstance(self.screen, GapScreen):
+                self.screen.diagnose([recording])
+
+        self.action_go("gap")
+        self.call_after_refresh(begin)
+
     def free_bus(self, then: Callable[[], None]) -> None:
         """Stop watching, so that a step can have the bus, then go on."""
         if self.session.watching:

@@ -21,7 +21,7 @@ from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.faults import Faults
 from openant_tools.tui.feeds import Feed, History, LiveFeed, ReplayFeed
 from openant_tools.tui.process import Process
-from openant_tools.tui.training import Training
+from openant_tools.tui.training import Play, Training
 from openant_tools.virtual.process import VIRTUAL_DEFAULT, virtual_robot
 
 __all__ = ["Session"]
@@ -51,7 +51,7 @@ class Session:
         self.selected = JOINT_NAMES[0]
         self.notices: list[str] = []
         self.doing = ""
-        self.training: Training | None = None
+        self.training: Training | Play | None = None
         self.diagnosing: Process | None = None
         self._engine: EngineProcess | None = None
         self._virtual_process = contextlib.ExitStack()

@@ -11,8 +11,13 @@ from typing import Literal
 
 from openant_tools.tui.process import Process
 
-__all__ = ["AGENTS", "CurvePoint", "Training", "read_curve"]
+__all__ = ["AGENTS", "CurvePoint", "Place", "Play", "Training", "read_curve"]
 
+#: where it walks; what is not `sim` moves a robot, and the stop key reaches it
+Place = Literal["sim", "robot", "virtual"]
+#: last lines of what a command said
+
+SAID = 6
 #: agents that this version has
 AGENTS: tuple[str, ...] = tuple(
     name for name in ("sac", "sarsa") if importlib.util.find_spec(f"openant_agents.{name}") is not None
@@ -44,7 +49,7 @@ class Training(Process):
     steps: int
     seed: int
     folder: Path
-    where: Literal["sim", "robot", "virtual"] = "sim"
+    where: Place = "sim"
 
     def __post_init__(self) -> None:
         arguments = (
@@ -55,6 +60,22 @@ class Training(Process):
             *(("--virtual",) if self.where == "virtual" else ()),
         )
         super().__init__(arguments, self.folder / "train.log")
+
+
+class Play(Process):
+    """What is done with trained agents: evaluated, played, compared."""
+
+    def __init__(self, arguments: tuple[str, ...], folder: Path, where: Place = "sim") -> None:
+        super().__init__(arguments, folder / f"{arguments[0]}.log")
+        self.where = where
+
+    @property
+    def said(self) -> list[str]:
+        """Its last lines."""
+        try:
+            return self.log.read_text(encoding="utf-8", errors="replace").splitlines()[-SAID:]
+        except OSError:
+            return []
 
 
 def read_curve(folder: Path) -> list[CurvePoint]:

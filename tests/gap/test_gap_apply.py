@@ -346,7 +346,7 @@ def test_one_page_says_it_all(model: Path, tmp_path: Path) -> None:
     runs = [commanded(plant, sweep(T, 1))]
     diagnosed = diagnosis(model, found("action_delay", "all", delay_s=0.02))
     page = diagnosis_report(diagnosed, runs, [], model).html()
-    for words in ("action_delay (all)", "confidence 95 %", "floor", "What next", "Where", "improved model"):
+    for words in ("action_delay (all)", "confidence 95\u00a0%", "floor", "What to do next", "Where", "improved model"):
         assert words in page
     assert sentence(dataclasses.replace(diagnosed, verdict="none", selected=())).startswith("Nothing beyond the floor")
     assert "closest is action_delay" in sentence(dataclasses.replace(diagnosed, verdict="unexplained", selected=()))

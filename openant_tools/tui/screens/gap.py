@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -147,13 +148,19 @@ improved model, which `w` writes beside the robot's own. The full report with pi
     def action_diagnose(self) -> None:
         """Diagnose the chosen runs."""
         folder = self.session.folder
-        if folder is None or len(self._chosen) < 2:
-            self.notify("choose at least two runs of different motions first: Enter on them", severity="warning")
+        if folder is None or not self._chosen:
+            self.notify("choose runs first: Enter on them", severity="warning")
             return
+        self.diagnose([path for path in self._runs if path in self._chosen])
+
+    def diagnose(self, runs: Sequence[Path]) -> None:
+        """Diagnose these recordings."""
+        folder = self.session.folder
+        assert folder is not None
         out = folder.diagnoses / datetime.datetime.now(datetime.UTC).strftime(STAMP)
-        runs = [str(path) for path in self._runs if path in self._chosen]
+        names = map(str, runs)
         self._start(
-            folder, "diagnose", *runs, "--robot", str(folder.path), "--json", f"{out}.json", "--report", str(out)
+            folder, "diagnose", *names, "--robot", str(folder.path), "--json", f"{out}.json", "--report", str(out)
         )
 
     def action_write(self) -> None:

@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar
 
 import numpy as np
 from rich.text import Text
 from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.widgets import Input, Label, OptionList, Static
 from textual.widgets.option_list import Option
 
-from openant_tools.numbers import number, percent, span
-from openant_tools.tui.braille import trace
+from openant_tools.bringup.gait import walks_at
+from openant_tools.numbers import number, percent
 from openant_tools.tui.choices import Choices
+from openant_tools.tui.curve import PAPER_CM_S, curve_lines
 from openant_tools.tui.dialogs import Question
-from openant_tools.tui.marks import BLUE, marked, plain, spelled
+from openant_tools.tui.marks import marked, plain, spelled
 from openant_tools.tui.page import Page
-from openant_tools.tui.training import AGENTS, Training, read_curve
+from openant_tools.tui.training import AGENTS, Place, Play, Training, read_curve
 
 __all__ = ["LearnScreen"]
 
 REFRESH_S = 1.0
 ON_ROBOT = " robot"
+EVALUATE, PLAY, COMPARE, DIAGNOSE = "evaluate", "play", "compare", "diagnose"
+#: lines of the curve
+MOST_ROWS = 16
 #: the paper's list for the start of an experiment
 BEFORE = (
     "The robot moves, for as long as it trains. Is it on the floor, inside the circle, facing its reward, its cables outside "
@@ -44,8 +50,13 @@ Choose an agent and where it trains: in the simulation of this robot, or on the 
 stands on the screen. You may leave this screen meanwhile. Stopping saves; the same choice goes on from there. `Space` stops
 training on the robot, too, with torque off.
 
-The curve is the average reward over the last 120 s of robot time, in cm/s: how fast it walks where it should.
+The curve is the average reward over the last 120 s of robot time, in cm/s: how fast it walks where it should. The dotted line
+is what the paper's agents reached.
+
+With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is recorded), *compare* it with the other runs, or
+`d`: have its last recording on the robot *diagnosed*, which says what the simulation lacks.
 """
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("d", "diagnose", "Diagnose")]
 
     def body(self) -> ComposeResult:
         with Vertical(id="form"):
@@ -61,17 +72,89 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
                 *(Option(f"Train {name} in simulation: {_WORDS[name]}", id=name) for name in AGENTS),
                 *(Option(f"Train {name} on the robot: it moves", id=f"{name}{ON_ROBOT}") for name in AGENTS),
                 Option("Stop and save", id="stop"),
+                *self._after(),
                 id="choices",
             )
         yield Static(id="progress")
 
+    def _newest(self) -> Path | None:
+        """The run that learned last."""
+        folder = self.session.folder
+        curves = [] if folder is None else list(folder.runs.glob("*/learning_curve.csv"))
+        return max(curves, key=lambda path: path.stat().st_mtime).parent if curves else None
+
+    def _after(self) -> list[Option]:
+        """What to do with the newest run."""
+        run = self._newest()
+        if run is None:
+            return []
+        return [
+            Option(f"Evaluate {run.name} in simulation", id=EVALUATE),
+            Option(f"Play {run.name} on the robot: it moves", id=PLAY),
+            Option("Compare all runs in simulation", id=COMPARE),
+            Option(f"Diagnose what {run.name} did on the robot (d)", id=DIAGNOSE),
+        ]
+
     def on_mount(self) -> None:
         super().on_mount()
         self.set_interval(REFRESH_S, self.draw_progress)
-        chooser = self.query_one("#choices", Choices)
-        chooser.highlighted = 0
-        chooser.focus()
+        self._finished = True
+        self.query_one("#choices", Choices).highlighted = 0
+        self.query_one("#steps", Input).focus()
+        # The room for the curve is known once the screen is laid out.
+        self.call_after_refresh(self.draw_progress)
+
+    def _use(self, choice: str) -> None:
+        """Do with the newest run what was chosen."""
+        folder, run = self.session.folder, self._newest()
+        if folder is None or run is None:
+            return
+        robot = ("--robot", str(folder.path))
+        if choice == DIAGNOSE:
+            self.action_diagnose()
+        elif choice == EVALUATE:
+            self._play(run, "eval", str(run), "--env", "sim", *robot)
+        elif choice == COMPARE:
+            out = folder.runs / "compared.json"
+            self._play(
+                folder.runs,
+                "policies",
+                "play",
+                "--policies",
+                str(folder.runs),
+                "--on",
+                str(folder.path),
+                "--json",
+                str(out),
+            )
+        else:
+            virtual = self.session.virtual is not None
+            words = ("eval", str(run), "--env", "hardware", *robot, "--yes", *(("--virtual",) if virtual else ()))
+            if virtual:
+                self._play(run, *words, where="virtual")
+            else:
+                self._asked(lambda: self._play(run, *words, where="robot"), "play it")
+
+    def _play(self, folder: Path, *arguments: str, where: Place = "sim") -> None:
+        if self.session.learning:
+            self.notify("one at a time: stop what runs first", severity="warning")
+            return
+        self.session.training = Play(arguments, folder, where)
+        self.session.training.start()
         self.draw_progress()
+
+    def action_diagnose(self) -> None:
+        """Have the newest recording of a policy diagnosed, on the screen of the gap."""
+        folder = self.session.folder
+        played = (
+            []
+            if folder is None
+            else sorted(folder.runs.glob("*/recordings/*.mcap"), key=lambda path: path.stat().st_mtime)
+        )
+        if not played:
+            self.notify("no policy was played on the robot yet: Play it there first", severity="warning")
+            return
+        self.ant.diagnose(played[-1])
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
         self.query_one("#choices").focus()
@@ -80,6 +163,8 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
         if event.option_id == "stop":
             if self.session.training is not None:
                 self.session.training.stop()
+        elif event.option_id in (EVALUATE, PLAY, COMPARE, DIAGNOSE):
+            self._use(event.option_id)
         elif event.option_id is not None and event.option_id.endswith(ON_ROBOT):
             self._ask_robot(event.option_id.removesuffix(ON_ROBOT))
         elif event.option_id is not None:
@@ -92,13 +177,16 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
             self.start(agent, "virtual")
             return
 
+        self._asked(lambda: self.start(agent, "robot"), "train")
+
+    def _asked(self, then: Callable[[], None], what: str) -> None:
         def answered(choice: int | None) -> None:
             if choice == 0:
-                self.ant.free_bus(lambda: self.start(agent, "robot"))
+                self.ant.free_bus(then)
 
-        self.app.push_screen(Question(BEFORE, "Yes, train", "No"), answered)
+        self.app.push_screen(Question(BEFORE, f"Yes, {what}", "No"), answered)
 
-    def start(self, agent: str, where: Literal["sim", "robot", "virtual"] = "sim") -> None:
+    def start(self, agent: str, where: Place = "sim") -> None:
         """Train, or go on with the run of the same agent, place and seed."""
         folder = self.session.folder
         progress = self.query_one("#progress", Static)
@@ -121,6 +209,14 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
     def draw_progress(self) -> None:
         """From the files of the run."""
         training, folder = self.session.training, self.session.folder
+        running = self.session.learning
+        if self._finished != (not running):
+            self._finished = not running
+            if self._finished:  # there is a run now with which something can be done
+                chooser = self.query_one("#choices", Choices)
+                for option in self._after():
+                    if all(option.id != other.id for other in chooser.options):
+                        chooser.add_option(option)
         text = Text()
         if training is not None:
             if training.running:
@@ -132,11 +228,15 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
                     else marked("fail", training.last_words)
                 )  # fmt: skip
             text.append(f"   {training.command}\n")
-            self._curve(text, training.folder, training.steps)
+            if isinstance(training, Training):
+                self._curve(text, training.folder, training.steps)
+            else:
+                text.append("\n".join(training.said))
         elif folder is not None:
-            for run in sorted(folder.runs.glob("*/learning_curve.csv")):
-                text.append(f"{run.parent.name}\n", "bold")
-                self._curve(text, run.parent, None)
+            run = self._newest()
+            if run is not None:
+                text.append(f"{run.name}  ", "bold")
+                self._curve(text, run, None)
         if not text:
             text.append("No run yet.")
         self.query_one("#progress", Static).update(text)
@@ -147,16 +247,17 @@ The curve is the average reward over the last 120 s of robot time, in cm/s: how 
             text.append("  no point of the curve yet\n")
             return
         step = np.array([point.step for point in points], float)
-        reward = 100 * np.array([point.average_reward_m_s for point in points])
-        width = max(20, self.size.width - 4)
-        share = "" if steps is None else f" of {steps} ({percent(step[-1] / steps)})"
-        text.append(
-            f"  step {number(step[-1])}{share}, {number(points[-1].seconds / 60, decimals=0)} min of robot time: "
-            f"{spelled(number(reward[-1], sign=True, decimals=1))} cm/s\n"
-        )
-        low, high = min(0.0, float(reward.min())), max(1.0, float(reward.max()))
+        reward = np.array([point.average_reward_m_s for point in points])
+        share = "" if steps is None else f" of {number(steps)} ({percent(step[-1] / steps)})"
+        minutes = number(points[-1].seconds / 60, decimals=0)
+        level, words = PAPER_CM_S.get(run.name.partition("-")[0], (None, ""))
+        text.append(spelled(walks_at(float(reward[-1]))), "bold")
+        text.append(f"; step {number(step[-1])}{share}, {minutes} min of robot time\n")
         stop = max(float(step[-1]), float(steps or 0.0))
-        lines = trace(step, reward, 0.0, stop, low, high, width, 4, plain=plain())
-        for line in lines:
-            text.append(f"  {line}\n", BLUE)
-        text.append(f"  {spelled(span(low, high))} cm/s over {span(0.0, stop)} steps\n")
+        room = self.query_one("#progress").size.height - text.plain.count("\n") - 4
+        for line in curve_lines(step, 100 * reward, stop, level, self.size.width - 4, min(max(room, 3), MOST_ROWS)):
+            text.append_text(line).append("\n")
+        text.append(
+            f"mean of the last 120 s{'; the paper (dotted): ' if words else ''}{words}\n",
+            "dim" if not plain() else "",
+        )

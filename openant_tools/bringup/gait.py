@@ -1,0 +1,21 @@
+"""How well it walks, in words."""
+
+from __future__ import annotations
+
+from openant_tools.numbers import number
+
+__all__ = ["WALKS_M_S", "walks", "walks_at"]
+
+#: m/s, the slowest that the paper calls competent walking; below it a robot shuffles on the spot
+WALKS_M_S = 0.02
+
+
+def walks(reward_m_s: float) -> bool:
+    """Whether an average reward is that of a robot that walks."""
+    return reward_m_s >= WALKS_M_S
+
+
+def walks_at(reward_m_s: float) -> str:
+    """`walks at 13.5 cm/s`, or `does not walk yet (−2.3 cm/s)`."""
+    speed = f"{number(100 * reward_m_s, decimals=1)} cm/s"
+    return f"walks at {speed}" if walks(reward_m_s) else f"does not walk yet ({speed})"
