@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 import pytest
 from rich.text import Text
+from syrupy.assertion import SnapshotAssertion
 from textual.pilot import Pilot
 from textual.widgets import Input
 
@@ -191,15 +192,8 @@ EVENTS: dict[str, tuple[Event, ...]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
-@pytest.mark.parametrize("name", ["walk", *SCREENS, "step", "intent", "bars", "help", "jump", "palette"])
-def test_every_screen_looks_as_it_did(
-    name: str,
-    size: tuple[int, int],
-    robot: RobotFolder,
-    snap_compare: Callable[..., bool],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def a_worked_folder(robot: RobotFolder, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """A robot with a recording, a learning curve and a diagnosis, of always the same date."""
     monkeypatch.setenv("TEXTUAL_ANIMATIONS", "none")
     monkeypatch.setattr(settings, "_facts", lambda: Text("openant-tools 1, textual 8\nPython 3 on Linux"))
     monkeypatch.setenv("TZ", "UTC")
@@ -213,18 +207,26 @@ def test_every_screen_looks_as_it_did(
     rows = [f"{step},{0.12 * step:.2f},{0.04 * (1 - np.exp(-step / 8000)):.5f}" for step in range(100, 12_001, 100)]
     curve.write_text("\n".join(["step,seconds,average_reward_m_s", *rows]) + "\n")
     a_diagnosis(robot)
+    return run
+
+
+@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
+@pytest.mark.parametrize("name", ["walk", *SCREENS, "step"])
+def test_every_screen_looks_as_it_did(
+    name: str,
+    size: tuple[int, int],
+    robot: RobotFolder,
+    snap_compare: Callable[..., bool],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = a_worked_folder(robot, monkeypatch)
     app = OpenAnt(Path("my-ant"), ticking=False)
 
     async def before(pilot: Pilot[int]) -> None:
         if name in SCREENS:
             await _go(pilot, name)
-        elif name in ("step", "intent", "bars"):
+        elif name == "step":
             await _step(pilot)
-            for event in EVENTS.get(name, ()):
-                app.screen.shown(event)  # type: ignore[attr-defined]
-            app.screen.draw()  # type: ignore[attr-defined]
-        elif name in ("help", "jump", "palette"):
-            await pilot.press({"help": "f1", "jump": "ctrl+o", "palette": "ctrl+p"}[name])
         if name == "live":
             app.session.selected = "knee_fl"
             frozen(app, run, 10.0)
@@ -234,6 +236,43 @@ def test_every_screen_looks_as_it_did(
         await pilot.pause()
 
     assert snap_compare(app, terminal_size=size, run_before=before)
+
+
+def test_every_state_reads_as_it_did(
+    robot: RobotFolder, monkeypatch: pytest.MonkeyPatch, snapshot: SnapshotAssertion
+) -> None:
+    """What a step asks and shows, the helpers over a screen, a fault, and a window that is too small."""
+    a_worked_folder(robot, monkeypatch)
+    seen = dict[str, str]()
+
+    async def look() -> None:
+        app = OpenAnt(Path("my-ant"), ticking=False)
+        async with app.run_test(size=(80, 24)) as pilot:
+            for name, key in {"help": "f1", "jump": "ctrl+o"}.items():
+                await pilot.press(key)
+                await pilot.pause()
+                seen[name] = screen_text(app)
+                await pilot.press("escape")
+            app.session.faults.note("knee_fl", "does not answer")
+            app.screen.draw()  # type: ignore[attr-defined]
+            await pilot.pause()
+            seen["fault"] = screen_text(app)
+            await pilot.press("f8")
+            await _step(pilot)
+            for name, events in EVENTS.items():
+                for event in events:
+                    app.screen.shown(event)  # type: ignore[attr-defined]
+                app.screen.draw()  # type: ignore[attr-defined]
+                await pilot.pause()
+                seen[name] = screen_text(app)
+            await pilot.resize_terminal(60, 14)
+            await pilot.pause()
+            seen["small"] = screen_text(app)
+
+    asyncio.run(look())
+    assert "SPACE: STOP" in seen["small"]
+    assert "Make the window larger: 80 columns and 24 lines at least." in seen["small"]
+    assert "\n".join(f"==== {name}\n{text}" for name, text in seen.items()) == snapshot
 
 
 def test_without_unicode_every_screen_is_ascii(robot: RobotFolder) -> None:

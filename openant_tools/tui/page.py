@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Page", "help_of"]
 
+#: columns and lines that every screen needs
+LEAST = (80, 24)
 STOP_STYLE = "bold #000000 on #FFE14D"
 
 
@@ -41,8 +43,8 @@ class Page(Screen[None]):
     def __init__(self) -> None:
         super().__init__()
         # From which size on a screen uses the room beside and below.
-        self.HORIZONTAL_BREAKPOINTS = [(0, "-narrow"), (110, "-wide")]
-        self.VERTICAL_BREAKPOINTS = [(0, "-short"), (34, "-tall")]
+        self.HORIZONTAL_BREAKPOINTS = [(0, "-small"), (LEAST[0], "-narrow"), (110, "-wide")]
+        self.VERTICAL_BREAKPOINTS = [(0, "-low"), (LEAST[1], "-short"), (34, "-tall")]
         self._drawn_top: Text | None = None
 
     @property
@@ -61,9 +63,20 @@ class Page(Screen[None]):
         """What F1 says first, of what is at hand now; Markdown."""
         return ""
 
+    @property
+    def verdict(self) -> Text:
+        """What has to be seen whatever the size of the window."""
+        return Text()
+
+    @property
+    def small(self) -> bool:
+        """Whether the window has no room for the screen."""
+        return self.size.width < LEAST[0] or self.size.height < LEAST[1]
+
     def compose(self) -> ComposeResult:
         yield Static(id="top")
         yield Static(id="faults")
+        yield Static(id="small")
         yield from self.body()
         yield Static(id="replay")
         yield Footer(compact=True, show_command_palette=False)
@@ -78,6 +91,9 @@ class Page(Screen[None]):
     def on_screen_resume(self) -> None:
         self.draw()
 
+    def on_resize(self) -> None:
+        self.draw()
+
     def draw(self) -> None:
         """Show the session as it is now."""
         if not self.query("#top"):
@@ -87,6 +103,9 @@ class Page(Screen[None]):
         if top != self._drawn_top:
             self._drawn_top = top
             self.query_one("#top", Static).update(top)
+        if self.small:
+            least = f"Make the window larger: {LEAST[0]} columns and {LEAST[1]} lines at least."
+            self.query_one("#small", Static).update(Text("\n").join([self.verdict, Text(least, style="bold")]))
         faults = session.faults.unseen
         bar = self.query_one("#faults", Static)
         bar.display = bool(faults)
@@ -131,7 +150,7 @@ class Page(Screen[None]):
             text.append("  ")
             text.append_text(marked("on" if on else "off", "torque ON" if on else "torque off"))
         stop = "[SPACE: STOP]" if plain() else " SPACE: STOP "
-        room = max(self.size.width - 2 - len(stop) - 1, 20)
+        room = max(self.size.width - 2 - len(stop) - 1, 0)
         text.truncate(room, overflow="ellipsis", pad=True)
         # The brightest thing of every screen, by its brightness alone where there are no colours.
         return text.append(" ").append(stop, STOP_STYLE)

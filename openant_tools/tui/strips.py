@@ -60,6 +60,8 @@ _FACTOR: Mapping[str, float] = {"rtt": 1e3, "pos": math.degrees(1), "vel": math.
 _BEFORE, _AFTER = 25, 17
 #: of one joint: each line costs time ten times a second
 MOST_LINES = 2
+#: columns from one dot of the zero line to the next
+ZERO_EVERY = 4
 
 
 class JointStrips(Widget, can_focus=True):
@@ -69,7 +71,7 @@ class JointStrips(Widget, can_focus=True):
 # Strips
 
 One line a joint: how its servo is, the newest value, the last ten seconds, supply and temperature.
-A gap in a trace is a time without an answer; nothing is drawn that was not measured.
+A gap in a trace is a time without an answer; nothing is drawn that was not measured. The dotted line is zero.
 
 | key | |
 |---|---|
@@ -168,6 +170,10 @@ All strips of a signal share one scale, which stands in the top line; it grows w
         drawn = trace(
             self._history.t, values, stop - WINDOW_S, stop, low, high, across, height, plain=plain()
         )  # fmt: skip
+        if low < 0.0 < high:  # where nothing was drawn a dotted line is zero
+            at = min(int(high / (high - low) * height), height - 1)
+            dot = "." if plain() else "┈"
+            drawn[at] = "".join(dot if c == " " and k % ZERO_EVERY == 0 else c for k, c in enumerate(drawn[at]))
         name = Style(bold=here, reverse=here)
         state = Style(color=MARKS[found.mark].colour, bold=found.mark == "fail")
         newest = values[-1] if len(values) else np.nan

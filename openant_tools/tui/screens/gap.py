@@ -131,6 +131,7 @@ improved model, which `w` writes beside the robot's own. The full report with pi
         self._choose(set() if len(self._chosen) == len(self._runs) else set(self._runs))
 
     def on_resize(self) -> None:
+        super().on_resize()
         if self._shown is not None:
             self._show(self._shown)
 

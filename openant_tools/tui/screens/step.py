@@ -83,6 +83,12 @@ and can be begun again: what it found or wrote before stays, and every write to 
     def about(self) -> str:
         return step_help(self.step)
 
+    @property
+    def verdict(self) -> Text:
+        if self._found is not None and not self.running:
+            return verdict(self._found, self._found_before)
+        return Text.assemble(self._head(), "\n", spelled(self._now))
+
     def body(self) -> ComposeResult:
         yield Static(id="head")
         yield Static(id="now")
@@ -109,7 +115,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
         super().draw()
         self.query_one("#head", Static).update(self._head())
         now, found = self.query_one("#now", Static), self.query_one("#found", Static)
-        now.display, found.display = bool(self._now), self._found is not None
+        now.display, found.display = bool(self._now) and not self.small, self._found is not None and not self.small
         now.update(Text(spelled(self._now), style="bold"))
         if self._found is not None:
             found.update(verdict(self._found, self._found_before))
