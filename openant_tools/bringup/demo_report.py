@@ -150,7 +150,7 @@ def write_report(demo: Demo) -> dict[str, Any]:
     keys = [
         KeyFigure(
             "held-out error",
-            f"{gap_words(before['gap_full_rad'])} → {gap_words(after['gap_full_rad'])}",
+            f"{gap_words(before['gap_full_rad']).removesuffix(' mrad')} → {gap_words(after['gap_full_rad'])}",
             f"data sheets → calibrated, over a motion of {number(run.duration_s, decimals=0)} s that the fit did not see",
             "good" if after["gap_full_rad"] < before["gap_full_rad"] else "bad",
         ),
@@ -202,7 +202,7 @@ def write_report(demo: Demo) -> dict[str, Any]:
     report.details("All values", Table(columns, [_row(row) for row in rows]), Text(_explained(rows)))
     if curve is not None:
         assert walking is not None
-        report.section("Learning")
+        report.section("Learning", open=True)
         if demo.video.exists() and demo.strip.exists():
             report.add(
                 Picture(

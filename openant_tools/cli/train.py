@@ -47,7 +47,7 @@ def train() -> None:
 )  # fmt: skip
 @click.option(
     "--batch", type=click.IntRange(min=1),
-    help="Transitions in an update; half as many take half the time, for a first look.  [default: 256]",
+    help="Transitions in an update; half as many take about three quarters of the time, for a first look.  [default: 256]",
 )  # fmt: skip
 @settings_option
 @click.option(

@@ -66,9 +66,14 @@ addEventListener("hashchange", unfold); unfold();
 
 @dataclass
 class Section:
-    """A heading and what stands under it."""
+    """A heading and what stands under it.
+
+    Attributes:
+        open: unfolded from the first.
+    """
 
     title: str
+    open: bool = False
     parts: list[Part] = field(default_factory=list)
 
 
@@ -128,9 +133,9 @@ class Report:
         foot: list[Part] = [Text(f"Made by openant-tools {version('openant-tools')} on {when}{with_}")]
         return [Files("Made from", self.recordings, folder), *foot] if self.recordings else foot
 
-    def section(self, title: str) -> Report:
-        """Begin a section; what is added next belongs to it."""
-        self.sections.append(Section(title))
+    def section(self, title: str, *, open: bool = False) -> Report:
+        """Begin a section, folded unless `open`; what is added next belongs to it."""
+        self.sections.append(Section(title, open))
         return self
 
     def add(self, *parts: Part) -> Report:
@@ -178,7 +183,7 @@ class Report:
             if section.title:
                 title = escape(section.title)
                 contents.append(f'<li><a href="#{anchor}">{title}</a></li>')
-                inside = f"<details><summary><h2>{title}</h2></summary>\n{inside}\n</details>"
+                inside = f"<details{' open' if section.open else ''}><summary><h2>{title}</h2></summary>\n{inside}\n</details>"
             sections.append(f'<section id="{anchor}">{inside}</section>')
         return _PAGE.substitute(
             title=escape(self.title),
