@@ -496,7 +496,7 @@ def test_a_model_is_written_from_a_diagnosis_once_the_builder_has_said_so(robot:
 
 
 def test_runs_that_cannot_be_diagnosed_are_refused_in_words(robot: RobotFolder) -> None:
-    """Two are wanted; the process says what is wrong with them, and the screen says it on."""
+    """One is wanted; the process says what is wrong with them, and the screen says it on."""
     run = a_run(robot.path.parent, seconds=3.0)
     still = {name: np.zeros(len(run.t)) for name in run.columns}
     for name in ("a", "b"):
@@ -508,7 +508,7 @@ def test_runs_that_cannot_be_diagnosed_are_refused_in_words(robot: RobotFolder) 
             await pilot.press("g")
             await pilot.pause()
             assert "No diagnosis yet" in screen_text(app)
-            await pilot.press("enter", "d")
+            await pilot.press("d")
             await pilot.pause()
             assert app.session.diagnosing is None
             await pilot.press("a", "a")

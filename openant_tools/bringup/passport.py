@@ -168,6 +168,7 @@ def _portrait(folder: RobotFolder) -> Part | None:
         whole.imshow(imread(io.BytesIO(picture)))
         whole.axis("off")
     axes[0, 1].sharex(axes[1, 1])
+    axes[0, 1].tick_params(labelbottom=False)
     draw_moment(axes[0, 1], axes[1, 1], moment)
     plots.legend(axes[0, 1], ncols=2, loc="lower right")
     return Figure(
