@@ -675,7 +675,7 @@ def test_the_camera_sees_the_robot_and_can_freeze():
 
 
 def test_stepped_time_moves_only_when_told():
-    with served(stepped=True) as server:
+    with served(stepped=True, clock={"doze": True}) as server:
         remote = Remote(server)
         assert remote.ask("now") == {"t": 0.0, "stepped": True}
         time.sleep(0.05)

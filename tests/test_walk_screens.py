@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import json
 import math
 import subprocess
@@ -19,6 +20,7 @@ from walker import AGAIN, BY_ITSELF, Reply, Walker
 
 from openant_tools.bringup.virtual_box import virtual_box
 from openant_tools.bringup.walk import WALK, do, standing
+from openant_tools.calib import wires
 from openant_tools.cli import main
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.procedure.finding import Finding
@@ -270,10 +272,16 @@ size = 0.03
 # ---- the whole walk ------------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def half_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The engine goes round 50 times a second: half of the packets, and every motion as long."""
+    monkeypatch.setattr(wires, "config_of_robot", functools.partial(wires.config_of_robot, rate_hz=50.0))
+
+
 @pytest.mark.minutes
 @pytest.mark.timeout(1800)
 def test_the_whole_walk_from_loose_motors_to_the_passport_and_on_to_learning(
-    tmp_path: Path, brisk: None, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, brisk: None, half_rate: None, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """By the command from the box to the built legs, where Ctrl-C ends it; from there by the screens; then it learns."""
     folder, given, report = tmp_path / "ant", tmp_path / "box.toml", tmp_path / "walk.json"

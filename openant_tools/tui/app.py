@@ -189,9 +189,11 @@ class OpenAnt(App[int]):
         if notices:
             more = f" (and {len(notices) - 1} more)" if len(notices) > 1 else ""
             self.notify(f"{notices[0]}{more}", title="Robot", timeout=8)
-        if isinstance(self.screen, Page) and (
-            self.session.feed is not None or before is not None or self._running_step
-        ):
+        if (
+            not isinstance(self.screen, Page) or not self.screen.is_mounted
+        ):  # a busy computer may not have filled it yet
+            return
+        if self.session.feed is not None or before is not None or self._running_step:
             self.screen.draw()
 
     # ---- stop ----------------------------------------------------------------------------------------------------
