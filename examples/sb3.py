@@ -10,11 +10,13 @@ For your own robot: gymnasium.make("openant/Ant-v0", robot="my-ant").
 import sys
 
 import gymnasium
+import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import openant_env  # noqa: F401  (registers the environments)
 
+torch.set_num_threads(1)  # networks this small wait for each other on more
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 300
 env = gymnasium.make("openant/Ant-v0", max_episode_steps=100)
 model = SAC("MlpPolicy", env, learning_starts=100, gamma=0.95, policy_kwargs={"net_arch": [64, 64]}, seed=0)

@@ -16,6 +16,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 
 import openant_env  # noqa: F401  (registers the environments)
 
+torch.set_num_threads(1)  # networks this small wait for each other on more
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 300
 env = TransformedEnv(GymEnv("openant/Ant-v0"), Compose(DoubleToFloat(), StepCounter(max_steps=100)))
 check_env_specs(env)

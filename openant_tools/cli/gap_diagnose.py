@@ -13,6 +13,7 @@ import click
 from openant_tools.cli.options import joint_option, json_option, report_option, robot_option, write_report
 from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.runs import checked, model_of, read_runs
+from openant_tools.errors import BadInput
 
 if TYPE_CHECKING:
     from openant_tools.gap.diagnosis import Diagnosis
@@ -115,11 +116,20 @@ def prepare(runs: tuple[Path, ...], model: Path | None, joints: tuple[str, ...],
 @model_option
 @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="IMPROVED.xml", help="What to make.")
 @robot_option
-def apply(diagnosis: Path, model: Path | None, out: Path, robot: Path | None) -> None:
+@click.option(
+    "--for",
+    "engine",
+    type=click.Choice(["mujoco", "mjx"]),
+    default="mujoco",
+    show_default=True,
+    help="What is to play the model.",
+)
+def apply(diagnosis: Path, model: Path | None, out: Path, robot: Path | None, engine: str) -> None:
     """Write the model with the effects that a diagnosis selected.
 
     What MuJoCo has features for stands in IMPROVED.xml, which plain MuJoCo loads; the rest beside it in
-    IMPROVED.effects.toml, or with --robot in its robot.toml.
+    IMPROVED.effects.toml, or with --robot in its robot.toml. With --for mjx what MJX does not carry stands there, too, for the
+    code that steps it. Which engines carry what was written is said, and stands in the file's first comment.
     """
     from openant_tools.cli.options import robot_folder
     from openant_tools.gap.apply import apply as applied
@@ -128,7 +138,9 @@ def apply(diagnosis: Path, model: Path | None, out: Path, robot: Path | None) ->
 
     found = read_diagnosis(diagnosis)
     source = model or (RobotFolder.at(robot_folder(robot)).model_path() if robot is not None else Path(found.model))
-    done = applied(found, source, out, robot=robot)
+    if robot is not None and engine != "mujoco":
+        raise BadInput("a robot's folder is simulated by MuJoCo", remedy="leave --robot or --for out")
+    done = applied(found, source, out, robot=robot, engine=None if engine == "mujoco" else engine)
     for line in done.carried:
         click.echo(line)
     for line in done.notes:

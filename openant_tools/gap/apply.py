@@ -25,6 +25,7 @@ from openant_tools.files import json_text, write_text
 from openant_tools.gap.closure import BODY, adjust
 from openant_tools.gap.diagnosis import Diagnosis, Found
 from openant_tools.model.body import floor_contacts
+from openant_tools.model.engines import carries, elsewhere, state
 from openant_tools.model.mjcf import document_text, write_model
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.robot.config import Effect, Provenance
@@ -52,12 +53,13 @@ class Applied:
     notes: tuple[str, ...]
 
 
-def apply(found: Diagnosis, model: Path, out: Path, *, robot: Path | None = None) -> Applied:
+def apply(found: Diagnosis, model: Path, out: Path, *, robot: Path | None = None, engine: str | None = None) -> Applied:
     """Write the improved model of a diagnosis, and beside it what MuJoCo does not carry.
 
     Args:
         model: the MJCF that was diagnosed. out: the file to make.
         robot: a robot's folder whose robot.toml gets the effects and names the model, in place of a file beside it.
+        engine: that is to play the model (a name in `model.engines`); what it does not carry stands beside the model, too.
 
     Raises:
         BadInput: the model lacks a joint of the diagnosis, or keeps one where it cannot be edited.
@@ -67,8 +69,12 @@ def apply(found: Diagnosis, model: Path, out: Path, *, robot: Path | None = None
         folder.refuse_if_held()
     plant = load_plant(model, None, Setup.FLOOR)
     selected = [one for one in found.effects if one.effect in found.selected and (one.parameters or one.coordinates)]
-    improved = robot_of(plant, selected, found.calibration)
-    entries = _entries(plant, selected, improved)
+    lacks = [one for one in selected if engine is not None and not carries(engine, one.effect)]
+    improved = robot_of(plant, [one for one in selected if one not in lacks], found.calibration)
+    entries = _entries(plant, [one for one in selected if one not in lacks], improved) + [_entry(one) for one in lacks]
+    if engine is not None and not carries(engine, "action_delay") and improved.delay.any():  # as calibrated
+        entries += entries_of({("action_delay", "delay_s"): improved.delay.copy()}, plant.joints)
+        improved.delay[:] = 0.0
     beside = out.with_name(f"{out.stem}.effects.toml")
     with (
         folder.hold() if folder is not None else contextlib.nullcontext()
@@ -91,7 +97,11 @@ def apply(found: Diagnosis, model: Path, out: Path, *, robot: Path | None = None
     where = "robot.toml" if folder is not None else beside.name
     carried = [
         f"{one.effect} ({_where(one)}): "
-        + (where if any(entry.effect == one.effect for entry in entries) else f"MuJoCo, in {out.name}")
+        + (
+            where
+            if any(entry.effect == one.effect for entry in entries)
+            else f"MuJoCo, in {out.name}{elsewhere(one.effect)}"
+        )
         for one in selected
     ]
     if not selected:
@@ -166,7 +176,8 @@ def write_robot(source: Path, robot: Robot, out: Path, *, note: str, pair: str |
             _lengthen_keys(tree.getroot(), written, done)
         write_text(partial, document_text(tree))
         for setup in Setup:
-            load_plant(partial, plant.joints, setup)
+            whole = load_plant(partial, plant.joints, setup)
+        state(tree.getroot(), whole.model)
     finally:
         partial.unlink(missing_ok=True)
     write_text(out, document_text(tree))
@@ -213,9 +224,12 @@ def _entries(plant: Plant, selected: list[Found], robot: Robot) -> list[Effect]:
     for one in selected:
         if catalogue()[one.effect].native or any(entry.effect == one.effect for entry in entries):
             continue
-        values = {name: float(f"{span.value:.6g}") for name, span in one.parameters.items()}
-        entries.append(Effect(one.effect, one.joints, values))
+        entries.append(_entry(one))
     return entries
+
+
+def _entry(one: Found) -> Effect:
+    return Effect(one.effect, one.joints, {name: float(f"{span.value:.6g}") for name, span in one.parameters.items()})
 
 
 def _others(folder: RobotFolder, found: Diagnosis, given: str | None) -> list[Effect]:

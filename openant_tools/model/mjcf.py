@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.files import write_text
 from openant_tools.model.attribute import Attribute, Stated
+from openant_tools.model.engines import state
 from openant_tools.model.plant import (
     KD,
     KP,
@@ -97,6 +98,7 @@ def write_model(
             _set_damping_ratios(ratios, trial, plant, variant)
             write_text(trial, document_text(tree))
         _check(trial, plant, variant)
+        state(root, load_plant(trial, joints, Setup.FLOOR).model)
     finally:
         trial.unlink(missing_ok=True)
     write_text(out, document_text(tree))
