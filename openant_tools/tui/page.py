@@ -92,7 +92,8 @@ class Page(Screen[None]):
         self.draw()
 
     def on_resize(self) -> None:
-        self.draw()
+        if self.query("#top"):  # the first comes before there is anything to draw
+            self.draw()
 
     def draw(self) -> None:
         """Show the session as it is now."""
