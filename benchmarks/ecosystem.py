@@ -38,7 +38,7 @@ class Row:
 
     Attributes:
         what: is shown by it.
-        steps: installations in order; each a tuple of requirements, `.` being this project.
+        steps: installations in order; each a tuple of requirements, `.` being this project; after `-` of what is taken out again.
         command: after `python`, in the root of this project.
         versions: of these distributions the table says the version.
         needs: a program without which it cannot be run.
@@ -56,7 +56,7 @@ def peer(name: str) -> tuple[str, ...]:
 
 
 def tests(*names: str) -> tuple[str, ...]:
-    return ("-m", "pytest", "-q", "-p", "no:cacheprovider", *names)
+    return ("-m", "pytest", "-p", "no:cacheprovider", *names)
 
 
 ROWS = {
@@ -103,7 +103,7 @@ ROWS = {
         ("optuna", "psycopg2-binary"), "pg_lsclusters",
     ),
     "mujoco-3.17": Row(
-        "the oldest MuJoCo with `mujoco.batch`", ((".", *PYTEST), ("--reinstall" if shutil.which("uv") else "--force-reinstall", "--no-deps", "mujoco==3.17.0")),
+        "the oldest MuJoCo with `mujoco.batch`", ((".", *PYTEST), ("-", "mujoco-core", "mujoco"), ("--no-deps", "mujoco==3.17.0")),
         tests("tests/test_rollout.py", "tests/test_plant.py", "tests/test_write_model.py", "tests/test_plain_mujoco.py"),
         ("mujoco", "mujoco-core"),
     ),
@@ -134,7 +134,12 @@ def run(name: str) -> dict[str, Any]:
     try:
         for step in row.steps:
             words = [str(ROOT) + one[1:] if one == "." or one.startswith(".[") else one for one in step]
-            done = _run([*install, *words], environment, place)
+            if step[0] == "-":
+                out = [uv, "pip", "uninstall", "--python", python] if uv else [python, "-m", "pip", "uninstall", "-y"]
+                words = [name for name in step[1:] if _versions(python, (name,))]
+                done = _run([*out, *words], environment, place)
+            else:
+                done = _run([*install, *words], environment, place)
             if done.returncode:
                 return told | {"result": f"cannot be installed: {_last(done.stderr)}", "ok": None}
         told["versions"] = _versions(python, row.versions)

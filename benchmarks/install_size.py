@@ -8,6 +8,9 @@ Each is made in a temporary folder, weighed (what pip itself and the empty envir
 
 from __future__ import annotations
 
+import os
+import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -32,8 +35,12 @@ def main() -> None:
             venv.create(environment, with_pip=True)
             empty = weight(environment)
             wanted = f"{ROOT}[{extra}]" if extra else str(ROOT)
-            pip = [str(environment / "bin" / "python"), "-m", "pip", "install", "-q", "--disable-pip-version-check"]
-            subprocess.run([*pip, "-c", str(ROOT / "constraints.txt"), wanted], check=True)
+            python, uv = str(environment / "bin" / "python"), shutil.which("uv")
+            install = [python, "-m", "pip", "install", "-q", "--disable-pip-version-check"]
+            if uv:  # a third of the time, the same files
+                install = [uv, "pip", "install", "-q", "--compile-bytecode", "--link-mode", "copy", "--python", python]
+            install += shlex.split(os.environ.get("ECOSYSTEM_INSTALL", ""))
+            subprocess.run([*install, "-c", str(ROOT / "constraints.txt"), wanted], check=True)
             print(f"| `pip install '.[{extra}]'` |" if extra else "| `pip install .` |", end=" ")
             print(f"{weight(environment) - empty:.0f} |", flush=True)
 
