@@ -98,7 +98,8 @@ def write_model(
             _set_damping_ratios(ratios, trial, plant, variant)
             write_text(trial, document_text(tree))
         _check(trial, plant, variant)
-        state(root, load_plant(trial, joints, Setup.FLOOR).model)
+        if note:
+            state(root, load_plant(trial, joints, Setup.FLOOR).model)
     finally:
         trial.unlink(missing_ok=True)
     write_text(out, document_text(tree))
