@@ -53,7 +53,6 @@ effect = Effect(
             },
         ),
     ),
-    nuisance=True,
     told_from={
         "sensor_delay": Action(
             "tap the robot",

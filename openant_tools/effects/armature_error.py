@@ -37,5 +37,4 @@ effect = Effect(
             told_from={"damping": "`chirp`: inertia rules above the resonance, damping at it"},
         ),
     ),
-    nuisance=True,
 )

@@ -51,6 +51,5 @@ effect = Effect(
             shown_by="`full`, on the floor",
         ),
     ),
-    nuisance=True,
     shows=lambda reference: reference.floor,
 )

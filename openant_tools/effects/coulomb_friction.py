@@ -38,5 +38,4 @@ effect = Effect(
             },
         ),
     ),
-    nuisance=True,
 )

@@ -53,7 +53,6 @@ effect = Effect(
             told_from={"electrical_damping": "`releases` or `drops`: without torque only the mechanical share brakes"},
         ),
     ),
-    nuisance=True,
     told_from={
         "electrical_damping": Action("let it fall", "record `drops` and `releases`: without torque back-EMF is gone")
     },

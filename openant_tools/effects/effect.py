@@ -204,7 +204,6 @@ class Effect:
         acts_on: what an environment applies it to, where it is no law.
 
         vector: sizes share one magnitude in a random direction; else each is drawn by itself.
-        nuisance: whether a template of it says how robots within its tolerance differ, so that this much of it is no evidence.
         shows: whether it can show on what was recorded.
         signal: the signal of the log that it acts on, where that is not the motion itself.
         silent: whether command and encoder shift alike, so that joint positions hardly show it.
@@ -230,7 +229,6 @@ class Effect:
     shared: bool = False
     acts_on: Literal["commands", "sensors"] | None = None
     vector: bool = False
-    nuisance: bool = False
     shows: Callable[[Reference], bool] = everywhere
     signal: str | None = None
     silent: bool = False
@@ -278,6 +276,15 @@ class Effect:
     def values(self, x: Mapping[str, float], reference: Reference, joints: Ints) -> dict[str, float]:
         """The parameters at a point of the coordinates."""
         return {q.name: q.value(x[q.name], q.scale(reference, joints)) for q in self.quantities}
+
+    def edges(self, reference: Reference, joints: Ints) -> list[dict[str, float]]:
+        """Coordinates of robots at the edge of each of its tolerances, which differ in nothing else."""
+        out = []
+        for one in self.quantities:
+            if one.tolerance > 0 and not one.shape:
+                edge = {q.name: q.sought()[len(q.sought()) // 2] if q.shape else 0.0 for q in self.quantities}
+                out.append({**edge, one.name: one.allowed(reference, joints)})
+        return out
 
     def starts(self, strength: float, turn: int = 0, turns: int = 1) -> list[dict[str, float]]:
         """Coordinates of one size in every direction that matters: either sign, each part of a vector by itself.

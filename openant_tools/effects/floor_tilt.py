@@ -37,7 +37,6 @@ effect = Effect(
     native=True,
     writer=Writer(75, body=_write),
     vector=True,
-    nuisance=True,
     shows=lambda reference: reference.floor,
     stated=lambda values, reference, joints: {
         "angle_rad": math.hypot(values["downhill_x"], values["downhill_y"]),

@@ -46,7 +46,6 @@ effect = Effect(
     native=True,
     writer=Writer(95, body=_write),
     vector=True,
-    nuisance=True,
     shows=lambda reference: reference.imu,
     signal="imu",
     told_from={

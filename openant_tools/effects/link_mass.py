@@ -48,7 +48,6 @@ effect = Effect(
             shown_by="`drops` and `long-holds`",
         ),
     ),
-    nuisance=True,
     told_from={
         "stiffness_error": Action("weigh one leg", "a scale of mass, gains and friction in common shows in no position")
     },

@@ -87,7 +87,6 @@ effect = Effect(
             told_from={"link_mass": "`drops` on the stand, where the torso is held"},
         ),
     ),
-    nuisance=True,
     shows=lambda reference: reference.floor,
     told_from={
         "torque_limit": _hang_a_mass,

@@ -40,5 +40,4 @@ effect = Effect(
             },
         ),
     ),
-    nuisance=True,
 )

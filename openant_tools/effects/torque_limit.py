@@ -42,6 +42,5 @@ effect = Effect(
             },
         ),
     ),
-    nuisance=True,
     shows=lambda reference: bool(np.isfinite(reference.limit).any()),
 )

@@ -54,6 +54,5 @@ effect = Effect(
             shown_by="`long-holds`; a joint with a vertical axis shows its zero only with the robot tilted",
         ),
     ),
-    nuisance=True,
     silent=True,
 )

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.effects.catalogue import enter
-from openant_tools.effects.effect import Scope
+from openant_tools.effects.effect import Cause, Scope
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.features import Floats
 from openant_tools.gap.population import WARMING_C, Case, applicable, robot_of
@@ -34,21 +34,33 @@ EXACT = -1
 
 
 def templates_of(protocol: Protocol) -> list[Case]:
-    """Every cause at every place that it may sit, with either sign, on a robot that is else as the model says."""
-    everything, out = tuple(range(len(protocol.joints))), []
+    """Every cause at every place that it may sit, with either sign, on a robot that is else as the model says.
+
+    First those of one place at the edge of what robots of one build differ by: what healthy robots do (`gap.whitening`).
+    """
+    edges, out = [], []
     for cause in applicable(protocol):
-        where: list[tuple[int, ...]] = []
-        if Scope.JOINT in cause.scopes:
-            where += [(j,) for j in everything]
-        if Scope.SERVO in cause.scopes and len(protocol.servos()) > 1:
-            where += [tuple(group) for group in protocol.servos()]
-        if everything not in where and ({Scope.ALL, Scope.BODY} & set(cause.scopes) or not where):
-            where.append(everything)
+        where = _places(cause, protocol)
+        for joints in [at for at in where if len(at) == 1] or where[-1:]:
+            edges += [Case({cause.name: (joints, x)}, EXACT) for x in cause.edges(protocol.reference, np.array(joints))]
         for joints in where:
             # Shapes are sought at half their levels at one joint, and at all of them, in turn, where more have them.
-            strengths = OF_ONE if len(joints) == 1 < len(everything) else OF_MORE
+            strengths = OF_ONE if len(joints) == 1 < len(protocol.joints) else OF_MORE
             for turn, strength in enumerate(strengths):
                 out += [Case({cause.name: (joints, x)}, EXACT) for x in cause.starts(strength, turn, len(OF_MORE))]
+    return edges + out
+
+
+def _places(cause: Cause, protocol: Protocol) -> list[tuple[int, ...]]:
+    """Indices of joints that a cause may sit at, single ones first."""
+    everything = tuple(range(len(protocol.joints)))
+    out: list[tuple[int, ...]] = []
+    if Scope.JOINT in cause.scopes:
+        out += [(j,) for j in everything]
+    if Scope.SERVO in cause.scopes and len(protocol.servos()) > 1:
+        out += [tuple(group) for group in protocol.servos()]
+    if everything not in out and ({Scope.ALL, Scope.BODY} & set(cause.scopes) or not out):
+        out.append(everything)
     return out
 
 
@@ -61,7 +73,7 @@ def templates_at(protocol: Protocol, bank: Sequence[Case]) -> list[Floats]:
         for robot, group in zip(robots, groups, strict=True):
             for n in group:
                 enter(robot, protocol.reference, [(name, at, x) for name, (at, x) in bank[n].causes.items()])
-            robot.heat_c = WARMING_C / 2 * k
+            robot.heat_c += WARMING_C / 2 * k
         signals = _simulated(played, [Robot(len(protocol.joints)), *robots], seed=k)
         found = played.layout.features(_others(signals), _first(signals))
         of_tree = played.plant.tree[_joints(played)]

@@ -92,15 +92,11 @@ def _tolerances(templates: Array, bank: Sequence[Case], reference: Reference) ->
     taken = set()
     for template, case in zip(templates, bank, strict=True):
         ((name, (joints, x)),) = case.causes.items()
-        effect = catalogue()[name]
-        if not effect.nuisance:
-            continue
-        main = max((q for q in effect.quantities if not q.shape), key=lambda q: abs(x[q.name]) / q.small)
+        main = max((q for q in catalogue()[name].quantities if not q.shape), key=lambda q: abs(x[q.name]) / q.small)
         key = (name, joints, main.name)
-        # The smallest template of a place: the nearest to a derivative.
-        if key in taken:
-            continue
-        taken.add(key)
-        out.append(template * (SPREAD * main.allowed(reference, np.array(joints)) / x[main.name]))
+        # The first of a place is the smallest: the nearest to a derivative.
+        if main.tolerance > 0 and key not in taken:
+            taken.add(key)
+            out.append(template * (SPREAD * main.allowed(reference, np.array(joints)) / x[main.name]))
     found: Floats = np.array(out).T.astype(np.float32)
     return found
