@@ -42,8 +42,8 @@ INDEPENDENT_S = 0.1
 POLISH = 0.3
 #: times what it was found to be that a size may become
 FARTHEST = 2.5
-#: and how often slopes are followed
-ITERATIONS = 4
+#: how often slopes are followed, and the step, in prior deviations, below which a fit has settled
+ITERATIONS, SETTLED = 8, 0.02
 #: how often errors are taken to be as large as a step leaves them: no model of a real servo is true, and one that trusts its sensors
 #: follows what no parameter explains, to the ends of all of them
 INFLATIONS = 4
@@ -384,20 +384,24 @@ class Windows:
         learnt = {k: known for k, known in self._learnt.items() if k in fitted}
         counts = {k: self._count(k) for k in fitted}
         descents = [_Descent.of(start, len(self.names), learnt, counts) for start in starts]
+        moving = descents
         for _ in range(ITERATIONS):
-            self._linearize(descents, fitted)
+            self._linearize(moving, fitted)
             for k in fitted:
-                if poor := [one for one in descents if one.failed(k)]:
+                if poor := [one for one in moving if one.failed(k)]:
                     for one in poor:
                         del one.slopes[k]
                     self._linearize(poor, [k])
-            for one in descents:
+            for one in moving:
                 if one.cost > one.least:
                     # Farther than the slopes hold.
                     one.u = (one.at + one.u) / 2
                     continue
                 one.at, one.least, one.blocks = one.u, one.cost, dict(one.seen)
                 one.u = self._solve(one, list(one.blocks))
+            moving = [one for one in moving if (np.abs(one.u - one.at) > SETTLED * one.scale).any()]
+            if not moving:
+                break
         return descents
 
     def _keep(self, found: _Descent) -> None:
