@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +13,10 @@ from numpy.typing import NDArray
 from openant_tools.arrays import read_arrays
 from openant_tools.effects.robot import Reference
 from openant_tools.gap.evidence import Evidence, Layouts, RunLayout, Scale, evidence_of
-from openant_tools.gap.features import ARRIVAL, IMU_DELAY, LATENESS
+from openant_tools.gap.features import ARRIVAL, IMU_DELAY, LATENESS, Floats
 from openant_tools.gap.population import Case
 
-__all__ = ["Shard", "read_shard"]
+__all__ = ["Shard", "read_shard", "refined_place"]
 
 Bools = NDArray[np.bool_]
 
@@ -30,6 +31,7 @@ class Shard:
     """One experiment as `shards` wrote it.
 
     Attributes:
+        refined: some learned robots → templates of their likeliest causes at the sizes that fit them best, and their features.
         robots: (robots, features), of them the first `measure` make the measure. log: (features,) of the robot that recorded it.
     """
 
@@ -44,17 +46,25 @@ class Shard:
     truth: Case
     measure: int
     reference: Reference
+    refined: Mapping[int, tuple[list[Case], Floats]]
 
-    def scale(self, known: Bools, without: str | None = None) -> Scale:
-        """What evidence is measured by; without a cause as if no catalogue had it."""
-        some = [n for n, case in enumerate(self.bank) if without not in case.causes]
-        bank, templates = [self.bank[n] for n in some], self.templates[some]
-        return Scale.of(self.layouts, known, self.robots[: self.measure], templates, bank, self.reference)
+    def scale(self, known: Bools, without: str | None = None, robot: int | None = None) -> Scale:
+        """What evidence is measured by, or that of a robot; without a cause as if no catalogue had it."""
+        more, found = self.refined[robot] if robot is not None else ([], self.templates[:0])
+        bank, templates = [*self.bank, *more], np.concatenate([self.templates, found])
+        some = [n for n, case in enumerate(bank) if without not in case.causes]
+        return Scale.of(
+            self.layouts, known, self.robots[: self.measure], templates[some], [bank[n] for n in some], self.reference
+        )
 
     def evidence(self, known: Bools, without: str | None = None, some: NDArray[np.int64] | None = None) -> Evidence:
         """Rows of all robots that do not make the measure (or of some of them), and of the log itself as the last."""
         robots = np.concatenate([self.robots[self.measure :], self.log[None]])
         return evidence_of(self.scale(known, without), robots if some is None else robots[some])
+
+    def evidence_refined(self, known: Bools, robot: int, without: str | None = None) -> Evidence:
+        """The rows of a refined robot."""
+        return evidence_of(self.scale(known, without, robot), self.robots[self.measure + robot][None])
 
     @property
     def learned(self) -> list[Case]:
@@ -97,8 +107,24 @@ def read_shard(folder: Path, seed: int) -> Shard:
         np.concatenate([arrays[f"known{k}"] for k in runs]).astype(bool),
         side_by_side("robots"), side_by_side("templates"), side_by_side("log")[0],
         [_case(one, -1) for one in facts["bank"]], [_case(one, 0) for one in facts["cases"]], _case(facts["truth"], 0),
-        facts["measure"], reference,
+        facts["measure"], reference, _refined(folder, seed),
     )  # fmt: skip
+
+
+def refined_place(folder: Path, seed: int) -> Path:
+    """Where what was refined of a shard lies."""
+    return folder / f"{seed:05d}-refined.npz"
+
+
+def _refined(folder: Path, seed: int) -> dict[int, tuple[list[Case], Floats]]:
+    place = refined_place(folder, seed)
+    if not place.exists():
+        return {}
+    facts, arrays = json.loads(place.with_suffix(".json").read_text()), read_arrays(place)
+    return {
+        int(robot): ([_case(one, -1) for one in stated], arrays[f"robot{robot}"].astype(np.float32))
+        for robot, stated in facts.items()
+    }
 
 
 def _case(stated: dict[str, list[object]], seed: int) -> Case:

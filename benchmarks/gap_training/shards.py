@@ -21,14 +21,18 @@ import joblib
 import numpy as np
 
 from benchmarks.gap_training.experiments import Experiment, experiment
+from benchmarks.gap_training.rows import read_shard, refined_place
 from openant_tools.arrays import write_arrays
 from openant_tools.errors import BadInput
 from openant_tools.files import json_text, write_text
 from openant_tools.gap.ensemble import robots_at, templates_at, templates_of
 from openant_tools.gap.population import Case, applicable, draw
+from openant_tools.gap.refine import refined
 
 #: robots of a shard: healthy ones that make the measure, and others that are learned from
 MEASURE, HEALTHY, ILL = 72, 30, 110
+#: of those some that are refined as a diagnosis would, healthy and ill ones
+REFINED = 2, 6
 #: robots that one batch simulates
 BATCH = 53
 
@@ -44,6 +48,7 @@ def shard(seed: int, folder: Path) -> float:
     except BadInput:
         return 0.0
     write_shard(place, made, _cases(made, seed, MEASURE + HEALTHY, ILL), MEASURE)
+    write_refined(folder, seed, made)
     return time.monotonic() - begun
 
 
@@ -78,6 +83,27 @@ def write_shard(place: Path, made: Experiment, cases: Sequence[Case], measure: i
         },
     }
     write_text(place.with_suffix(".json"), json_text(facts))
+    write_arrays(place, arrays)
+
+
+def write_refined(folder: Path, seed: int, made: Experiment) -> None:
+    """What the likeliest causes of some of its robots do at the sizes that fit them best, as a diagnosis looks at it."""
+    done, rng = read_shard(folder, seed), np.random.default_rng((31, seed))
+    count = np.array([len(case.causes) for case in done.learned[: len(done.robots) - MEASURE]])
+    some = [
+        rng.choice(np.flatnonzero(kind), n, replace=False)
+        for kind, n in ((count == 0, REFINED[0]), (count > 0, REFINED[1]))
+    ]
+    scale, stated, arrays = done.scale(done.known), {}, {}
+    for robot in np.concatenate(some).tolist():
+        cases, features = refined(
+            scale, done.robots[MEASURE + robot],
+            lambda cases: np.concatenate(templates_at(made.protocol, cases), axis=1),
+        )  # fmt: skip
+        stated[robot] = [_stated(case) for case in cases]
+        arrays[f"robot{robot}"] = _small(features)
+    place = refined_place(folder, seed)
+    write_text(place.with_suffix(".json"), json_text(stated))
     write_arrays(place, arrays)
 
 

@@ -36,6 +36,8 @@ Bools = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 
 TREES, LEAVES, RATE = 300, 24, 0.06
+#: what a robot counts that was looked at as a diagnosis does
+REFINED = 10.0
 #: causes of an experiment that are left out in turn, and how large one has to be to be looked for (0 just beyond tolerance, 1 clearly ill)
 LEFT_OUT, LOOKED_FOR = 6, 0.25
 #: descriptions of an experiment of several runs by some of them
@@ -52,13 +54,14 @@ class Described:
 
     Attributes:
         rows: (robots, causes, columns). true: (robots, causes). count: (robots,) causes that a robot has.
-        outside: its cause is none of these.
+        outside: its cause is none of these. refined: as a diagnosis looks at them.
     """
 
     rows: NDArray[np.float16]
     true: Bools
     count: NDArray[np.int64]
     outside: bool = False
+    refined: bool = False
 
 
 def described(folder: Path, seed: int) -> list[Described]:
@@ -73,7 +76,23 @@ def described(folder: Path, seed: int) -> list[Described]:
         out.append(
             Described(found.rows.astype(np.float16), true, np.array([len(case.causes) for case in shard.learned]))
         )
-    return out + _outsiders(shard, rng)
+    return out + _outsiders(shard, rng) + _refined(shard, rng)
+
+
+def _refined(shard: Shard, rng: np.random.Generator) -> list[Described]:
+    """Robots looked at as a diagnosis does: templates of their likeliest causes made anew; some as if no catalogue had their cause."""
+    out = []
+    for robot in shard.refined:
+        case = shard.learned[robot]
+        looks: list[tuple[Bools, str | None]] = [(shard.known, None), (shard.lacking(rng), None)]
+        if len(case.causes) == 1 and _strength(case) > LOOKED_FOR:
+            looks.append((shard.known, next(iter(case.causes))))
+        for known, without in looks:
+            found = shard.evidence_refined(known, robot, without)
+            true = np.array([[cause in case.causes and without is None for cause in found.causes]])
+            count, outside = np.array([len(case.causes)]), without is not None
+            out.append(Described(found.rows.astype(np.float16), true, count, outside, refined=True))
+    return out
 
 
 def _outsiders(shard: Shard, rng: np.random.Generator) -> list[Described]:
@@ -119,6 +138,7 @@ def taught(parts: Sequence[Described], trees: int = TREES) -> Classifier:
     mine = [part for part in parts if not part.outside]
     x = np.concatenate([part.rows.reshape(-1, part.rows.shape[2]) for part in mine]).astype(np.float32)
     y = np.concatenate([part.true.ravel() for part in mine])
+    weight = np.concatenate([np.full(part.true.size, REFINED if part.refined else 1.0) for part in mine])
     model = HistGradientBoostingClassifier(
         max_iter=trees,
         learning_rate=RATE,
@@ -129,7 +149,7 @@ def taught(parts: Sequence[Described], trees: int = TREES) -> Classifier:
         early_stopping=False,
         random_state=0,
     )
-    return exported(model.fit(x, y))
+    return exported(model.fit(x, y, weight))
 
 
 def exported(model: HistGradientBoostingClassifier) -> Classifier:
@@ -160,14 +180,15 @@ def weighed(parts: Sequence[Described], odds: Sequence[Floats]) -> dict[str, flo
     right = [_right(part) for part in parts]
     # As many robots count as outsiders as have nothing, and half of all have causes.
     kinds = [np.where(part.outside, 2, np.minimum(part.count, 1)) for part in parts]
-    of = np.bincount(np.concatenate(kinds), minlength=3)
+    weight = [REFINED if part.refined else 1.0 for part in parts]
+    of = sum(w * np.bincount(kind, minlength=3) for w, kind in zip(weight, kinds, strict=True))
     share = np.array([0.25, 0.5, 0.25]) / np.maximum(of, 1)
 
     def surprise(w: NDArray[np.float64]) -> float:
         named, total = dict(zip(WEIGHTS, w, strict=True)), 0.0
-        for features, truth, kind in zip(x, right, kinds, strict=True):
+        for features, truth, kind, counts in zip(x, right, kinds, weight, strict=True):
             p = log_posterior(features, named)
-            total -= float((share[kind] * np.logaddexp.reduce(np.where(truth, p, -np.inf), axis=1)).sum())
+            total -= counts * float((share[kind] * np.logaddexp.reduce(np.where(truth, p, -np.inf), axis=1)).sum())
         return total + float(np.square(w / FAR).sum()) / of.sum()
 
     start = np.array([{"odds": 1.0, "none: odds": 0.0}.get(name, 0.0) for name in WEIGHTS])
@@ -215,7 +236,12 @@ def main() -> None:
     parser.add_argument("--folds", type=int, default=3)
     parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
-    seeds = [(folder, int(path.stem)) for folder in options.folder for path in sorted(folder.glob("*.npz"))]
+    seeds = [
+        (folder, int(path.stem))
+        for folder in options.folder
+        for path in sorted(folder.glob("*.npz"))
+        if path.stem.isdigit()
+    ]
     if options.rows:
         rows: dict[str, NDArray[np.generic]] = {}
         for folder, seed in reversed(seeds.copy()):

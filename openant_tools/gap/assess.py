@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import joblib
@@ -25,6 +25,7 @@ from openant_tools.gap.features import Floats
 from openant_tools.gap.population import Case
 from openant_tools.gap.posterior import NONE, OUTSIDE, features_of, log_posterior
 from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.refine import refined
 from openant_tools.gap.templates import Template
 from openant_tools.workers import tied
 
@@ -34,8 +35,10 @@ Bools = NDArray[np.bool_]
 
 #: healthy robots that make the measure, and others that say how far one may be outside it; robots of one batch
 MEASURE, OTHERS, BATCH = 72, 24, 32
+#: that templates are simulated in, beside each other
+PARTS = 4
 #: of simulated robots: raise it where the same recording gives others
-VERSION = 4
+VERSION = 5
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,14 @@ def assess(
     seen = np.concatenate([one.features(there)[0] for one, there in zip(coarse.runs, nominal, strict=True)])
     known = np.concatenate([one.layout.known(one.seen) for one in coarse.runs])
     set_aside: dict[str, float] = {}
+
+    def refined_with(known: Bools, cases: list[Case], features: Floats) -> tuple[list[Case], Floats]:
+        progress(0.9, "what the likeliest causes do at their best sizes")
+        scale = Scale.of(layouts, known, healthy[:MEASURE], features, cases, coarse.reference)
+        more, found = refined(scale, seen, lambda cases: _more(coarse, cases, jobs))
+        return [*cases, *more], np.concatenate([features, found])
+
+    bank, templates = refined_with(known, bank, templates)
     while True:
         scale = Scale.of(layouts, known, healthy[:MEASURE], templates, bank, coarse.reference)
         beyond = unknown_signals(scale, healthy[MEASURE:], seen)
@@ -102,6 +113,9 @@ def assess(
         worst = max(beyond, key=lambda name: beyond[name])
         set_aside[worst] = beyond[worst]
         known = known & (layouts.signal != worst)
+    if set_aside:  # what they said had a part in the sizes
+        bank, templates = refined_with(known, bank, templates)
+        scale = Scale.of(layouts, known, healthy[:MEASURE], templates, bank, coarse.reference)
     evidence = evidence_of(scale, seen[None])
     odds = classifier()(evidence.rows)
     p = np.exp(log_posterior(features_of(evidence.rows, odds), weights()))[0]
@@ -131,29 +145,55 @@ def _simulated(
     protocol: Protocol, bank: list[Case], progress: Callable[[float, str], None], jobs: int
 ) -> tuple[Floats, Floats]:
     """(templates, features) and (healthy robots, features), of all runs side by side."""
-    place = cache_folder() / f"recording-{_name(protocol)}.npz"
+
+    def make() -> dict[str, Floats]:
+        work = _of_templates(protocol, bank)
+        parts = len(work)
+        healthy = [Case({}, seed) for seed in range(MEASURE + OTHERS)]
+        work += [
+            joblib.delayed(tied(robots_at))(protocol, healthy[n : n + BATCH], n) for n in range(0, len(healthy), BATCH)
+        ]
+        found = []
+        for done in joblib.Parallel(n_jobs=jobs, return_as="generator")(work):
+            found.append(np.concatenate(done, axis=1))
+            progress(0.9 * len(found) / len(work), "what each cause does to this recording")
+        return {"templates": np.concatenate(found[:parts]), "healthy": np.concatenate(found[parts:])}
+
+    stored = _kept(f"recording-{_name(protocol)}", make)
+    return stored["templates"], stored["healthy"]
+
+
+def _more(protocol: Protocol, cases: Sequence[Case], jobs: int) -> Floats:
+    """(cases, features)"""
+
+    def make() -> dict[str, Floats]:
+        done = joblib.Parallel(n_jobs=jobs)(_of_templates(protocol, cases))
+        return {"templates": np.concatenate([np.concatenate(part, axis=1) for part in done])}
+
+    asked = hashlib.sha256(json.dumps([list(case.causes.items()) for case in cases]).encode()).hexdigest()
+    return _kept(f"recording-{_name(protocol)}-{asked[:12]}", make)["templates"]
+
+
+def _of_templates(protocol: Protocol, cases: Sequence[Case]) -> list[object]:
+    # As many parts on any computer, so that they come to the same.
+    step = -(-len(cases) // PARTS)
+    return [joblib.delayed(tied(templates_at))(protocol, cases[n : n + step]) for n in range(0, len(cases), step)]
+
+
+def _kept(name: str, make: Callable[[], dict[str, Floats]]) -> Mapping[str, Floats]:
+    """What was made once, under the name of all that it follows from."""
+    place = cache_folder() / f"{name}.npz"
     if place.exists():
         try:
             stored = read_arrays(place)
             place.touch()  # used now
-            return stored["templates"], stored["healthy"]
+            return {key: stored[key] for key in stored}
         except (BadInput, OSError, KeyError):
             pass  # cut or another's: it is made anew
-    step = -(-len(bank) // 4)
-    work = [joblib.delayed(tied(templates_at))(protocol, bank[n : n + step]) for n in range(0, len(bank), step)]
-    parts = len(work)
-    healthy = [Case({}, seed) for seed in range(MEASURE + OTHERS)]
-    work += [
-        joblib.delayed(tied(robots_at))(protocol, healthy[n : n + BATCH], n) for n in range(0, len(healthy), BATCH)
-    ]
-    found = []
-    for done in joblib.Parallel(n_jobs=jobs, return_as="generator")(work):
-        found.append(np.concatenate(done, axis=1))
-        progress(len(found) / (len(work) + 1), "what each cause does to this recording")
-    templates, robots = np.concatenate(found[:parts]), np.concatenate(found[parts:])
-    write_arrays(place, {"templates": templates, "healthy": robots})
+    made = make()
+    write_arrays(place, made)
     keep_small(place)
-    return templates, robots
+    return made
 
 
 def _name(protocol: Protocol) -> str:

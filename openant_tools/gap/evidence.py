@@ -233,6 +233,14 @@ class Scale:
             len(reference.torque), int(mine.run.max()) + 1,
         )  # fmt: skip
 
+    def whitened(self, features: Floats) -> Floats:
+        """(robots, means) of what was seen of robots (robots, features)."""
+        return self.whitening(features[:, self.some][:, self.layouts.mean].astype(np.float32))
+
+    def vectors(self, templates: Floats) -> Floats:
+        """(templates, means) of robots without scatter, (templates, features)."""
+        return self.whitening.of_templates(templates[:, self.some][:, self.layouts.mean].astype(np.float32))
+
     @cached_property
     def means(self) -> Layouts:
         return self.layouts.only(self.layouts.mean)
@@ -245,7 +253,7 @@ class Scale:
 def evidence_of(scale: Scale, features: Floats) -> Evidence:
     """The rows of robots of whom features (robots, features) were seen."""
     x = features[:, scale.some].astype(np.float32)
-    z, t = scale.whitening(x[:, scale.layouts.mean]), scale.templates
+    z, t = scale.whitened(features), scale.templates
     means, fit = scale.means, t.fits(z)
     n, root = len(x), float(np.sqrt(z.shape[1]))
     by = t.by_cause(fit)
@@ -302,7 +310,7 @@ def anomalies(scale: Scale, healthy: Floats, features: Floats) -> dict[str, floa
         healthy: (robots, features) not those of the scale. features: (features,) of the robot at hand.
     """
     means = scale.means
-    z = scale.whitening(np.vstack([healthy, features])[:, scale.some][:, scale.layouts.mean].astype(np.float32))
+    z = scale.whitened(np.vstack([healthy, features]))
     out = {}
     for signal in SIGNALS:
         size = np.linalg.norm(z[:, means.signal == signal], axis=1)
@@ -322,7 +330,7 @@ def unknown_signals(scale: Scale, healthy: Floats, features: Floats) -> dict[str
         healthy: (robots, features) not those of the scale. features: (features,) of the robot at hand.
     """
     means, t = scale.means, scale.templates
-    z = scale.whitening(np.vstack([healthy, features])[:, scale.some][:, scale.layouts.mean].astype(np.float32))
+    z = scale.whitened(np.vstack([healthy, features]))
     left = t.without_best(z[-1], EXPLAINING)
     out = {}
     for signal in SIGNALS[1:]:

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap.assess import layouts_of
 from openant_tools.gap.ensemble import robots_at, templates_at, templates_of
 from openant_tools.gap.evidence import COLUMN_NAMES, Layouts, RunLayout, Scale, anomalies, evidence_of, unknown_signals
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.population import Case, draw
 from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.refine import refined
 from openant_tools.recording.run import Facts, Run
 
 PENDULUM = """
@@ -62,6 +64,48 @@ def _with(protocol: Protocol, cause: str, count: int) -> list[Case]:
     found = (draw(protocol, seed) for seed in range(10_000))
     alone = (case for case in found if list(case.causes) == [cause])
     return [next(alone) for _ in range(count)]
+
+
+@pytest.fixture(scope="module")
+def simulated(pendulum: Protocol) -> tuple[list[Case], NDArray[np.float32], NDArray[np.float32]]:
+    """The bank, what it shows, and a few healthy robots."""
+    bank = templates_of(pendulum)
+    return (
+        bank,
+        _features(templates_at(pendulum, bank)),
+        _features(robots_at(pendulum, _healthy(pendulum, 40), 1)),
+    )
+
+
+@pytest.mark.parametrize(("cause", "x"), [("torque_limit", -0.9), ("actuator_lag", 1.0), ("dead_zone", 1.0)])
+def test_a_size_that_no_template_has_is_found_and_explains_the_rest(
+    pendulum: Protocol,
+    simulated: tuple[list[Case], NDArray[np.float32], NDArray[np.float32]],
+    cause: str,
+    x: float,
+) -> None:
+    (first, *others) = catalogue()[cause].quantities
+    truth = {first.name: x * first.large, **{q.name: q.sought()[0] if q.shape else 0.0 for q in others}}
+    seen = _features(templates_at(pendulum, [Case({cause: ((0,), truth)}, -1)]))[0]
+    bank, templates, healthy = simulated
+    known = np.concatenate([one.layout.known(one.seen) for one in pendulum.runs])
+
+    def scale(bank: list[Case], templates: NDArray[np.float32]) -> Scale:
+        return Scale.of(layouts_of(pendulum), known, healthy, templates, bank, pendulum.reference)
+
+    def share(scale: Scale) -> float:
+        """How much of what was seen the cause's best template explains."""
+        z = scale.whitened(seen[None])
+        fit = scale.templates.fits(z)[0][scale.templates.of_cause[scale.templates.causes.index(cause)]]
+        return float(fit.max() / np.linalg.norm(z))
+
+    before = scale(bank, templates)
+    more, found = refined(before, seen, lambda cases: _features(templates_at(pendulum, cases)))
+    after = scale([*bank, *more], np.concatenate([templates, found]))
+    assert share(after) > max(0.97, share(before))
+    name, _, at = after.templates.bank[int(np.argmax(after.templates.fits(after.whitened(seen[None]))[0]))]
+    assert name == cause
+    assert at[first.name] == pytest.approx(truth[first.name], rel=0.15)
 
 
 def _features(parts: list[NDArray[np.float32]]) -> NDArray[np.float32]:
