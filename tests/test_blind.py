@@ -296,7 +296,7 @@ def test_the_score_counts_what_is_right_and_shows_what_is_not(
         gap, ["blind", "score", str(folder), "--key-file", str(key_file), "--json", str(out), "--docs", str(docs)]
     )
     assert done.exit_code == 0, done.output
-    assert "| false alarms on robots without effect | 0 % (0 … 79 %) of 1 |" in done.output
+    assert "| false alarms on robots without effect | 0 % (0 to 79 %) of 1 |" in done.output
     rows = {row["what"]: row for row in json.loads(out.read_text())["rows"]}
     assert rows["right name first, medium and large, joint, servo, bus"]["k"] == 1
     assert rows["outside the catalogue: not given a name"]["k"] == 1
@@ -318,7 +318,7 @@ def test_several_sets_are_scored_together(sealed_set: tuple[Path, Path, bytes], 
     assert done.exit_code == 0, done.output
     told = json.loads(out.read_text())
     assert (told["robots"], told["missing"], len(told["sets"])) == (6, 0, 2)
-    assert "| false alarms on robots without effect | 0 % (0 … 66 %) of 2 |" in done.output
+    assert "| false alarms on robots without effect | 0 % (0 to 66 %) of 2 |" in done.output
     assert docs.read_text().count("commitment of the answers") == 2
     refused = CliRunner().invoke(gap, [*asked, "--key-file", str(key_file)])
     assert "1 keys for 2 sets" in str(refused.exception)
@@ -448,7 +448,7 @@ def test_another_program_makes_the_robots_and_each_maker_has_a_column(
     told = CliRunner().invoke(gap, [*asked, "--key-file", str(sealed_set[1]), "--key-file", key])
     assert "| what | batch | their generator.py fine | first | then | reached by all |" in told.output
     assert (
-        "| false alarms on robots without effect | 0 % (0 … 79 %) of 1 | 0 % (0 … 66 %) of 2 | ≤ 3 % |" in told.output
+        "| false alarms on robots without effect | 0 % (0 to 79 %) of 1 | 0 % (0 to 66 %) of 2 | ≤ 3 % |" in told.output
     )
     makers = {row["maker"] for row in json.loads(out.read_text())["rows"]}
     assert makers == {"batch", "their generator.py fine"}

@@ -242,6 +242,6 @@ def test_timing_says_what_it_cannot_use(tmp_path: Path) -> None:
         comms, ["timing", str(tmp_path / "walk.parquet"), "--json", str(tmp_path / "t.json"), "--picture", str(picture)]
     )
     assert done.exit_code == 0, done.output
-    assert "13.3% of the step" in done.output
+    assert "13.3 % of the step" in done.output
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert read_run(tmp_path / "walk.parquet").name == "walk"

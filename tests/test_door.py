@@ -18,7 +18,6 @@ import pytest
 from killing import (
     ELSEWHERE,
     OFF_S,
-    STAND,
     WAYS,
     InLine,
     NotBegun,
@@ -106,7 +105,7 @@ HOLDING = textwrap.dedent(
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="a suspended parent is seen by /proc")
 def test_suspension_and_a_lost_terminal_end_motion_first(tmp_path: Path) -> None:
-    (tmp_path / "stand.toml").write_text(STAND)
+    (tmp_path / "stand.toml").write_text("[camera]\npresent = false\n")
     with virtual_robot(str(tmp_path / "stand.toml"), clock="real", camera=False) as found:
         control = VirtualControl(str(found["control"]))
         ready = tmp_path / "ready.json"

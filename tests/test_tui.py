@@ -263,7 +263,8 @@ def test_every_state_reads_as_it_did(
                 for event in events:
                     app.screen.shown(event)  # type: ignore[attr-defined]
                 app.screen.draw()  # type: ignore[attr-defined]
-                await pilot.pause()
+                await pilot.wait_for_scheduled_animations()
+                await pilot.pause(0.1)  # what scrolls into view has a frame to do so
                 seen[name] = screen_text(app)
             await pilot.resize_terminal(60, 14)
             await pilot.pause()
