@@ -265,7 +265,10 @@ def main() -> None:
             odds.append(model(part.rows.astype(np.float32)))
     weights = weighed(parts, odds)
     print({name: round(value, 3) for name, value in weights.items()})
-    print(figures(parts, odds, weights), flush=True)
+    for refined in (False, True):  # as a diagnosis looks at them apart
+        some = [(part, z) for part, z in zip(parts, odds, strict=True) if part.refined == refined]
+        if some:
+            print(figures(*zip(*some, strict=True), weights), flush=True)
     if options.out:
         write_arrays(options.out / "classifier.npz", taught([part for some in every for part in some]).arrays())
         write_text(options.out / "posterior.json", json_text(weights))

@@ -91,7 +91,8 @@ def assess(
     """
     coarse = protocol.coarse()
     bank = templates_of(coarse)
-    templates, healthy = _simulated(coarse, bank, progress, jobs)
+    name = f"recording-{_name(coarse)}"
+    templates, healthy = _simulated(coarse, name, bank, progress, jobs)
     layouts = layouts_of(coarse)
     nominal = coarse.nominal()
     seen = np.concatenate([one.features(there)[0] for one, there in zip(coarse.runs, nominal, strict=True)])
@@ -101,7 +102,7 @@ def assess(
     def refined_with(known: Bools, cases: list[Case], features: Floats) -> tuple[list[Case], Floats]:
         progress(0.9, "what the likeliest causes do at their best sizes")
         scale = Scale.of(layouts, known, healthy[:MEASURE], features, cases, coarse.reference)
-        more, found = refined(scale, seen, lambda cases: _more(coarse, cases, jobs))
+        more, found = refined(scale, seen, lambda cases: _more(coarse, name, cases, jobs))
         return [*cases, *more], np.concatenate([features, found])
 
     bank, templates = refined_with(known, bank, templates)
@@ -142,7 +143,7 @@ def layouts_of(protocol: Protocol) -> Layouts:
 
 
 def _simulated(
-    protocol: Protocol, bank: list[Case], progress: Callable[[float, str], None], jobs: int
+    protocol: Protocol, name: str, bank: list[Case], progress: Callable[[float, str], None], jobs: int
 ) -> tuple[Floats, Floats]:
     """(templates, features) and (healthy robots, features), of all runs side by side."""
 
@@ -159,19 +160,19 @@ def _simulated(
             progress(0.9 * len(found) / len(work), "what each cause does to this recording")
         return {"templates": np.concatenate(found[:parts]), "healthy": np.concatenate(found[parts:])}
 
-    stored = _kept(f"recording-{_name(protocol)}", make)
+    stored = _kept(name, make)
     return stored["templates"], stored["healthy"]
 
 
-def _more(protocol: Protocol, cases: Sequence[Case], jobs: int) -> Floats:
-    """(cases, features)"""
+def _more(protocol: Protocol, name: str, cases: Sequence[Case], jobs: int) -> Floats:
+    """(cases, features) of more templates."""
 
     def make() -> dict[str, Floats]:
         done = joblib.Parallel(n_jobs=jobs)(_of_templates(protocol, cases))
         return {"templates": np.concatenate([np.concatenate(part, axis=1) for part in done])}
 
     asked = hashlib.sha256(json.dumps([list(case.causes.items()) for case in cases]).encode()).hexdigest()
-    return _kept(f"recording-{_name(protocol)}-{asked[:12]}", make)["templates"]
+    return _kept(f"{name}-{asked[:12]}", make)["templates"]
 
 
 def _of_templates(protocol: Protocol, cases: Sequence[Case]) -> list[object]:
