@@ -1,6 +1,6 @@
 """Do simulations rank policies as a robot does? Three robots with sealed faults, three simulations of each.
 
-    python benchmarks/policy_ranking.py make   --out SET [--robots 3] [--seed-from COMMIT] [--motions N] --key-file KEY
+    python benchmarks/policy_ranking.py make   --out SET [--robots 3] [--seed-from COMMIT] --key-file KEY
     python benchmarks/policy_ranking.py models --out SET
     python benchmarks/policy_ranking.py play   --out SET --policies DIR --key-file KEY
     python benchmarks/policy_ranking.py rank   --out SET --policies DIR [--docs docs/policies-result.md]
@@ -9,7 +9,7 @@
 and lets each play the blind benchmark's runs. `models` makes three simulations of each robot from these runs alone: the
 nominal model; `sysid fit`'s of it; and the one that `gap apply` makes with the effects that were diagnosed, calibrated by
 `sysid fit`, too. Diagnosing the nominal
-model compares all robots with the same simulated ones, made once (of `--motions`, where a set of those was prepared before).
+model compares all robots with the same simulated ones, made once.
 `play` lets policies walk on the true robots, simulated by the blind benchmark's own code at half a
 millisecond: no line of it is the environments'. `rank` plays them in the simulations (`openant policies rank`).
 Each step goes on where it was stopped.
@@ -53,9 +53,9 @@ RUNS = ("stand-1", "stand-2", "floor-1", "floor-2", "floor-3")
 HELD_OUT = ("stand-3", "floor-4")
 
 
-def make(out: Path, count: int, commit: str, motions: int | None, key: bytes | None) -> None:
+def make(out: Path, count: int, commit: str, key: bytes | None) -> None:
     seed, full = seed_of_commit(commit)
-    print("commitment", make_set(out, count, seed, mix=MIX, commit=full, motion_seed=motions, key=key))
+    print("commitment", make_set(out, count, seed, mix=MIX, commit=full, key=key))
 
 
 # ------------------------------------------------------------------------------------------------------- simulations
@@ -337,9 +337,6 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--robots", type=int, default=3)
     parser.add_argument("--seed-from", default="HEAD")
-    parser.add_argument(
-        "--motions", type=int, metavar="N", help="seed of the motions that robots play; default: the set's"
-    )
     parser.add_argument("--key-file", type=Path)
     parser.add_argument("--policies", type=Path)
     parser.add_argument("--seconds", type=float, default=60.0)
@@ -353,7 +350,7 @@ def main() -> None:
 
         key = read_key(chosen.key_file) if chosen.key_file.exists() else make_key(chosen.key_file)
     if chosen.step == "make":
-        make(chosen.out, chosen.robots, chosen.seed_from, chosen.motions, key)
+        make(chosen.out, chosen.robots, chosen.seed_from, key)
     elif chosen.step == "models":
         models(chosen.out, chosen.only)
     elif chosen.step == "play":

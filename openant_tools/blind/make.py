@@ -62,7 +62,6 @@ def make_set(
     commit: str | None = None,
     key: bytes | None = None,
     answers: Sequence[Answer] | None = None,
-    motion_seed: int | None = None,
     maker: str | None = None,
     jobs: int = 1,
     progress: Callable[[str, float], None] = lambda words, share: None,
@@ -76,7 +75,6 @@ def make_set(
         commit: whose hash gave the seed, for the record.
         key: seals the answers; None leaves them open, as `truth.toml` beside the runs.
         answers: in place of what the seed draws.
-        motion_seed: of the commands, where it is not to be the set's: sets of one protocol can share what was prepared.
         maker: of all robots: "batch", "bus" or a command; None: of the two that live here either.
         jobs: processes.
 
@@ -89,9 +87,8 @@ def make_set(
     if command is not None:
         words_of(command)
     drawn = list(answers) if answers is not None else draw_answers(count, seed, mix, by)
-    motion_seed = seed if motion_seed is None else motion_seed
-    played = motions(motion_seed)
-    facts: dict[str, Any] = {"robots": len(drawn), "seed": seed, "motion_seed": motion_seed}
+    played = motions(seed)
+    facts: dict[str, Any] = {"robots": len(drawn), "seed": seed}
     if maker is not None:
         facts["maker"] = maker
     commitment, robots = _claim(out, drawn, facts, commit, mix, key)

@@ -40,13 +40,6 @@ def _share(name: str, words: str) -> Callable[[click.decorators.FC], click.decor
 @click.option("--robots", "count", type=click.IntRange(1, 10_000), default=240, show_default=True, metavar="N")
 @seed_option
 @seed_from_option
-@click.option(
-    "--motions",
-    "motion_seed",
-    type=click.IntRange(0),
-    metavar="S",
-    help="Seed of the commands. Default: the set's own.",
-)
 @_share("--none", "Robots without effect, of all. Default 0.35.")
 @_share("--two", "Robots with two effects. Default 0.15.")
 @_share("--outside", "Robots outside the catalogue. Default 0.12.")
@@ -65,7 +58,6 @@ def make(
     count: int,
     seed: int | None,
     commit: str | None,
-    motion_seed: int | None,
     maker: str | None,
     key_file: Path | None,
     unsealed: bool,
@@ -100,7 +92,6 @@ def make(
             mix=Mix(**given),
             commit=full,
             key=key,
-            motion_seed=motion_seed,
             maker=maker,
             jobs=jobs,
             progress=progress,

@@ -6,8 +6,6 @@ that has no control (`input="none"`): the file has no more controls than before.
 
 from __future__ import annotations
 
-import mujoco
-
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.document import Document, Element, Writer
 from openant_tools.effects.robot import Robot
@@ -40,15 +38,12 @@ def edit(root: Element, plant: Plant, robot: Robot) -> Document:
 
 
 def _contacts(document: Document) -> None:
-    """The form of contacts, which is no effect: how steep friction is, and in what kind of cone."""
+    """The form of contacts, which is no effect: how steep friction is."""
     robot = document.robot
     if robot.impratio != 1:
         # Of the compiled variant, which had it too, only its elements are written.
         given = float(document.plant.model.opt.impratio)
         document.last("option").set("impratio", number(given * robot.impratio))
-    if robot.cone is not None:
-        elliptic = robot.cone == int(mujoco.mjtCone.mjCONE_ELLIPTIC)
-        document.last("option").set("cone", "elliptic" if elliptic else "pyramidal")
 
 
 contacts = Writer(80, body=_contacts)

@@ -174,7 +174,7 @@ class Robot:
         laws: (effect, parameter) → values of the effects that act between steps (`openant_tools.effects`).
         payload_kg, payload_m: (3,) in the torso's frame. torso_kg: added to it.
         floor_friction, softness, contact_damping, contact_give, contact_depth, impratio: factors; `give` on how far from rigid
-            contacts are (solimp), the last on how much stiffer friction is than contact. cone: mjtCone, None as given.
+            contacts are (solimp), the last on how much stiffer friction is than contact.
         adhesion_n: force of each foot. tilt: (2,) rad, how far downhill lies along the floor's x and y.
         jitter_s: deviation of when a command acts. dropout: share of commands lost, (joints,); longest_s: at a stretch.
         shared_dropout: all joints lose the same commands.
@@ -216,7 +216,6 @@ class Robot:
     contact_give: float = 1.0
     contact_depth: float = 1.0
     impratio: float = 1.0
-    cone: int | None = None
     adhesion_n: float = 0.0
     tilt: Array = field(default_factory=lambda: np.zeros(2))
     cable: Cable = field(default_factory=Cable)
@@ -299,8 +298,6 @@ class Robot:
         _soften(model.geom_solref, model.geom_solimp, contacts.geoms, *mine)
         _soften(model.pair_solref, model.pair_solimp, contacts.pairs, *mine)
         model.opt.impratio *= self.impratio
-        if self.cone is not None:
-            model.opt.cone = self.cone
         if (form := self.form) is not None:
             like = 1.0, form.contact_damping, form.contact_give, form.contact_depth
             _soften(model.geom_solref, model.geom_solimp, contacts.geoms, *like)

@@ -75,7 +75,7 @@ def simulate(
 
     Args:
         rollouts: the runs, prepared; re-initialised from measurement as they say.
-        robots: any number; those with an integrator or cone of their own are simulated in it.
+        robots: any number; those with a form of their own are simulated in it.
         seed: of what is random in time (jitter, lost commands).
         signals: those wanted; default all that there are.
         warm_c: of each run (joints,) °C, by which servos are known to be warmer than in the coolest one; default none.
@@ -177,10 +177,7 @@ class _Batch:
             self._take("opt.gravity", down)
         own = Form(given.integrator, given.cone == _CONES[True], given.impratio)
         forms = [robot.form or own for robot in self._robots]
-        cones = [
-            robot.cone if robot.form is None and robot.cone is not None else _CONES[form.elliptic]
-            for form, robot in zip(forms, self._robots, strict=True)
-        ]
+        cones = [_CONES[form.elliptic] for form in forms]
         if any(form.integrator != given.integrator for form in forms):
             self._take("opt.integrator", [form.integrator for form in forms])
         if any(cone != given.cone for cone in cones):
