@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 __all__ = ["KINDS", "ImuDelay"]
 
@@ -75,6 +74,8 @@ class ImuDelay:
         usual = np.trace(square, axis1=1, axis2=2) / square.shape[1] + len(self.inside) * LEAST_RAD_S**2
         inverse = np.linalg.inv(square + NOISE * usual[:, None, None] * np.eye(square.shape[1]))
         # Between rows noise would average out: what is explained is asked there of a spline, how much there is of the rows alone.
+        from scipy.interpolate import CubicSpline  # half a second to load
+
         turning = CubicSpline(self.t, turned, axis=1)
         energy = np.square(turned - turned.mean(axis=1, keepdims=True)).sum(axis=2)
         left = np.empty((len(pos), len(self.shifts)))

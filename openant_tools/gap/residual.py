@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import csd
 
 from openant_tools.gap.closure import Refit, Windows
 from openant_tools.gap.measure import Measurement
@@ -179,6 +178,8 @@ def _spectrum(
     x: Sequence[Array], y: Sequence[Array], period: float, length: int
 ) -> tuple[Array, NDArray[np.complex128]]:
     """Frequencies, Hz, and the cross spectrum summed over runs, each by its length."""
+    from scipy.signal import csd  # a second to load
+
     total = np.zeros(length // 2 + 1, complex)
     for one, other in zip(x, y, strict=True):
         f, found = csd(one, other, 1 / period, nperseg=length, detrend="constant")

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.features import Floats, Signals, with_noise
@@ -70,6 +69,8 @@ class TorqueSensor:
         y = torque.astype(np.float64)
         period = float(np.median(np.diff(t)))
         if self.filter_s:
+            from scipy.signal import lfilter  # a second to load
+
             keep = math.exp(-period / self.filter_s)
             known = np.nan_to_num(y)
             y = lfilter([1 - keep], [1, -keep], known, axis=0, zi=keep * known[:1])[0]

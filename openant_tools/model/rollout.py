@@ -40,16 +40,19 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, position_servos
 from openant_tools.recording.run import Run
+
+if TYPE_CHECKING:
+    from scipy.interpolate import PchipInterpolator
 
 __all__ = ["Measured", "Rollouts", "Segment", "Staircase", "Trajectories", "initial_velocities"]
 
@@ -635,6 +638,8 @@ class Measured:
     @classmethod
     def of(cls, t: Array, pos: Array) -> Measured:
         """Of positions (rows, joints) rad at times (s); missing samples are bridged."""
+        from scipy.interpolate import PchipInterpolator  # half a second to load
+
         there = np.isfinite(pos)
         return cls(tuple(PchipInterpolator(t[known], own[known]) for own, known in zip(pos.T, there.T, strict=True)))
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from openant_tools.model.gap import Gap
 from openant_tools.recording.run import Run
@@ -321,7 +321,7 @@ def _helps(one: Sequence[Gap], other: Sequence[Gap], before: Sequence[Gap]) -> b
     if not 1 < n < MOST_FOLDS:
         return True
     error = float(np.std(gains, ddof=1)) / math.sqrt(n)
-    return float(np.mean(gains)) > float(student.ppf(CERTAIN, n - 1)) * error
+    return float(np.mean(gains)) > float(stdtrit(n - 1, CERTAIN)) * error
 
 
 def _score(figure: Gap, before: Gap) -> float:

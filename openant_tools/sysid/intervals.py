@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from openant_tools.sysid.dataset import Dataset, runs_of
 from openant_tools.sysid.forward import ForwardModel
@@ -188,7 +188,7 @@ def halves(
     variance = sum(inverse - inverse @ inverse for inverse in inverses)
     apart = inverses[0] - inverses[1]
     deviation = np.sqrt(np.maximum(np.diag(variance + apart @ apart), 1e-12))
-    limit = norm.isf(FALSE_ALARM / 2 / max(1, int(free.sum())))
+    limit = -ndtri(FALSE_ALARM / 2 / max(1, int(free.sum())))
     contradictory = np.zeros(n, bool)
     contradictory[free] = np.abs(each[0] - each[1])[free] > limit * deviation
     return np.clip(each, prior.low, prior.high), contradictory

@@ -12,8 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from scipy.stats import beta
-
 from openant_tools.comms.dropouts.causes import CAUSES, OTHERWISE, Cause, Spread, separating_test
 from openant_tools.comms.dropouts.episodes import cables
 from openant_tools.comms.dropouts.log import read_log
@@ -201,6 +199,8 @@ def judge(measures: Measures) -> DropoutDiagnosis:
 
 def _density(value: float, spread: Spread) -> float:
     """Log of the Beta density at a mark, away from the ends, where it may be infinite, and above a floor."""
+    from scipy.stats import beta  # a second to load, and only who diagnoses needs it
+
     x = min(0.985, max(0.015, value))
     return math.log(FLOOR + (1 - FLOOR) * float(beta.pdf(x, *spread)))
 

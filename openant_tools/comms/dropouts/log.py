@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from openant_tools.errors import BadInput
 from openant_tools.recording.run import Run
@@ -213,6 +212,8 @@ def _lagged(t: Array, command: Array, lag_s: float) -> Array:
     """A command behind a first-order lag, its rows taken as evenly spaced."""
     if lag_s <= 0:
         return command
+    from scipy.signal import lfilter  # a second to load
+
     keep = float(np.exp(-float(np.median(np.diff(t))) / lag_s))
     out: Array = lfilter([1 - keep], [1, -keep], command - command[0]) + command[0]
     return out
