@@ -6,6 +6,7 @@ import os
 import tempfile
 
 import pytest
+from hypothesis import settings
 
 # Each worker has its share of the cores, and so have the processes that it starts: threads of matrix products that wait for
 # one another by spinning cost a fit five times its time where another worker has the other core. Read when numpy is
@@ -21,6 +22,10 @@ os.environ.setdefault("XDG_STATE_HOME", tempfile.mkdtemp(prefix="openant-state-"
 # What the tests start by the hundred compiles our modules once, not each time; and MuJoCo loads no window library.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 os.environ.setdefault("MUJOCO_GL", "disable")
+
+# How long an example takes says what else the machine does.
+settings.register_profile("ours", deadline=None)
+settings.load_profile("ours")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -78,7 +78,7 @@ JSON = st.recursive(
 
 
 @pytest.mark.parametrize("kind", [kind for kind, reader in READERS.items() if reader.name.endswith(".json")])
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_json_of_another_structure_is_read_or_refused(
     kind: str, written: tuple[Reader, Path, str], data: st.DataObject

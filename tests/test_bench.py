@@ -196,7 +196,7 @@ def test_a_hip_needs_its_lever_arm_and_a_hanging_leg_has_none(
     scatter=st.floats(0.0, 0.01),
     seed=st.integers(0, 10**6),
 )
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_the_line_finds_its_slope_whatever_the_tare(stiffness: float, offset: float, scatter: float, seed: int) -> None:
     x = np.linspace(0.0, 0.1, 8)
     y = stiffness * x + offset + scatter * np.random.default_rng(seed).standard_normal(8)

@@ -118,7 +118,7 @@ def test_widest_effects_are_at_one_joint_only_where_they_cannot_be_at_more() -> 
     assert {one.joints for one in drawn if one.effect == "action_delay"} == {"all"}
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**31))
 def test_an_answer_survives_its_file_and_describes_a_robot(seed: int) -> None:
     for answer in draw_answers(6, seed, Mix(none=0.1, two=0.3, outside=0.3)):

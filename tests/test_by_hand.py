@@ -38,7 +38,7 @@ def gradients(module: torch.nn.Module) -> list[np.ndarray]:
     return [weight.grad.numpy().copy() for weight in module.parameters()]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 10_000), st.booleans())
 def test_every_derivative_is_autograds(seed, layer_norm):
     by_hand, by_torch = pair(seed, layer_norm)

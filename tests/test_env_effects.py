@@ -171,7 +171,7 @@ def test_each_effect_can_be_left_out_by_name(robot):
     assert both._path is not None
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(st.floats(0.02, 0.6), st.floats(0.0, 0.3), st.booleans(), st.integers(0, 1000))
 def test_as_much_is_lost_as_the_entry_says(fraction, longest_s, shared, seed):
     effects = CommandEffects(0.0, np.full(3, fraction), longest_s, shared)

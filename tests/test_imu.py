@@ -395,7 +395,7 @@ def test_the_driver_never_sends_a_byte_outside_a_frame() -> None:
         assert msp.encode(msp.Parser().feed(data)[0]) == data
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.one_of(st.binary(max_size=40), st.sampled_from([b"#", b"R", b"$M<", b"exit\r", msp.request(230)]))))
 def test_any_bytes_leave_the_controller_answering_after_a_power_cycle(chunks: list[bytes]) -> None:
     bench = Bench()

@@ -463,7 +463,7 @@ ENTRY = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(entry=ENTRY)
 def test_whatever_stands_in_an_entry_is_fitted_or_refused_in_one_line(
     entry: dict[str, Any], tmp_path_factory: pytest.TempPathFactory

@@ -143,7 +143,7 @@ def test_figures_of_a_case_done_by_hand():
         agreement([Measured.of([1.0])] * 2, [Measured.of([1.0])] * 2)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.lists(st.floats(-1, 1, allow_nan=False), min_size=3, max_size=8, unique=True), st.integers(0, 100))
 def test_rank_violation_is_what_its_definition_says(real, seed):
     simulated = np.random.default_rng(seed).normal(size=len(real))

@@ -40,7 +40,7 @@ SPACE = CommandSpace.around_home()
     st.integers(0, 2**32 - 1),
     st.sampled_from([20.0, 50.0, 100.0]),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_every_protocol_stays_in_bounds_and_begins_and_ends_at_rest_at_home(
     name: str, seconds: float, seed: int, rate: float
 ) -> None:

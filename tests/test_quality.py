@@ -155,7 +155,7 @@ def test_spikes_are_taken_out_and_nothing_else(plant: Plant) -> None:
     jitter=st.floats(0.0, 0.3),
     seed=st.integers(0, 1000),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_no_true_motion_is_a_spike(gain: float, reach: float, rate: float, jitter: float, seed: int) -> None:
     """Steps of a stiff and hardly damped servo, sampled with jitter by a coarse encoder."""
     model = mujoco.MjModel.from_xml_string(

@@ -193,7 +193,7 @@ def test_viewers_decode_the_file_by_its_own_schema(whole: Path) -> None:
 
 
 @given(st.lists(st.text(min_size=1, max_size=12), min_size=1, max_size=5, unique=True))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_any_joint_names_make_a_schema(names: list[str]) -> None:
     channels = [ServoChannel(name, "m", k, scales={"pos": RAD}) for k, name in enumerate(names)]
     telemetry = Telemetry(channels)
@@ -231,7 +231,7 @@ def rows_after(whole: Path, data: bytes, folder: Path) -> int:
     return assert_exact_prefix(torn, read_recording(whole).run)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(share=st.floats(0.0, 1.0))
 def test_a_file_cut_anywhere_gives_every_whole_record_before(
     whole: Path, tmp_path_factory: pytest.TempPathFactory, share: float
@@ -242,7 +242,7 @@ def test_a_file_cut_anywhere_gives_every_whole_record_before(
     assert rows == max([count for end, count in chunk_ends(whole) if end <= cut], default=0)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(share=st.floats(0.0, 1.0))
 def test_a_zeroed_tail_gives_every_whole_record_before(
     whole: Path, tmp_path_factory: pytest.TempPathFactory, share: float
@@ -305,7 +305,7 @@ def chunk_ends(path: Path) -> list[tuple[int, int]]:
     return ends
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(share=st.floats(0.0, 0.999), payload=st.binary(min_size=1, max_size=40))
 def test_garbage_anywhere_never_becomes_a_row(
     whole: Path, tmp_path_factory: pytest.TempPathFactory, share: float, payload: bytes
@@ -557,7 +557,7 @@ def test_export_and_import_give_the_same_run(whole: Path, tmp_path: Path, suffix
 cells = st.one_of(st.just(math.nan), st.floats(-3.0, 3.0))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(rows=st.lists(st.tuples(cells, cells, cells, cells), min_size=2, max_size=8))
 def test_any_table_survives_import(tmp_path_factory: pytest.TempPathFactory, rows: list[tuple[float, ...]]) -> None:
     columns = np.array(rows).T

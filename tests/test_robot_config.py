@@ -267,7 +267,7 @@ def test_no_setting_is_read_by_nobody() -> None:
 
 
 @given(data=st.data())
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
 def test_a_file_cut_anywhere_is_refused_in_one_line(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
@@ -452,7 +452,7 @@ def owned(draw: st.DrawFn, text: str) -> str:
 
 
 @given(data=st.data())
-@settings(suppress_health_check=list(HealthCheck), max_examples=20, deadline=None)
+@settings(suppress_health_check=list(HealthCheck), max_examples=20)
 def test_whatever_the_owner_wrote_survives(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     folder = create_robot(tmp_path_factory.mktemp("owned") / "ant")
     text = data.draw(owned(folder.config_file.read_text(encoding="utf-8")))

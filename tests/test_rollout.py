@@ -150,7 +150,7 @@ def test_a_missing_command_leaves_the_one_before_in_force(pendulum: Plant) -> No
     )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     gaps=st.lists(st.floats(0.0, 0.05), min_size=1, max_size=40),
     levels=st.lists(st.integers(-8, 8), min_size=41, max_size=41),

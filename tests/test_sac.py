@@ -68,7 +68,7 @@ def run_command(*arguments) -> int:
 # --------------------------------------------------------------------------------------------------------- formulas
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000))
 def test_log_pi_is_that_of_a_squashed_gaussian(seed):
     torch.manual_seed(seed)
@@ -116,7 +116,7 @@ def test_critics_learn_the_return_with_each_step_weighed_by_its_time():
         assert q.item() == pytest.approx(dt * dt / (1 - 0.02**dt), rel=0.1)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(1, 20), st.integers(0, 60))
 def test_a_restored_replay_holds_every_row_where_it_was(capacity, count):
     replay, again = Replay(2, 1, capacity), Replay(2, 1, capacity)

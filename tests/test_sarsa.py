@@ -64,7 +64,7 @@ def plain_tiles(values, tilings):
     return boxes
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30)
 @given(st.data(), st.integers(1, 6), st.integers(1, 16), st.sampled_from([1, 3, 8, 24]))
 def test_the_tile_coder_is_exact(data, inputs, tiles, tilings):
     # Sixteenths: what a division cannot round to the other side of a tile's edge.
@@ -190,7 +190,7 @@ def plain_sarsa(transitions, rows, actions, settings):
     return w
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 10_000))
 def test_the_update_is_that_of_the_book(seed):
     random = np.random.default_rng(seed)

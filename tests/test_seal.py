@@ -97,7 +97,7 @@ def test_without_its_key_it_stays_shut(sealed: tuple[Path, Path], tmp_path: Path
 
 
 @given(st.integers(min_value=0), st.integers(1, 255))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_no_changed_byte_goes_unnoticed(at: int, change: int) -> None:
     from openant_tools.virtual import seal as seals
 

@@ -70,7 +70,7 @@ def test_a_table_comes_back_as_it_was_written(tmp_path: Path, suffix: str) -> No
 samples = hnp.arrays(float, 6, elements=st.one_of(st.just(np.nan), st.floats(-20.0, 20.0)))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     pos=samples,
     words=st.lists(st.text(st.characters(codec="utf-8", exclude_characters="\r\n\0")), min_size=6, max_size=6),
@@ -320,7 +320,7 @@ mutations = st.lists(
 )
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(mutations=mutations)
 @pytest.mark.parametrize("suffix", [".csv", ".parquet", ".json"])
 def test_a_damaged_table_is_read_or_refused_in_one_line(

@@ -103,7 +103,7 @@ def whole(lite: Inputs) -> Fit:
 # ---- thermometers ----
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(st.integers(0, 300), min_size=1, max_size=4, unique=True),
     st.floats(0.005, 0.1),

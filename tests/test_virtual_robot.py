@@ -225,7 +225,7 @@ def _abused() -> Wire:
     return Wire()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(st.tuples(st.binary(max_size=40), st.sampled_from([0.0, 0.0005, 0.01])), max_size=6))
 def test_no_bytes_make_the_line_raise(portions):
     wire = _abused()

@@ -487,7 +487,7 @@ def test_indirect_cells_keep_bytes_of_their_own_until_they_are_mapped(desk):
 # ---- whatever comes ----
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     st.lists(
         st.tuples(
@@ -508,7 +508,7 @@ def test_no_instruction_makes_it_raise(instructions):
             assert p2.Parser().feed(status.encode()) == [status]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(address=st.integers(0, 1023), data=st.binary(min_size=1, max_size=12))
 def test_a_write_is_either_refused_whole_or_reads_back(address, data):
     desk = Desk()

@@ -36,7 +36,7 @@ def said(pos: np.ndarray, gyro: np.ndarray) -> np.ndarray:
     return out
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(late_s=st.floats(-0.04, 0.06), seed=st.integers(0, 100))
 def test_it_tells_how_late_a_body_is(late_s: float, seed: int) -> None:
     lag = said(legs(T)[None], turning(T - late_s, seed, noise=0.1))[0]

@@ -36,7 +36,7 @@ def test_each_fault_is_what_it_is_called() -> None:
     assert (np.abs(told(standby=0.4))[1:] >= np.abs(TORQUE)[1:]).all()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_whatever_a_sensor_does_rows_without_a_sample_stay_so(seed: int) -> None:
     torque = TORQUE[None].copy()

@@ -335,7 +335,7 @@ def swung(seconds: float, seed: int = 0, jitter_s: float = 0.0, quiet: tuple[flo
 
 
 @given(st.floats(6, 90), st.floats(0.3, 4), st.floats(4, 30), st.integers(0, 5))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 def test_windows_lie_in_what_can_be_simulated_and_take_no_more_time_than_they_may(
     pendulum: Plant, seconds: float, length_s: float, at_most_s: float, seed: int
 ) -> None:
