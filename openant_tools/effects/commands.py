@@ -55,6 +55,7 @@ class CommandPath:
         # Between two stretches of mean length L lie (1 − p)/p sendings that arrive: fraction = L / (L + 1/p − 1).
         share = np.maximum(fraction, 1e-12)
         self._begins = np.where(fraction > 0.0, 1.0 / (1.0 + mean_length * (1.0 - share) / share), 0.0)
+        self._loses = bool(self._begins.any())
         self.reset(np.zeros(len(effects.fraction)))
 
     def reset(self, command: Array) -> None:
@@ -94,14 +95,14 @@ class CommandPath:
 
     def _lost(self, random: np.random.Generator) -> NDArray[np.bool_] | None:
         """Which joints' sending does not arrive, (joints,); None for none."""
-        if not self._begins.any():
+        if not self._loses:
             return None
         begins = (self._left == 0) & (random.random(len(self._begins)) < self._begins)
         if begins.any():
             self._left[begins] = random.integers(1, self._most + 1, int(begins.sum()))
-        lost = self._left > 0
-        self._left[lost] -= 1
-        return np.broadcast_to(lost, len(self._effects.fraction))
+        lost: NDArray[np.bool_] = self._left > 0
+        self._left -= lost
+        return np.broadcast_to(lost, len(self._effects.fraction)) if self._effects.shared else lost
 
     def get_state(self) -> dict[str, Any]:
         """What `set_state` needs to go on, as arrays."""
