@@ -15,8 +15,8 @@ from torch import Tensor
 __all__ = ["Adam"]
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
-#: torch before 2.4 has the fused step on graphics cards only
-FUSED = tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (2, 4)
+#: torch before 2.4 has the fused step on graphics cards only; it is none of what torch promises to keep
+FUSED = hasattr(torch, "_fused_adam_") and tuple(int(part) for part in torch.__version__.split(".")[:2]) >= (2, 4)
 
 
 class Adam:
