@@ -62,8 +62,8 @@ from openant_tools.virtual.world import World
 
 __all__ = ["Device", "Server"]
 
-#: s between two advances of the world while nobody talks.
-IDLE_S = 4e-3
+#: s between two advances of the world while nobody talks; of one that dozes, which takes as many in one bound.
+IDLE_S, DOZING_S = 4e-3, 2e-2
 #: s before an answer is due in which the loop spins, since sleeping overshoots by 0.1 ms and more.
 SPIN_S = 2e-4
 #: s after bytes of the bus in which the loop spins: a client that goes as fast as the wire lets it is back by then.
@@ -153,6 +153,7 @@ class Server:
         folder: Path | None = None,
     ) -> None:
         self.world, self.stepped = world, stepped
+        self._idle_s = DOZING_S if world.doze else IDLE_S
         # In stepped time it is the host's clock that stands still (`_sleep_through`); in real time nobody can stop it.
         world.line.settings.holds_back = not stepped
         self._camera = camera
@@ -276,7 +277,7 @@ class Server:
     def _pause(self) -> tuple[float, float]:
         """s to sleep until something is due; or 0, and until when (s) to spin."""
         now = self.now
-        due = now + IDLE_S
+        due = now + self._idle_s
         if self._imu is not None:
             due = min(due, self._imu.next_event(self.world.now))
         if self._outbox and (answer := self._outbox[0][0] - HOP_S) - SPIN_S <= due:
@@ -300,9 +301,9 @@ class Server:
     def _keep_time(self) -> None:
         now = self.now
         if now - self.world.now > MAX_LAG_S:
-            self._start += now - self.world.now - IDLE_S
+            self._start += now - self.world.now - self._idle_s
             now = self.now
-        if now - self.world.now >= IDLE_S:
+        if now - self.world.now >= self._idle_s:
             self.world.advance(now)
         while self._outbox and self._outbox[0][0] <= self.now + HOP_S:
             due, _, name, data = heapq.heappop(self._outbox)
