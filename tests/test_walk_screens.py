@@ -339,11 +339,10 @@ def test_the_whole_walk_from_loose_motors_to_the_passport_and_on_to_learning(
     assert walked["ok"]
     assert {now["state"] for now in walked["steps"].values()} == {"ok"}
     pytest.importorskip("torch")
-    # On the bus a step takes the bus's time: enough of them to see that it walks, records and learns from this folder.
-    runs = {"sim": ("--steps", "200"), "virtual": ("--steps", "20", "--env", "hardware", "--virtual", "--yes")}
-    for run, how in runs.items():
-        command = [sys.executable, "-m", "openant_tools.cli", "train", "sac", "--robot", str(folder), *how]
-        out = folder / "runs" / run
-        trained = subprocess.run([*command, "--out", str(out)], capture_output=True, text=True, check=False)
-        assert trained.returncode == 0, trained.stderr[-2000:]
-        assert (out / "learning_curve.csv").is_file()
+    # On the bus a step takes the bus's time: enough of them to see that it walks, records and learns from this folder. (The
+    # demo learns in the simulation of one.)
+    command = [sys.executable, "-m", "openant_tools.cli", "train", "sac", "--robot", str(folder)]
+    how = ["--steps", "20", "--env", "hardware", "--virtual", "--yes", "--out", str(folder / "runs" / "virtual")]
+    trained = subprocess.run([*command, *how], capture_output=True, text=True, check=False)
+    assert trained.returncode == 0, trained.stderr[-2000:]
+    assert (folder / "runs" / "virtual" / "learning_curve.csv").is_file()
