@@ -17,7 +17,6 @@ import plants
 import pytest
 
 from openant_tools.errors import BadInput
-from openant_tools.model.gap import Gap
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
@@ -26,8 +25,9 @@ from openant_tools.robot.joints import JOINT_NAMES, JOINTS
 from openant_tools.robot.kit import PLATFORM_PWM_LIMIT_COUNTS
 from openant_tools.robot.kit import kit as kit_by_name
 from openant_tools.robot.mjcf import nominal_mjcf
-from openant_tools.sysid.choice import _helps
+from openant_tools.sysid.choice import helps, lacking
 from openant_tools.sysid.data_sheet import data_sheet_model
+from openant_tools.sysid.estimate import Posterior
 from openant_tools.sysid.identify import Identification, Value, calibrated, identify
 from openant_tools.sysid.protocols import CommandSpace, protocol
 from openant_tools.sysid.result import write_fit
@@ -472,7 +472,7 @@ def test_what_one_run_promises_and_another_breaks_is_not_kept(model: Path) -> No
     runs = [Robot(8.0, damping, 0.006, 0.04).record(f"{k}", 2.0, seed=k) for k, damping in enumerate((0.08, 0.18))]
     result = identify(runs, model, kinds=["damping", "coulomb_friction"])
     for turn in result.turns:
-        assert turn.chosen.full < 0.3 * turn.before.full < 0.3 * turn.after.full
+        assert turn.chosen.after.full < 0.3 * turn.before.full < 0.3 * turn.after.full
     assert {found.verdict for found in result.values} == {"fell back"}
     assert result.after == result.before, "it is the given model that is written"
 
@@ -516,15 +516,29 @@ def test_without_held_out_runs_each_motion_is_left_out_in_turn(model: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("without", "goes"),
-    [([0.05, 0.05], True), ([0.02, 0.099], False), ([0.02, 0.12], False), ([0.04, 0.05, 0.06], True)],
-    ids=["alike on both", "on one", "at the other's cost", "on all of three"],
+    ("gains", "goes"),
+    [([0.7, 0.7], True), ([1.6, 0.01], False), ([1.6, -0.2], False), ([0.9, 0.7, 0.5], True), ([0.005, 0.005], False)],
+    ids=["alike on both", "on one", "at the other's cost", "on all of three", "not worth it"],
 )
-def test_of_few_motions_each_must_agree_that_a_parameter_goes_back(without: list[float], goes: bool) -> None:
-    """What the error on each left-out motion would be without a kind that leaves 0.1 rad of 0.2."""
-    figures = [[Gap(error, error) for error in (0.0, *errors)] for errors in
-               (without, [0.1] * len(without), [0.2] * len(without))]  # fmt: skip
-    assert _helps(*figures) == goes
+def test_of_few_motions_each_must_agree_that_a_parameter_goes_back(gains: list[float], goes: bool) -> None:
+    """By how much each left-out motion is followed better without it."""
+    assert helps(gains) == goes
+
+
+def test_what_a_model_lacks_stays_away_unless_the_data_tell_it_from_none() -> None:
+    """Of two that only together are known the likelier one stays; what the model has stays in any case."""
+    precision = np.linalg.inv(np.array([[0.25, -0.24, 0.0], [-0.24, 0.25, 0.0], [0.0, 0.0, 0.25]])) - np.eye(3)
+    fit = Posterior(
+        u=np.array([0.7, 0.8, 0.5]),
+        covariance=np.eye(3),
+        centre=np.zeros(3),
+        low=np.array([0.0, 0.0, -np.inf]),
+        high=np.full(3, np.inf),
+        precision=precision,
+        prior_precision=np.ones(3),
+    )
+    assert lacking(fit).tolist() == [True, False, False]
+    assert lacking(replace(fit, u=np.array([0.1, 0.1, 0.5]))).tolist() == [True, True, False]
 
 
 def test_a_single_run_is_cut_in_three(model: Path) -> None:

@@ -76,6 +76,8 @@ def with_effects(
         tie=tie,
         declared=declared,
         measured_supply=measured_supply or None,
+        # A law that may trust the motions that it follows well chooses what it is judged by.
+        tempered=True,
         effects=effects,
         checked=plain.checked,
         progress=progress,
@@ -83,18 +85,23 @@ def with_effects(
 
 
 def better(richer: Identification, plain: Identification) -> bool:
-    """Whether a fit with effects found some, and follows what was left out of it better than the plain one at both horizons.
+    """Whether a fit with effects found some, their intervals clear of none, and folds do not show the plain one to be better.
 
-    Held-out runs have no say in it: they judge.
+    Gears are known to rub more under load, so that two or three motions left out are no jury that must be won over: they have a
+    veto. Held-out runs have no say in it: they judge.
     """
-    found = any(value.accepted and value.name.partition(".")[0] in TRIED for value in richer.values)
-    return found and pays(richer.choice.after, plain.choice.after)
+    found = any(
+        value.name.partition(".")[0] in TRIED and value.low is not None and value.low > 0 for value in richer.values
+    )
+    return found and not pays(plain.choice, richer.choice, surely=True)
 
 
 def chosen_in_turn(richer: Identification, plain: Identification) -> Gap | None:
-    """What the better of both leaves of runs left out in turn, where it is chosen anew without each; None where none were."""
+    """What the better of both leaves of runs left out in turn, where the folds have their say anew without each; None where none
+    were."""
     best = [
-        one if pays(one.chosen, other.chosen) else other for one, other in zip(richer.turns, plain.turns, strict=True)
+        other if pays(other.chosen, one.chosen, surely=True) else one
+        for one, other in zip(richer.turns, plain.turns, strict=True)
     ]
     return pooled([turn.after for turn in best], [turn.samples for turn in best]) if best else None
 

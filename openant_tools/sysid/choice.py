@@ -20,21 +20,34 @@ from openant_tools.model.gap import Gap
 from openant_tools.recording.run import Run
 from openant_tools.sysid.dataset import Dataset, gaps, runs_of
 from openant_tools.sysid.estimate import Estimate, Posterior
+from openant_tools.sysid.intervals import TWO_SIDED_95
 from openant_tools.sysid.parameter import Parameter
 from openant_tools.sysid.problem import Problem
 from openant_tools.sysid.verdict import undetermined
 
-__all__ = ["Choice", "Fold", "Settled", "by_gain", "by_motion", "choose", "pays", "pooled", "settle"]
+__all__ = [
+    "Choice",
+    "Fold",
+    "Settled",
+    "by_gain",
+    "by_motion",
+    "choose",
+    "helps",
+    "lacking",
+    "pays",
+    "pooled",
+    "settle",
+]
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Progress = Callable[[str, float], None]
-#: asks for what options of kept parameters leave, is answered with that over all folds and over each, ends with a choice
-Choosing = Generator["_Ask", Sequence[Sequence[Gap]], "Choice"]
+#: asks for what options of kept parameters leave, is answered with that of each fold, ends with a choice
+Choosing = Generator["_Ask", Sequence[Sequence["_Left"]], "Choice"]
 
-#: going back must pay this much on what was left out (relative, over both horizons): less is luck
+#: what is chosen must pay this much on what was left out (relative, over both horizons)
 WORTH = 0.01
-#: and, of two or three folds, must pay with this probability
+#: and going back with this probability
 CERTAIN = 0.95
 #: motions are left out in so many folds at most
 MOST_FOLDS = 4
@@ -128,12 +141,29 @@ class _Ask:
 
 
 @dataclass(frozen=True)
+class _Left:
+    """What is left of a fold, and how many positions it has."""
+
+    gap: Gap
+    samples: int
+
+
+@dataclass(frozen=True)
 class Choice:
-    """Which parameters keep what was found, and what the given model and this choice leave of all folds."""
+    """Which parameters keep what was found, and what the given model and this choice leave of each fold."""
 
     kept: Bools
-    before: Gap
-    after: Gap
+    given: tuple[_Left, ...]
+    left: tuple[_Left, ...]
+
+    @property
+    def before(self) -> Gap:
+        """Of all folds, of the given model."""
+        return pooled([one.gap for one in self.given], [one.samples for one in self.given])
+
+    @property
+    def after(self) -> Gap:
+        return pooled([one.gap for one in self.left], [one.samples for one in self.left])
 
 
 @dataclass(frozen=True)
@@ -231,6 +261,21 @@ def _shown(fit: Posterior, trial: Posterior, kept: Bools) -> Array:
     return np.where(undetermined(trial) & ~undetermined(fit), _at(fit, kept), _at(trial, kept))
 
 
+def lacking(fit: Posterior) -> Bools:
+    """(parameters,) of what the given model lacks, those that the data cannot tell from none, the others given: a delay of a few
+    milliseconds that a slow motion neither shows nor excludes is a guess, and none is the safer one."""
+    out = np.zeros(len(fit.u), bool)
+    fit = replace(fit, covariance=fit.narrow)
+    while True:
+        u, precision = fit.with_given(out), np.linalg.inv(fit.covariance)[np.ix_(~out, ~out)]
+        clear = np.full(len(u), math.inf)
+        clear[~out] = u[~out] / np.sqrt(np.diag(np.linalg.inv(precision)))
+        unclear = (fit.low == 0) & (fit.centre == 0) & (u > 0) & (clear < TWO_SIDED_95)
+        if not unclear.any():
+            return out
+        out[np.argmin(np.where(unclear, clear, math.inf))] = True
+
+
 def choose(
     trials: Sequence[Sequence[_Trial]],
     parameters: Sequence[Parameter],
@@ -243,11 +288,11 @@ def choose(
         trials: for each fit the fit itself, and then those without a fold of its runs.
         refit: trials and what each keeps → the same with that fitted anew, and the rest as given.
     """
-    choosing = [_choose(parameters, len(each) - 1) for each in trials]
+    choosing = [_choose(parameters, lacking(each[0].posterior)) for each in trials]
     now = {k: list(each) for k, each in enumerate(trials)}
     tried: dict[int, tuple[Bools, list[_Trial]]] = {}
     ended: dict[int, tuple[Choice, Posterior]] = {}
-    answers: dict[int, Sequence[Sequence[Gap]] | None] = dict.fromkeys(range(len(trials)))
+    answers: dict[int, Sequence[Sequence[_Left]] | None] = dict.fromkeys(range(len(trials)))
     told = 0.0
     while answers:
         if progress:
@@ -273,55 +318,54 @@ def choose(
     return [ended[k] for k in range(len(trials))]
 
 
-def _choose(parameters: Sequence[Parameter], folds: int) -> Choosing:
+def _choose(parameters: Sequence[Parameter], unclear: Bools) -> Choosing:
     """The rule of formats, section 6.
 
-    Starting from all, the kind or joint whose return to the given model helps most on what was left out goes back, as long as
-    one does, by more than chance; and on, while what is left does not beat the given model at both horizons. Which one it is is
-    seen to first order, whether it helps with the rest fitted anew.
+    Starting from all but what is `lacking`, the kind, the joint or the whole whose return to the given model helps most on what was
+    left out goes back, as long as that is more than chance; and on, while what is left follows none of it better than the given
+    model. What stays needs no second proof: its prior has shrunk it as far as the data are weak, and a fit to half of the motions
+    that fails at the other half speaks against the half. Which one it is is seen to first order, whether it helps with the rest
+    fitted anew.
     """
-    kept = np.ones(len(parameters), bool)
-    before, after = yield _Ask([~kept, kept])
-    while folds and kept.any():
-        # What is kept must pay too. Where physics knows better than the given model, its value is no safer one.
-        short, full, gain = after[0].horizon, after[0].full, _score(after[0], before[0])
-        beats = short < before[0].horizon and full < before[0].full and gain < -WORTH
-        groups = [
-            np.array([bool(kept[k]) and p.kind == kind for k, p in enumerate(parameters)])
-            for kind in dict.fromkeys(p.kind for p in parameters if not beats or p.centre == 0)
+    kept = ~unclear
+    before, after = yield _Ask([np.zeros_like(kept), kept])
+    if unclear.any():
+        (after,) = yield _Ask([kept], fitted=True)
+    while kept.any():
+        somewhere = max(_gains(after, before, before), default=math.inf) > WORTH
+        # Where physics knows better than the given model, its value is no safer one.
+        kinds = dict.fromkeys(p.kind for p in parameters if p.centre == 0)
+        groups = [np.array([p.kind == kind for p in parameters]) for kind in kinds]
+        groups += [
+            np.array([p.label == label for p in parameters]) for label in dict.fromkeys(p.label for p in parameters)
         ]
-        labels = list(dict.fromkeys(p.label for p in parameters))
-        if len(labels) > 1:
-            groups += [
-                np.array([bool(kept[k]) and p.label == label for k, p in enumerate(parameters)]) for label in labels
-            ]
-
-        def better(one: Sequence[Gap], other: Sequence[Gap] = after, gain: float = gain) -> bool:
-            # What helps on one motion and hardly on another is luck, and two or three motions have much of it.
-            return _score(one[0], before[0]) <= gain - WORTH and _helps(one, other, before)
-
-        options = [kept & ~group for group in groups if group.any()]
-        results = (yield _Ask(options)) if options else []
-        found = [(option, one) for option, one in zip(options, results, strict=True) if not beats or better(one)]
-        if not found:
+        options = [kept & ~group for group in (*groups, kept) if (kept & group).any()]
+        gains = [_gains(one, after, before) for one in (yield _Ask(options))]
+        best = int(np.argmax([_mean(each) for each in gains]))
+        if somewhere and not helps(gains[best]):
             break
-        option, _ = min(found, key=lambda each: _score(each[1][0], before[0]))
-        (there,) = (yield _Ask([option], fitted=True)) if option.any() else [before]
-        if beats and not better(there):
+        (there,) = (yield _Ask([options[best]], fitted=True)) if options[best].any() else [before]
+        if somewhere and not helps(_gains(there, after, before)):
             break
-        kept, after = option, there
-    return Choice(kept, before[0], after[0])
+        kept, after = options[best], there
+    return Choice(kept, tuple(before), tuple(after))
 
 
-def _helps(one: Sequence[Gap], other: Sequence[Gap], before: Sequence[Gap]) -> bool:
-    """Whether one choice of parameters follows what was left out better than another, where folds are few by more than they
-    differ (Student)."""
-    gains = [_score(b, given) - _score(a, given) for a, b, given in zip(one[1:], other[1:], before[1:], strict=True)]
+def _gains(one: Sequence[_Left], other: Sequence[_Left], before: Sequence[_Left]) -> list[float]:
+    """By how much one choice follows each fold better than another."""
+    return [_score(b.gap, given.gap) - _score(a.gap, given.gap) for a, b, given in zip(one, other, before, strict=True)]
+
+
+def helps(gains: Sequence[float]) -> bool:
+    """Whether what was left out is followed better: by what is worth it, and by more than the folds differ (Student). What helps on
+    one motion and hardly on another is luck, and two or three motions have much of it."""
     n = len(gains)
-    if not 1 < n < MOST_FOLDS:
-        return True
-    error = float(np.std(gains, ddof=1)) / math.sqrt(n)
-    return float(np.mean(gains)) > float(stdtrit(n - 1, CERTAIN)) * error
+    error = float(np.std(gains, ddof=1)) / math.sqrt(n) if n > 1 else 0.0
+    return _mean(gains) > max(WORTH, float(stdtrit(max(1, n - 1), CERTAIN)) * error)
+
+
+def _mean(gains: Sequence[float]) -> float:
+    return float(np.mean(gains)) if gains else 0.0
 
 
 def _score(figure: Gap, before: Gap) -> float:
@@ -330,14 +374,16 @@ def _score(figure: Gap, before: Gap) -> float:
     return float(np.mean(np.where(ratios > 0, 3 * ratios, ratios)))
 
 
-def pays(one: Gap, other: Gap) -> bool:
-    """Whether one way to fit follows what was left out better than another: at both horizons, and by more than luck at one."""
-    short, full = one.horizon / other.horizon, one.full / other.full
-    return max(short, full) < 1.0 and min(short, full) < 1.0 - WORTH
+def pays(one: Choice, other: Choice, *, surely: bool = False) -> bool:
+    """Whether one way to fit follows what was left out better than another; `surely`: by more than chance."""
+    gains = _gains(one.left, other.left, other.given)
+    return helps(gains) if surely else _mean(gains) > WORTH
 
 
 def pooled(figures: Sequence[Gap], samples: Sequence[int]) -> Gap:
     """The gap over all samples together."""
+    if not figures:
+        return Gap(math.nan, math.nan)
     squares = np.average([[one.horizon**2, one.full**2] for one in figures], axis=0, weights=samples)
     return Gap(*np.sqrt(squares).tolist())
 
@@ -348,8 +394,8 @@ def _samples(datasets: Sequence[Dataset]) -> int:
 
 def _left(
     trials: Mapping[int, Sequence[_Trial]], parameters: Sequence[Parameter], asked: Mapping[int, Sequence[Bools]]
-) -> dict[int, list[list[Gap]]]:
-    """For each fit and option of kept parameters the gap over all folds, and then over each.
+) -> dict[int, list[list[_Left]]]:
+    """For each fit and option of kept parameters what is left of each fold.
 
     What different fits would have done on the same fold is simulated together.
     """
@@ -364,9 +410,8 @@ def _left(
         figures = gaps(trials[first_k][first_t].unseen, parameters, us)
         for k, t in places:
             found[k, t], figures = figures[: len(asked[k])], figures[len(asked[k]) :]
-    out = {}
-    for k, options in asked.items():
-        counts = [_samples(trial.unseen) for trial in trials[k][1:]]
-        each = [[found[k, t][o] for t in range(1, 1 + len(counts))] for o in range(len(options))]
-        out[k] = [[pooled(one, counts), *one] if one else [Gap(math.nan, math.nan)] for one in each]
-    return out
+    counts = {k: [_samples(trial.unseen) for trial in trials[k][1:]] for k in asked}
+    return {
+        k: [[_Left(found[k, t][o], n) for t, n in enumerate(counts[k], 1)] for o in range(len(options))]
+        for k, options in asked.items()
+    }

@@ -51,7 +51,7 @@ VERDICTS = """
 - **tied**: the data tell it only together with the other that is named; knowing one would settle both.
 - **conflict**: the data are certain, and contradict what the given model says; the data's value is written.
 - **not in the data**: the data say nothing about it; it stays at its prior.
-- **fell back**: it did not beat the given model on runs that the fit had not seen; the given value stays.
+- **fell back**: runs that the fit had not seen are followed better without it, or it may as well be none; the given value stays.
 """
 
 

@@ -30,7 +30,6 @@ class ForwardModel:
     Args:
         datasets: all with the same joints in the same order.
         parameters: the unknowns.
-        coarse: whether long time steps may serve where a direction is enough.
 
     Attributes:
         on_floor: whether contacts chatter.
@@ -40,10 +39,10 @@ class ForwardModel:
         evaluations: variants that were simulated so far.
     """
 
-    def __init__(self, datasets: Sequence[Dataset], parameters: Sequence[Parameter], *, coarse: bool) -> None:
+    def __init__(self, datasets: Sequence[Dataset], parameters: Sequence[Parameter]) -> None:
         self.datasets, self.parameters, self.evaluations = datasets, parameters, 0
         self.on_floor = any(data.plant.setup is Setup.FLOOR for data in datasets)
-        self.coarse = coarse and any(data.coarse is not data for data in datasets)
+        self.coarse = any(data.coarse is not data for data in datasets)
         chattering = [FLOOR_STEP_OF_BODY if p.definition.body else FLOOR_STEP for p in parameters]
         self.differences: Array = np.array(chattering if self.on_floor else [STEP] * len(parameters))
         shared = any(effect(name).shared for data in datasets for name, _ in data.acting)

@@ -1,8 +1,8 @@
 """Identification from end to end: runs and a model in; values with intervals and verdicts, judged on held-out runs, out.
 
 What is reported as better was measured on runs that neither the fit nor any choice saw. A parameter that the data cannot
-determine stays at its prior; what does not beat the given model on runs that are left out of the fit in turn, at the short horizon
-and over full runs, goes back (`choice.py`). Runs that were held out judge once, and may only send all of it back.
+determine stays at its prior; what runs that are left out of the fit in turn are followed better without, at the short horizon and
+over full runs, goes back (`choice.py`). Runs that were held out judge once, and may only send all of it back.
 """
 
 from __future__ import annotations
@@ -113,8 +113,8 @@ class Value:
         low, high: 95 % interval of the estimate; none where the value is not the data's.
         prior_low, prior_high: 95 % interval of the prior.
         verdict: `identified`, `weak` (between data and prior), `tied` (the data tell it only together with another),
-            `conflict` (the data's, which contradict the prior), `not in the data` (left at its prior) or `fell back` (it
-            did not beat the given model on runs that the fit had not seen).
+            `conflict` (the data's, which contradict the prior), `not in the data` (left at its prior) or `fell back` (runs that
+            the fit had not seen are followed better without it, or the data do not tell it from none).
         information: share of the precision that the data gave, 0…1.
         tied_to: the other parameter's name, where it is tied.
         record_next: what to record so that it becomes identified; empty where it is, or where nothing is known.
@@ -160,13 +160,13 @@ class Turn:
     Attributes:
         runs: their names.
         samples: how many positions they have.
-        chosen: what the choice leaves of the folds within the others.
+        chosen: by the folds within the others.
         before, after: the gap on the runs, of the given model and of what was chosen.
     """
 
     runs: tuple[str, ...]
     samples: int
-    chosen: Gap
+    chosen: Choice
     before: Gap
     after: Gap
 
@@ -309,6 +309,7 @@ def identify(
     tie: str = "joint",
     declared: Declaration | None = None,
     measured_supply: bool | None = False,
+    tempered: bool = False,
     effects: Sequence[Entry] = (),
     checked: Sequence[str] | None = None,
     progress: Progress | None = None,
@@ -327,6 +328,7 @@ def identify(
         declared: parameters that a user declared, fitted besides.
         measured_supply: gains and torque limits follow the voltage that the runs logged, in the given model too; None: if what
             is left out of the fit is followed better so.
+        tempered: all runs count alike (`Problem`).
         effects: `[[effect]]` entries that the robot has: those that act between steps act in every simulation as they are,
             unless they are fitted themselves.
         checked: what `check_runs` noted of all these runs, where they have gone through it before; default they do now.
@@ -398,7 +400,7 @@ def identify(
 
     ways = list[tuple[Problem, Estimate, list[Settled]]]()
     for supply in supplies:
-        problem = Problem(data if supply == supplies[0] else datasets(runs, supply), chosen, floor)
+        problem = Problem(data if supply == supplies[0] else datasets(runs, supply), chosen, floor, tempered)
         start = ways[0][1].u if ways else None
         estimate = problem.solve(start, share(2 * len(ways)))
         prepare = partial(datasets, supply=supply)
@@ -407,7 +409,7 @@ def identify(
         )
     # What is chosen of all runs comes first, then what is chosen anew without each turn.
     best, *anew = (
-        1 if len(each) > 1 and pays(each[1].choice.after, each[0].choice.after) else 0
+        1 if len(each) > 1 and pays(each[1].choice, each[0].choice) else 0
         for each in zip(*(settled for *_, settled in ways), strict=True)
     )
     problem, estimate, (settled, *_) = ways[best]
@@ -470,7 +472,7 @@ def identify(
 
 def _turn(settled: Settled, fold: Fold, parameters: Sequence[Parameter]) -> Turn:
     before, after = gaps(settled.unseen, parameters, [np.zeros(len(parameters)), settled.u])
-    return Turn(tuple(run.name for run in fold.runs), settled.samples, settled.choice.after, before, after)
+    return Turn(tuple(run.name for run in fold.runs), settled.samples, settled.choice, before, after)
 
 
 def joints_in_common(runs: Sequence[Run], model: Path, wanted: Sequence[str] | None) -> list[str]:

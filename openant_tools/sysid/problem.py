@@ -47,8 +47,8 @@ Bools = NDArray[np.bool_]
 Progress = Callable[[str, float], None]
 
 #: squared length of a step in posterior deviations, per parameter, below which a descent is near, if the step is short in prior
-#: deviations too; and where laws are compared that differ by little
-NEAR, NEAR_TEMPERED = 5.0, 0.05
+#: deviations too; and where it started near
+NEAR, NEARER = 5.0, 0.05
 #: rounds in which a step and the weights that it leads to find each other, before anything is simulated
 FORESEEN = 4
 #: a residual this small, in deviations that the encoder alone makes, has nothing in it that a second descent could find
@@ -71,9 +71,9 @@ class Problem:
         datasets: all with the same joints in the same order.
         parameters: the unknowns.
         floor: (joints,) rad, the least residual deviation that a sensor of this resolution can show.
-        tempered: all runs of a joint count alike, by their length, as one observation per TEMPER_S: to compare models all
-            of which are wrong by the error that they leave. Trusting each stretch as far as the model can follow it, as is
-            done otherwise, lets a wrong model choose what it is judged by.
+        tempered: all runs of a joint count alike, by their length: for laws all of which are wrong, by the error that they leave.
+            Trusting each stretch as far as the model can follow it, as is done otherwise, lets a wrong model choose what it is
+            judged by.
         freed: (parameters,) whose priors the data contradict, so that they count for next to nothing; found by `solve`.
         left_out: (rows,) of all datasets that nothing is fitted to: they are simulated, and count for nothing; None: no row.
     """
@@ -86,8 +86,7 @@ class Problem:
     left_out: Bools | None = None
 
     def __post_init__(self) -> None:
-        # Laws that are compared shall differ in nothing but themselves.
-        self._model = ForwardModel(self.datasets, self.parameters, coarse=not self.tempered)
+        self._model = ForwardModel(self.datasets, self.parameters)
         self._weighing = Weighing(stretches(self.datasets, self.left_out), self.floor, self.tempered)
         self._valley = np.array([parameter.definition.valley for parameter in self.parameters], bool)
         self.centre: Array = np.array([parameter.centre for parameter in self.parameters])
@@ -167,7 +166,7 @@ class Problem:
     def _from(self, found: Descent, start: Array | None, held: Bools | None) -> Steps:
         tangent = replace(found.tangent, change=found.tangent.change.copy())  # a descent changes it
         point = found.point if start is None else (yield Look(start))
-        return (yield from self._approach(point, enough=NEAR_TEMPERED, held=held, tangent=tangent))
+        return (yield from self._approach(point, enough=NEARER, held=held, tangent=tangent))
 
     def _further(self, found: Descent) -> Steps:
         """Once more from where the data lead alone, if what is left may have something in it that the priors kept from view."""
@@ -229,7 +228,7 @@ class Problem:
             # Nothing in driven stretches tells the valleys; their prior alone must not move them out of theirs.
             driven = yield from self._approach(point, enough=NEAR, driven_only=True, held=self._valley)
             point = driven.point
-        near = yield from self._approach(point, enough=NEAR_TEMPERED if self.tempered else NEAR)
+        near = yield from self._approach(point, enough=NEAR)
         # Differences to one side are good enough to get near. Where parameters almost undo each other (all torques a
         # per cent larger) they are not: there the minimum and the intervals come from both sides.
         return (yield from self._approach(near.point, central=True))
@@ -251,10 +250,9 @@ class Problem:
             self.prior,
             lambda there: self._weighing(there, driven_only=driven_only).each,
             enough=enough,
-            rounds=1 if self.tempered else FORESEEN,
+            rounds=FORESEEN,
             central=central,
             coarse=coarse,
-            thorough=self.tempered,
             least=self._model.differences,
             held=held,
             tangent=tangent,
@@ -281,7 +279,6 @@ class Problem:
             loose,
             lambda there: weight,
             coarse=self._model.coarse,
-            thorough=self.tempered,
             least=self._model.differences,
             tangent=tangent,
         )

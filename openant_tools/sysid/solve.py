@@ -217,7 +217,6 @@ def descend(
     rounds: int = 1,
     central: bool = False,
     coarse: bool = False,
-    thorough: bool = False,
     least: Array | float = 0.0,
     held: Bools | None = None,
     tangent: Tangent | None = None,
@@ -231,7 +230,6 @@ def descend(
         rounds: in which a step and the weights that it leads to find each other, before anything is simulated.
         central: derivatives from both sides.
         coarse: derivatives that show a direction will do, until they do not.
-        thorough: `enough` alone decides, however short steps are and however little they gain.
         least: (unknowns,) derivatives learn nothing from a step that is shorter than this in all.
         held: unknowns that stay where they are.
         tangent: derivatives that are there already; they are changed.
@@ -242,7 +240,7 @@ def descend(
             tangent = yield Derive(point, central, coarse)
         step = _best_step(point, tangent, prior, weigh, damping, held, enough, rounds)
         away = _longest(point.u - tangent.u)
-        short = thorough or _longest(step.by) < SAME_PLACE
+        short = _longest(step.by) < SAME_PLACE
         reliable = away < SAME_PLACE or enough > ARRIVED
         arrived = step.length < (enough if short else ARRIVED)
         if arrived and reliable:
@@ -255,11 +253,11 @@ def descend(
         kept = gained / max(step.promised, 1e-300)
         taken, broken = kept > WORSE, kept < BROKEN
         if taken:
-            if thorough or (np.abs(step.by) > least).any():
+            if (np.abs(step.by) > least).any():
                 tangent.correct(step.by, there.residual - point.residual)
             point, refused = there, 0
             damping /= 10 if kept > BROKEN else 1
-        settled = short and reliable and not thorough
+        settled = short and reliable
         if step.promised < TRIFLE * len(point.u) and (broken or settled):
             return Descent(point, tangent, True)  # what is left is no more than a hair's difference makes
         if not taken and away == 0.0:

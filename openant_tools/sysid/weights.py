@@ -76,7 +76,7 @@ class Weighing:
     Attributes:
         stretches: of all runs.
         floor: (joints,) rad, the least deviation.
-        tempered: all rows of a joint alike, one effective sample per TEMPER_S; else each stretch by its own residuals.
+        tempered: all rows of a joint alike, by what is left of all; else each stretch by its own residuals.
     """
 
     stretches: Sequence[Stretch]
@@ -166,13 +166,21 @@ class Weighing:
         return np.asarray(np.nanmean(np.where(self.counts(residual) > 0, residual, np.nan) ** 2, axis=0), np.float64)
 
     def _alike(self, residual: Array) -> Weights:
-        """One deviation for all rows of a joint, and one effective sample per TEMPER_S."""
+        """One deviation for all rows of a joint, and one effective sample per autocorrelation time."""
         each = np.zeros_like(residual)
         noise = np.maximum(np.sqrt(self._together(residual)), self.floor)
+        samples, times = np.zeros((2, len(noise)))
         for stretch in self.stretches:
             for j, rows in enumerate(stretch.rows):
-                each[rows, j] = math.sqrt(stretch.period / TEMPER_S) / noise[j]
-        return Weights(each, noise, np.full(len(noise), TEMPER_S), 0.0)
+                part = residual[rows, j]
+                n = int(np.isfinite(part).sum())
+                samples[j] += n
+                times[j] += n * autocorrelation_time(part, limit=len(part) // 2) * stretch.period
+        times /= np.maximum(samples, 1)
+        for stretch in self.stretches:
+            for j, rows in enumerate(stretch.rows):
+                each[rows, j] = math.sqrt(stretch.period / max(times[j], stretch.period)) / noise[j]
+        return Weights(each, noise, times, 0.0)
 
 
 def autocorrelation_time(residual: Array, limit: int) -> float:
