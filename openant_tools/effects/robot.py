@@ -181,7 +181,7 @@ class Robot:
         log_delay: s by which a signal's log lags: "pos", "vel", "imu", "acc" beyond that, "base".
         imu_rotation: (3,) rad. gyro_bias (3,) rad/s, acc_bias (3,) m/s². base_scale, base_yaw: of the tracker.
         noise: signal → deviation of one sample; what else its sensors do by chance.
-        form: of its simulation.
+        form: of its simulation. creeps: whether joints that dry friction holds give way as they do in MuJoCo by default.
     """
 
     joints: int
@@ -231,6 +231,7 @@ class Robot:
     base_yaw: float = 0.0
     noise: dict[str, float] = field(default_factory=dict)
     form: Form | None = None
+    creeps: bool = False
 
     def __post_init__(self) -> None:
         n = self.joints
@@ -281,6 +282,8 @@ class Robot:
             _stretch(model, link_bodies(model, plant, int(j)), float(self.length[j]))
         shared = self.electrical > 0
         model.dof_damping[plant.dof[shared]] *= 1 - self.electrical[shared]
+        if not self.creeps:
+            _hold(model, plant)
         self._body(model, plant)
         mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
@@ -307,6 +310,12 @@ class Robot:
             model.geom_adhesion[contacts.geoms] = self.adhesion_n
         if self.tilt.any():
             model.opt.gravity[:] = tilted(plant.model.opt.gravity, self.tilt)
+
+
+def _hold(model: mujoco.MjModel, plant: Plant) -> None:
+    """Let joints that dry friction holds stay where they are, unless the model says itself how far they give way."""
+    given = plant.dof[(model.dof_solimp[plant.dof, :2] == GIVES_WAY).all(axis=1)]
+    model.dof_solimp[given, :2] = HOLDS
 
 
 def _soften(
@@ -352,6 +361,9 @@ def tilted(gravity: Array, tilt: Array) -> Array:
     return out
 
 
+#: least and largest impedance of dry friction: as MuJoCo has it by default, where a joint that should stick creeps (about 20 mrad in a
+#: second under half of what would break it loose), and so stiff that it does not
+GIVES_WAY, HOLDS = (0.9, 0.95), (0.999, 0.999)
 #: kind of a scale or an amount → how each number of a servo that it stands for is read and set
 _NUMBERS = {
     "stiffness": ((read_stiffness, write_stiffness),),

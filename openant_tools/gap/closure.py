@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
-from scipy.stats import t as student
 
 from openant_tools.effects.catalogue import enter
 from openant_tools.effects.effect import Quantity
@@ -29,7 +28,7 @@ from openant_tools.model.plant import Setup
 from openant_tools.model.rollout import Rollouts
 
 __all__ = [
-    "BODY", "TWO_SIDED_95", "Closure", "Refit", "Windows", "adjust", "calibration_of", "closures", "heat_loss_of", "nothing", "unmoved",
+    "BODY", "Closure", "Refit", "Windows", "adjust", "calibration_of", "closures", "heat_loss_of", "nothing", "unmoved",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -63,8 +62,6 @@ TILTS = ("tilt_x", "tilt_y")
 HEAT_LOSS, WARMED_C, LESS = "heat_loss", 2.0, ("stiffness", "torque_limit")
 #: whose calibration it is that belongs to no joint
 BODY = "body"
-#: standard deviations that 95 % lie within
-TWO_SIDED_95 = 1.96
 #: rad, the least that a position is known to
 LEAST_SIGMA_RAD = 2e-4
 
@@ -87,9 +84,9 @@ class Closure:
     """What a hypothesis leaves of the gap on folds that its fit had not seen.
 
     Attributes:
-        after, floor: rad. closed: share of the excess that is gone; low, high: over the folds, 95 %. fitted: the same on what it was
-            fitted to.
-        squares: (2, folds) rad², summed over rows and joints, of the given model and of this one. counts: (folds,) of how many.
+        after, floor: rad. closed: share of the excess that is gone; low, high: over the folds, 95 %.
+        squares: (2, folds, joints) rad², summed over rows, of the given model and of this one; counts: (folds,) of how many errors.
+        fitted: (joints,) rad², mean square of what it leaves of all that it was fitted to.
         refit: on all training runs together.
         std: of the coordinates of its causes, in order: by curvature with errors as large as the fit leaves them, or by how much folds
             differ (jackknife), whichever is more.
@@ -100,7 +97,7 @@ class Closure:
     closed: float
     low: float
     high: float
-    fitted: float
+    fitted: Array
     squares: Array
     counts: Array
     refit: Refit
@@ -111,24 +108,21 @@ class Closure:
         """rad, the gap of the given model."""
         return float(np.sqrt(self.squares[0].sum() / self.counts.sum()))
 
-    def beyond(self, other: Closure) -> tuple[float, float]:
-        """How much more of the excess it closes than another on the same folds, and the standard error of that.
+    def support(self, other: Closure) -> float:
+        """Logarithm of how much less it leaves than another on the same folds, rms, mean of them, summed over joints.
 
-        By the jackknife over folds, widened as Student's t is for so few.
+        Up to a factor that of their likelihoods, where errors of each joint on each fold have a size of their own that nobody knows,
+        but not less than sensors'.
         """
-        n = len(self.counts)
-        whole = self.closed - other.closed
-        if n < 2:
-            return whole, np.inf
-        without = [~(np.arange(n) == f) for f in range(n)]
-        each = np.array([self._share(some) - other._share(some) for some in without])
-        error = float(np.sqrt((n - 1) / n * np.square(each - each.mean()).sum()))
-        return whole, error * float(student.ppf(0.975, n - 1)) / TWO_SIDED_95
+        rows = self.counts[:, None] / self.squares.shape[2]
+        return self._less(other.squares[1] / rows, self.squares[1] / rows) / len(self.counts)
 
-    def _share(self, folds: NDArray[np.bool_]) -> float:
-        total = self.counts[folds].sum()
-        before, after = np.sqrt(self.squares[:, folds].sum(axis=1) / total)
-        return _closed(float(before), float(after), self.floor)
+    def foretold(self, other: Closure) -> float:
+        """The same of what it was fitted to."""
+        return self._less(other.fitted, self.fitted)
+
+    def _less(self, other: Array, own: Array) -> float:
+        return float(0.5 * np.log((other + self.floor**2) / (own + self.floor**2)).sum())
 
 
 @dataclass(frozen=True)
@@ -184,6 +178,7 @@ class _Descent:
         seen: the same where it is now.
         slopes: of each run, weighted, (coordinates, rows). bends: which of them are other ones wherever it comes to.
         counts: of each run, of how many independent errors what it costs is.
+        share: of the way to where its blocks lead that it has gone since.
     """
 
     start: Refit
@@ -197,6 +192,7 @@ class _Descent:
     bends: NDArray[np.bool_]
     counts: Mapping[int, float]
     least: float = np.inf
+    share: float = 1.0
     blocks: dict[int, tuple[float, Array, Array]] = dataclasses.field(default_factory=dict)
     seen: dict[int, tuple[float, Array, Array]] = dataclasses.field(default_factory=dict)
 
@@ -294,9 +290,9 @@ class Windows:
             warm_c: (joints,) °C above the coolest run; default as warm as its servos were then.
         """
         reference = self.protocol.reference
-        robot = Robot(len(self.protocol.joints), reference.low, reference.high)
         if refit is None:
-            return robot
+            return Robot(len(self.protocol.joints), creeps=True)
+        robot = Robot(len(self.protocol.joints), reference.low, reference.high)
         enter(robot, reference, [(p.cause, p.joints, x) for p, x in zip(refit.hypothesis, refit.x, strict=True)])
         for one, u in zip(self.names, refit.nuisance, strict=True):
             if one.name == HEAT_LOSS:
@@ -362,7 +358,9 @@ class Windows:
         out = []
         for one in descents:
             folds = [[k for k in one.blocks if k not in left] for left in leave_out]
-            whole, parts = _from(one.start, one.u), [_from(one.start, self._solve(one, fold)) for fold in folds]
+            # As far as all of them together went.
+            each = [one.at + one.share * (self._solve(one, fold) - one.at) for fold in folds]
+            whole, parts = _from(one.start, one.u), [_from(one.start, u) for u in each]
             out.append((whole, parts, _from(one.start, self._deviations(one, parts)).x))
         return out
 
@@ -395,9 +393,10 @@ class Windows:
             for one in moving:
                 if one.cost > one.least:
                     # Farther than the slopes hold.
+                    one.share /= 2
                     one.u = (one.at + one.u) / 2
                     continue
-                one.at, one.least, one.blocks = one.u, one.cost, dict(one.seen)
+                one.at, one.least, one.blocks, one.share = one.u, one.cost, dict(one.seen), 1.0
                 one.u = self._solve(one, list(one.blocks))
             moving = [one for one in moving if (np.abs(one.u - one.at) > SETTLED * one.scale).any()]
             if not moving:
@@ -524,29 +523,29 @@ def closures(
     """
     fits = windows.refit(starts, training, folds)
     judged = {k for fold in folds for k in fold}
-    each, counts = np.zeros((len(starts) + 1, len(folds))), np.zeros(len(folds))
-    seen, rows = np.zeros(len(starts) + 1), 0
+    joints = windows.measured[0].shape[1]
+    each, counts = np.zeros((len(starts) + 1, len(folds), joints)), np.zeros(len(folds))
+    seen, rows = np.zeros((len(starts), joints)), 0.0
     for k in sorted(judged | set(training)):
         mine = [f for f, fold in enumerate(folds) if k in fold]
         refits = [one for whole, parts, _ in fits for one in (whole, *(parts[f] for f in mine))]
         errors = np.concatenate([windows.before(k)[None], windows.errors(k, refits)])
         good = np.isfinite(errors).all(axis=0)
-        squares = np.square(np.where(good, errors, 0.0)).sum(axis=(1, 2))
-        of = squares[1:].reshape(len(starts), 1 + len(mine))
+        squares = np.square(np.where(good, errors, 0.0)).sum(axis=1)
+        of = squares[1:].reshape(len(starts), 1 + len(mine), joints)
         if k in training:
-            seen, rows = seen + np.array([squares[0], *of[:, 0]]), rows + int(good.sum())
+            seen, rows = seen + of[:, 0], rows + good.sum() / joints
         each[0, mine] += squares[0]
         each[1:, mine] += of[:, 1:]
         counts[mine] += good.sum()
     floor = float(np.sqrt(np.mean(windows.floor**2)))
-    fitted = [_closed(float(np.sqrt(seen[0] / rows)), float(np.sqrt(one / rows)), floor) for one in seen[1:]]
     out = []
     for n, (whole, _, std) in enumerate(fits):
         both = each[[0, n + 1]]
-        before, after = np.sqrt(both.sum(axis=1) / counts.sum())
-        low, high = _interval(both[0], both[1], counts, floor)
+        before, after = np.sqrt(both.sum(axis=(1, 2)) / counts.sum())
+        low, high = _interval(both[0].sum(axis=1), both[1].sum(axis=1), counts, floor)
         closed = _closed(float(before), float(after), floor)
-        out.append(Closure(float(after), floor, closed, low, high, fitted[n], both, counts, whole, std))
+        out.append(Closure(float(after), floor, closed, low, high, seen[n] / rows, both, counts, whole, std))
     return out
 
 

@@ -18,19 +18,19 @@ from openant_tools.effects.catalogue import catalogue
 from openant_tools.errors import BadInput
 from openant_tools.gap.assess import Assessment, assess
 from openant_tools.gap.decide import Row, adds, decide
-from openant_tools.gap.diagnosis import UNEXPLAINED, Diagnosis
+from openant_tools.gap.diagnosis import AMBIGUOUS, UNEXPLAINED, Diagnosis
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.finding import Given, finding
 from openant_tools.gap.trials import Trials
 from openant_tools.recording.run import Run
 from openant_tools.sysid.identify import joints_in_common
 
-__all__ = ["diagnose", "prepare"]
+__all__ = ["diagnose", "hypotheses", "prepare"]
 
 Progress = Callable[[float, str], None]
 
-#: causes that are fitted: as likely as this; of a robot of so many joints one, but not fewer or more at once
-SUSPECT, JOINTS, FEWEST, MOST = 0.03, 24, 3, 8
+#: causes that are fitted by themselves, the likeliest by the evidence; and beside what is chosen
+SUSPECTS, BESIDE = 8, 3
 #: causes of one improved model
 CAUSES = 3
 #: what a builder's word is worth who expects a cause: odds, to one
@@ -65,35 +65,39 @@ def diagnose(
     # In whatever order runs are named, the same robots are simulated for them.
     experiment = Experiment.of(sorted(runs, key=_content), model, wanted, sorted(hold_out, key=_content))
     tell(0.02, str(experiment.selection))
-    assessment = assess(experiment.protocol, lambda share, words: tell(0.02 + 0.58 * share, words))
-    leads = _expected(assessment, prior)
-    ranked = sorted(leads, key=lambda name: -leads[name])
-    count = min(max(JOINTS // len(wanted), FEWEST), MOST)
-    suspects = [name for name in ranked if leads[name] > SUSPECT][:count]
-    suspects += [name for name in prior if name in leads and name not in suspects]
-    tell(0.6, "what the likeliest causes close on held-out parts")
-    trials = Trials.of(experiment, assessment)
-    trials.fit([(), *((name,) for name in suspects)])
-    rows = [Row((), probability=assessment.none), *(trials.row((name,), leads[name]) for name in ranked)]
+    trials, rows = hypotheses(experiment, prior, lambda share, words: tell(0.02 + 0.73 * share, words))
+    assessment = trials.assessment
     decision = decide(rows, assessment.outside)
-    if decision.verdict == UNEXPLAINED and suspects:
+    if decision.verdict == UNEXPLAINED:
         # What no cause explains by itself two may.
         tell(0.75, "what two causes close together")
-        first = max(suspects, key=lambda name: trials.closures[name,].closed)
-        trials.fit(pairs := _beside(assessment, (first,), count))
+        (first,) = max((causes for causes in trials.closures if causes), key=lambda one: trials.closures[one].closed)
+        trials.fit(pairs := _beside(assessment, (first,)))
         likely = [assessment.present[first] * assessment.present[causes[-1]] for causes in pairs]
         both = [trials.whole(causes, chance) for causes, chance in zip(pairs, likely, strict=True)]
         decision = decide([*rows, *both], assessment.outside)
     chosen = tuple(name for row in decision.selected for name in row.causes)
-    while chosen in trials.closures and 0 < len(chosen) < CAUSES:
+    while decision.verdict != AMBIGUOUS and chosen in trials.closures and 0 < len(chosen) < CAUSES:
         tell(0.8 + 0.05 * len(chosen), f"what acts beside {' and '.join(chosen)}")
-        trials.fit(further := _beside(assessment, chosen, count))
+        trials.fit(further := _beside(assessment, chosen))
         more = adds([trials.row(causes, assessment.present[causes[-1]]) for causes in further])
         if more is None:
             break
         chosen = more.causes
     tell(1.0, "decision")
     return finding(trials, Given(model, tuple(runs), tuple(hold_out), tuple(prior)), rows, decision, chosen)
+
+
+def hypotheses(experiment: Experiment, prior: Sequence[str], progress: Progress) -> tuple[Trials, list[Row]]:
+    """What is decided on: no cause, and each by itself, the likeliest of them fitted."""
+    assessment = assess(experiment.protocol, lambda share, words: progress(0.8 * share, words))
+    leads = _expected(assessment, prior)
+    ranked = sorted(leads, key=lambda name: -leads[name])
+    suspects = ranked[:SUSPECTS] + [name for name in prior if name in ranked[SUSPECTS:]]
+    progress(0.8, "what the likeliest causes close on held-out parts")
+    trials = Trials.of(experiment, assessment)
+    trials.fit([(), *((name,) for name in suspects)])
+    return trials, [Row((), probability=assessment.none), *(trials.row((name,), leads[name]) for name in ranked)]
 
 
 def prepare(
@@ -108,10 +112,10 @@ def prepare(
     return assess(experiment.protocol, progress or (lambda share, words: None)).robots
 
 
-def _beside(assessment: Assessment, chosen: tuple[str, ...], count: int) -> list[tuple[str, ...]]:
+def _beside(assessment: Assessment, chosen: tuple[str, ...]) -> list[tuple[str, ...]]:
     """What is chosen with one cause more, the likeliest ones."""
     present = sorted(assessment.present, key=lambda name: -assessment.present[name])
-    return [(*chosen, name) for name in present if name not in chosen][:count]
+    return [(*chosen, name) for name in present if name not in chosen][:BESIDE]
 
 
 def _expected(assessment: Assessment, prior: Sequence[str]) -> dict[str, float]:

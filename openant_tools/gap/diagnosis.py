@@ -69,6 +69,7 @@ class Diagnosis:
         refuted: effect → what signature speaks against it, in words.
         notes: what it rests on, and what more signals would add.
         sensors: what was found about signals, and whether they had a part in the verdict.
+        rows: what was decided on, see `gap.decide.Row`; "outside" among them has no row of its own but its probability.
     """
 
     model: str
@@ -88,6 +89,7 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     rest: Mapping[str, Any] = field(default_factory=dict)
     sensors: Sequence[Mapping[str, Any]] = ()
+    rows: Sequence[Mapping[str, Any]] = ()
 
     def as_json(self) -> dict[str, Any]:
         """As formats, section 2, has it; what is ours alone comes after."""
@@ -126,6 +128,7 @@ class Diagnosis:
             "rest": dict(self.rest),
             "refuted": dict(self.refuted),
             "notes": list(self.notes),
+            "rows": [dict(row) for row in self.rows],
         }
 
 
@@ -166,6 +169,7 @@ def read_diagnosis(path: Path) -> Diagnosis:
             next_experiment=text["next_experiment"], gap=text["gap"], where=text["where"],
             calibration=text.get("calibration", {}), removal=text.get("removal", {}), notes=tuple(text.get("notes", ())),
             rest=text.get("rest", {}), sensors=tuple(text.get("sensors", ())), refuted=text.get("refuted", {}),
+            rows=tuple(text.get("rows", ())),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise BadInput(

@@ -11,8 +11,8 @@ import numpy as np
 
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.effect import Scope
-from openant_tools.gap.closure import TWO_SIDED_95, Closure, calibration_of, heat_loss_of
-from openant_tools.gap.decide import Decision, Row
+from openant_tools.gap.closure import Closure, calibration_of, heat_loss_of
+from openant_tools.gap.decide import OUTSIDE, Decision, Row
 from openant_tools.gap.diagnosis import Diagnosis, Found, Span
 from openant_tools.gap.measure import measure
 from openant_tools.gap.next import suggestion
@@ -20,6 +20,7 @@ from openant_tools.gap.residual import residual_after
 from openant_tools.gap.trials import Trials
 from openant_tools.gap.velocity_delay import velocity_delay
 from openant_tools.recording.run import Run
+from openant_tools.sysid.intervals import TWO_SIDED_95
 
 __all__ = ["Given", "finding"]
 
@@ -91,7 +92,18 @@ def finding(
         notes=tuple(notes),
         rest={} if rest is None else rest.as_json(),
         sensors=_sensors(trials, given),
+        rows=_rows(trials, rows),
     )
+
+
+def _rows(trials: Trials, rows: Sequence[Row]) -> tuple[dict[str, Any], ...]:
+    """What was decided on, so that it can be decided anew and weights be learned from it."""
+    outside = {"causes": [OUTSIDE], "probability": trials.assessment.outside, "support": None, "foretold": 0.0}
+    every = [
+        {"causes": list(row.causes), "probability": row.probability, "support": row.support, "foretold": row.foretold}
+        for row in rows
+    ]
+    return outside, *every
 
 
 def _rank(one: Found, rows: Sequence[Row], chosen: Sequence[str]) -> float:
@@ -103,7 +115,7 @@ def _rank(one: Found, rows: Sequence[Row], chosen: Sequence[str]) -> float:
 
 def _why_not(row: Row, plain: Closure) -> str:
     assert row.gain is not None
-    words = "closes no more" if row.gain <= row.error else f"closes {100 * row.gain:.0f} % more"
+    words = "closes no more" if row.gain < 0.005 else f"closes {100 * row.gain:.0f} % more"
     return f"on held-out data it {words} than a re-fit within tolerance, which closes {100 * plain.closed:.0f} %"
 
 

@@ -236,7 +236,7 @@ def worst(found: Diagnosis, runs: Sequence[Run], model: Path) -> MatplotlibFigur
     for run, plant in zip(runs, plants_of(runs, model, joints), strict=True):
         improved = robot_of(plant, selected, found.calibration)
         # Each is led by itself to where a window begins.
-        leads = (Robot(len(joints)), None), (improved, improved.model(plant))
+        leads = (Robot(len(joints), creeps=True), None), (improved, improved.model(plant))
         both = np.concatenate(
             [
                 simulate(Rollouts(plant, [run], HORIZON_S, leader=leader), [robot], signals=["pos"]).signals["pos"]

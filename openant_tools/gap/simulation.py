@@ -15,7 +15,6 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from openant_tools.effects.robot import Cable, Form, Robot, tilted
 from openant_tools.effects.rollout import laws_of
@@ -143,6 +142,7 @@ class _Batch:
         self._take_forms()
         state = np.repeat([segment.state for segment in self._segments], self._n, axis=0)
         state[:, 1 + plant.qpos] += np.tile(np.array([robot.start for robot in robots]), (copies, 1)) - self._zero
+        self._look_ahead(state)
         if misread:
             self._misread(state)
         self._batch.state[:] = state
@@ -151,6 +151,19 @@ class _Batch:
         self._led = round(LED_S / plant.timestep) if hidden else 0
         warm = np.zeros((len(rollouts.runs), len(plant.joints))) if warm_c is None else np.array(warm_c)
         self._laws = self._make_laws(warm[[segment.run for segment in self._segments]][:, None])
+
+    def _look_ahead(self, state: Array) -> None:
+        """Move where simulations begin, in place, to where joints were whose encoders are late: what these say comes later."""
+        late = np.array([robot.log_delay.get("pos", 0.0) for robot in self._robots])
+        (some,) = np.nonzero(late >= self._plant.timestep)
+        speed, around = 1 + self._plant.model.nq, VELOCITY_SPAN_S / 2 * np.array([-1.0, 0.0, 1.0])
+        for s, segment in enumerate(self._segments if len(some) else ()):
+            measured, rows = self._rollouts.measured[segment.run], s * self._n + some[:, None]
+            now = measured.at(segment.start + around)[0][:, None]
+            then = measured.at((segment.start + around[:, None] + late[some]).ravel())[0]
+            moved = then.reshape(len(around), len(some), -1) - now
+            state[rows, 1 + self._plant.qpos] += moved[1]
+            state[rows, speed + self._plant.dof] += (moved[2] - moved[0]) / VELOCITY_SPAN_S
 
     def _misread(self, state: Array) -> None:
         """Move where simulations begin, in place, by what each robot's sensors make of it."""
@@ -423,8 +436,12 @@ class _Batch:
                 k = s * self._n + r
                 for name, values in out.items():
                     late = sum(robot.log_delay.get(group, 0.0) for group in LATE_WITH.get(name, (name,)))
-                    when = np.clip(at - late / h, 0.0, steps)
-                    values[r, segment.row] = states.at(name, k, when, steps, robot)
+                    when = at - late / h
+                    found = states.at(name, k, np.clip(when, 0.0, steps), steps, robot)
+                    if name == "pos" and late >= h and (before := when < 0).any():
+                        # Where joints were before the start is in the log.
+                        found[before] = self._rollouts.measured[segment.run].at(segment.start + at[before] * h)[0]
+                    values[r, segment.row] = found
 
 
 class _States:
@@ -520,6 +537,8 @@ def _without(values: Array, lost: NDArray[np.bool_]) -> Array:
 
 def _filtered(values: Array, ratio: float) -> Array:
     """First-order lag, exact for a piecewise constant input, from rest at the first value."""
+    from scipy.signal import lfilter  # a second to load
+
     keep = float(np.exp(-ratio))
     out, _ = lfilter([1 - keep], [1, -keep], values, zi=[keep * values[0]])
     filtered: Array = out

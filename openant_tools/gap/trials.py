@@ -50,21 +50,14 @@ class Trials:
         # What joints' positions hardly show, or no simulation repeats, held-out positions do not tell.
         if one is None or other is None or effect.random or effect.unseen_in_joints:
             return Row(causes, places, probability)
-        gain, error = one.beyond(other)
-        # Who leads should close as much as anything that was fitted did there; who comes beside, as much as it did itself.
-        expected = self._most() if len(causes) == 1 else one.fitted - other.fitted
-        return Row(causes, places, probability, gain, error, max(expected, 0.0))
+        return Row(causes, places, probability, *_beyond(one, other))
 
     def whole(self, causes: Causes, probability: float) -> Row:
         """What is known of causes together, that which does more of it first."""
-        gain, error = self.closures[causes].beyond(self.closures[()])
         first = max(causes, key=lambda name: self.closures[name,].closed if (name,) in self.closures else -np.inf)
         ordered = (first, *(name for name in causes if name != first))
-        return Row(ordered, tuple(map(self.assessment.place, ordered)), probability, gain, error, self._most())
-
-    def _most(self) -> float:
-        """The most that anything closed where it was fitted, beyond a re-fit within tolerance."""
-        return max(one.fitted for one in self.closures.values()) - self.closures[()].fitted
+        beyond = _beyond(self.closures[causes], self.closures[()])
+        return Row(ordered, tuple(map(self.assessment.place, ordered)), probability, *beyond)
 
     def removal(self, causes: Causes) -> dict[str, float]:
         """Of causes together, what closes less without each, the most first; of those that were tried without it."""
@@ -96,3 +89,8 @@ class Trials:
         if before is None:
             return unmoved(self.windows, parts, [self.size(name) for name in causes])
         return Refit(tuple(parts), (*before.refit.x, self.size(causes[-1])), before.refit.nuisance)
+
+
+def _beyond(one: Closure, other: Closure) -> tuple[float, float, float]:
+    """What a row says of held-out data, and of the data that were fitted."""
+    return one.support(other), one.foretold(other), one.closed - other.closed

@@ -20,7 +20,13 @@ def sentence(found: Diagnosis) -> str:
     if found.verdict == AMBIGUOUS:
         sets = "; ".join(" or ".join(group) for group in found.ambiguous_with)
         candidates = sets or " or ".join(one.effect for one in found.effects[:2])
-        return f"The gap is real, but these runs cannot tell its causes apart: {candidates} ({sure})."
+        words = f"The gap is real, but these runs cannot tell its causes apart: {candidates} ({sure})."
+        share = 100 * closed(found)
+        return (
+            f"{words} With {found.selected[0]} {share:.0f} % of it closes on held-out runs."
+            if found.selected
+            else words
+        )
     if found.verdict == UNEXPLAINED:
         best = _closest(found)
         closest = "" if best is None else f"; closest is {best.effect}" + (

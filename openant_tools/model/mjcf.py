@@ -301,6 +301,8 @@ def _write_joint(element: etree._Element, plant: Plant, variant: mujoco.MjModel,
         element.set("armature", number(variant.dof_armature[dof]))
     if _differ(given.dof_frictionloss[dof], variant.dof_frictionloss[dof]):
         element.set("frictionloss", number(variant.dof_frictionloss[dof]))
+    if (given.dof_solimp[dof] != variant.dof_solimp[dof]).any():
+        element.set("solimpfriction", numbers(variant.dof_solimp[dof]))
     if _differ(given.qpos0[adr], variant.qpos0[adr]):
         element.set("ref", number(variant.qpos0[adr] * scale))
         if given.jnt_limited[joint]:
@@ -537,6 +539,7 @@ def _check(out: Path, plant: Plant, variant: mujoco.MjModel) -> None:
             (written.model.dof_damping[written.dof[j]], variant.dof_damping[dof]),
             (written.model.dof_armature[written.dof[j]], variant.dof_armature[dof]),
             (written.model.dof_frictionloss[written.dof[j]], variant.dof_frictionloss[dof]),
+            (written.model.dof_solimp[written.dof[j]], variant.dof_solimp[dof]),
             (written.model.qpos0[written.qpos[j]], variant.qpos0[adr]),
         ]
         for got, wanted in pairs:

@@ -148,7 +148,7 @@ def test_one_file_adds_an_effect_to_the_diagnosis_the_environment_and_what_to_do
     given, diagnosed = simulate(rollouts, [Robot(1), robot], signals=["pos"]).signals["pos"]
     assert np.abs(diagnosed - given).max() > 1e-3
     values = values_of(entries_of(robot.laws, plant.joints), plant.joints)
-    (played,) = rollout(rollouts, [plant.model], [values]).pos
+    (played,) = rollout(rollouts, [robot.model(plant)], [values]).pos
     assert played == pytest.approx(diagnosed, abs=1e-4)
     told = action("coulomb_friction", rubbing_cable)
     assert told is not None

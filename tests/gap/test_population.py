@@ -50,10 +50,23 @@ MODEL = nominal_model_path()
 def test_a_robot_as_the_model_says_moves_as_its_rollout(setup: Setup) -> None:
     plant = load_plant(MODEL, JOINT_NAMES, setup)
     rollouts = Rollouts(plant, [commanded(str(setup), 1.0)])
-    found = simulate(rollouts, [Robot(8)]).signals
+    found = simulate(rollouts, [Robot(8, creeps=True)]).signals
     assert np.allclose(found["pos"][0], rollouts().pos[0], atol=1e-5)
     assert np.allclose(found["vel"][0], rollouts().vel[0], atol=1e-4)
     assert set(found) == {"pos", "vel", "torque", "volt", *(COLUMNS if setup is Setup.FLOOR else ())}
+
+
+def test_a_joint_that_dry_friction_holds_stays_where_it_is() -> None:
+    """Under less than what would break it loose a joint of MuJoCo creeps by default; a gear does not."""
+    plant = load_plant(MODEL, JOINT_NAMES, Setup.STAND)
+    run = commanded("stand", 1.0)
+    still = {name: np.full_like(run.t, 0.05) if name.startswith("cmd.") else 0 * run.t for name in run.columns}
+    rollouts = Rollouts(plant, [dataclasses.replace(run, columns=still)])
+    robots = [Robot(8, creeps=True), Robot(8)]
+    for robot in robots:
+        robot.more("coulomb_friction")[:] = 1.5
+    creeping, held = np.abs(simulate(rollouts, robots, signals=["pos"]).signals["pos"]).max(axis=(1, 2))
+    assert held < 1e-3 < creeping
 
 
 def test_commands_that_come_by_chance_come_so_to_no_other_robot() -> None:

@@ -397,9 +397,9 @@ def test_rollouts_of_windows_begin_at_their_first_complete_rows_and_leave_out_th
     assert gap(run.signal("pos"), simulated[:, None]) < 2e-3
     assert np.isfinite(rollouts.thinned(2)().pos).sum() < inside.sum()
     assert np.abs(rollouts.finer(2)().pos[0, :, 0] - simulated)[inside].max() < 4e-3
-    robot = Robot(1)
+    robot = Robot(1, creeps=True)
     robot.play[:] = 0.02
-    log = simulate(rollouts, [Robot(1), robot], signals=["pos"]).signals["pos"]
+    log = simulate(rollouts, [Robot(1, creeps=True), robot], signals=["pos"]).signals["pos"]
     assert np.abs(log[0, inside, 0] - simulated[inside]).max() < 1e-4
     assert np.isfinite(log[1, inside]).all()
     with pytest.raises(ValueError, match="overlaps"):

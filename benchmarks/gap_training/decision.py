@@ -1,0 +1,125 @@
+"""Learn how the decision weighs evidence against held-out data, from robots that were diagnosed and whose answers are open.
+
+    openant gap blind make --out SET --seed 1 --open …; openant gap blind run SET
+    python -m benchmarks.gap_training.decision SET… [--out openant_tools/gap]
+
+What a diagnosis decided on stands in its JSON (`rows`), so that nothing is simulated here. Sets of several makers are named together:
+each counts as much as any other, and figures are of each by the weights that the others alone teach.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from openant_tools.files import json_text, read_toml, write_text
+from openant_tools.gap.decide import FILE, OUTSIDE, WEIGHTS, Row, chances
+from openant_tools.gap.diagnosis import NONE
+
+#: where weights begin: evidence as it is, held-out data as a few independent errors a fold; and how far from there costs as much as one
+#: robot's surprise
+START = {"evidence": 1.0, "support": 1.0, "shortfall": 0.3, "none": 0.0, "outside": 0.0, "outside: support": 0.0}
+FAR = 1.0
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What was decided on of one robot, and what is right to say of it."""
+
+    rows: tuple[Row, ...]
+    outside: float
+    right: frozenset[str]
+    ill: bool
+
+
+def judged(folder: Path) -> list[Judged]:
+    """The robots of a set that were diagnosed."""
+    return [
+        robot(json.loads(path.read_text()), read_toml(folder / path.stem / "truth.toml"))
+        for path in sorted((folder / "verdicts").glob("*.json"))
+    ]
+
+
+def robot(found: Mapping[str, object], truth: Mapping[str, object]) -> Judged:
+    rows, outside = [], 0.0
+    for row in found["rows"]:
+        if row["causes"] == [OUTSIDE]:
+            outside = row["probability"]
+            continue
+        rows.append(Row(tuple(row["causes"]), (), row["probability"], row["support"], row["foretold"]))
+    effects = truth.get("effect", [])
+    right = {one["effect"] for one in effects}
+    # What is hardly beyond tolerance need not be found.
+    if not right:
+        right = {OUTSIDE if truth.get("outside") else NONE}
+    elif all(one["size"] == "small" for one in effects):
+        right |= {NONE}
+    return Judged(tuple(rows), outside, frozenset(right), bool(effects))
+
+
+def learned(sets: Sequence[Sequence[Judged]]) -> dict[str, float]:
+    """The weights under which what is right surprises least."""
+    start = np.array([START[name] for name in WEIGHTS])
+
+    def surprise(w: NDArray[np.float64]) -> float:
+        named = dict(zip(WEIGHTS, w, strict=True))
+        size = max(map(len, sets))
+        return float(np.square((w - start) / FAR).sum()) + sum(
+            size / len(some) * float(np.mean([_surprise(one, named) for one in some])) * len(some) for some in sets
+        )
+
+    bounds = [(0.0, None) if name in ("evidence", "support", "shortfall") else (None, None) for name in WEIGHTS]
+    return dict(zip(WEIGHTS, minimize(surprise, start, bounds=bounds).x.tolist(), strict=True))
+
+
+def _surprise(one: Judged, weights: Mapping[str, float]) -> float:
+    p = chances(one.rows, one.outside, weights)
+    return -float(np.log(max(sum(p.get(name, 0.0) for name in one.right), 1e-6)))
+
+
+def figures(some: Sequence[Judged], weights: Mapping[str, float]) -> dict[str, str]:
+    """Shares: first among causes, among the first two, likeliest of all (of ill ones, healthy ones, outsiders), and mean surprise."""
+    first, two, ill, healthy, outsiders = [], [], [], [], []
+    for one in some:
+        p = chances(one.rows, one.outside, weights)
+        order = sorted((name for name in p if name not in (NONE, OUTSIDE)), key=lambda name: -p[name])
+        likeliest = max(p, key=lambda name: p[name]) in one.right
+        if one.ill:
+            first.append(order[0] in one.right)
+            two.append(bool(set(order[:2]) & one.right))
+            ill.append(likeliest)
+        elif NONE in one.right:
+            healthy.append(likeliest)
+        else:
+            outsiders.append(likeliest)
+    parts = {"first": first, "first two": two, "ill": ill, "healthy": healthy, "outside": outsiders}
+    surprise = np.mean([_surprise(one, weights) for one in some])
+    return {name: f"{sum(of)} of {len(of)}" for name, of in parts.items()} | {"surprise": f"{surprise:.2f}"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sets", type=Path, nargs="+")
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    sets = [judged(folder) for folder in options.sets]
+    for n, folder in enumerate(options.sets):
+        if others := [some for k, some in enumerate(sets) if k != n]:
+            print(folder.name, "by the others:", figures(sets[n], learned(others)))
+    weights = learned(sets)
+    print({name: round(value, 3) for name, value in weights.items()})
+    for folder, some in zip(options.sets, sets, strict=True):
+        print(folder.name, "by all:", figures(some, weights))
+    if options.out:
+        write_text(options.out / FILE, json_text(weights))
+
+
+if __name__ == "__main__":
+    main()
