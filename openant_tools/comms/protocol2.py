@@ -40,7 +40,6 @@ __all__ = [
     "crc16",
     "encode_joined",
     "factory_reset",
-    "fast_bulk_read",
     "fast_sync_read",
     "ping",
     "read",
@@ -463,10 +462,6 @@ class SyncWriteTemplate:
 def bulk_read(items: Sequence[tuple[int, int, int]]) -> Instruction:
     """`items` of (id, address, bytes), an ID once."""
     return Instruction(BROADCAST, Inst.BULK_READ, b"".join(struct.pack("<BHH", *item) for item in items))
-
-
-def fast_bulk_read(items: Sequence[tuple[int, int, int]]) -> Instruction:
-    return Instruction(BROADCAST, Inst.FAST_BULK_READ, b"".join(struct.pack("<BHH", *item) for item in items))
 
 
 def bulk_write(items: Sequence[tuple[int, int, bytes]]) -> Instruction:

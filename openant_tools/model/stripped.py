@@ -18,7 +18,7 @@ __all__ = ["strip_colliding", "strip_visual"]
 
 #: m; what is left of a geom that is only drawn
 POINT_M = 1e-4
-_MESH, _HFIELD = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD
+_MESH = mujoco.mjtGeom.mjGEOM_MESH
 _FROM_GEOMS, _WHERE_UNSTATED = (
     mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE,
     mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO,

@@ -49,7 +49,6 @@ CAUSES: Mapping[str, Mapping[str, Any]] = {
     "camera_stalled": {},
 }
 
-_QUANTITIES = ("_s", "_v", "_rad", "_ohm", "fraction", "byte_error", "volts", "_c", "flicker")
 _NEEDS_WHERE = frozenset(
     {"broken_wire", "bad_servo", "bad_cable", "duplicate_id", "overheated", "encoder_error"}
 )  # fmt: skip
