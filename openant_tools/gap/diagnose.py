@@ -30,7 +30,7 @@ __all__ = ["diagnose", "hypotheses", "prepare"]
 Progress = Callable[[float, str], None]
 
 #: causes that are fitted by themselves, the likeliest by the evidence; and beside what is chosen
-SUSPECTS, BESIDE = 8, 3
+SUSPECTS, BESIDE = 5, 3
 #: causes of one improved model
 CAUSES = 3
 #: what a builder's word is worth who expects a cause: odds, to one
