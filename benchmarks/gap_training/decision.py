@@ -70,10 +70,8 @@ def learned(sets: Sequence[Sequence[Judged]]) -> dict[str, float]:
 
     def surprise(w: NDArray[np.float64]) -> float:
         named = dict(zip(WEIGHTS, w, strict=True))
-        size = max(map(len, sets))
-        return float(np.square((w - start) / FAR).sum()) + sum(
-            size / len(some) * float(np.mean([_surprise(one, named) for one in some])) * len(some) for some in sets
-        )
+        each = [float(np.mean([_surprise(one, named) for one in some])) for some in sets]
+        return float(np.square((w - start) / FAR).sum()) + max(map(len, sets)) * sum(each)
 
     bounds = [(0.0, None) if name in ("evidence", "support", "shortfall") else (None, None) for name in WEIGHTS]
     return dict(zip(WEIGHTS, minimize(surprise, start, bounds=bounds).x.tolist(), strict=True))

@@ -361,8 +361,8 @@ def tilted(gravity: Array, tilt: Array) -> Array:
     return out
 
 
-#: least and largest impedance of dry friction: as MuJoCo has it by default, where a joint that should stick creeps (about 20 mrad in a
-#: second under half of what would break it loose), and so stiff that it does not
+#: least and largest impedance of dry friction: as MuJoCo has it by default, where a joint that should stick creeps (at its least d and
+#: solref 0.02 s by a (1 − d)/d / (2/(0.95 · 0.02 s)) = a/950 rad/s, of the acceleration a that it would have), and so stiff that it does not
 GIVES_WAY, HOLDS = (0.9, 0.95), (0.999, 0.999)
 #: kind of a scale or an amount → how each number of a servo that it stands for is read and set
 _NUMBERS = {

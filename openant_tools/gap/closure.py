@@ -114,7 +114,7 @@ class Closure:
         Up to a factor that of their likelihoods, where errors of each joint on each fold have a size of their own that nobody knows,
         but not less than sensors'.
         """
-        rows = self.counts[:, None] / self.squares.shape[2]
+        rows = np.maximum(self.counts[:, None] / self.squares.shape[2], 1.0)  # of a fold without any nothing is left
         return self._less(other.squares[1] / rows, self.squares[1] / rows) / len(self.counts)
 
     def foretold(self, other: Closure) -> float:
@@ -122,7 +122,8 @@ class Closure:
         return self._less(other.fitted, self.fitted)
 
     def _less(self, other: Array, own: Array) -> float:
-        return float(0.5 * np.log((other + self.floor**2) / (own + self.floor**2)).sum())
+        known = max(self.floor, LEAST_SIGMA_RAD) ** 2
+        return float(0.5 * np.log((other + known) / (own + known)).sum())
 
 
 @dataclass(frozen=True)

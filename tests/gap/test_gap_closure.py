@@ -17,7 +17,7 @@ from plants import BENCH, ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, wr
 import openant_tools.gap.closure as closure
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.robot import Robot
-from openant_tools.gap.closure import Refit, Windows, calibration_of, closures, heat_loss_of, nothing
+from openant_tools.gap.closure import Closure, Refit, Windows, calibration_of, closures, heat_loss_of, nothing
 from openant_tools.gap.hypothesis import Part
 from openant_tools.gap.protocol import Played, Protocol
 from openant_tools.gap.simulation import Log, simulate
@@ -104,6 +104,16 @@ def test_a_cause_that_is_not_there_ends_at_nothing_and_not_beyond(name: str, tmp
     assert 0 <= found.refit.x[0][size] < start[size]
     assert found.support(plain) < 0.2, "held-out data do not speak for it"
     assert np.isfinite([found.before, found.floor, found.after, found.low, found.high, found.foretold(plain)]).all()
+
+
+def test_what_leaves_nothing_at_all_and_a_fold_without_rows_say_nothing() -> None:
+    """Of a log without noise: no sensor has a floor there."""
+    none = Closure(
+        0, 0, 1, 1, 1, np.zeros(1), np.zeros((2, 2, 1)), np.array([0.0, 50.0]), Refit((), (), np.zeros(0)), ()
+    )
+    some = dataclasses.replace(none, squares=np.array([[[0.0], [0.5]], [[0.0], [0.5]]]))
+    assert none.support(none) == none.foretold(none) == 0.0
+    assert 0 < none.support(some) == -some.support(none) < 10
 
 
 def test_a_simulation_that_falls_apart_is_wrong_and_not_unknown(
