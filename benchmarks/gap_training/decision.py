@@ -4,7 +4,8 @@
     python -m benchmarks.gap_training.decision SET… [--out openant_tools/gap]
 
 What a diagnosis decided on stands in its JSON (`rows`), so that nothing is simulated here. Sets of several makers are named together:
-each counts as much as any other, and figures are of each by the weights that the others alone teach.
+each counts as much as any other, and figures are of each by the weights that the others alone teach, with held-out data and, as an
+ablation, by the evidence alone.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from openant_tools.gap.diagnosis import NONE
 #: robot's surprise
 START = {"evidence": 1.0, "support": 1.0, "shortfall": 0.3, "none": 0.0, "outside": 0.0, "outside: support": 0.0}
 FAR = 1.0
+#: the weights of what held-out data say
+HELD_OUT = ("support", "shortfall", "outside: support")
 
 
 @dataclass(frozen=True)
@@ -64,8 +67,8 @@ def robot(found: Mapping[str, object], truth: Mapping[str, object]) -> Judged:
     return Judged(tuple(rows), outside, frozenset(right), bool(effects))
 
 
-def learned(sets: Sequence[Sequence[Judged]]) -> dict[str, float]:
-    """The weights under which what is right surprises least."""
+def learned(sets: Sequence[Sequence[Judged]], *, held_out: bool = True) -> dict[str, float]:
+    """The weights under which what is right surprises least; without `held_out` what was not fitted is nothing to them."""
     start = np.array([START[name] for name in WEIGHTS])
 
     def surprise(w: NDArray[np.float64]) -> float:
@@ -74,6 +77,9 @@ def learned(sets: Sequence[Sequence[Judged]]) -> dict[str, float]:
         return float(np.square((w - start) / FAR).sum()) + max(map(len, sets)) * sum(each)
 
     bounds = [(0.0, None) if name in ("evidence", "support", "shortfall") else (None, None) for name in WEIGHTS]
+    if not held_out:
+        start = np.where([name in HELD_OUT for name in WEIGHTS], 0.0, start)
+        bounds = [(0.0, 0.0) if name in HELD_OUT else bound for name, bound in zip(WEIGHTS, bounds, strict=True)]
     return dict(zip(WEIGHTS, minimize(surprise, start, bounds=bounds).x.tolist(), strict=True))
 
 
@@ -111,6 +117,7 @@ def main() -> None:
     for n, folder in enumerate(options.sets):
         if others := [some for k, some in enumerate(sets) if k != n]:
             print(folder.name, "by the others:", figures(sets[n], learned(others)))
+            print(folder.name, "the same, evidence alone:", figures(sets[n], learned(others, held_out=False)))
     weights = learned(sets)
     print({name: round(value, 3) for name, value in weights.items()})
     for folder, some in zip(options.sets, sets, strict=True):

@@ -2,7 +2,7 @@
 
 A choice asks no simulation. Each window is a vector of what its joints do: angles, speeds, steps, reversals, how far they stay behind.
 The next one chosen is always that which adds most to the logarithm of the determinant of what all of them show together (a D-optimal
-design, greedily), so that rich windows that are unlike each other win. Each fold has its share of the time.
+design, greedily), so that rich windows that are unlike each other win. Each fold has one, and its share of the time.
 """
 
 from __future__ import annotations
@@ -99,6 +99,9 @@ def select(
     if sum(piece.seconds for piece in pieces) > at_most_s:
         shown = {k: _Shown(runs[k], plants[k]) for k, _ in parts}
         what = np.array([shown[piece.run].window(piece.start, piece.stop) for piece in pieces])
+        # What the same motion tells on a floor is another matter than on a stand.
+        floor = np.array([plants[piece.run].setup is Setup.FLOOR for piece in pieces])[:, None]
+        what = np.hstack([np.where(floor, 0.0, what), np.where(floor, what, 0.0)])
         pieces = _most_telling(pieces, what, at_most_s)
     # A fold of which nothing is simulated cannot be held out.
     there = sorted({piece.fold for piece in pieces})
@@ -150,10 +153,11 @@ def _most_telling(pieces: Sequence[_Piece], what: Array, at_most_s: float) -> li
     spent, inverse = np.zeros(len(share)), np.eye(what.shape[1])
     left, follows = np.ones(len(pieces), bool), np.zeros(len(pieces), bool)
     while True:
-        fits = left & (spent[fold] + seconds <= share[fold] + SLACK_S)
-        if not fits.any():  # of each fold's share less than a window is over: together that may be one
-            fits = left & (spent.sum() + seconds <= at_most_s + SLACK_S)
-        if not fits.any():
+        # One of each fold first, however short its share is; and where of each share less than a window is over, together that may be one.
+        inside = left & (spent.sum() + seconds <= at_most_s + SLACK_S)
+        steps = inside & (spent[fold] == 0), inside & (spent[fold] + seconds <= share[fold] + SLACK_S), inside
+        fits = next((some for some in steps if some.any()), None)
+        if fits is None:
             return [piece for piece, here in zip(pieces, left, strict=True) if not here]
         gain = np.log1p(np.einsum("wi,ij,wj->w", what, inverse, what)) * np.where(follows, FOLLOWS, 1.0)
         best = int(np.argmax(np.where(fits, np.round(gain, DIGITS), -np.inf)))

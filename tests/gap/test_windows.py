@@ -351,6 +351,17 @@ def test_windows_lie_in_what_can_be_simulated_and_take_no_more_time_than_they_ma
         assert stop - start <= max(1.3 * length_s, 0.5)
 
 
+def test_a_few_runs_on_the_floor_beside_many_on_a_stand_are_looked_at(floor: Plant, stand: Plant, walked: Run) -> None:
+    """Windows of a floor are longer than what each of so many runs may use; what pulls at the body shows there alone."""
+    on_stand = replace(walked, facts=replace(walked.facts, setup="stand"))
+    runs = [replace(on_stand if k % 2 else walked, name=f"run-{k}") for k in range(8)]
+    found = select(runs, [stand if k % 2 else floor for k in range(8)])
+    assert all(found.windows)
+    seconds = [sum(stop - start for start, stop in own) for own in found.windows]
+    assert sum(seconds[::2]) > sum(seconds[1::2])
+    assert sum(seconds) <= AT_MOST_S + 1e-6
+
+
 def test_the_windows_of_a_long_run_are_those_in_which_something_happens(pendulum: Plant) -> None:
     run = swung(120, quiet=(20, 45))
     chosen = select([run], [pendulum])
