@@ -43,8 +43,8 @@ POLISH = 0.3
 FARTHEST = 2.5
 #: how often slopes are followed, and the step, in prior deviations, below which a fit has settled
 ITERATIONS, SETTLED = 8, 0.02
-#: how often errors are taken to be as large as a step leaves them: no model of a real servo is true, and one that trusts its sensors
-#: follows what no parameter explains, to the ends of all of them
+#: how often errors of each joint in each run are taken to be as large as a step leaves them: no model of a real servo is true, and one
+#: that trusts its sensors follows what no parameter explains, to the ends of all of them
 INFLATIONS = 4
 #: times what slopes foretold that may be left: beyond, they are looked at anew
 FORETOLD = 1.3
@@ -169,16 +169,61 @@ def adjust(robot: Robot, kind: str, joints: Sequence[int], value: float) -> None
         raise KeyError(kind)
 
 
+@dataclass(frozen=True)
+class _Block:
+    """What a run says where a descent is, joint by joint; errors count in deviations of their sensors.
+
+    Attributes:
+        cost: (joints,) squares. more: (joints, coordinates, coordinates), slope: (joints, coordinates), so that so far from there squares
+            are cost + 2 slope·moved + moved·more·moved. count: (joints,) of how many independent errors.
+    """
+
+    cost: Array
+    more: Array
+    slope: Array
+    count: Array
+
+    @classmethod
+    def of(cls, errors: Floats, slopes: Floats, count: Array) -> _Block:
+        """Of weighted errors (rows, joints) and how each coordinate moves them (coordinates, rows, joints)."""
+        along = slopes.transpose(2, 0, 1)  # of float32, as large as they are
+        left = errors.T[:, :, None]
+        return cls(
+            np.square(errors, dtype=np.float64).sum(axis=0),
+            (along @ along.transpose(0, 2, 1)).astype(np.float64),
+            (along @ left)[:, :, 0].astype(np.float64),
+            np.maximum(count, 1.0),
+        )
+
+    def left(self, moved: Array) -> Array:
+        """(joints,) squares that are foretold so far from there."""
+        out: Array = np.maximum(self.cost + 2 * self.slope @ moved + self.more @ moved @ moved, 0.0)
+        return out
+
+    def inflation(self, left: Array) -> Array:
+        """(joints,) how many times its sensors' variance."""
+        out: Array = np.maximum(left / self.count, 1.0)
+        return out
+
+    @property
+    def surprise(self) -> float:
+        """Minus twice the logarithm of how likely it is, with errors as large as they are, if not smaller than sensors'."""
+        inflation = self.inflation(self.cost)
+        return float((self.cost / inflation + self.count * np.log(inflation)).sum())
+
+    def weighted(self, weight: Array) -> tuple[Array, Array]:
+        """Normal matrix and gradient of all joints together."""
+        return np.tensordot(weight, self.more, 1), weight @ self.slope
+
+
 @dataclass
 class _Descent:
     """One hypothesis on its way to where it leaves least.
 
     Attributes:
         u: where it is, sizes of causes, then tolerances. prior, scale: around what, and how far it may go.
-        at, least, blocks: where it was best, what it cost there, and of each run cost, normal matrix and gradient there.
-        seen: the same where it is now.
-        slopes: of each run, weighted, (coordinates, rows). bends: which of them are other ones wherever it comes to.
-        counts: of each run, of how many independent errors what it costs is.
+        at, least, blocks: where it was best, what it cost there, and what each run says there. seen: the same where it is now.
+        slopes: of each run, weighted, (coordinates, rows, joints). bends: which of them are other ones wherever it comes to.
         share: of the way to where its blocks lead that it has gone since.
     """
 
@@ -191,14 +236,13 @@ class _Descent:
     slopes: dict[int, Floats]
     at: Array
     bends: NDArray[np.bool_]
-    counts: Mapping[int, float]
     least: float = np.inf
     share: float = 1.0
-    blocks: dict[int, tuple[float, Array, Array]] = dataclasses.field(default_factory=dict)
-    seen: dict[int, tuple[float, Array, Array]] = dataclasses.field(default_factory=dict)
+    blocks: dict[int, _Block] = dataclasses.field(default_factory=dict)
+    seen: dict[int, _Block] = dataclasses.field(default_factory=dict)
 
     @classmethod
-    def of(cls, start: Refit, tolerances: int, learnt: Mapping[int, Floats], counts: Mapping[int, float]) -> _Descent:
+    def of(cls, start: Refit, tolerances: int, learnt: Mapping[int, Floats]) -> _Descent:
         """From a start, with what slopes are known of the tolerances alone."""
         centre = _vector(start)
         shares = np.array([q.share for q in _quantities(start)], bool)
@@ -219,7 +263,6 @@ class _Descent:
             slopes,
             u,
             np.array([True] * len(centre) + [False] * tolerances),
-            counts,
         )
 
     def moved(self, members: Iterable[tuple[int, NDArray[np.bool_]]]) -> Array:
@@ -231,25 +274,18 @@ class _Descent:
 
     @property
     def cost(self) -> float:
-        """Minus twice the logarithm of how likely it is where it is now, with errors as large as it leaves them, if not smaller
-        than sensors'."""
+        """Minus twice the logarithm of how likely it is where it is now, and what that says of sizes and tolerances."""
         own = float(np.sum(np.square((self.u - self.prior) / self.scale)))
-        left, count = sum(cost for cost, _, _ in self.seen.values()), sum(self.counts[k] for k in self.seen)
-        return own + (count * (1 + np.log(left / count)) if left > count else left)
-
-    @property
-    def inflation(self) -> float:
-        """How many times the sensors' variance it leaves where it was best."""
-        return max(1.0, sum(cost for cost, _, _ in self.blocks.values()) / max(sum(self.counts.values()), 1.0))
+        return own + sum(block.surprise for block in self.seen.values())
 
     def failed(self, k: int) -> bool:
         """Whether a run leaves clearly more than its slopes foretold where it was best, though all together have gained."""
         if k not in self.blocks or self.cost > self.least:
             return False
-        moved = self.u - self.at
-        cost, more, slope = self.blocks[k]
-        expected = max(cost + float(2 * slope @ moved + moved @ more @ moved), 0.0)
-        return self.seen[k][0] > FORETOLD * expected
+        before, now = self.blocks[k], self.seen[k]
+        foretold = before.left(self.u - self.at)
+        weight = 1 / before.inflation(before.cost)
+        return bool(weight @ now.cost > FORETOLD * (weight @ foretold))
 
 
 class Windows:
@@ -368,7 +404,8 @@ class Windows:
     def _deviations(self, descent: _Descent, folds: Sequence[Refit]) -> Array:
         """Standard deviations of a fit's coordinates."""
         normal = np.diag(1 / descent.scale**2)
-        normal += sum(more for _, more, _ in descent.blocks.values()) / descent.inflation
+        for block in descent.blocks.values():
+            normal += block.weighted(1 / block.inflation(block.cost))[0]
         curvature: Array = np.sqrt(np.diag(np.linalg.inv(normal)))
         if len(folds) < 2:
             return curvature
@@ -381,8 +418,7 @@ class Windows:
         """Follow each start to where it leaves least on these runs."""
         # Slopes cost the most: what was learnt without causes does until it fails.
         learnt = {k: known for k, known in self._learnt.items() if k in fitted}
-        counts = {k: self._count(k) for k in fitted}
-        descents = [_Descent.of(start, len(self.names), learnt, counts) for start in starts]
+        descents = [_Descent.of(start, len(self.names), learnt) for start in starts]
         moving = descents
         for _ in range(ITERATIONS):
             self._linearize(moving, fitted)
@@ -416,10 +452,11 @@ class Windows:
         out: Array = np.sqrt(FOLLOWED[played.plant.setup] / max(1.0, INDEPENDENT_S / period)) / self._sigma
         return out
 
-    def _count(self, k: int) -> float:
-        """How many independent errors the rows of a run are, as weighted."""
+    def _count(self, k: int) -> Array:
+        """(joints,) how many independent errors the rows of a run are, as weighted."""
         weight = np.square(self._weight(k) * self._sigma)
-        return float((np.isfinite(self.measured[k]) & self._followed[k][:, None]).sum(axis=0) @ weight)
+        count: Array = (np.isfinite(self.measured[k]) & self._followed[k][:, None]).sum(axis=0) * weight
+        return count
 
     def _solve(self, descent: _Descent, runs: Sequence[int]) -> Array:
         """Where the blocks of some runs lead, made where the descent was best."""
@@ -427,15 +464,15 @@ class Windows:
         ends = [_limits(q, float(at)) for q, at in zip(_quantities(descent.start), prior, strict=False)]
         low, high = np.array([*ends, *[(-END, END)] * len(self.names)]).T
         within = np.minimum(low - u, 0) - TINY, np.maximum(high - u, 0) + TINY
-        cost, more, slope = (sum(parts) for parts in zip(*(descent.blocks[k] for k in runs), strict=True))
-        count, found = max(sum(self._count(k) for k in runs), 1.0), u
+        blocks, found = [descent.blocks[k] for k in runs], u
         for _ in range(INFLATIONS):
-            moved = found - u
-            inflation = max(1.0, float(cost + 2 * slope @ moved + moved @ more @ moved) / count)
+            more, slope = np.diag(1 / scale**2), (u - prior) / scale**2
+            for block in blocks:
+                own, along = block.weighted(1 / block.inflation(block.left(found - u)))
+                more, slope = more + own, slope + along
             # What ends at a bound leaves its part to the others: clipped afterwards it would leave it undone.
-            root = np.linalg.cholesky(np.diag(1 / scale**2) + more / inflation)
-            target = -np.linalg.solve(root, (u - prior) / scale**2 + slope / inflation)
-            found = np.clip(u + lsq_linear(root.T, target, bounds=within).x, low, high)
+            root = np.linalg.cholesky(more)
+            found = np.clip(u + lsq_linear(root.T, -np.linalg.solve(root, slope), bounds=within).x, low, high)
         return found
 
     def _linearize(self, descents: Sequence[_Descent], fitted: Sequence[int]) -> None:
@@ -452,21 +489,16 @@ class Windows:
             at = 0
             for one, mine in zip(descents, columns, strict=True):
                 base = np.nan_to_num(errors[at]) * weight
-                slopes = np.zeros((len(one.u), base.size), np.float32)
+                slopes = np.zeros((len(one.u), *base.shape), np.float32)
                 if k in one.slopes:
                     slopes[:] = one.slopes[k]
                 for row, members in enumerate(mine, at + 1):
                     change = np.nan_to_num(errors[row] - errors[at]) * weight
                     for p, mask in members:
-                        slopes[p] = (np.where(mask, change, 0.0) / one.steps[p]).ravel()
+                        slopes[p] = np.where(mask, change, 0.0) / one.steps[p]
                 at += 1 + len(mine)
-                left = base.ravel().astype(np.float32)
                 one.slopes[k] = slopes
-                one.seen[k] = (
-                    float(left.astype(np.float64) @ left),
-                    (slopes @ slopes.T).astype(np.float64),
-                    (slopes @ left).astype(np.float64),
-                )
+                one.seen[k] = _Block.of(base.astype(np.float32), slopes, self._count(k))
 
     def _columns(self, k: int, descent: _Descent) -> list[list[tuple[int, NDArray[np.bool_]]]]:
         """What is varied on a run. A joint within tolerance moves little: slopes once known are not looked at again."""
