@@ -28,7 +28,7 @@ ALLOWED = {
     # torch's restricted unpickler of tensors, numbers and texts; another test hands it malicious files
     ("openant_agents/runs.py", "torch.load"),
     # what its own parent sends over a private socket pair, which no file can reach
-    ("openant_tools/comms/engine.py", "pickle"),
+    ("openant_tools/comms/parent.py", "pickle"),
 }
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from openant_tools.comms.engine import _changes
+from openant_tools.comms.hardware import changes
 from openant_tools.numbers import exact, number, percent, span
 from openant_tools.procedure.journal import EepromWrite
 
@@ -75,7 +75,7 @@ def test_what_eight_servos_are_told_alike_is_one_line():
     joints = ["hip_rr", "knee_rr", "hip_fr"]
     writes = [EepromWrite(joint, 10 + k, "pwm_limit", 885, 442) for k, joint in enumerate(joints)]
     writes.append(EepromWrite("knee_fl", 31, "drive_mode", 1, 0))
-    assert list(_changes(writes)) == [
+    assert list(changes(writes)) == [
         "3 servos: pwm_limit 885 → 442: at most 50 % of full power",
         "knee_fl (id 31): drive_mode 1 → 0",
     ]

@@ -12,9 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.comms.bus import Answer
+from openant_tools.comms.servos import Block, Servo
 from openant_tools.files import shared_memory
 
-__all__ = ["ERR_CODES", "SIGNALS", "Ring", "columns"]
+__all__ = ["ERR_CODES", "SIGNALS", "Ring", "columns", "joint_values"]
 
 #: per joint, in this order
 SIGNALS = ("cmd", "pos", "vel", "cur", "load", "pwm", "volt", "temp", "tick", "ok", "err", "rtt")
@@ -29,11 +31,35 @@ ERR_CODES = ("", "timeout", "crc", "short", "late", "port", "alert")
 #: 10 s at 100 Hz, what a screen shows
 SLOTS = 1024
 _HEADER = 64
+_ERR_CODE = {word: code for code, word in enumerate(ERR_CODES)}
+_NAN = float("nan")
 
 
 def columns(joints: Sequence[str]) -> list[str]:
     """Names of a row's numbers; `signal.joint` as in a run table, `err` by `ERR_CODES`."""
     return [*COMMON, *(f"{signal}.{joint}" for joint in joints for signal in SIGNALS)]
+
+
+def joint_values(servo: Servo, command: float, answer: Answer, block: Block | None) -> list[float]:
+    """SIGNALS of one joint: what it was sent (rad), and what it answered."""
+    if block is None:
+        return [command, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, 0.0, _ERR_CODE[answer.word], _NAN]
+    table, sign = servo.model.registers, servo.direction
+    effort = sign * servo.model.effort.to_si(block.effort)
+    return [
+        command,
+        servo.to_joint(block.position * table["present_position"].scale),
+        sign * block.velocity * table["present_velocity"].scale,
+        effort if servo.model.has_current_sensor else _NAN,
+        _NAN if servo.model.has_current_sensor else effort,
+        sign * block.pwm * table["present_pwm"].scale,
+        block.voltage * table["present_input_voltage"].scale,
+        float(block.temperature),
+        float(block.tick),
+        float(answer.ok),
+        _ERR_CODE[answer.word],
+        _NAN if answer.rtt is None else answer.rtt,
+    ]
 
 
 class Ring:

@@ -1,0 +1,117 @@
+"""What measures the body while the engine moves the joints: IMU and overhead camera, taken in between two cycles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.comms.body_imu import BodyImu
+from openant_tools.comms.clock import Clock
+from openant_tools.comms.messages import EngineConfig
+from openant_tools.comms.recorder import Recorder
+from openant_tools.errors import HardwareFault
+
+if TYPE_CHECKING:
+    from openant_tools.comms.body_camera import BodyCamera
+
+__all__ = ["BodySensors"]
+
+#: rad. No body whose tag is seen from above leans farther.
+STEEP_RAD = np.pi / 4
+#: The IMU's port is left alone for so long before a cycle begins.
+IMU_SLACK_S = 0.3e-3
+_NAN = float("nan")
+
+
+class BodySensors:
+    """The sensors of one robot, as far as it has them.
+
+    Attributes:
+        imu, camera: None where there is none, or none that answers, which has been told.
+    """
+
+    def __init__(self) -> None:
+        self.imu: BodyImu | None = None
+        self.camera: BodyCamera | None = None
+        self._imu_calibrated = False
+        #: kind of the reason for which no pose is seen, as the recording was told; empty while poses come
+        self._pose_lost = ""
+
+    def open(self, config: EngineConfig, clock: Clock, notice: Callable[[str], None]) -> None:
+        """Connect to those that the robot has; what does not answer is told, and left out."""
+        if config.imu is not None:
+            self._imu_calibrated = config.imu.calibrated
+            try:
+                self.imu = BodyImu(config.imu, clock)
+                for note in self.imu.notes:
+                    notice(f"IMU: {note}")
+            except HardwareFault as error:
+                notice(f"going on without the IMU: {error}")
+        if config.camera is not None:
+            from openant_tools.comms.body_camera import BodyCamera  # OpenCV takes its time to load
+
+            try:
+                self.camera = BodyCamera(config.camera, clock)
+                for note in self.camera.notes:
+                    notice(f"camera: {note}")
+            except HardwareFault as error:
+                notice(f"going on without the camera: {error}")
+
+    def take_until(self, due: float, recorder: Recorder) -> None:
+        """Take in samples until shortly before `due` (s), and poses that are there; record them.
+
+        Raises:
+            RecordingStopped: they cannot be recorded.
+        """
+        if self.imu is not None:
+            for sample in self.imu.until(due - IMU_SLACK_S):
+                if recorder.writer is not None:
+                    recorder.writer.imu(*sample)
+        if self.camera is not None:
+            self._take_poses(self.camera, recorder)
+
+    def _take_poses(self, camera: BodyCamera, recorder: Recorder) -> None:
+        from openant_tools.comms.tags import BodyPose
+
+        lean = None if self.imu is None else self.imu.lean
+        if lean is not None and self._may_lean(*lean[1:]):
+            camera.lean(*lean)
+        for seen in camera.poses():
+            if recorder.writer is None:
+                continue
+            if isinstance(seen, BodyPose):
+                recorder.writer.pose(
+                    seen.t, position=seen.position.tolist(), yaw=seen.yaw, quaternion=seen.quaternion.tolist()
+                )
+            reason = "" if isinstance(seen, BodyPose) else seen.reason
+            if seen.kind != self._pose_lost:
+                self._pose_lost = seen.kind
+                recorder.event("pose lost" if reason else "pose found", taken=seen.t, reason=reason)
+
+    def _may_lean(self, roll: float, pitch: float) -> bool:
+        """Whether a lean (rad) can be the body's: an IMU whose place nobody has measured may sit in it any way round."""
+        return self._imu_calibrated or bool(np.cos(roll) * np.cos(pitch) > np.cos(STEEP_RAD))
+
+    def news(self) -> list[str]:
+        """What is wrong with them, once when it begins and from time to time while it lasts."""
+        told = (sensor.news() for sensor in (self.imu, self.camera) if sensor is not None)
+        return [news for news in told if news is not None]
+
+    def newest(self, t: float) -> tuple[float, ...]:
+        """(12,) as of `t`: the IMU's rates and accelerations, the body's x, y, z and yaw, when each was measured."""
+        body = (_NAN,) * 6 if self.imu is None else self.imu.newest(t)
+        base = (_NAN,) * 4 if self.camera is None else self.camera.newest(t)
+        taken = _NAN if self.imu is None else self.imu.taken_at, _NAN if self.camera is None else self.camera.taken_at
+        return (*body, *base, *taken)
+
+    def picture(self) -> NDArray[np.uint8] | None:
+        return None if self.camera is None else self.camera.picture()
+
+    def close(self) -> None:
+        if self.imu is not None:
+            self.imu.close()
+        if self.camera is not None:
+            self.camera.close()
