@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.protocol2 import ALERT_BIT, BROADCAST, Error, Instruction, Status
 from openant_tools.robot.servo import SERVO_MODELS, servo_model
-from openant_tools.virtual.servo import HEAT_ERROR, Loop, Sensed, ServoDevice, Snapshot
+from openant_tools.virtual.servo import ServoDevice
+from openant_tools.virtual.servo_power import HEAT_ERROR, Loop, Sensed, Snapshot
 
 XM, XC, XL = servo_model("XM430-W350"), servo_model("XC430-W240"), servo_model("XL430-W250")
 

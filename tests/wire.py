@@ -12,7 +12,8 @@ from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import kit
 from openant_tools.virtual.bus import BusSettings
 from openant_tools.virtual.bus import Line as Wire
-from openant_tools.virtual.servo import Loop, Sensed, ServoDevice
+from openant_tools.virtual.servo import ServoDevice
+from openant_tools.virtual.servo_power import Loop, Sensed
 
 IDS = [joint.id for joint in JOINTS.values()]
 

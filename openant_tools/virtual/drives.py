@@ -24,16 +24,15 @@ from openant_tools.virtual.body import Body
 from openant_tools.virtual.hands import Grip, grip_torque
 from openant_tools.virtual.motor import MotorSettings
 from openant_tools.virtual.profile import Trajectory, start_trajectory
-from openant_tools.virtual.servo import (
+from openant_tools.virtual.servo_power import Loop, Sensed
+from openant_tools.virtual.servo_registers import (
     CURRENT_MODE,
     CURRENT_POSITION_MODE,
     EXTENDED_MODE,
     POSITION_MODE,
     PWM_MODE,
     VELOCITY_MODE,
-    Loop,
-    Sensed,
-)  # fmt: skip
+)
 
 __all__ = ["Drive", "Drives"]
 

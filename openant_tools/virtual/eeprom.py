@@ -8,7 +8,7 @@ from pathlib import Path
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json, write_text
 from openant_tools.robot.registers import EEPROM_END
-from openant_tools.virtual.servo import Snapshot
+from openant_tools.virtual.servo_power import Snapshot
 from openant_tools.virtual.world import World
 
 __all__ = ["EepromFile"]

@@ -15,7 +15,7 @@ import numpy as np
 
 from openant_tools.errors import BadInput
 from openant_tools.virtual.imperfections import nearest
-from openant_tools.virtual.servo import ENCODER_ERROR
+from openant_tools.virtual.servo_power import ENCODER_ERROR
 from openant_tools.virtual.world import World
 
 __all__ = ["CAUSES", "Fault", "Faults"]

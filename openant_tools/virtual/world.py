@@ -22,7 +22,8 @@ from openant_tools.virtual.bus import BusSettings, Line
 from openant_tools.virtual.drives import Drive, Drives
 from openant_tools.virtual.hands import Grip, Tilting
 from openant_tools.virtual.motor import MotorSettings
-from openant_tools.virtual.servo import OVERLOAD_ERROR, ServoDevice
+from openant_tools.virtual.servo import ServoDevice
+from openant_tools.virtual.servo_power import OVERLOAD_ERROR
 
 __all__ = ["MOUNT_EIGHTHS", "ServoSetup", "SupplySettings", "World", "WorldSettings", "standard_servos"]
 
