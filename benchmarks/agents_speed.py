@@ -24,7 +24,7 @@ import sac_speed
 import sarsa_speed
 import torch
 
-from openant_agents.beside import _LearnerProcess
+from openant_agents.async_training import LearnerProcess
 from openant_agents.learner import Job
 from openant_agents.sac import Sac, Settings
 
@@ -68,7 +68,7 @@ def deadlines(agent: Sac, before: Callable[[], object]) -> np.ndarray:
     return np.array(taken[20:])
 
 
-def beside() -> np.ndarray:
+def beside_a_learner() -> np.ndarray:
     """`deadlines` while another process learns without a pause."""
     settings = Settings(learning_start=0)
     agent = Sac(sac_speed.OBSERVATIONS, sac_speed.ACTIONS, replace(settings, buffer=1), seed=0)
@@ -76,7 +76,7 @@ def beside() -> np.ndarray:
         rows = np.random.default_rng(0).normal(size=(4096, agent.replay.width)).astype(np.float32)
         (Path(name) / "transitions.f32").write_bytes(rows.tobytes())
         job = Job(Path(name), settings, sac_speed.OBSERVATIONS, sac_speed.ACTIONS, 0, "cpu", 1e6)
-        learner = _LearnerProcess(job, agent)
+        learner = LearnerProcess(job, agent)
         try:
             return deadlines(agent, learner.follow)
         finally:
@@ -115,9 +115,9 @@ def main() -> None:
     own, python = (np.median(each) for each in found.values())
     row("SARSA(λ) decision against a dictionary in plain Python", "10×", "40×", f"{python / own:.1f}× ({own:.2f} ms)")
     for what, first, then, waited in (
-        ("deadline to action beside a learner, 50 ms loop, p99", "2 ms", "1 ms", beside()),
+        ("deadline to action beside a learner, 50 ms loop, p99", "2 ms", "1 ms", beside_a_learner()),
         ("the same with nobody learning: what the machine takes", "–", "–", deadlines(ours, lambda: None)),
-        ("the same, an update before each action (`--learn between`)", "–", "–", deadlines(ours, ours.update)),
+        ("the same, an update before each action (`--learn sync`)", "–", "–", deadlines(ours, ours.update)),
     ):
         here = f"{np.percentile(waited, 99):.1f} ms (median {np.median(waited):.1f})"
         row(what, first, then, f"{here}, load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")

@@ -1,6 +1,6 @@
 """SAC's updates in a process of their own, so that computing does not eat the time from observation to action.
 
-Run as `python -m openant_agents.learner`, by `openant_agents.beside`. What it learns from is the run's own file of
+Run as `python -m openant_agents.learner`, by `openant_agents.async_training`. What it learns from is the run's own file of
 transitions, which the acting process appends to; what it gives back are the actor's weights, in shared memory. It alone
 writes checkpoints. When the acting process dies, its last transitions are in the file: they are learned from, saved,
 and nothing is lost.

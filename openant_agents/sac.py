@@ -21,10 +21,9 @@ written out, a tenth quicker.
 from __future__ import annotations
 
 import math
-import threading
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -38,21 +37,22 @@ from torch.nn import functional as F
 
 from openant_agents.adam import Adam
 from openant_agents.by_hand import Gradients, acting, flatten, squashed
-from openant_agents.runs import CurvePoint, Run, load_checkpoint, making_sense, read_facts
+from openant_agents.runs import load_checkpoint, making_sense, read_facts
 from openant_agents.training import (
-    CHECKPOINT_EVERY_S,
-    REPORT_EVERY_S,
     Progress,
-    event_writer,
+    Training,
+    check_trained_on,
+    described,
     finite_or_raise,
     reset_or_stop,
-    stop_on_signal,
+    run_facts,
+    training_run,
 )
-from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput, HardwareFault
 
 __all__ = [
-    "Actor", "Critics", "Progress", "Replay", "Sac", "Settings", "device_of", "load_policy", "run_facts", "sizes", "train",
+    "Actor", "Critics", "Progress", "Replay", "Sac", "Settings", "device_of", "load_policy", "one_thread",
+    "run_facts_of", "sizes", "train",
 ]  # fmt: skip
 
 Array = NDArray[np.float32]
@@ -426,17 +426,22 @@ class Sac:
 CURVE_EVERY = 100
 
 
-def run_facts(
+def run_facts_of(
     env: gymnasium.Env[Any, Any], settings: Settings, seed: int, env_facts: Mapping[str, Any] | None
 ) -> dict[str, Any]:
     """What `run.json` says of a run of SAC."""
-    observations, actions = sizes(env)
-    describe = getattr(env.unwrapped, "describe", None)
-    return {
-        "agent": "sac", "seed": seed, "settings": settings.as_dict(), "env": dict(env_facts or {}),
-        "trained_on": {} if describe is None else dict(describe()), "observations": observations, "actions": actions,
-        "versions": {"torch": torch.__version__, "numpy": np.__version__, "gymnasium": gymnasium.__version__},
-    }  # fmt: skip
+    return run_facts("sac", env, settings.as_dict(), seed, env_facts, sizes(env), {"torch": torch.__version__})
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Have torch compute on one thread: the matrices are too small for two."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def train(
@@ -473,70 +478,31 @@ def train(
     settings = settings or Settings()
     observations, actions = sizes(env)
     agent = Sac(observations, actions, settings, seed=seed, device=device_of(device))
-    run = Run(folder, run_facts(env, settings, seed, env_facts))
-    events = event_writer(folder) if tensorboard else None
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with stop_on_signal() as stop:
-            return _train(env, run, agent, steps, seed, events, report, stop)
-    finally:
-        torch.set_num_threads(threads)
-        run.close()
-        if events is not None:
-            events.close()
+    facts = run_facts_of(env, settings, seed, env_facts)
+    with one_thread(), training_run(folder, facts, tensorboard) as (run, events, stop):
+        return _train(Training(env, run, steps, report, stop), agent, seed, events)
 
 
-def _train(
-    env: gymnasium.Env[Any, Any],
-    run: Run,
-    agent: Sac,
-    steps: int,
-    seed: int,
-    events: Any,
-    report: Callable[[Progress], None] | None,
-    stop: threading.Event,
-) -> Progress:
-    settings, replay = agent.settings, agent.replay
-    average = AverageReward()
-    helped: Counter[str] = Counter()
-    step, seconds, late = 0, 0.0, 0
-    observation: Array | None = reset_or_stop(env, seed, stop)
-    if observation is None:
-        raise KeyboardInterrupt
+def _train(training: Training, agent: Sac, seed: int, events: Any) -> Progress:
+    env, run, settings, replay = training.env, training.run, agent.settings, agent.replay
+    observation = training.begin(seed)
     checkpoint = run.resume()
     if checkpoint is not None:
         with making_sense(run.folder):
-            step, seconds = int(checkpoint["step"]), float(checkpoint["seconds"])
             agent.set_state(checkpoint["agent"])
             replay.restore(run.transitions(replay.width, replay.capacity), int(checkpoint["transitions"]))
-            average.set_state(checkpoint["average"])
-            helped.update(checkpoint["helped"])
-            if checkpoint["env"] is not None:
-                env.unwrapped.set_state(checkpoint["env"])
-                observation = checkpoint["observation"].numpy()
-
+            before = training.restore(checkpoint)
+            observation = observation if before is None else before
     saved = replay.added
-    last_save = last_report = time.monotonic()
 
     def save() -> None:
-        nonlocal saved, last_save
+        nonlocal saved
         agent.sound_or_raise(run.folder)
-        get_state = getattr(env.unwrapped, "get_state", None)
-        state = {
-            "step": step, "seconds": seconds, "agent": agent.get_state(), "average": average.get_state(),
-            "helped": dict(helped), "observation": observation,
-            "env": None if get_state is None else get_state(),
-        }  # fmt: skip
-        run.save(state, replay.between(saved, replay.added))
-        saved, last_save = replay.added, time.monotonic()
+        run.save(training.state(observation) | {"agent": agent.get_state()}, replay.between(saved, replay.added))
+        saved, training.saved_at = replay.added, time.monotonic()
 
-    def progress() -> Progress:
-        learning = step > settings.learning_start
-        return Progress(step, steps, seconds, average.value, learning, dict(helped), late)
-
-    while step < steps and not stop.is_set():
-        random = step < settings.learning_start
+    while training.going:
+        random = training.step < settings.learning_start
         action = agent.random_action() if random else agent.act(observation)
         try:
             next_observation, reward, terminated, truncated, info = env.step(action)
@@ -544,47 +510,37 @@ def _train(
             save()  # what was learned until the robot could not go on
             raise
         reward = float(reward)
-        finite_or_raise(next_observation, reward, step, run.folder)
+        finite_or_raise(next_observation, reward, training.step, run.folder)
         dt = float(info.get("dt", 1.0))
         void = bool(info.get("void", False))
         if not void:
             replay.add(observation, action, reward, dt, terminated, next_observation)
-            average.add(reward, dt)
-            step += 1
-            seconds += dt
-        late = int(info.get("overruns", 0))
+            training.add(reward, dt)
+        training.late = int(info.get("overruns", 0))
         observation = next_observation
         if terminated or truncated:
-            reason = str(info.get("reason", "the episode ended"))
-            helped[reason] += 1
-            run.add_intervention(step, seconds, reason)
+            training.note_help(info)
             try:
-                begun: Array | None = reset_or_stop(env, None, stop)
+                begun = reset_or_stop(env, None, training.stop)
             except HardwareFault:
                 save()
                 raise
             observation = observation if begun is None else begun
-        if not void and step > settings.learning_start:
+        learning = training.step > settings.learning_start
+        if not void and learning:
             agent.update()
-        if not void and step % CURVE_EVERY == 0:
+        if not void and training.step % CURVE_EVERY == 0:
             agent.sound_or_raise(run.folder)
-            run.add_curve_point(CurvePoint(step, seconds, average.value))
+            training.curve_point()
             if events is not None:
-                events.add_scalar("average_reward_m_s", average.value, step)
-                events.add_scalar("alpha", agent.log_alpha.exp().item(), step)
-        now = time.monotonic()
+                events.add_scalar("average_reward_m_s", training.average.value, training.step)
+                events.add_scalar("alpha", agent.log_alpha.exp().item(), training.step)
         # Rows of a full ring are overwritten by and by: save them before that, however little time has passed.
-        if now - last_save > CHECKPOINT_EVERY_S or replay.added - saved >= replay.capacity:
+        if training.save_is_due or replay.added - saved >= replay.capacity:
             save()
-        if report is not None and now - last_report > REPORT_EVERY_S:
-            last_report = now
-            report(progress())
+        training.tell(learning)
     save()
-    if report is not None:
-        report(progress())
-    if stop.is_set() and step < steps:
-        raise KeyboardInterrupt
-    return progress()
+    return training.end(training.step > settings.learning_start)
 
 
 def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
@@ -594,32 +550,20 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
         BadInput: no such run, or one whose observations or actions are not the environment's.
     """
     with making_sense(folder):
-        return _policy(folder, env)
-
-
-def _policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
-    facts = read_facts(folder)
-    observations, actions = sizes(env)
-    if (facts["observations"], facts["actions"]) != (observations, actions):
-        raise BadInput(
-            f"its policy takes {facts['observations']} observations and gives {facts['actions']} actions, "
-            f"this robot has {observations} and {actions}",
-            where=folder,
-            remedy="play it on a robot like the one it was trained on",
-        )
-    describe = getattr(env.unwrapped, "describe", None)
-    here = describe() if describe is not None else {}
-    for what in ("observation_names", "action_names", "action_range"):
-        if what in here and facts["trained_on"].get(what) != here[what]:
+        facts = read_facts(folder)
+        observations, actions = sizes(env)
+        if (facts["observations"], facts["actions"]) != (observations, actions):
             raise BadInput(
-                f"its policy was trained with other {what.replace('_', ' ')} than this environment has",
+                f"its policy takes {facts['observations']} observations and gives {facts['actions']} actions, "
+                f"this robot has {observations} and {actions}",
                 where=folder,
-                remedy="make the environment as run.json says",
+                remedy="play it on a robot like the one it was trained on",
             )
-    checkpoint = load_checkpoint(folder)
-    agent = Sac(observations, actions, Settings(**{**facts["settings"], "buffer": 1}), seed=int(facts["seed"]))
-    agent.actor.load_state_dict(checkpoint["agent"]["actor"])
-    return agent, int(checkpoint["step"])
+        check_trained_on(facts, described(env), ("observation_names", "action_names", "action_range"), folder)
+        checkpoint = load_checkpoint(folder)
+        agent = Sac(observations, actions, Settings(**{**facts["settings"], "buffer": 1}), seed=int(facts["seed"]))
+        agent.actor.load_state_dict(checkpoint["agent"]["actor"])
+        return agent, int(checkpoint["step"])
 
 
 def device_of(name: str) -> torch.device:

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -37,18 +37,18 @@ from numpy.typing import NDArray
 
 from openant_agents.compiled import compiled
 from openant_agents.primitives import Gait
-from openant_agents.runs import CurvePoint, Run, load_checkpoint, making_sense, read_facts
+from openant_agents.runs import load_checkpoint, making_sense, read_facts
 from openant_agents.tile_coding import Rows, TileCoder
 from openant_agents.training import (
-    CHECKPOINT_EVERY_S,
-    REPORT_EVERY_S,
     Progress,
-    event_writer,
+    Training,
+    check_trained_on,
+    described,
     finite_or_raise,
     reset_or_stop,
-    stop_on_signal,
+    run_facts,
+    training_run,
 )
-from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput, HardwareFault
 
 __all__ = ["Sarsa", "SarsaPolicy", "Settings", "load_policy", "train"]
@@ -408,68 +408,38 @@ def train(
         KeyboardInterrupt: asked for by SIGINT or SIGTERM; the run is saved and goes on with the same call.
     """
     settings = settings or Settings()
-    describe = getattr(env.unwrapped, "describe", None)
-    described = dict(describe()) if describe is not None else {}
-    gait = _gait(env, described)
+    gait = _gait(env, described(env))
     _compile()
     bounds = _Bounds.of(env)
-    run = Run(
-        folder,
-        {
-            "agent": "sarsa", "seed": seed, "settings": settings.as_dict(), "env": dict(env_facts or {}),
-            "trained_on": described, "observations": len(bounds.low), "actions": len(gait),
-            "versions": {"numpy": np.__version__, "gymnasium": gymnasium.__version__},
-        },
-    )  # fmt: skip
-    events = event_writer(folder) if tensorboard else None
-    scribe = _Scribe()
-    try:
-        with stop_on_signal() as stop:
-            return _train(env, gait, bounds, run, scribe, settings, steps, seed, events, report, stop)
-    finally:
-        scribe.close()
-        run.close()
-        if events is not None:
-            events.close()
+    facts = run_facts("sarsa", env, settings.as_dict(), seed, env_facts, (len(bounds.low), len(gait)), {})
+    with training_run(folder, facts, tensorboard) as (run, events, stop):
+        scribe = _Scribe()
+        try:
+            training = Training(env, run, steps, report, stop, scribe.write)
+            return _train(training, gait, bounds, scribe, settings, seed, events)
+        finally:
+            scribe.close()
 
 
 def _train(
-    env: gymnasium.Env[Any, Any],
-    gait: Gait,
-    bounds: _Bounds,
-    run: Run,
-    scribe: _Scribe,
-    settings: Settings,
-    steps: int,
-    seed: int,
-    events: Any,
-    report: Callable[[Progress], None] | None,
-    stop: Any,
+    training: Training, gait: Gait, bounds: _Bounds, scribe: _Scribe, settings: Settings, seed: int, events: Any
 ) -> Progress:
+    env, run = training.env, training.run
     columns = _Columns(len(bounds.low))
-    average = AverageReward()
-    helped: Counter[str] = Counter()
-    step, seconds, late = 0, 0.0, 0
     random = np.random.default_rng(seed)
     agent = _agent(bounds, len(gait), settings, seed) if bounds.complete else None
-    observation: Array | None = reset_or_stop(env, seed, stop)
-    if observation is None:
-        raise KeyboardInterrupt
+    observation = training.begin(seed)
     action: int | None = None
     checkpoint = run.resume()
     log: list[Array] = []  # decisions not yet handed to the scribe
     if checkpoint is not None:
         with making_sense(run.folder):
-            step, seconds = int(checkpoint["step"]), float(checkpoint["seconds"])
-            average.set_state(checkpoint["average"])
-            helped.update(checkpoint["helped"])
             random.bit_generator.state = checkpoint["random"]
             bounds, agent = _learned(run.folder, checkpoint, len(gait), settings, seed)
-            if checkpoint["env"] is not None:
-                env.unwrapped.set_state(checkpoint["env"])
-                observation, action = checkpoint["observation"].numpy(), int(checkpoint["action"])
+            before = training.restore(checkpoint)
+            if before is not None:
+                observation, action = before, int(checkpoint["action"])
                 gait.sent(checkpoint["last"].numpy())
-    last_save = last_report = time.monotonic()
 
     def choose(observed: Array) -> int:
         if agent is None:
@@ -477,55 +447,45 @@ def _train(
         return agent.choose(agent.rows_of(np.asarray(observed, np.float32)))
 
     def save() -> None:
-        nonlocal last_save
-        get_state = getattr(env.unwrapped, "get_state", None)
-        state = {
-            "step": step, "seconds": seconds, "average": average.get_state(), "helped": dict(helped),
+        state = training.state(observation) | {
             "random": random.bit_generator.state, "bounds": [bounds.low, bounds.high, bounds.known],
-            "agent": None if agent is None else _summary(agent),
-            "observation": observation, "action": action, "last": gait.last,
-            "env": None if get_state is None else get_state(),
+            "agent": None if agent is None else _summary(agent), "action": action, "last": gait.last,
         }  # fmt: skip
         rows = np.stack(log) if log else np.empty((0, columns.width), np.float32)
         log.clear()
-        last_save = time.monotonic()
+        training.saved_at = time.monotonic()
         scribe.write(run.save, state, rows)
-
-    def progress() -> Progress:
-        return Progress(step, steps, seconds, average.value, agent is not None, dict(helped), late)
 
     if action is None:
         action = choose(observation)
     try:
-        while step < steps and not stop.is_set():
+        while training.going:
             reward = took = 0.0
             terminated = truncated = void = False
             for command in gait.actions(action):
                 seen, r, terminated, truncated, info = env.step(command.astype(np.float32))
                 r = float(r)
-                finite_or_raise(seen, r, step, run.folder)
+                finite_or_raise(seen, r, training.step, run.folder)
                 void = bool(info.get("void", False))
-                late = int(info.get("overruns", 0))
+                training.late = int(info.get("overruns", 0))
                 if void:
                     break
                 dt = float(info["dt"])
                 gait.sent(command)
                 reward += settings.gamma ** (took / STEP_S) * r
                 took += dt
-                average.add(r, dt)
-                step += 1
+                training.add(r, dt)
                 if agent is None:
                     bounds.see(seen)
-                if step % CURVE_EVERY == 0:
-                    scribe.write(run.add_curve_point, CurvePoint(step, seconds + took, average.value))
+                if training.step % CURVE_EVERY == 0:
+                    training.curve_point()
                 if terminated or truncated:
                     break
-            seconds += took
             next_action = choose(seen)
             if void:
                 pass
             elif agent is None:
-                if seconds > settings.bounds_from_s - 0.5 * STEP_S:
+                if training.seconds > settings.bounds_from_s - 0.5 * STEP_S:
                     agent = _agent(bounds, len(gait), settings, seed)
             else:
                 log.append(columns.row(observation, action, reward, took, terminated, seen, next_action))
@@ -537,35 +497,26 @@ def _train(
                         remedy="use a smaller step size",
                     )
                 if events is not None and agent.decisions % 20 == 0:
-                    scribe.write(events.add_scalar, "average_reward_m_s", average.value, step)
-                    scribe.write(events.add_scalar, "error", error, step)
+                    scribe.write(events.add_scalar, "average_reward_m_s", training.average.value, training.step)
+                    scribe.write(events.add_scalar, "error", error, training.step)
             observation, action = seen, next_action
             if terminated or truncated:
-                reason = str(info.get("reason", "the episode ended"))
-                helped[reason] += 1
-                scribe.write(run.add_intervention, step, seconds, reason)
-                begun: Array | None = reset_or_stop(env, None, stop)
+                training.note_help(info)
+                begun = reset_or_stop(env, None, training.stop)
                 if begun is not None:
                     observation = begun
                     gait.rest()
                     action = choose(observation)
-            now = time.monotonic()
-            if now - last_save > CHECKPOINT_EVERY_S:
+            if training.save_is_due:
                 save()
-            if report is not None and now - last_report > REPORT_EVERY_S:
-                last_report = now
-                report(progress())
+            training.tell(agent is not None)
     except HardwareFault:
         save()  # what was learned until the robot could not go on
         scribe.finish()
         raise
     save()
     scribe.finish()
-    if report is not None:
-        report(progress())
-    if stop.is_set() and step < steps:
-        raise KeyboardInterrupt
-    return progress()
+    return training.end(agent is not None)
 
 
 def _summary(agent: Sarsa) -> dict[str, Any]:
@@ -655,33 +606,22 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[SarsaPolicy
         BadInput: no such run, or one whose observations or actions are not the environment's.
     """
     with making_sense(folder):
-        return _policy(folder, env)
-
-
-def _policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[SarsaPolicy, int]:
-    facts = read_facts(folder)
-    describe = getattr(env.unwrapped, "describe", None)
-    here = dict(describe()) if describe is not None else {}
-    gait = _gait(env, here)
-    for what in ("observation_names", "action_names", "action_range", "dt"):
-        if what in here and facts["trained_on"].get(what) != here[what]:
+        facts = read_facts(folder)
+        here = described(env)
+        gait = _gait(env, here)
+        check_trained_on(facts, here, ("observation_names", "action_names", "action_range", "dt"), folder)
+        checkpoint = load_checkpoint(folder)
+        _compile()
+        settings, seed = Settings(**facts["settings"]), int(facts["seed"])
+        _, agent = _learned(folder, checkpoint, len(gait), settings, seed)
+        if agent is None:
             raise BadInput(
-                f"its policy was trained with other {what.replace('_', ' ')} than this environment has",
+                "it had not begun to learn when it was saved: its first minute measures the bounds of observations",
                 where=folder,
-                remedy="make the environment as run.json says",
+                remedy="train a little longer",
             )
-    checkpoint = load_checkpoint(folder)
-    _compile()
-    settings, seed = Settings(**facts["settings"]), int(facts["seed"])
-    _, agent = _learned(folder, checkpoint, len(gait), settings, seed)
-    if agent is None:
-        raise BadInput(
-            "it had not begun to learn when it was saved: its first minute measures the bounds of observations",
-            where=folder,
-            remedy="train a little longer",
-        )
-    agent.settle()
-    return SarsaPolicy(agent, gait), int(checkpoint["step"])
+        agent.settle()
+        return SarsaPolicy(agent, gait), int(checkpoint["step"])
 
 
 def _gait(env: gymnasium.Env[Any, Any], described: Mapping[str, Any]) -> Gait:

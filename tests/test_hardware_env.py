@@ -421,7 +421,7 @@ def test_sac_learns_on_the_robot_beside_acting_with_a_cable_that_comes_off_in_th
     walker: Walker, tmp_path: Path
 ) -> None:
     pytest.importorskip("torch")
-    from openant_agents.beside import train_beside
+    from openant_agents.async_training import train_async
     from openant_agents.interventions import read_interventions
     from openant_agents.sac import Settings
 
@@ -441,7 +441,7 @@ def test_sac_learns_on_the_robot_beside_acting_with_a_cable_that_comes_off_in_th
             return super().reset(**options)
 
     small = Settings(learning_start=5, batch=8, hidden=8)
-    done = train_beside(Tripping(walker.env), folder=tmp_path, steps=18, seed=0, settings=small)
+    done = train_async(Tripping(walker.env), folder=tmp_path, steps=18, seed=0, settings=small)
     assert done.step == 18
     assert done.updates is not None
     # What it then learns in a dozen steps may well throw it on its back, where the camera loses it.

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 torch = pytest.importorskip("torch")
 
 import openant_env  # noqa: E402, F401
-from openant_agents import adam, runs, sac  # noqa: E402
+from openant_agents import adam, runs, sac, training  # noqa: E402
 from openant_agents.curves import plot_curves  # noqa: E402
 from openant_agents.runs import CurvePoint, load_checkpoint, read_curve  # noqa: E402
 from openant_agents.sac import Actor, Replay, Sac, Settings, load_policy, train  # noqa: E402
@@ -216,7 +216,7 @@ def test_stopping_and_going_on_changes_nothing(tmp_path, straight):
 
 
 def test_ctrl_c_saves_and_the_same_call_goes_on(tmp_path, straight, monkeypatch):
-    monkeypatch.setattr(sac, "REPORT_EVERY_S", 0.0)
+    monkeypatch.setattr(training, "REPORT_EVERY_S", 0.0)
 
     def interrupt(progress):
         if progress.step == 150:
@@ -249,8 +249,8 @@ def test_a_full_disk_leaves_the_checkpoint_before_it_whole(tmp_path, straight, m
 def test_kill_9_loses_only_what_came_after_the_last_checkpoint(tmp_path, straight):
     program = f"""
 import gymnasium, openant_env
-from openant_agents import sac
-sac.CHECKPOINT_EVERY_S = 0.05
+from openant_agents import sac, training
+training.CHECKPOINT_EVERY_S = 0.05
 env = gymnasium.make("openant/Ant-v0", dt=0.02)
 sac.train(env, folder=__import__("pathlib").Path({str(tmp_path)!r}), steps=100_000, seed=3,
           settings=sac.Settings(**{dataclasses.asdict(SMALL)!r}))

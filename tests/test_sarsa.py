@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 torch = pytest.importorskip("torch")
 
 import openant_env  # noqa: E402, F401
-from openant_agents import sarsa, tile_coding  # noqa: E402
+from openant_agents import sarsa, tile_coding, training  # noqa: E402
 from openant_agents.interventions import read_interventions  # noqa: E402
 from openant_agents.policies import load_policy  # noqa: E402
 from openant_agents.primitives import LEGS, PRIMITIVES, Gait  # noqa: E402
@@ -276,8 +276,8 @@ def test_a_stopped_run_goes_on_bit_for_bit(tmp_path):
 def test_kill_minus_nine_costs_no_more_than_since_the_last_save(tmp_path):
     script = (
         "import gymnasium, pathlib, openant_env\n"
-        "from openant_agents import sarsa\n"
-        "sarsa.CHECKPOINT_EVERY_S = 0.05\n"
+        "from openant_agents import sarsa, training\n"
+        "training.CHECKPOINT_EVERY_S = 0.05\n"
         "env = gymnasium.make('openant/Ant-v0', dt=0.05, action_range='sarsa')\n"
         f"chosen = sarsa.Settings(bounds_from_s={QUICK.bounds_from_s}, table={QUICK.table}, tilings={QUICK.tilings})\n"
         f"sarsa.train(env, folder=pathlib.Path({str(tmp_path)!r}), steps=10**6, seed=1, settings=chosen)\n"
@@ -411,7 +411,7 @@ def test_a_decision_never_waits_for_the_disk(tmp_path, monkeypatch):
             return self.env.step(action)
 
     monkeypatch.setattr(runs.Run, "save", hanging)
-    monkeypatch.setattr(sarsa, "CHECKPOINT_EVERY_S", 0.0)
+    monkeypatch.setattr(training, "CHECKPOINT_EVERY_S", 0.0)
     train(Counted(ant()), folder=tmp_path, steps=250, seed=0, settings=QUICK)
     assert len(saves) == 26  # one after each primitive, and the last
     assert load_checkpoint(tmp_path)["step"] == 250

@@ -8,12 +8,12 @@ from typing import Any
 import click
 
 from openant_tools.cli.hardware import Moving
-from openant_tools.cli.learning import need_agents, settings_of, settings_option
+from openant_tools.cli.learning import settings_of, settings_option
 from openant_tools.cli.options import Number, json_option
 from openant_tools.cli.train_sarsa import sarsa
 from openant_tools.cli.training import (
+    Place,
     effects_option,
-    place_of,
     show_result,
     tensorboard_option,
     training,
@@ -51,31 +51,24 @@ def train() -> None:
 )  # fmt: skip
 @settings_option
 @click.option(
-    "--learn", "learn", type=click.Choice(["between", "beside"]),
-    help="Updates between the steps, reproducibly, or beside them in a process of their own, so that acting never waits.  "
-    "[default: between in the simulation, beside on a robot]",
+    "--learn", "learn", type=click.Choice(["sync", "async"]),
+    help="Updates between the steps, reproducibly, or in a process of their own, so that acting never waits.  "
+    "[default: sync in the simulation, async on a robot]",
 )  # fmt: skip
 @click.option(
     "--updates-per-step", type=Number(min=0.0, min_open=True), default=1.0, show_default=True,
-    help="With --learn beside: updates for each step at most.",
+    help="With --learn async: updates for each step at most.",
 )  # fmt: skip
 @click.option("--device", default="cpu", show_default=True, help="Where torch computes, such as cpu or cuda.")
 @tensorboard_option
 @json_option
 def sac(
-    robot: Path | None,
-    kit: str | None,
-    where: str,
-    virtual_source: str | None,
-    clock: str | None,
-    yes: bool,
+    place: Place,
     steps: int,
     seed: int,
     out: Path,
-    task: str,
     dt: float | None,
     action_range: str | None,
-    effects: bool,
     randomise: bool,
     learning_start: int | None,
     entropy_start: float | None,
@@ -95,34 +88,28 @@ def sac(
       openant eval my-ant/runs/sac-1 --seconds 120
       openant train sac --env hardware --robot my-ant --out my-ant/runs/real-1
     """
-    need_agents()
-    name, options = place_of(where, robot, kit, virtual_source, clock, task, effects)
-    if dt is not None:
-        options["dt"] = dt
-    if action_range is not None:
-        options["action_range"] = action_range
-    if randomise:
-        if where == "hardware":
-            raise BadInput("--randomise is for the simulation", remedy="leave it out on a robot")
-        options["randomise"] = True
+    if randomise and place.hardware:
+        raise BadInput("--randomise is for the simulation", remedy="leave it out on a robot")
+    chosen = {"dt": dt, "action_range": action_range, "randomise": randomise or None}
+    place.options.update({name: value for name, value in chosen.items() if value is not None})
     if learn is None:
-        learn = "beside" if where == "hardware" else "between"
+        learn = "async" if place.hardware else "sync"
 
-    from openant_agents.beside import train_beside
+    from openant_agents.async_training import train_async
     from openant_agents.sac import Settings
     from openant_agents.sac import train as train_sac
 
     given = {"learning_start": learning_start, "entropy_start": entropy_start, "batch": batch}
     settings = settings_of(Settings, settings_file, "sac", given)
-    more: dict[str, Any] = {"updates_per_step": updates_per_step} if learn == "beside" else {}
-    with training(name, options, yes=yes, steps=steps, out=out) as (env, bar):
-        result = (train_beside if learn == "beside" else train_sac)(
+    more: dict[str, Any] = {"updates_per_step": updates_per_step} if learn == "async" else {}
+    with training(place, steps, out) as (env, bar):
+        result = (train_async if learn == "async" else train_sac)(
             env,
             folder=out,
             steps=steps,
             seed=seed,
             settings=settings,
-            env_facts={"id": name, "options": options},
+            env_facts={"id": place.name, "options": place.options},
             device=device,
             tensorboard=tensorboard,
             report=bar.show,

@@ -7,11 +7,11 @@ from pathlib import Path
 import click
 
 from openant_tools.cli.hardware import Moving
-from openant_tools.cli.learning import need_agents, settings_of, settings_option
+from openant_tools.cli.learning import settings_of, settings_option
 from openant_tools.cli.options import Number, json_option
 from openant_tools.cli.training import (
+    Place,
     effects_option,
-    place_of,
     show_result,
     tensorboard_option,
     training,
@@ -42,19 +42,12 @@ __all__ = ["sarsa"]
 @tensorboard_option
 @json_option
 def sarsa(
-    robot: Path | None,
-    kit: str | None,
-    where: str,
-    virtual_source: str | None,
-    clock: str | None,
-    yes: bool,
+    place: Place,
     steps: int,
     seed: int,
     out: Path,
-    task: str,
     dt: float,
     action_range: str,
-    effects: bool,
     epsilon: float | None,
     step_size: float | None,
     reward_scale: float | None,
@@ -73,9 +66,7 @@ def sarsa(
       openant eval my-ant/runs/sarsa-1 --seconds 120
       openant train sarsa --env hardware --robot my-ant --out my-ant/runs/real-sarsa-1
     """
-    need_agents()
-    name, options = place_of(where, robot, kit, virtual_source, clock, task, effects)
-    options |= {"dt": dt, "action_range": action_range}
+    place.options.update(dt=dt, action_range=action_range)
 
     from openant_agents.runs import load_checkpoint
     from openant_agents.sarsa import Settings
@@ -83,14 +74,14 @@ def sarsa(
 
     given = {"epsilon": epsilon, "step_size": step_size, "reward_scale": reward_scale}
     settings = settings_of(Settings, settings_file, "sarsa", given)
-    with training(name, options, yes=yes, steps=steps, out=out) as (env, bar):
+    with training(place, steps, out) as (env, bar):
         result = train_sarsa(
             env,
             folder=out,
             steps=steps,
             seed=seed,
             settings=settings,
-            env_facts={"id": name, "options": options},
+            env_facts={"id": place.name, "options": place.options},
             tensorboard=tensorboard,
             report=bar.show,
         )

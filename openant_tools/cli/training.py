@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from openant_tools.cli.learning import LearningBar, kit_option, robot_argument
+from openant_tools.cli.learning import LearningBar, kit_option, need_agents, robot_argument
 from openant_tools.cli.options import robot_option
 from openant_tools.cli.walking import (
     HARDWARE_ID,
@@ -24,7 +26,7 @@ from openant_tools.errors import BadInput, StorageFault
 if TYPE_CHECKING:
     from openant_agents.training import Progress
 
-__all__ = ["effects_option", "place_of", "show_result", "tensorboard_option", "training", "training_options"]
+__all__ = ["Place", "effects_option", "show_result", "tensorboard_option", "training", "training_options"]
 
 effects_option = click.option(
     "--effects/--no-effects", default=True, help="Whether the robot's [[effect]] entries act.  [default: on]"
@@ -34,8 +36,26 @@ tensorboard_option = click.option(
 )
 
 
+@dataclass(frozen=True)
+class Place:
+    """Where an agent trains.
+
+    Attributes:
+        name, options: the environment's id and options, as `run.json` keeps them.
+        yes: a robot there may move without a question.
+    """
+
+    name: str
+    options: dict[str, Any]
+    yes: bool
+
+    @property
+    def hardware(self) -> bool:
+        return self.name == HARDWARE_ID
+
+
 def training_options(hour: int, step_s: float, leaves: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """The robot and where it trains, `--steps`, `--seed`, `--out`, `--task`.
+    """The robot and where it trains, as `place`; `--steps`, `--seed`, `--out`, `--task`.
 
     Args:
         hour: so many steps are an hour of robot time. step_s: s, of each.
@@ -64,14 +84,30 @@ def training_options(hour: int, step_s: float, leaves: str) -> Callable[[Callabl
     )  # fmt: skip
 
     def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(command)
+        def placed(
+            robot: Path | None,
+            kit: str | None,
+            where: str,
+            virtual_source: str | None,
+            clock: str | None,
+            yes: bool,
+            task: str,
+            effects: bool,
+            **rest: Any,
+        ) -> Any:
+            need_agents()
+            name, chosen = _place_of(where, robot, kit, virtual_source, clock, task, effects)
+            return command(place=Place(name, chosen, yes), **rest)
+
         for option in reversed(options):
-            command = option(command)
-        return command
+            placed = option(placed)
+        return placed
 
     return add
 
 
-def place_of(
+def _place_of(
     where: str,
     robot: Path | None,
     kit: str | None,
@@ -96,13 +132,11 @@ def place_of(
 
 
 @contextlib.contextmanager
-def training(
-    name: str, options: Mapping[str, Any], *, yes: bool, steps: int, out: Path
-) -> Iterator[tuple[Any, LearningBar]]:
-    """An environment by its id, once a robot may move, and the bar; Ctrl-C says how to go on."""
-    if name == HARDWARE_ID:
-        may_walk(options, yes)
-    with environment(name, options, out / "recordings") as env:
+def training(place: Place, steps: int, out: Path) -> Iterator[tuple[Any, LearningBar]]:
+    """The environment, once a robot may move, and the bar; Ctrl-C says how to go on."""
+    if place.hardware:
+        may_walk(place.options, place.yes)
+    with environment(place.name, place.options, out / "recordings") as env:
         try:
             with LearningBar(steps, out) as bar:
                 yield env, bar
@@ -110,7 +144,7 @@ def training(
             click.echo(f"saved in {out}; the same command goes on from there", err=True)
             raise
         except OSError as error:
-            if name != HARDWARE_ID:
+            if not place.hardware:
                 raise
             raise StorageFault(
                 f"nothing more is saved, and the robot stops: {error.strerror or error}",

@@ -16,8 +16,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from openant_agents import beside  # noqa: E402
-from openant_agents.beside import train_beside  # noqa: E402
+from openant_agents import async_training  # noqa: E402
+from openant_agents.async_training import train_async  # noqa: E402
 from openant_agents.interventions import read_interventions  # noqa: E402
 from openant_agents.learner import SharedWeights  # noqa: E402
 from openant_agents.runs import load_checkpoint, read_curve  # noqa: E402
@@ -59,7 +59,7 @@ def rows(folder: Path) -> np.ndarray:
 
 def test_it_learns_beside_acting_and_goes_on_with_every_transition(tmp_path):
     said = []
-    done = train_beside(Robot(stopped_at=(31,)), folder=tmp_path, steps=120, seed=0, settings=SMALL, report=said.append)
+    done = train_async(Robot(stopped_at=(31,)), folder=tmp_path, steps=120, seed=0, settings=SMALL, report=said.append)
     assert done.step == 120
     assert done.robot_seconds == pytest.approx(12.0)
     assert done.helped == {"the cable came off": 1}
@@ -77,7 +77,7 @@ def test_it_learns_beside_acting_and_goes_on_with_every_transition(tmp_path):
     before = rows(tmp_path)
     with (tmp_path / "transitions.f32").open("ab") as stream:
         stream.write(b"half a row")
-    more = train_beside(Robot(), folder=tmp_path, steps=150, seed=0, settings=SMALL)
+    more = train_async(Robot(), folder=tmp_path, steps=150, seed=0, settings=SMALL)
     assert more.step == 150
     assert more.robot_seconds == pytest.approx(15.0)
     assert more.helped == {"the cable came off": 1}
@@ -95,8 +95,8 @@ def test_kill_9_loses_no_transition(tmp_path):
         import sys
         sys.path.insert(0, {str(Path(__file__).parent)!r})
         from pathlib import Path
-        from test_beside import Robot, SMALL, train_beside
-        train_beside(Robot(5e-3), folder=Path({str(tmp_path)!r}), steps=100_000, seed=0, settings=SMALL)
+        from test_async_training import Robot, SMALL, train_async
+        train_async(Robot(5e-3), folder=Path({str(tmp_path)!r}), steps=100_000, seed=0, settings=SMALL)
     """
     with subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)]) as process:
         while not (tmp_path / "transitions.f32").is_file() or len(rows_so_far(tmp_path)) < 60:
@@ -107,7 +107,7 @@ def test_kill_9_loses_no_transition(tmp_path):
     made = len(rows_so_far(tmp_path))
     wait_for_the_learner(tmp_path)  # it finds nobody there, saves and goes
     assert load_checkpoint(tmp_path)["transitions"] == made
-    done = train_beside(Robot(), folder=tmp_path, steps=made + 5, seed=0, settings=SMALL)
+    done = train_async(Robot(), folder=tmp_path, steps=made + 5, seed=0, settings=SMALL)
     assert done.step == made + 5
     assert done.robot_seconds == pytest.approx(0.1 * (made + 5))
 
@@ -126,7 +126,7 @@ def test_a_step_that_was_not_carried_out_counts_for_nothing_between_actions_too(
     assert checkpoint["agent"]["updates"] == 120 - SMALL.learning_start
 
 
-@pytest.mark.parametrize("learn", [train, train_beside])
+@pytest.mark.parametrize("learn", [train, train_async])
 def test_one_wish_to_stop_ends_waiting_for_a_robot(tmp_path, learn):
     class Lost(Robot):
         def reset(self, *, seed=None, options=None):
@@ -167,22 +167,22 @@ def test_a_learner_that_dies_is_told_and_the_same_call_goes_on(tmp_path, monkeyp
         started.append(popen(*arguments, **options))
         return started[-1]
 
-    monkeypatch.setattr(beside.subprocess, "Popen", remember)
+    monkeypatch.setattr(async_training.subprocess, "Popen", remember)
     with pytest.raises(HardwareFault, match=r"the learner has died \(exit status -9\) → repeat the command"):
-        train_beside(Fatal(), folder=tmp_path, steps=200, seed=0, settings=SMALL)
+        train_async(Fatal(), folder=tmp_path, steps=200, seed=0, settings=SMALL)
     assert len(rows(tmp_path)) >= 40
     monkeypatch.undo()
-    assert train_beside(Robot(), folder=tmp_path, steps=60, seed=0, settings=SMALL).step == 60
+    assert train_async(Robot(), folder=tmp_path, steps=60, seed=0, settings=SMALL).step == 60
 
 
 def test_nothing_is_learned_from_what_is_no_number(tmp_path):
     with pytest.raises(BadInput, match="step 24 gave a reward or an observation that is no number"):
-        train_beside(Robot(nan_at=25), folder=tmp_path / "a", steps=60, seed=0, settings=SMALL)
+        train_async(Robot(nan_at=25), folder=tmp_path / "a", steps=60, seed=0, settings=SMALL)
     assert np.isfinite(rows(tmp_path / "a")).all()
     assert load_checkpoint(tmp_path / "a")["transitions"] == 24
     huge = Settings(learning_start=20, batch=16, hidden=16, reward_scale=1e38)
     with pytest.raises(BadInput, match="weights or losses are no finite numbers any more"):
-        train_beside(Robot(2e-2), folder=tmp_path / "b", steps=3000, seed=0, settings=huge)
+        train_async(Robot(2e-2), folder=tmp_path / "b", steps=3000, seed=0, settings=huge)
     with pytest.raises(BadInput, match="weights or losses are no finite numbers any more"):
         train(Robot(0.0), folder=tmp_path / "c", steps=200, seed=0, settings=huge)
 

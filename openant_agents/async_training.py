@@ -11,9 +11,7 @@ import contextlib
 import socket
 import subprocess
 import sys
-import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from multiprocessing.connection import Connection
@@ -22,24 +20,14 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from openant_agents.learner import Job, SharedWeights
-from openant_agents.runs import CurvePoint, Run
-from openant_agents.sac import CURVE_EVERY, Sac, Settings, device_of, run_facts, sizes
-from openant_agents.training import (
-    REPORT_EVERY_S,
-    Progress,
-    event_writer,
-    finite_or_raise,
-    reset_or_stop,
-    stop_on_signal,
-)
-from openant_env.metrics import AverageReward
+from openant_agents.sac import CURVE_EVERY, Sac, Settings, device_of, one_thread, run_facts_of, sizes
+from openant_agents.training import Progress, Training, finite_or_raise, reset_or_stop, training_run
 from openant_tools.errors import BadInput, HardwareFault, StorageFault
 
-__all__ = ["train_beside"]
+__all__ = ["LearnerProcess", "train_async"]
 
 Array = NDArray[np.float32]
 
@@ -51,7 +39,7 @@ END_TIMEOUT_S = 60.0
 STATE_EVERY_S = 1.0
 
 
-class _LearnerProcess:
+class LearnerProcess:
     """The learner from outside.
 
     Args:
@@ -138,7 +126,7 @@ class _LearnerProcess:
         return str(what)
 
 
-def train_beside(
+def train_async(
     env: gymnasium.Env[Any, Any],
     *,
     folder: Path,
@@ -165,71 +153,40 @@ def train_beside(
     observations, actions = sizes(env)
     # Its replay stays empty and its critics are not used: the learner has both.
     agent = Sac(observations, actions, replace(settings, buffer=1), seed=seed)
-    run = Run(folder, run_facts(env, settings, seed, env_facts) | {"learning": {"updates_per_step": updates_per_step}})
-    events = event_writer(folder) if tensorboard else None
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    facts = run_facts_of(env, settings, seed, env_facts) | {"learning": {"updates_per_step": updates_per_step}}
     device_of(device)
-    learner: _LearnerProcess | None = None
-    try:
-        with stop_on_signal() as stop:
-            checkpoint, rows = run.go_on(agent.replay.width)
-            learner = _LearnerProcess(
-                Job(folder, settings, observations, actions, seed, device, updates_per_step), agent
-            )
-            walk = _Walk(env, run, agent, settings, learner, steps, events, report, stop)
-            walk.remember(checkpoint, rows)
-            try:
-                walk.go(seed)
-            except BaseException:
-                learner.close()  # it saves what it has
-                raise
-            learner.end(walk.state)
-            if report is not None:
-                report(walk.progress)
-            if stop.is_set() and walk.step < steps:
-                raise KeyboardInterrupt
-            return walk.progress
-    finally:
-        torch.set_num_threads(threads)
-        if learner is not None:
-            learner.close()
-        run.close()
-        if events is not None:
-            events.close()
+    with one_thread(), training_run(folder, facts, tensorboard) as (run, events, stop):
+        checkpoint, rows = run.go_on(agent.replay.width)
+        learner = LearnerProcess(Job(folder, settings, observations, actions, seed, device, updates_per_step), agent)
+        try:
+            acting = _Acting(Training(env, run, steps, report, stop), agent, settings, learner, events)
+            acting.remember(checkpoint, rows)
+            acting.go(seed)
+            learner.end(acting.state)
+            return acting.training.end(acting.learning, learner.updates)
+        finally:
+            learner.close()  # it saves what it has
 
 
-class _Walk:
+class _Acting:
     """The acting half: observation, action, transition, again and again."""
 
     def __init__(
-        self,
-        env: gymnasium.Env[Any, Any],
-        run: Run,
-        agent: Sac,
-        settings: Settings,
-        learner: _LearnerProcess,
-        steps: int,
-        events: Any,
-        report: Callable[[Progress], None] | None,
-        stop: threading.Event,
+        self, training: Training, agent: Sac, settings: Settings, learner: LearnerProcess, events: Any
     ) -> None:
-        self._env, self._run, self._agent, self._settings = env, run, agent, settings
-        self._learner, self._steps, self._events = learner, steps, events
-        self._report, self._stop = report, stop
-        self._average = AverageReward()
-        self._helped: Counter[str] = Counter()
-        self._seconds, self._late, self.step = 0.0, 0, 0
+        self.training, self._agent, self._settings, self._learner = training, agent, settings, learner
+        self._events = events
         self._row = np.empty(agent.replay.width, np.float32)
 
     def remember(self, checkpoint: Mapping[str, Any] | None, rows: NDArray[np.float32]) -> None:
         """Go on behind every transition that was made."""
         at = self._agent.replay.observations + self._agent.replay.actions
+        training = self.training
         for reward, dt in rows[-20_000:, at : at + 2].tolist():  # more than a window holds
-            self._average.add(reward, dt)
-        self._seconds, self.step = float(rows[:, at + 1].sum(dtype=np.float64)), len(rows)
+            training.average.add(reward, dt)
+        training.seconds, training.step = float(rows[:, at + 1].sum(dtype=np.float64)), len(rows)
         if checkpoint is not None:
-            self._helped.update(checkpoint.get("helped", {}))
+            training.helped.update(checkpoint.get("helped", {}))
         # Chance goes on elsewhere than it began, or every resumed stretch would explore alike.
         self._agent.random = np.random.default_rng((self._agent.noise.initial_seed(), len(rows)))
         self._agent.noise.manual_seed(self._agent.noise.initial_seed() + len(rows))
@@ -237,55 +194,47 @@ class _Walk:
     @property
     def state(self) -> dict[str, Any]:
         """For the checkpoint."""
-        return {"step": self.step, "seconds": self._seconds, "helped": dict(self._helped)}
+        training = self.training
+        return {"step": training.step, "seconds": training.seconds, "helped": dict(training.helped)}
 
     @property
-    def progress(self) -> Progress:
-        learning = self.step > self._settings.learning_start
-        return Progress(
-            self.step, self._steps, self._seconds, self._average.value, learning, dict(self._helped), self._late,
-            self._learner.updates,
-        )  # fmt: skip
+    def learning(self) -> bool:
+        return self.training.step > self._settings.learning_start
 
     def go(self, seed: int) -> None:
         """Until the run is long enough, or someone wants it to stop."""
-        env, agent, learner, settings = self._env, self._agent, self._learner, self._settings
-        observation: Array | None = reset_or_stop(env, seed, self._stop)
-        told = reported = time.monotonic()
-        while observation is not None and self.step < self._steps and not self._stop.is_set():
+        training, agent, learner, settings = self.training, self._agent, self._learner, self._settings
+        observation: Array | None = reset_or_stop(training.env, seed, training.stop)
+        told = time.monotonic()
+        while observation is not None and training.going:
             learner.follow()
-            random = self.step < settings.learning_start
+            random = training.step < settings.learning_start
             action = agent.random_action() if random else agent.act(observation)
-            seen, reward, terminated, truncated, info = env.step(action)
-            finite_or_raise(seen, float(reward), self.step, self._run.folder)
+            seen, reward, terminated, truncated, info = training.env.step(action)
+            finite_or_raise(seen, float(reward), training.step, training.run.folder)
             if not info.get("void", False):
                 self._keep(observation, action, float(reward), float(info.get("dt", 1.0)), terminated, seen)
-            self._late = int(info.get("overruns", 0))
+            training.late = int(info.get("overruns", 0))
             observation = seen
             if terminated or truncated:
-                reason = str(info.get("reason", "the episode ended"))
-                self._helped[reason] += 1
-                self._run.add_intervention(self.step, self._seconds, reason)
+                training.note_help(info)
                 learner.tell(self.state)
-                observation = reset_or_stop(env, None, self._stop)
+                observation = reset_or_stop(training.env, None, training.stop)
             now = time.monotonic()
             if now - told > STATE_EVERY_S:
                 told = now
                 learner.tell(self.state)
-            if self._report is not None and now - reported > REPORT_EVERY_S:
-                reported = now
-                self._report(self.progress)
+            training.tell(self.learning, learner.updates)
 
     def _keep(self, observation: Array, action: Array, reward: float, dt: float, terminated: bool, seen: Array) -> None:
-        row, o, a = self._row, self._agent.replay.observations, self._agent.replay.actions
+        training, row = self.training, self._row
+        o, a = self._agent.replay.observations, self._agent.replay.actions
         row[:o], row[o : o + a], row[o + a + 3 :] = observation, action, seen
         row[o + a : o + a + 3] = reward, dt, terminated
-        self._run.append(row)
-        self.step += 1
-        self._seconds += dt
-        self._average.add(reward, dt)
-        if self.step % CURVE_EVERY == 0:
-            self._run.add_curve_point(CurvePoint(self.step, self._seconds, self._average.value))
+        training.run.append(row)
+        training.add(reward, dt)
+        if training.step % CURVE_EVERY == 0:
+            training.curve_point()
             if self._events is not None:
-                self._events.add_scalar("average_reward_m_s", self._average.value, self.step)
-                self._events.add_scalar("updates", self._learner.updates, self.step)
+                self._events.add_scalar("average_reward_m_s", training.average.value, training.step)
+                self._events.add_scalar("updates", self._learner.updates, training.step)
