@@ -90,18 +90,8 @@ def theirs(path: str | None, fast: bool) -> Callable[[], list[int]]:
         assert (reader.fastSyncRead if fast else reader.txRxPacket)() == sdk.COMM_SUCCESS
         # The same eleven values of each block that our driver takes out.
         items = (
-            (120, 2),
-            (122, 1),
-            (123, 1),
-            (124, 2),
-            (126, 2),
-            (128, 4),
-            (132, 4),
-            (136, 4),
-            (140, 4),
-            (144, 2),
-            (146, 1),
-        )
+            (120, 2), (122, 1), (123, 1), (124, 2), (126, 2), (128, 4), (132, 4), (136, 4), (140, 4), (144, 2), (146, 1),
+        )  # fmt: skip
         return [[reader.getData(id, address, size) for address, size in items][6] for id in IDS]
 
     return cycle

@@ -94,18 +94,8 @@ def cost_of_cycles(port: str, seconds: float) -> dict[str, float]:
     bus.set_baudrate(1_000_000)
     ids, goals = list(IDS.values()), {joint: 2048 + k for k, joint in enumerate(IDS)}
     items = (
-        (120, 2),
-        (122, 1),
-        (123, 1),
-        (124, 2),
-        (126, 2),
-        (128, 4),
-        (132, 4),
-        (136, 4),
-        (140, 4),
-        (144, 2),
-        (146, 1),
-    )
+        (120, 2), (122, 1), (123, 1), (124, 2), (126, 2), (128, 4), (132, 4), (136, 4), (140, 4), (144, 2), (146, 1),
+    )  # fmt: skip
 
     def cycle() -> list[int]:
         bus.sync_write("Goal_Position", goals, normalize=False)

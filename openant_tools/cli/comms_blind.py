@@ -6,16 +6,7 @@ from pathlib import Path
 
 import click
 
-from openant_tools.cli.blind_sets import (
-    docs_option,
-    jobs_option,
-    key_of_set,
-    key_option,
-    seed_from_option,
-    seed_of_set,
-    seed_option,
-    set_argument,
-)
+from openant_tools.cli import blind_sets as sets
 from openant_tools.cli.options import Number, json_option, out_option
 from openant_tools.cli.progress import progress_bar
 
@@ -30,13 +21,13 @@ def blind() -> None:
 @blind.command()
 @out_option
 @click.option("--soaks", "count", type=click.IntRange(1, 10_000), default=320, show_default=True, metavar="N")
-@seed_option
-@seed_from_option
+@sets.seed_option
+@sets.seed_from_option
 @click.option("--healthy", type=Number(0, 1), metavar="SHARE", help="Healthy soaks. Default a third.")
 @click.option("--virtual", type=Number(0, 1), metavar="SHARE", help="From the virtual robot. Default 0.25.")
-@key_option
+@sets.key_option
 @click.option("--open", "unsealed", is_flag=True, help="Leave the answers open: for development.")
-@jobs_option("Soaks")
+@sets.jobs_option("Soaks")
 def make(
     out: Path,
     count: int,
@@ -57,8 +48,8 @@ def make(
     from openant_tools.blind.soak_set import make_soaks
     from openant_tools.blind.soaks import SoakMix
 
-    drawn_from, full = seed_of_set(seed, commit)
-    key = key_of_set(out, key_file, unsealed)
+    drawn_from, full = sets.seed_of_set(seed, commit)
+    key = sets.key_of_set(out, key_file, unsealed)
     usual = SoakMix()
     mix = SoakMix(usual.healthy if healthy is None else healthy, usual.virtual if virtual is None else virtual)
     with progress_bar() as progress:
@@ -68,8 +59,8 @@ def make(
 
 
 @blind.command()
-@set_argument
-@jobs_option("Soaks")
+@sets.set_argument
+@sets.jobs_option("Soaks")
 def run(folder: Path, jobs: int) -> None:
     """Diagnose every soak of SET that has no verdict yet; it may be stopped and goes on where it was."""
     from openant_tools.blind.soak_set import run_soaks
@@ -80,9 +71,9 @@ def run(folder: Path, jobs: int) -> None:
 
 
 @blind.command()
-@set_argument
-@key_option
-@docs_option
+@sets.set_argument
+@sets.key_option
+@sets.docs_option
 @click.option("--so-far", is_flag=True, help="Only soaks that have a verdict; the page says so.")
 @json_option
 def score(folder: Path, key_file: Path | None, docs: Path | None, so_far: bool, json_file: Path | None) -> None:

@@ -9,16 +9,7 @@ from typing import Any, cast
 
 import click
 
-from openant_tools.cli.blind_sets import (
-    docs_option,
-    jobs_option,
-    key_of_set,
-    key_option,
-    seed_from_option,
-    seed_of_set,
-    seed_option,
-    set_argument,
-)
+from openant_tools.cli import blind_sets as sets
 from openant_tools.cli.options import Number, json_option, out_option, report_option, write_report
 from openant_tools.cli.progress import progress_bar
 from openant_tools.errors import BadInput
@@ -38,8 +29,8 @@ def _share(name: str, words: str) -> Callable[[click.decorators.FC], click.decor
 @blind.command()
 @out_option
 @click.option("--robots", "count", type=click.IntRange(1, 10_000), default=240, show_default=True, metavar="N")
-@seed_option
-@seed_from_option
+@sets.seed_option
+@sets.seed_from_option
 @_share("--none", "Robots without effect, of all. Default 0.35.")
 @_share("--two", "Robots with two effects. Default 0.15.")
 @_share("--outside", "Robots outside the catalogue. Default 0.12.")
@@ -50,9 +41,9 @@ def _share(name: str, words: str) -> Callable[[click.decorators.FC], click.decor
     help="Who makes all of the robots; COMMAND is called with ANSWER.json and an empty folder (docs/blind.md). "
     "Default: batch and bus, by --virtual.",
 )
-@key_option
+@sets.key_option
 @click.option("--open", "unsealed", is_flag=True, help="Leave the answers open, beside the runs: for development.")
-@jobs_option("Robots")
+@sets.jobs_option("Robots")
 def make(
     out: Path,
     count: int,
@@ -81,8 +72,8 @@ def make(
         raise BadInput(
             "the bus has no robots outside the catalogue", remedy="leave --outside out, or say --maker batch"
         )
-    drawn_from, full = seed_of_set(seed, commit)
-    key = key_of_set(out, key_file, unsealed)
+    drawn_from, full = sets.seed_of_set(seed, commit)
+    key = sets.key_of_set(out, key_file, unsealed)
     given: dict[str, Any] = {name: value for name, value in shares.items() if value is not None}
     with progress_bar() as progress:
         commitment = make_set(
@@ -105,8 +96,8 @@ def make(
 
 
 @blind.command()
-@set_argument
-@jobs_option("Robots")
+@sets.set_argument
+@sets.jobs_option("Robots")
 @click.option("--backend", type=click.Choice(["loky", "dask", "ray"]), default="loky", show_default=True)
 @click.option("--scheduler", metavar="ADDRESS", help="Of a Dask cluster that runs already; else one starts here.")
 def run(folder: Path, jobs: int, backend: str, scheduler: str | None) -> None:
@@ -135,7 +126,7 @@ def run(folder: Path, jobs: int, backend: str, scheduler: str | None) -> None:
     metavar="FILE",
     help="The key of each set's answers, in their order. Default: they are open.",
 )
-@docs_option
+@sets.docs_option
 @click.option("--so-far", is_flag=True, help="Only robots that have a verdict; the table says so.")
 @json_option
 @report_option
