@@ -10,7 +10,7 @@ DEMO   ?= demo-robot
 # two workers: what CI has, and any laptop; each begins with a half of the files, so that few prepare the same
 PYTEST_ARGS ?= -n 2 --dist worksteal
 
-.PHONY: demo test lint types contracts pytest ecosystem pictures tour clean
+.PHONY: demo test lint types contracts pytest ecosystem pictures rooms tour clean
 
 demo: $(VENV)/.all
 	@$(BIN)/openant demo --robot $(DEMO)
@@ -51,6 +51,10 @@ ecosystem:
 # docs/tour.md and its pictures: the terminal program itself, walked with a virtual robot.
 tour: $(VENV)/.all
 	$(BIN)/python -m openant_tools.tui.tour docs
+
+# The picture of the packages in docs/architecture.md, from their imports.
+rooms: $(VENV)/.dev
+	$(BIN)/python benchmarks/rooms.py
 
 # The README's picture is the demo's own.
 pictures: demo

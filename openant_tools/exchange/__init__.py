@@ -1,1 +1,1 @@
-"""Other people's formats: datasets of LeRobot become runs."""
+"""Other people's formats: runs and models read from theirs, and written to them."""
