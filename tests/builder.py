@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from openant_tools.bringup.virtual_hands import VirtualHands
+from openant_tools.bringup.simulated_builder import SimulatedBuilder
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.step import (
     Answer,
@@ -50,7 +50,7 @@ class Builder:
         mistakes: Mapping[str, str] | None = None,
         before: Callable[[Event], None] | None = None,
     ) -> None:
-        self.hands = VirtualHands(control, mistakes)
+        self.hands = SimulatedBuilder(control, mistakes)
         self.answers, self.before = dict(answers or {}), before
         self.events = list[Event]()
 

@@ -228,9 +228,9 @@ def _compare(path: Path) -> Any:
 
 
 def _typed(path: Path) -> Any:
-    from openant_tools.sysid.bench.typed import typed_rows
+    from openant_tools.sysid.bench.readings import reading_rows
 
-    return list(typed_rows(path, "volts, grams"))
+    return list(reading_rows(path, "volts, grams"))
 
 
 def _ready(path: Path) -> Any:

@@ -12,8 +12,8 @@ import pytest
 from builder import robot
 
 from openant_tools.bringup.passport import write_passport
+from openant_tools.bringup.persistent_robot import persistent_robot
 from openant_tools.bringup.relay import relayed
-from openant_tools.bringup.virtual_box import virtual_box
 from openant_tools.bringup.walk import WALK, do, standing, step, walk
 from openant_tools.cli.calib import calib
 from openant_tools.comms.clock import VirtualControl
@@ -250,7 +250,7 @@ def test_the_box_remembers_what_was_written_to_its_servos(tmp_path):
     given = tmp_path / "given.toml"
     given.write_text('[robot]\nsetup = "loose"\n[camera]\npresent = false\n')
     for kept in (1, 77):
-        with virtual_box(str(given), tmp_path) as box:
+        with persistent_robot(str(given), tmp_path) as box:
             assert box.kit == "standard"
             state = VirtualControl(box.control).ask("state")
             assert (state["setup"], state["id"]["hip_rr"]) == ("loose", kept)

@@ -18,7 +18,7 @@ import pytest
 from builder import RUBS, SMALL_PICTURES
 from walker import AGAIN, BY_ITSELF, Reply, Walker
 
-from openant_tools.bringup.virtual_box import virtual_box
+from openant_tools.bringup.persistent_robot import persistent_robot
 from openant_tools.bringup.walk import WALK, do, standing
 from openant_tools.calib import wires
 from openant_tools.cli import main
@@ -314,8 +314,8 @@ def test_the_whole_walk_from_loose_motors_to_the_passport_and_on_to_learning(
             await walker.choose(f"Next: {WALK[name].title}")
             said[name] = await walker.begin()
 
-    with virtual_box(VIRTUAL_DEFAULT, folder) as box:  # what was written to its servos is still there
-        box.hands.resume(assembled=True)
+    with persistent_robot(VIRTUAL_DEFAULT, folder) as box:  # what was written to its servos is still there
+        box.builder.resume(assembled=True)
         addresses = {"bus": box.bus, "imu": box.imu, "camera": box.camera, "control": box.control}
         ant = Robot(RobotFolder.at(folder), addresses, folder / "virtual-eeprom.json")
         ant.walk(walk, {"while the legs swing. For how long?": "0.2", "Soak for how long?": "1"})

@@ -66,10 +66,10 @@ def bringup(
         hands = None
         control: str | None = None
         if virtual_source is not None:
-            from openant_tools.bringup.virtual_box import virtual_box
+            from openant_tools.bringup.persistent_robot import persistent_robot
 
-            box = stack.enter_context(virtual_box(virtual_source, robot))
-            hands, control = box.hands, box.control
+            box = stack.enter_context(persistent_robot(virtual_source, robot))
+            hands, control = box.builder, box.control
             port, imu, camera, kit = port or box.bus, imu or box.imu, camera or box.camera, kit or box.kit
         folder = RobotFolder.at(robot) if (robot / "robot.toml").is_file() else create_robot(robot, kit or "standard")
         face = CommandFace(yes=yes, hands=None if hands is None else hands.do)

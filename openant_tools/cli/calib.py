@@ -73,7 +73,7 @@ def bench_of(
 ) -> Iterator[tuple[Bench, Any]]:  # fmt: skip
     """The bench and the face that a step runs with; a virtual robot started for it, with a camera where the step `sees`,
     ends with the block. No other program moves the robot or writes into its folder meanwhile."""
-    from openant_tools.bringup.virtual_hands import VirtualHands
+    from openant_tools.bringup.simulated_builder import SimulatedBuilder
     from openant_tools.cli.face import CommandFace
     from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_robot
 
@@ -87,7 +87,7 @@ def bench_of(
             virtual_robot(virtual_source, clock=clock or clock_of_its_own(virtual_source), camera=sees)
         )
         control = str(found["control"])
-        hands = VirtualHands(control)
+        hands = SimulatedBuilder(control)
         stack.callback(hands.close)
         bench = Bench(folder, port or found["bus"], imu or found["imu"], camera or found["camera"], control, joints)
         yield bench, CommandFace(yes=yes, hands=hands.do)

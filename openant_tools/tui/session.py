@@ -129,10 +129,10 @@ class Session:
             self.virtual = None
             folder = self.folder
             if source is None and folder is not None:
-                from openant_tools.bringup.virtual_box import virtual_box  # it loads MuJoCo
+                from openant_tools.bringup.persistent_robot import persistent_robot  # it loads MuJoCo
 
-                box = self._virtual_process.enter_context(virtual_box(VIRTUAL_DEFAULT, folder.path, clock))
-                box.hands.resume(standing(folder)["legs"].state == "ok")
+                box = self._virtual_process.enter_context(persistent_robot(VIRTUAL_DEFAULT, folder.path, clock))
+                box.builder.resume(standing(folder)["legs"].state == "ok")
                 self.virtual = {"bus": box.bus, "imu": box.imu, "camera": box.camera, "control": box.control}
             else:
                 process = virtual_robot(source or VIRTUAL_DEFAULT, clock=clock)

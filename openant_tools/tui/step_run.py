@@ -7,7 +7,7 @@ import threading
 import traceback
 from collections.abc import Callable
 
-from openant_tools.bringup.virtual_hands import VirtualHands
+from openant_tools.bringup.simulated_builder import SimulatedBuilder
 from openant_tools.errors import OpenAntError
 from openant_tools.procedure.finding import Finding, keep
 from openant_tools.procedure.step import Answer, Ask, Bench, Declined, Event, Hands, Intent, Live, Step, drive
@@ -95,7 +95,7 @@ class StepRun:
 
     def _do_virtually(self, event: Hands) -> None:
         assert self._bench.control is not None
-        hands = VirtualHands(self._bench.control)
+        hands = SimulatedBuilder(self._bench.control)
         try:
             hands.do(event)
         finally:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2
-from openant_tools.sysid.bench.typed import typed_rows
+from openant_tools.sysid.bench.readings import reading_rows
 
 __all__ = [
     "BODY_UP", "Coefficient", "Kind", "Slope", "checked", "coefficient", "friction_finding", "onset_angle", "read_slopes",
@@ -152,7 +152,7 @@ def read_slopes(path: Path) -> list[Slope]:
         BadInput: names the line that cannot be.
     """
     slopes: list[Slope] = []
-    for where, cells in typed_rows(path, "angle,kind"):
+    for where, cells in reading_rows(path, "angle,kind"):
         match = _ANGLE.fullmatch(cells[0])
         if match is None:
             if not slopes and not any(character.isdigit() for character in cells[0]):

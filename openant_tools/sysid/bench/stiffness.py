@@ -27,7 +27,7 @@ from openant_tools.robot.gains import stiffness_nm_rad
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE
 from openant_tools.robot.servo import ServoModel
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2
-from openant_tools.sysid.bench.typed import typed_rows
+from openant_tools.sysid.bench.readings import reading_rows
 
 __all__ = [
     "ARM_UNCERTAINTY", "DIVISORS", "DivisorVerdict", "DutyReading", "Line", "Weighing", "decide_divisor", "fit_line", "lever_arm",
@@ -262,7 +262,7 @@ def read_weighings(path: Path) -> list[Weighing]:
         BadInput: names the line that cannot be.
     """
     readings: list[Weighing] = []
-    for where, cells in typed_rows(path, "deflection,grams"):
+    for where, cells in reading_rows(path, "deflection,grams"):
         if len(cells) < 2:
             raise BadInput("needs two columns", where=where, remedy="deflection in rad, then grams")
         try:

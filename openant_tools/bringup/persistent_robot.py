@@ -1,4 +1,4 @@
-"""A virtual robot in its box, for the walk: it keeps what is written to its servos from one start to the next."""
+"""A virtual robot for the walk: it keeps what is written to its servos from one start to the next."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ from pathlib import Path
 
 import tomlkit
 
-from openant_tools.bringup.virtual_hands import VirtualHands
+from openant_tools.bringup.simulated_builder import SimulatedBuilder
 from openant_tools.errors import BadInput
 from openant_tools.robot.config import editable_document
 from openant_tools.virtual.process import VIRTUAL_DEFAULT, virtual_robot
 from openant_tools.virtual.scenario import read_scenario_file
 
-__all__ = ["VirtualBox", "virtual_box"]
+__all__ = ["PersistentRobot", "persistent_robot"]
 
 #: What stands in the folder of a robot that is virtual.
 SCENARIO, EEPROM = "virtual.toml", "virtual-eeprom.json"
 
 
 @dataclass(frozen=True)
-class VirtualBox:
-    """The ports of the virtual robot, and its hands."""
+class PersistentRobot:
+    """The ports of the virtual robot, and the builder who stands beside it."""
 
     bus: str
     imu: str | None
     camera: str | None
     control: str
     kit: str
-    hands: VirtualHands
+    builder: SimulatedBuilder
 
 
 @contextlib.contextmanager
-def virtual_box(source: str, folder: Path, clock: str | None = "stepped") -> Iterator[VirtualBox]:
+def persistent_robot(source: str, folder: Path, clock: str | None = "stepped") -> Iterator[PersistentRobot]:
     """A robot of loose motors, or a scenario's; or one that runs already.
 
     Args:
@@ -53,9 +53,9 @@ def virtual_box(source: str, folder: Path, clock: str | None = "stepped") -> Ite
             source = str(path)
     with virtual_robot(source, clock=clock) as found, contextlib.ExitStack() as stack:
         control = str(found["control"])
-        hands = VirtualHands(control)
-        stack.callback(hands.close)
-        yield VirtualBox(str(found["bus"]), found["imu"], found["camera"], control, kit, hands)
+        builder = SimulatedBuilder(control)
+        stack.callback(builder.close)
+        yield PersistentRobot(str(found["bus"]), found["imu"], found["camera"], control, kit, builder)
 
 
 def _scenario(source: str, folder: Path) -> tomlkit.TOMLDocument:

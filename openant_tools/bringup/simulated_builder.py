@@ -1,4 +1,4 @@
-"""The hands of a builder who has a virtual robot: what a procedure asks of hands, done by the control socket."""
+"""The builder of a virtual robot: what a procedure asks of hands, done through its control socket."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from openant_tools.comms.clock import VirtualControl
 from openant_tools.procedure.step import Hands
 from openant_tools.robot.joints import JOINT_NAMES
 
-__all__ = ["VirtualHands"]
+__all__ = ["SimulatedBuilder"]
 
 #: s until servos that were just powered answer
 POWER_UP_S = 1.0
@@ -17,7 +17,7 @@ POWER_UP_S = 1.0
 TURN_S, TILT_S = 0.8, 1.0
 
 
-class VirtualHands:
+class SimulatedBuilder:
     """Hands that do at once, or begin, what they are asked to.
 
     Args:

@@ -9,10 +9,10 @@ from pathlib import Path
 from openant_tools.errors import BadInput
 from openant_tools.files import read_text
 
-__all__ = ["typed_rows"]
+__all__ = ["reading_rows"]
 
 
-def typed_rows(path: Path, columns: str) -> Iterator[tuple[str, list[str]]]:
+def reading_rows(path: Path, columns: str) -> Iterator[tuple[str, list[str]]]:
     """Where each row stands, for messages, and its cells; `columns` says what the file should hold.
 
     Raises:
