@@ -21,6 +21,7 @@ a function of the seed and k.
 from __future__ import annotations
 
 import contextlib
+import functools
 import http.server
 import multiprocessing
 import os
@@ -30,13 +31,17 @@ import time
 import urllib.parse
 from bisect import bisect_right
 from collections import OrderedDict, deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from openant_tools.virtual.camera_scene import OverheadCameraSettings, Scene
+
+if TYPE_CHECKING:
+    from openant_tools.virtual.overhead_camera import OverheadCamera
 
 __all__ = ["CAMERA_FAULTS", "VirtualCamera"]
 
@@ -192,13 +197,6 @@ class _Feed:
         self.fault: str | None = None
         self.watchers = 0
         self.published: tuple[int, _Picture | None] = (0, None)
-        from openant_tools.optional import cv2
-        from openant_tools.virtual.overhead_camera import OverheadCamera
-
-        # One thread a picture: the machine's other cores have the robot to compute.
-        cv2.setNumThreads(1)
-        self._jpeg = (cv2.imencode, cv2.IMWRITE_JPEG_QUALITY)
-        self._camera = OverheadCamera(settings, seed)
         self._seed = seed
         self._queue: deque[_Exposure] = deque()
         self._history: deque[_Exposure] = deque(maxlen=MEMORY)
@@ -206,6 +204,18 @@ class _Feed:
         self._held: _Picture | None = None
         self._delivered = 0
         self._render_lock = threading.Lock()
+        if not self.stepped:
+            _ = self._optics  # what is to come in time is got ready; a stepped robot waits for the first picture
+
+    @functools.cached_property
+    def _optics(self) -> tuple[OverheadCamera, Callable[..., Any], int]:
+        """The camera, and how its pictures are compressed. OpenCV and the floor take most of a second."""
+        from openant_tools.optional import cv2
+        from openant_tools.virtual.overhead_camera import OverheadCamera
+
+        # One thread a picture: the machine's other cores have the robot to compute.
+        cv2.setNumThreads(1)
+        return OverheadCamera(self.settings, self._seed), cv2.imencode, cv2.IMWRITE_JPEG_QUALITY
 
     def expose(self, index: int, t: float, monotonic: float, scene: Scene) -> None:
         s = self.settings
@@ -273,8 +283,8 @@ class _Feed:
         with self._render_lock:
             known = self._rendered.get(exposure.index)
             if known is None:
-                image = self._camera.picture(exposure.index, exposure.t, exposure.scene)
-                encode, quality = self._jpeg
+                camera, encode, quality = self._optics
+                image = camera.picture(exposure.index, exposure.t, exposure.scene)
                 known = _Picture(exposure, encode(".jpg", image, [quality, self.settings.jpeg_quality])[1].tobytes())
                 self._rendered[exposure.index] = known
                 if len(self._rendered) > 2 * QUEUE:

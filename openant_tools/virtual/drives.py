@@ -66,6 +66,8 @@ class Drives:
         self.body, self.motors, self.n = body, list(motors), n
         self.dt = body.settings.timestep_s
         self.time = 0.0
+        #: s, until when the body's last state is carried on in a straight line; the world sets it
+        self.now = 0.0
         self.sign, self.mount = sign.astype(float), mount_rad.astype(float)
         self._random = np.random.default_rng(seed)
         # state of the loops
@@ -552,17 +554,15 @@ class Drive:
 
     def __init__(self, drives: Drives, k: int) -> None:
         self._drives, self._k = drives, k
-        #: s, until when the body's last state is carried on in a straight line; the world sets it
-        self.now = 0.0
 
     def sense(self) -> Sensed:
-        return self._drives.sense(self._k, max(self.now, self._drives.time))
+        return self._drives.sense(self._k, max(self._drives.now, self._drives.time))
 
     def set_loop(self, loop: Loop) -> None:
         self._drives.set_loop(self._k, loop)
 
     def set_goal(self, pulses: float, *, velocity: float, acceleration: float, time_based: bool) -> None:
-        arrival = max(self.now, self._drives.time)
+        arrival = max(self._drives.now, self._drives.time)
         self._drives.set_goal(self._k, arrival, pulses, velocity, acceleration, time_based)
 
     def hold(self, pulses: float) -> None:

@@ -328,7 +328,6 @@ class Server:
     def _ready(self, what: Any) -> None:
         if what == "listener":
             client, _ = self._listener.accept()
-            client.setblocking(False)
             control = _Control(client)
             self._restart_counts(control)
             self._controls.append(control)
@@ -438,8 +437,6 @@ class Server:
     def _hear(self, control: _Control) -> None:
         try:
             data = control.socket.recv(65536)
-        except BlockingIOError:
-            return
         except OSError:
             data = b""
         if not data:
@@ -453,9 +450,7 @@ class Server:
             del control.buffer[: end + 1]
             answer = self._answer(control, line)
             with contextlib.suppress(OSError):
-                control.socket.setblocking(True)
                 control.socket.sendall(json.dumps(answer).encode() + b"\n")
-                control.socket.setblocking(False)
 
     def _answer(self, control: _Control, line: bytes) -> dict[str, Any]:
         try:

@@ -119,8 +119,7 @@ class World:
         joints = [setup.joint for setup in settings.servos]
         self.joints = tuple(joints)
         self._build_body()
-        self._views = [Drive(self.drives, k) for k in range(len(joints))]
-        self.servos = [self._build(setup, view) for setup, view in zip(settings.servos, self._views, strict=True)]
+        self.servos = [self._build(setup, Drive(self.drives, k)) for k, setup in enumerate(settings.servos)]
         self.line = Line(self.servos, settings.bus, self.advance, seed=settings.seed + 1)
         if not settings.bus.chains:
             settings.bus.chains = _chains_by_leg(joints)
@@ -182,19 +181,17 @@ class World:
         self._tilting = None
         was = self.drives
         self._build_body()
-        self.drives.time = was.time
+        self.drives.time, self.drives.now = was.time, self.now
         self.drives.winding, self.drives.case = was.winding, was.case
         self.drives.supply_v, self.drives.supply_ohm = was.supply_v, was.supply_ohm
-        self._views = [Drive(self.drives, k) for k in range(len(self.joints))]
         self.line.plugged = set(range(len(self.servos)))
-        for servo, view in zip(self.servos, self._views, strict=True):
-            view.now = self.now
-            servo.motor = view
+        for k, servo in enumerate(self.servos):
+            servo.motor = Drive(self.drives, k)
             servo.power_off()
             servo.power_on(self.now)
 
-    def _build(self, setup: ServoSetup, view: Drive) -> ServoDevice:
-        servo = ServoDevice(setup.model, view, firmware=setup.firmware, clock_ppm=setup.clock_ppm)
+    def _build(self, setup: ServoSetup, drive: Drive) -> ServoDevice:
+        servo = ServoDevice(setup.model, drive, firmware=setup.firmware, clock_ppm=setup.clock_ppm)
         ram = {}
         for name, counts in setup.registers.items():
             register = setup.model.register(name)
@@ -224,9 +221,7 @@ class World:
                 self._poll(POLL_S, protect=self._steps % self._heat_every == 0)
             if self._steps % self._heat_every == 0:
                 self._warm()
-        self.now = max(self.now, t)
-        for view in self._views:
-            view.now = self.now
+        self.now = drives.now = max(self.now, t)
 
     def _asleep(self, target: int) -> bool:
         """While all stands still, let only heat go on: one bound of NAP_S without mechanics. True where it did so.
@@ -256,9 +251,7 @@ class World:
     def _poll(self, elapsed: float, *, protect: bool) -> None:
         """Let faults, hands, firmware and supply look at what `elapsed` (s) brought."""
         now = self._steps * self.settings.body.timestep_s
-        self.now = max(self.now, now)
-        for view in self._views:
-            view.now = now
+        self.now, self.drives.now = max(self.now, now), now
         for event in self.events:
             event(now)
         if self._tilting is not None:
