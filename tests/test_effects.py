@@ -23,7 +23,7 @@ from openant_tools.effects.rollout import rollout
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.model.rollout import Rollouts
-from openant_tools.model.servo import usual_torque
+from openant_tools.model.servo import read_electrical, usual_torque, write_electrical
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import write_table
 from openant_tools.robot.config import Effect as Entry
@@ -32,7 +32,7 @@ from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
 from openant_tools.robot.pair import mark_of
 from openant_tools.sysid import rules
-from openant_tools.sysid.parameter import choose, colours, unloaded
+from openant_tools.sysid.parameter import apply, choose, colours, unloaded
 
 #: a size of each parameter that shows
 SHOWING = {
@@ -297,6 +297,29 @@ def test_beside_load_friction_a_gear_rubs_a_little_unloaded_unless_the_model_say
         else:
             assert beside.value(rubs, beside.centre) == pytest.approx(share * limit)
             assert beside.value(rubs, 0.0) == 0.0, "what falls back goes to the given model"
+
+
+def test_beside_load_friction_not_all_of_the_damping_goes_with_the_torque(tmp_path: Path) -> None:
+    """Grease brakes, too; and a model that was fitted so before is not sent beyond all of it when it is fitted again."""
+    plant = load_plant(write(tmp_path / "m.xml", pendulum(joint='damping="0.12"')), electrical=True)
+    for share in (None, 0.6):
+        if share is not None:
+            write_electrical(plant.model, plant, 0, share)
+        (alone,) = choose(plant, ["electrical_damping"])
+        given = read_electrical(plant.model, plant, 0)
+        assert alone.value(given, alone.centre) == pytest.approx(1.0)
+        beside = unloaded(alone, plant)
+        assert beside.value(given, beside.centre) == pytest.approx(0.92)
+
+
+def test_a_gear_that_rubs_under_load_holds_and_the_given_model_stays_as_it_is(tmp_path: Path) -> None:
+    """MuJoCo's dry friction creeps by default; real gears do not, so that load friction found with it would be another's."""
+    plant = load_plant(write(tmp_path / "m.xml", pendulum(joint='damping="0.12"')))
+    for kinds, holds in ((["coulomb_friction"], False), (["coulomb_friction", "load_friction"], True)):
+        parameters = choose(plant, kinds)
+        given, moved = (apply(plant, parameters, u) for u in np.array([np.zeros(len(kinds)), np.ones(len(kinds))]))
+        assert (given.dof_solimp == plant.model.dof_solimp).all()
+        assert (moved.dof_solimp != given.dof_solimp).any() == holds
 
 
 def test_entries_and_values_say_the_same() -> None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from openant_tools.model.body import floor_contacts, link_bodies, scale_mass, torso_body
 from openant_tools.model.plant import Plant
 from openant_tools.model.servo import (
+    hold_still,
     read_armature,
     read_damping,
     read_friction,
@@ -283,7 +284,7 @@ class Robot:
         shared = self.electrical > 0
         model.dof_damping[plant.dof[shared]] *= 1 - self.electrical[shared]
         if not self.creeps:
-            _hold(model, plant)
+            hold_still(model, plant)
         self._body(model, plant)
         mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
@@ -310,12 +311,6 @@ class Robot:
             model.geom_adhesion[contacts.geoms] = self.adhesion_n
         if self.tilt.any():
             model.opt.gravity[:] = tilted(plant.model.opt.gravity, self.tilt)
-
-
-def _hold(model: mujoco.MjModel, plant: Plant) -> None:
-    """Let joints that dry friction holds stay where they are, unless the model says itself how far they give way."""
-    given = plant.dof[(model.dof_solimp[plant.dof, :2] == GIVES_WAY).all(axis=1)]
-    model.dof_solimp[given, :2] = HOLDS
 
 
 def _soften(
@@ -361,9 +356,6 @@ def tilted(gravity: Array, tilt: Array) -> Array:
     return out
 
 
-#: least and largest impedance of dry friction: as MuJoCo has it by default, where a joint that should stick creeps (at its least d and
-#: solref 0.02 s by a (1 − d)/d / (2/(0.95 · 0.02 s)) = a/950 rad/s, of the acceleration a that it would have), and so stiff that it does not
-GIVES_WAY, HOLDS = (0.9, 0.95), (0.999, 0.999)
 #: kind of a scale or an amount → how each number of a servo that it stands for is read and set
 _NUMBERS = {
     "stiffness": ((read_stiffness, write_stiffness),),

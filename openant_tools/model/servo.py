@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from openant_tools.model.plant import KD, KP, LEAST_SHARE, MOTOR_CONSTANT, RESISTANCE, VMAX, Plant, is_motor
 
 __all__ = [
+    "hold_still",
     "read_armature",
     "read_damping",
     "read_electrical",
@@ -33,6 +34,9 @@ Array = NDArray[np.float64]
 
 #: rad; the greatest error that a servo works with, about: gains may be set low, but the friction of its gears stays
 USUAL_ERROR_RAD = 1.0
+#: least and largest impedance of dry friction: as MuJoCo has it by default, where a joint that should stick creeps (at its least d and
+#: solref 0.02 s by a (1 − d)/d / (2/(0.95 · 0.02 s)) = a/950 rad/s, of the acceleration a that it would have), and so stiff that it does not
+GIVES_WAY, HOLDS = (0.9, 0.95), (0.999, 0.999)
 
 # A servo is either affine (`position`, `general`, `pid`: τ = clip(kp e − kv ω, ±L)) or a DC motor of resistance 1 Ω
 # (plant.motor_form): duty clip(kp e − kv ω, ±L) with back-EMF K² ω beyond it, derivative gain K² + kv, Vmax = L / K.
@@ -140,6 +144,12 @@ def write_torque_limit(model: mujoco.MjModel, plant: Plant, j: int, value: float
         motor[VMAX] = value * motor[RESISTANCE] / motor[MOTOR_CONSTANT]
     else:
         model.actuator_forcerange[plant.actuator[j]] = (-value, value)
+
+
+def hold_still(model: mujoco.MjModel, plant: Plant) -> None:
+    """Let joints that dry friction holds stay where they are, unless the model says itself how far they give way."""
+    given = plant.dof[(model.dof_solimp[plant.dof, :2] == GIVES_WAY).all(axis=1)]
+    model.dof_solimp[given, :2] = HOLDS
 
 
 def usual_torque(model: mujoco.MjModel, plant: Plant, j: int) -> float:

@@ -23,8 +23,8 @@ from openant_tools.effects.catalogue import effect
 from openant_tools.effects.rollout import EffectValues
 from openant_tools.model.attribute import Attribute, stated
 from openant_tools.model.plant import Plant
-from openant_tools.model.servo import usual_torque
-from openant_tools.sysid.kinds import ACTION_DELAY, KINDS, Kind
+from openant_tools.model.servo import hold_still, usual_torque
+from openant_tools.sysid.kinds import ACTION_DELAY, ELECTRICAL_DAMPING, KINDS, LOAD_FRICTION, Kind
 
 __all__ = [
     "ACTION_DELAY",
@@ -50,6 +50,9 @@ Array = NDArray[np.float64]
 OF_REGISTERS = ("stiffness", "velocity_gain")
 #: share of its torque limit that a servo's gear takes unloaded, and its deviation
 UNLOADED, UNLOADED_STD = 0.03, 0.015
+#: share of a servo's damping that is back-EMF, and its deviation: of five servos on a bench (docs/effects.md), none of which is
+#: among the recordings that judge us
+BACK_EMF, BACK_EMF_STD = 0.92, 0.06
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class Parameter:
         declared: the kind, where a user declared it (`declared.py`).
         places: of what was declared, the attributes that change together, and which of an attribute's numbers.
         model: the file whose servos alone it belongs to, where runs were made with several; None for all.
-        middle: u in the middle of its prior, where that is known better than by its kind.
+        centre: u where the prior has its middle: 0, the given model's value, unless physics knows better.
     """
 
     kind: str
@@ -76,7 +79,7 @@ class Parameter:
     declared: Kind | None = None
     places: tuple[Place, ...] = ()
     model: Path | None = None
-    middle: float | None = None
+    centre: float = 0.0
 
     def belongs(self, plant: Plant) -> bool:
         """Whether it says anything of this plant."""
@@ -102,14 +105,6 @@ class Parameter:
             return low, math.log(kind.high / nominal) / self.std if math.isfinite(kind.high) else math.inf
         return (kind.low - nominal) / self.std, (kind.high - nominal) / self.std
 
-    @property
-    def centre(self) -> float:
-        """Where the prior has its middle: 0, the given model's value, unless physics knows better."""
-        prior = self.definition.prior
-        if self.middle is not None:
-            return self.middle
-        return 0.0 if prior is None else prior / self.std
-
 
 def apply(plant: Plant, parameters: Sequence[Parameter], u: Array) -> mujoco.MjModel:
     """A copy of the plant's model with every parameter at its u."""
@@ -124,6 +119,8 @@ def apply(plant: Plant, parameters: Sequence[Parameter], u: Array) -> mujoco.MjM
             nominal = kind.read(plant.model, plant, j)
             kind.write(model, plant, j, parameter.value(nominal, float(value)))
         constants |= kind.constants
+    if u.any() and any(parameter.kind == LOAD_FRICTION for parameter in parameters):
+        hold_still(model, plant)  # a gear under load sticks
     if constants:
         mujoco.mj_setConst(model, _scratch(plant.model))
     return model
@@ -270,21 +267,27 @@ def choose(
             limit = float(np.mean([usual_torque(plant.model, plant, j) for j in joints]))
             relative = kind.relative_std is not None and all(value > 0 for value in nominals)
             std = kind.relative_std if relative and kind.relative_std is not None else kind.absolute_std(limit)
-            chosen.append(Parameter(name, label, tuple(joints), relative, std))
+            centre = 0.0 if kind.prior is None else (kind.prior - float(np.mean(nominals))) / std
+            chosen.append(Parameter(name, label, tuple(joints), relative, std, centre=centre))
     return chosen
 
 
 def unloaded(parameter: Parameter, plant: Plant) -> Parameter:
-    """Dry friction beside one that follows the load: the share of the torque limit that a gear takes while it carries nothing.
+    """A parameter's prior beside a friction that follows the load, of which motions with torque on hardly tell.
 
-    What the model says of it stays its prior. Where it says nothing, none at all is the least likely: a joint that then falls
-    and swings would never come to rest, and motions with torque on hardly tell.
+    Dry friction is then the share of the torque limit that a gear takes while it carries nothing. What the model says of it
+    stays its prior. Where it says nothing, none at all is the least likely: a joint that then falls and swings would never
+    come to rest. And not all of the damping is back-EMF: grease brakes, too. (Without it, dry friction is that of loaded
+    gears, which brakes a falling joint more than the grease does.)
     """
     kind, joints = parameter.definition, parameter.joints
-    if parameter.kind != "coulomb_friction" or any(kind.read(plant.model, plant, j) > 0 for j in joints):
+    given = [kind.read(plant.model, plant, j) for j in joints]
+    if parameter.kind == ELECTRICAL_DAMPING:
+        return replace(parameter, std=BACK_EMF_STD, centre=(BACK_EMF - float(np.mean(given))) / BACK_EMF_STD)
+    if parameter.kind != "coulomb_friction" or max(given) > 0:
         return parameter
     limit = float(np.mean([usual_torque(plant.model, plant, j) for j in joints]))
-    return replace(parameter, std=UNLOADED_STD * limit, middle=UNLOADED / UNLOADED_STD)
+    return replace(parameter, std=UNLOADED_STD * limit, centre=UNLOADED / UNLOADED_STD)
 
 
 def by_register(parameters: Sequence[Parameter], plants: Sequence[Plant]) -> list[Parameter]:
