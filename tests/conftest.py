@@ -23,8 +23,9 @@ os.environ.setdefault("XDG_STATE_HOME", tempfile.mkdtemp(prefix="openant-state-"
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 os.environ.setdefault("MUJOCO_GL", "disable")
 
-# How long an example takes says what else the machine does.
-settings.register_profile("ours", deadline=None)
+# How long an example takes says what else the machine does. `--hypothesis-profile thorough` looks farther.
+settings.register_profile("ours", deadline=None, max_examples=50)
+settings.register_profile("thorough", deadline=None, max_examples=1000)
 settings.load_profile("ours")
 
 

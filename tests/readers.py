@@ -222,9 +222,9 @@ def _fit(folder: Path) -> None:
 
 
 def _compare(path: Path) -> Any:
-    from openant_tools.sysid.compare_sources import _read_json
+    from openant_tools.sysid.compare_sources import snapshot
 
-    return _read_json(path)
+    return snapshot(str(path))
 
 
 def _typed(path: Path) -> Any:
@@ -234,9 +234,10 @@ def _typed(path: Path) -> Any:
 
 
 def _ready(path: Path) -> Any:
-    from openant_tools.virtual.process import _read
+    from openant_tools.virtual.process import virtual_robot
 
-    return _read(path)
+    with virtual_robot(str(path)) as found:
+        return found
 
 
 def _set(folder: Path) -> None:
@@ -341,9 +342,9 @@ def _heat(folder: Path) -> None:
 
 
 def _known(path: Path) -> Any:
-    from openant_tools.cli.thermal_analysis import _known as known
+    from openant_tools.thermal.fit import Known
 
-    return known(path)
+    return Known.read(path)
 
 
 def _text(name: str, text: str) -> Callable[[Path], object]:

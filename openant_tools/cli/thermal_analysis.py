@@ -13,7 +13,6 @@ from openant_tools.cli.options import Number, json_option, report_option, robot_
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
-    from openant_tools.thermal.fit import Known
     from openant_tools.thermal.inputs import Inputs
 
 __all__ = ["compare", "fit", "forecast"]
@@ -46,13 +45,13 @@ def fit(
     """
     from openant_tools.numbers import number
     from openant_tools.thermal.finding import BELIEVED_K
-    from openant_tools.thermal.fit import PARAMETER_WORDS, held_out
+    from openant_tools.thermal.fit import PARAMETER_WORDS, Known, held_out
     from openant_tools.thermal.fit import fit as fit_runs
     from openant_tools.thermal.forecast import forecast as look_ahead
     from openant_tools.thermal.forecast import rest_advice
 
     inputs = [_read(path) for path in runs]
-    known = _known(after)
+    known = None if after is None else Known.read(after)
     earlier = fit_runs(inputs[:-1], after=known).known if len(inputs) > 1 else known
     found = fit_runs(inputs[-1:], after=earlier)
     held = held_out(inputs[-1], after=earlier) if inputs[-1].duration_s >= LEAST_HELD_OUT_S else None
@@ -152,6 +151,7 @@ def forecast(
     Exit code 1: a servo is more likely than not to shut down.
     """
     from openant_tools.errors import BadInput
+    from openant_tools.thermal.fit import Known
     from openant_tools.thermal.fit import fit as fit_runs
     from openant_tools.thermal.forecast import (
         HORIZON_S,
@@ -164,7 +164,7 @@ def forecast(
     from openant_tools.thermal.forecast import forecast as look_ahead
 
     inputs = _read(run)
-    known = _known(after)
+    known = None if after is None else Known.read(after)
     if at_min is not None and at_min * 60 > inputs.duration_s + 1:
         raise BadInput(f"the run ends after {inputs.duration_s / 60:.1f} min", where=run, remedy="give --at less")
     if at_min is not None:
@@ -296,22 +296,6 @@ def _read(path: Path) -> Inputs:
     for problem in problems(run, str(run.path)):
         click.echo(problem, err=True)
     return inputs_of(run)
-
-
-def _known(path: Path | None) -> Known | None:
-    from openant_tools.errors import BadInput
-    from openant_tools.files import read_json
-    from openant_tools.thermal.fit import Known
-
-    if path is None:
-        return None
-    try:
-        content = read_json(path, "name the fit.json that `openant thermal fit` wrote")
-    except OSError as error:
-        raise BadInput(
-            str(error.strerror), where=path, remedy="name the fit.json that `openant thermal fit` wrote"
-        ) from None
-    return Known.of_json(content, str(path))
 
 
 def _folder(robot: Path | None) -> RobotFolder | None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from openant_tools.errors import BadInput
+from openant_tools.files import read_json
 from openant_tools.robot.joints import JOINTS
 from openant_tools.thermal.inputs import Inputs
 from openant_tools.thermal.physics import Servos, State, advance, by_duty
@@ -178,6 +180,15 @@ class Known:
             "joints": list(self.joints), "models": list(self.models), "names": [list(name) for name in self.names],
             "theta": self.theta.tolist(), "covariance": self.covariance.tolist(),
         }  # fmt: skip
+
+    @classmethod
+    def read(cls, path: Path) -> Known:
+        """What stands in the fit.json of an earlier fit; BadInput where that is none."""
+        remedy = "name the fit.json that `openant thermal fit` wrote"
+        try:
+            return cls.of_json(read_json(path, remedy), str(path))
+        except OSError as error:
+            raise BadInput(str(error.strerror), where=path, remedy=remedy) from None
 
     @classmethod
     def of_json(cls, content: Any, where: str) -> Known:
