@@ -86,14 +86,14 @@ ROWS = {
     ),
     "viewers": Row(
         "Rerun and Foxglove read back what was exported", ((".", "rerun-sdk", "foxglove-sdk", *PYTEST),),
-        tests("tests/test_viewers.py"), ("rerun-sdk", "foxglove-sdk", "mcap"),
+        tests("tests/exchange/test_viewers.py"), ("rerun-sdk", "foxglove-sdk", "mcap"),
     ),
     "dynamixel-sdk": Row(
-        "the vendor's SDK on the virtual bus", ((".", *PYTEST),), tests("tests/test_vendor_sdk.py"), ("dynamixel-sdk",)
+        "the vendor's SDK on the virtual bus", ((".", *PYTEST),), tests("tests/comms/test_vendor_sdk.py"), ("dynamixel-sdk",)
     ),
     "dask": Row(
         "a Dask cluster of two workers diagnoses a blind set", ((".[dask,parquet]", *PYTEST),),
-        tests("tests/test_blind.py", "-k", "dask"), ("dask", "distributed"),
+        tests("tests/blind/test_blind.py", "-k", "dask"), ("dask", "distributed"),
     ),
     "notebooks": Row(
         "the notebooks of `examples/`, cell by cell", ((".[agents]",),), peer("notebooks"), ("torch", "mujoco-core", "matplotlib")
@@ -104,7 +104,7 @@ ROWS = {
     ),
     "mujoco-3.17": Row(
         "the oldest MuJoCo with `mujoco.batch`", ((".", *PYTEST), ("-", "mujoco-core", "mujoco"), ("--no-deps", "mujoco==3.17.0")),
-        tests("tests/test_rollout.py", "tests/test_plant.py", "tests/test_write_model.py", "tests/test_plain_mujoco.py"),
+        tests("tests/model/test_rollout.py", "tests/model/test_plant.py", "tests/model/test_write_model.py", "tests/model/test_plain_mujoco.py"),
         ("mujoco", "mujoco-core"),
     ),
 }  # fmt: skip

@@ -2,7 +2,7 @@
 
 At a batch of 256 and layers of 256 autograd's recording of operations and the memory for what they return take a tenth of an
 update. Here each network keeps its memory, and each derivative is one line of arithmetic; the numbers are autograd's but for
-rounding (tests/test_by_hand.py). On processors only: graphics cards have other troubles.
+rounding (tests/agents/test_by_hand.py). On processors only: graphics cards have other troubles.
 
 Acting is the same network for a single observation, compiled, on the very weights: a matrix times a vector takes less time
 than torch needs to find out what it is to do.

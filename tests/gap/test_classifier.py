@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import ROOT
 from scipy.stats import binomtest
 from sklearn.ensemble import HistGradientBoostingClassifier
 
@@ -14,8 +15,6 @@ from openant_tools.arrays import read_arrays, write_arrays
 from openant_tools.gap.classifier import LEAF, Classifier, classifier, weights
 from openant_tools.gap.evidence import COLUMN_NAMES
 from openant_tools.gap.posterior import COLUMNS, NONE, OUTSIDE, WEIGHTS, features_of, log_posterior
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")

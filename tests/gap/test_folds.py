@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from places import SHARED
 from plants import BENCH, ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, write
 
 from openant_tools.gap.assess import assess
@@ -21,7 +22,7 @@ from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
 
 RATE_HZ = 50
-REAL = Path(__file__).parents[3] / "shared" / "realdata" / "bam-xl330"
+REAL = SHARED / "realdata" / "bam-xl330"
 #: the given model has all of its damping in the joint and no friction; the robot's is back-EMF, and it rubs
 GIVEN = pendulum(f'<position {SERVO} kp="8" forcerange="-4 4"/>', joint='damping="0.12" armature="0.006"')
 ROBOT = pendulum(

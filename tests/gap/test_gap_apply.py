@@ -14,6 +14,7 @@ import plain
 import pytest
 from click.testing import CliRunner
 from numpy.typing import NDArray
+from places import ROOT
 from plants import pendulum, sweep, write
 
 from openant_tools.cli.gap import gap
@@ -39,7 +40,7 @@ from openant_tools.robot.pair import PLAIN, mark_of
 
 Array = NDArray[np.float64]
 
-ANT = Path(__file__).parents[2] / "openant_tools" / "robot" / "assets" / "ant_standard.xml"
+ANT = ROOT / "openant_tools" / "robot" / "assets" / "ant_standard.xml"
 T = np.arange(0.0, 2.5, 0.01)
 #: of the motion that an effect changes, and rad beside it, by which the replay may differ: rows of the population are at
 #: steps of the same length, but its friction, stops and filters are other code

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import ROOT, SHARED
 from plants import pendulum, sweep, write
 from test_gap_apply import diagnosis, found
 
@@ -24,7 +25,7 @@ from openant_tools.model.plant import load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run
 
-CATALOGUE = Path(__file__).parents[2] / "shared" / "effects.md"
+CATALOGUE = SHARED / "effects.md"
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +121,7 @@ def test_nothing_is_open_where_nothing_was_found(model: Path) -> None:
 @pytest.fixture
 def rubbing_cable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """The effect that docs/new-effect.md adds, as a file of the package."""
-    page = (Path(__file__).parents[2] / "docs" / "new-effect.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "new-effect.md").read_text(encoding="utf-8")
     code = re.search(r"```python\n(.*?)```", page, re.S)
     assert code is not None
     write(tmp_path / "rubbing_cable.py", code[1])

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from places import ROOT
 
 from openant_tools.cli.comms import comms
 from openant_tools.comms.clock import VirtualControl
@@ -30,7 +31,7 @@ from openant_tools.thermal.soak import Plan, soak_config
 from openant_tools.thermal.soak import soak as soak_servos
 from openant_tools.virtual.process import virtual_robot
 
-PAGE = Path(__file__).parent.parent / "docs" / "restart.md"
+PAGE = ROOT / "docs" / "restart.md"
 #: what ends motion for good by the issue that this table answers
 FOR_GOOD = ("storage", "limits", "port", "guardian", "fall", "by_hand", "unknown")
 

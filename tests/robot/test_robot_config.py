@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from places import ROOT
 
 from openant_tools.cli import main
 from openant_tools.errors import BadInput
@@ -222,7 +223,7 @@ def reads_of_settings() -> dict[str, set[str]]:
     classes = {name: section for section, name in sections.items()} | {"Motor": "motors", "CameraFacts": "camera"}
     found: dict[str, set[str]] = {section: set() for section in classes.values()}
     for root in ("openant_tools", "openant_env", "openant_agents"):
-        for path in (Path(__file__).parents[1] / root).rglob("*.py"):
+        for path in (ROOT / root).rglob("*.py"):
             text = path.read_text()
             nodes = list(ast.walk(ast.parse(text)))
             stands: dict[str, str] = {"motor": "motors", "m": "motors"}

@@ -15,6 +15,7 @@ import numpy as np
 import plain
 import plants
 import pytest
+from places import SHARED
 
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Setup, load_plant
@@ -33,7 +34,7 @@ from openant_tools.sysid.protocols import CommandSpace, protocol
 from openant_tools.sysid.result import write_fit
 from openant_tools.sysid.weights import autocorrelation_time
 
-REAL = Path(__file__).parents[2] / "shared" / "realdata" / "bam-xl330"
+REAL = SHARED / "realdata" / "bam-xl330"
 
 NOISE = 3e-4
 #: what no model can beat: an encoder of 4096 steps a turn, and the noise before it

@@ -22,6 +22,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from places import SHARED, TESTS
 
 from openant_tools.cli import main
 from openant_tools.cli.rec import rec
@@ -36,7 +37,7 @@ from openant_tools.recording.tables import read_run, read_table, write_table
 from openant_tools.recording.telemetry import Answer, Cycle, ServoChannel, Telemetry
 from openant_tools.recording.writer import RecordingStopped, RecordingWriter
 
-REALDATA = Path(__file__).parents[1] / ".." / "shared" / "realdata"
+REALDATA = SHARED / "realdata"
 RAD = 2 * math.pi / 4096
 SCALES = {"pos": RAD, "vel": 0.0239691, "load": 1e-3, "volt": 0.1, "temp": 1.0, "tick": 1.0}
 CHANNELS = (
@@ -367,7 +368,7 @@ def test_repair_does_not_overwrite_an_earlier_rescue(whole: Path, tmp_path: Path
 
 CHILD = """
     import sys, time
-    sys.path.insert(0, {tests!r})
+    sys.path[:0] = {folders!r}
     from test_recording import CHANNELS, FACTS, RecordingWriter, cycle
     writer = RecordingWriter({path!r}, facts=FACTS, channels=CHANNELS)
     for k in range(100000):
@@ -381,7 +382,7 @@ CHILD = """
 
 def test_kill_minus_nine_keeps_all_that_was_synced(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    code = textwrap.dedent(CHILD).format(path=str(path), tests=str(Path(__file__).parent))
+    code = textwrap.dedent(CHILD).format(path=str(path), folders=[str(Path(__file__).parent), str(TESTS)])
     child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     try:
         assert child.stdout is not None

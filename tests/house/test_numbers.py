@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from pathlib import Path
 
 import pytest
+from places import ROOT
 
 from openant_tools.comms.hardware import changes
 from openant_tools.numbers import exact, number, percent, span
 from openant_tools.procedure.journal import EepromWrite
 
-HOUSE = Path(__file__).resolve().parent.parent / "openant_tools"
+HOUSE = ROOT / "openant_tools"
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 import pytest
 import tomlkit
+from places import ROOT
 from plants import pendulum, write
 
 from openant_tools.effects.catalogue import catalogue
@@ -17,7 +18,7 @@ from openant_tools.model.engines import EFFECTS, FEATURES, engines, features_of
 from openant_tools.model.mjcf import write_model
 from openant_tools.model.plant import Setup, load_plant
 
-BENCHMARK = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "engines.py"))
+BENCHMARK = runpy.run_path(str(ROOT / "benchmarks" / "engines.py"))
 
 
 @pytest.mark.parametrize("feature", FEATURES)

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 import pytest
+from places import DATA
 
 from openant_tools.comms.line import SerialLine
 from openant_tools.comms.ports import Host, explain_open_error, udev_rule
@@ -14,7 +15,7 @@ from openant_tools.comms.setup import find_bus
 from openant_tools.errors import HardwareFault
 
 # Kept as a list and not as files: names with colons cannot be checked out everywhere.
-RECORDED = Path(__file__).parent / "data" / "host_ant.txt"
+RECORDED = DATA / "host_ant.txt"
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ import tomlkit
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from places import SHARED
 
 from openant_tools.blind import commands
 from openant_tools.blind import make as make_module
@@ -131,7 +132,7 @@ def test_an_answer_survives_its_file_and_describes_a_robot(seed: int) -> None:
 
 
 def test_the_catalogue_is_whole_and_sizes_grow() -> None:
-    names = Path(__file__).parents[2] / "shared" / "effects.md"
+    names = SHARED / "effects.md"
     if names.exists():
         rows = [line.split("|")[2].strip(" `") for line in names.read_text().splitlines() if line.startswith("| ")]
         assert set(rows[1:]) - {"effect"} == set(KINDS)

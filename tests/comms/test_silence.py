@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from places import ROOT
 from talker import READER, Talker, talking
 from wire import IDS, ant
 
@@ -318,7 +319,7 @@ def test_no_rate_is_given_that_the_wire_does_not_allow() -> None:
 
 
 def test_the_page_is_what_the_program_says() -> None:
-    page = Path(__file__).parents[1] / "docs" / "troubleshooting.md"
+    page = ROOT / "docs" / "troubleshooting.md"
     assert page.read_text() == troubleshooting.page(), (
         "python -m openant_tools.comms.troubleshooting > docs/troubleshooting.md"
     )

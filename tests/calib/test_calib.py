@@ -10,10 +10,10 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from boards import TILTS, board_views
 from builder import robot
 from hypothesis import given
 from hypothesis import strategies as st
-from test_camera import TILTS, board_views
 
 from openant_tools.calib import arena as arena_step
 from openant_tools.calib.arena import LYING_M, STANDING_M, arena, judge_sizes

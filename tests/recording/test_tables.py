@@ -13,12 +13,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from places import SHARED
 
 from openant_tools.errors import BadInput
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run, write_table
 
-REALDATA = Path(__file__).parents[1] / ".." / "shared" / "realdata"
+REALDATA = SHARED / "realdata"
 
 
 def a_run(rows: int = 50, **columns: Any) -> Run:

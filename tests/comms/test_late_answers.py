@@ -12,10 +12,10 @@ import time
 import tty
 from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from faulty_line import IDS, FaultyLine, register_bytes
+from places import ROOT
 
 from openant_tools.comms.bus import Bus, Timing
 from openant_tools.comms.clock import RealClock, portions
@@ -24,7 +24,7 @@ from openant_tools.comms.line import PortGone, SerialLine
 from openant_tools.comms.protocol2 import Status
 from openant_tools.comms.ticks import PROOF_S, TickClock
 
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+sys.path.append(str(ROOT / "benchmarks"))
 from fuzz_transactions import TICK_GRAIN_S, faults, transact
 
 

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lerobot_data import CALIBRATION, JOINTS, TURN, angles, calibrate, counts_of, make, written
+from places import SHARED
 
 from openant_tools.cli import main
 from openant_tools.exchange.lerobot_units import MotorRange, Unit, joint_scale
@@ -22,7 +23,7 @@ from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run
 
 Refused = Callable[..., str]
-REALDATA = Path(__file__).parents[1] / ".." / "shared" / "realdata" / "sage-so101"
+REALDATA = SHARED / "realdata" / "sage-so101"
 
 
 def code_of(*words: object) -> int:

@@ -16,6 +16,7 @@ from builder import robot
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from places import DATA
 
 from openant_tools.cli import openant as manual
 from openant_tools.comms import messages
@@ -51,7 +52,6 @@ from openant_tools.thermal.thermometer import Thermometer, clean
 from openant_tools.virtual.scenario import parse_scenario
 from openant_tools.virtual.world import World
 
-DATA = Path(__file__).parent / "data"
 DOZING = {"clock": {"mode": "stepped", "doze": True}}
 
 

@@ -20,6 +20,7 @@ import click
 import mujoco
 import numpy as np
 import pytest
+from places import ROOT
 from plants import drive, pendulum, run_of, sweep
 
 from openant_tools.cli import main
@@ -141,8 +142,6 @@ def test_the_version_is_printed() -> None:
 
 
 # ---- what the pages for builders tell to type ----
-
-ROOT = Path(__file__).parent.parent
 
 
 def commands_in(page: Path) -> list[str]:

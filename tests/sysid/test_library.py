@@ -16,13 +16,13 @@ import matplotlib
 import numpy as np
 import plants
 import pytest
+from places import ROOT
 
 from openant_tools import sysid
 from openant_tools.cli import main
 from openant_tools.recording.tables import write_table
 from openant_tools.sysid.rules import Verdict
 
-ROOT = Path(__file__).parent.parent
 NOTEBOOK, PAGE = ROOT / "examples" / "identify.ipynb", ROOT / "docs" / "python.md"
 
 

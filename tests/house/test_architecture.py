@@ -6,9 +6,8 @@ import re
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
+from places import ROOT
 
 
 def test_the_picture_of_the_rooms_is_up_to_date() -> None:
