@@ -34,7 +34,7 @@ from openant_tools.robot.config import Provenance
 from openant_tools.robot.derating import derating_of
 from openant_tools.robot.folder import RobotFolder, create_robot
 
-SCENARIO = FLOOR + '[clock]\nmode = "stepped"\ndoze = true\n'
+SCENARIO = FLOOR + '[clock]\nmode = "stepped"\n'
 STILL = np.zeros(8, np.float32)
 RULE = {"start_c": 62.0, "stop_c": 70.0, "least": 0.4}
 
