@@ -40,7 +40,7 @@ class Reader:
     name: str
     make: Callable[[Path], object]
     read: Callable[[Path], Any]
-    tries: int = 1000
+    tries: int = 300
 
 
 def _run() -> Run:
