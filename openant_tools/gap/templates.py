@@ -26,6 +26,8 @@ Template = tuple[str, tuple[int, ...], dict[str, float]]
 SHOWS = 1e-3
 #: of what templates of one place have in common, the share that is taken for noise
 NOISE = 1e-3
+#: deviations by which a template has to show, to be fitted as it is: what differs by less is noise along any direction
+FITS = 1.0
 #: numbers that only must not be zero
 TINY = 1e-6
 
@@ -58,7 +60,7 @@ class Templates:
 
     @cached_property
     def _unit(self) -> Floats:
-        out: Floats = self.vectors / np.maximum(np.linalg.norm(self.vectors, axis=1, keepdims=True), TINY)
+        out: Floats = self.vectors / np.maximum(np.linalg.norm(self.vectors, axis=1, keepdims=True), FITS)
         return out
 
     @cached_property
@@ -89,7 +91,7 @@ class Templates:
         unit = self._unit
         if some is not None:
             z, part = z[:, some], self.vectors[:, some]
-            unit = part / np.maximum(np.linalg.norm(part, axis=1, keepdims=True), TINY)
+            unit = part / np.maximum(np.linalg.norm(part, axis=1, keepdims=True), FITS)
         out: Floats = np.maximum(z @ unit.T, 0.0)
         return out
 

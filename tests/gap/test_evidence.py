@@ -108,6 +108,21 @@ def test_a_size_that_no_template_has_is_found_and_explains_the_rest(
     assert at[first.name] == pytest.approx(truth[first.name], rel=0.15)
 
 
+def test_a_tolerance_takes_what_lies_within_it_and_no_more(
+    pendulum: Protocol, simulated: tuple[list[Case], NDArray[np.float32], NDArray[np.float32]]
+) -> None:
+    """Gains three tolerances off were once taken for those of an unlikely robot of the same build."""
+    bank, templates, healthy = simulated
+    known = np.concatenate([one.layout.known(one.seen) for one in pendulum.runs])
+    scale = Scale.of(layouts_of(pendulum), known, healthy, templates, bank, pendulum.reference)
+    tolerance = catalogue()["stiffness_error"].quantities[0].tolerance
+    cases = [Case({"stiffness_error": ((0,), {"scale": n * tolerance})}, -1) for n in (0.8, 3.0)]
+    within, beyond = np.linalg.norm(scale.vectors(_features(templates_at(pendulum, cases))), axis=1)
+    typical = np.median(np.linalg.norm(scale.whitened(healthy), axis=1))
+    assert within < 0.3 * typical
+    assert beyond > 3 * typical
+
+
 def _features(parts: list[NDArray[np.float32]]) -> NDArray[np.float32]:
     return np.concatenate(parts, axis=1)
 
