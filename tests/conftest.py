@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import tempfile
+from collections.abc import Iterator
 
 import pytest
 from hypothesis import settings
@@ -47,3 +49,13 @@ def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arena, "WIGGLE_S", 3.0)
     monkeypatch.setattr(comms_step, "DEFAULT_MIN", 0.2)
     monkeypatch.setattr(thermal_step, "DEFAULT_MIN", 1.0)
+
+
+@pytest.fixture(scope="module")
+def half_rate() -> Iterator[None]:
+    """The engine of calibration goes round 50 times a second: half of the packets, and every motion as long."""
+    from openant_tools.calib import wires
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wires, "config_of_robot", functools.partial(wires.config_of_robot, rate_hz=50.0))
+        yield

@@ -45,6 +45,7 @@ from openant_tools.robot.config import Camera
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
 
+pytestmark = pytest.mark.usefixtures("half_rate")
 LOOSE = {"robot": {"setup": "loose"}}
 HIP = ("hip_rr",)
 

@@ -89,9 +89,14 @@ def motor(**more: float) -> dict[str, object]:
 
 
 @pytest.fixture(scope="module")
-def lite() -> Inputs:
+def stress() -> Run:
     """The Lite under the paper's stress test, until a knee shuts down."""
-    return inputs_of(stalled(**motor(case_air_k_w=18.0)))
+    return stalled(**motor(case_air_k_w=18.0))
+
+
+@pytest.fixture(scope="module")
+def lite(stress: Run) -> Inputs:
+    return inputs_of(stress)
 
 
 @pytest.fixture(scope="module")
@@ -493,12 +498,12 @@ def test_a_stalled_robot_presses_until_a_servo_shuts_down(tmp_path: Path) -> Non
 
 def test_the_walks_step_soaks_fits_and_finds(tmp_path: Path) -> None:
     with robot(tmp_path / "ant", **DOZING) as there:
-        finding, builder = there.do(thermal_soak(there.bench), there.builder(answers={"how long": 5.0}))
+        finding, builder = there.do(thermal_soak(there.bench), there.builder(answers={"how long": 2.0}))
         assert not any(there.torque())
     assert finding.step == "thermal"
     assert finding.ok, finding.problems
     assert any(one.name == "knee_fl holds for ever" for one in finding.evidence)
-    assert "hold the home pose for 5 min" in builder.said
+    assert "hold the home pose for 2 min" in builder.said
     assert (tmp_path / "ant" / "recordings" / "soak.mcap").is_file()
 
 
@@ -548,8 +553,8 @@ def command(*words: object) -> tuple[int, str]:
     return int(done.return_value or 0), done.output
 
 
-def test_fit_forecast_and_compare_from_tables(tmp_path: Path, lite: Inputs) -> None:
-    bare = stalled(**motor(case_air_k_w=18.0))
+def test_fit_forecast_and_compare_from_tables(tmp_path: Path, stress: Run) -> None:
+    bare = stress
     write_table(bare, tmp_path / "bare.parquet")
     write_table(stalled(seconds=1500, **motor(case_air_k_w=12.0)), tmp_path / "cool.csv")
     assert command("config", "new", "--kit", "lite", "--robot", tmp_path / "ant")[0] == 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import json
 import math
 import subprocess
@@ -20,7 +19,6 @@ from walker import AGAIN, BY_ITSELF, Reply, Walker
 
 from openant_tools.bringup.persistent_robot import persistent_robot
 from openant_tools.bringup.walk import WALK, do, standing
-from openant_tools.calib import wires
 from openant_tools.cli import main
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.procedure.finding import Finding
@@ -32,6 +30,7 @@ from openant_tools.tui.app import OpenAnt
 from openant_tools.tui.screens.walk import WalkScreen
 from openant_tools.virtual.process import VIRTUAL_DEFAULT, virtual_robot
 
+pytestmark = pytest.mark.usefixtures("half_rate")
 WIDE = (120, 40)
 BLIND = "[camera]\npresent = false\n"
 
@@ -251,16 +250,10 @@ def test_a_tag_of_another_size_is_named_on_the_screen(tmp_path: Path, brisk: Non
 # ---- the whole walk ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def half_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The engine goes round 50 times a second: half of the packets, and every motion as long."""
-    monkeypatch.setattr(wires, "config_of_robot", functools.partial(wires.config_of_robot, rate_hz=50.0))
-
-
 @pytest.mark.minutes
 @pytest.mark.timeout(1800)
 def test_the_whole_walk_from_loose_motors_to_the_passport_and_on_to_learning(
-    tmp_path: Path, brisk: None, half_rate: None, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, brisk: None, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """By the command from the box to the built legs, where Ctrl-C ends it; from there by the screens; then it learns."""
     folder, given, report = tmp_path / "ant", tmp_path / "box.toml", tmp_path / "walk.json"
