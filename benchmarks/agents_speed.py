@@ -26,7 +26,7 @@ import torch
 
 from openant_agents.async_training import LearnerProcess
 from openant_agents.learner import Job
-from openant_agents.sac import Sac, Settings
+from openant_agents.sac import Sac, SacSettings
 
 #: s, the loop that acts while another process learns, and how many times
 LOOP_S, LOOPS = 0.05, 300
@@ -70,7 +70,7 @@ def deadlines(agent: Sac, before: Callable[[], object]) -> np.ndarray:
 
 def beside_a_learner() -> np.ndarray:
     """`deadlines` while another process learns without a pause."""
-    settings = Settings(learning_start=0)
+    settings = SacSettings(learning_start=0)
     agent = Sac(sac_speed.OBSERVATIONS, sac_speed.ACTIONS, replace(settings, buffer=1), seed=0)
     with tempfile.TemporaryDirectory() as name:
         rows = np.random.default_rng(0).normal(size=(4096, agent.replay.width)).astype(np.float32)
@@ -93,7 +93,7 @@ def main() -> None:
     for substeps, first, then in ((24, 0.95, 0.97), (60, 0.97, 0.99)):
         env_us, c_us = env_speed.measure(substeps)
         row(f"env step as a share of a C loop, {substeps} physics steps", f"{first}", f"{then}", f"{c_us / env_us:.3f}")
-    settings = Settings(buffer=4096)
+    settings = SacSettings(buffer=4096)
     ours, usual = sac_speed.learner(settings), sac_speed.Usual(settings)
     mine, theirs, ratio = sac_speed.compared(ours.update, usual.update)
     row(

@@ -28,7 +28,7 @@ from typing import Any
 from unittest import mock
 
 from openant_tools.comms import protocol2 as p2
-from openant_tools.comms.bus import Bus, Timing
+from openant_tools.comms.bus import Bus, BusTiming
 from openant_tools.comms.clock import RealClock
 from openant_tools.comms.line import Line, SerialLine
 from openant_tools.comms.servos import BLOCK, BLOCK_ADDRESS, BLOCK_SIZE, Servo, Servos
@@ -58,7 +58,7 @@ def replier(master: int) -> None:
 def ours(path: str | None, fast: bool) -> Callable[[], list[int]]:
     line = MemoryPort() if path is None else SerialLine(path, 1_000_000)
     line.baud = 10**9  # no wire here, and none to wait for
-    bus = Bus(line, MemoryClock() if path is None else RealClock(), Timing(write_read_gap_s=0.0))
+    bus = Bus(line, MemoryClock() if path is None else RealClock(), BusTiming(write_read_gap_s=0.0))
     bus.guarded = True  # no servo is there
     servos = Servos(bus, [Servo(j.name, j.id, kit("standard").servo(j.kind)) for j in JOINTS.values()])
     bus.fast = set(IDS) if fast else set()

@@ -17,7 +17,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from openant_tools.comms.bus import Bus, Timing
+from openant_tools.comms.bus import Bus, BusTiming
 from openant_tools.comms.faults import BrokenAnswer, NoAnswer, Refused
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
@@ -95,7 +95,7 @@ def main() -> None:
     while seen["transactions"] < options.transactions:
         chance = random.Random(seed)
         line = FaultyLine(faults=faults(chance), seed=seed)
-        bus = Bus(line, line, Timing(return_delay_s=0.0, latency_timer_s=chance.choice((1e-3, 16e-3))))
+        bus = Bus(line, line, BusTiming(return_delay_s=0.0, latency_timer_s=chance.choice((1e-3, 16e-3))))
         found = transact(bus, line, chance, LINES, seen)
         if found:
             print(f"seed {seed}, {line.faults}: {Counter(found)}")

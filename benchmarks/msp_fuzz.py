@@ -2,7 +2,7 @@
 
 A stream is either noise (with `$`, `M`, `X` … made frequent) or the reply to one request, mutated: one byte replaced, a
 burst of up to 8 bits, bytes lost or inserted, cut off, or several of these. A reading counts as good where the driver
-would take it: the checksum holds, the payload has the length of its message, and nothing is left over (`Parser.clean`).
+would take it: the checksum holds, the payload has the length of its message, and nothing is left over (`MspParser.clean`).
 
 What must be 0 here: one replaced byte, a burst of up to 8 bits (v2), lost and inserted bytes, a lost tail. Several
 faults at once pass an 8-bit checksum once in 256 times where the length stays right, which no host can see; how often
@@ -20,7 +20,7 @@ import time
 from collections import Counter
 
 from openant_tools.comms import msp
-from openant_tools.comms.msp import Command, Direction, Frame, Framing, Parser
+from openant_tools.comms.msp import Command, Direction, Framing, MspFrame, MspParser
 
 READINGS = [msp.RawImu((i, -i, 2048), (i * 3, 7, -i), (0, 0, 0)) for i in range(1, 40)]
 ANGLES = [msp.Attitude(i, -i, i * 9 % 360) for i in range(1, 40)]
@@ -39,7 +39,7 @@ def reply(rng: random.Random, framing: Framing) -> bytearray:
             (Command.MULTIPLE_MSP, msp.encode_multiple([raw, angles])),
         ]
     )
-    return bytearray(msp.encode(Frame(Direction.REPLY, command, payload, framing)))
+    return bytearray(msp.encode(MspFrame(Direction.REPLY, command, payload, framing)))
 
 
 def mutate(rng: random.Random, data: bytearray, how: str) -> None:
@@ -66,7 +66,7 @@ def mutate(rng: random.Random, data: bytearray, how: str) -> None:
                 )
 
 
-def good_payloads(frames: list[Frame]) -> list[bytes]:
+def good_payloads(frames: list[MspFrame]) -> list[bytes]:
     """What the driver would take for readings."""
     out = []
     for frame in frames:
@@ -109,7 +109,7 @@ def main() -> int:
                 how = "one byte"
             if how != "whole":
                 mutate(rng, data, how)
-        machine = Parser()
+        machine = MspParser()
         one = time.perf_counter()
         at = rng.randrange(len(data) + 1)
         frames = machine.feed(data[:at]) + machine.feed(data[at:])

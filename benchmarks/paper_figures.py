@@ -83,9 +83,11 @@ def train_one(agent: str, folder: Path, steps: int, seed: int, changed: Mapping[
     env = gymnasium.make("openant/AntContinuing-v0", **options)
     facts = {"id": "openant/Ant-v0", "options": options}
     if agent == "sac":
-        sac.train(env, folder=folder, steps=steps, seed=seed, settings=sac.Settings(**changed), env_facts=facts)
+        sac.train(env, folder=folder, steps=steps, seed=seed, settings=sac.SacSettings(**changed), env_facts=facts)
     else:
-        sarsa.train(env, folder=folder, steps=steps, seed=seed, settings=sarsa.Settings(**changed), env_facts=facts)
+        sarsa.train(
+            env, folder=folder, steps=steps, seed=seed, settings=sarsa.SarsaSettings(**changed), env_facts=facts
+        )
     return time.process_time() - begun
 
 

@@ -30,7 +30,7 @@ import mujoco
 import numpy as np
 
 from openant_agents.policies import Policy, load_policy
-from openant_agents.ranking import Measured, find_policies, read_measured, write_measured
+from openant_agents.ranking import PlaceResult, find_policies, read_measured, write_measured
 from openant_agents.runs import read_facts
 from openant_env.observations import layout
 from openant_env.tasks import BackAndForth
@@ -251,7 +251,7 @@ def play(out: Path, policies: Path, key: bytes | None, seconds: float, plays: in
             continue
         begun = time.monotonic()
         dts = {run: read_facts(folder)["trained_on"]["dt"] for run, folder in runs.items()}
-        measured: dict[str, Measured] = {}
+        measured: dict[str, PlaceResult] = {}
         for dt in sorted(set(dts.values())):
             chosen = [run for run in runs if dts[run] == dt]
             loaded, ranges = [], []
@@ -272,7 +272,7 @@ def play(out: Path, policies: Path, key: bytes | None, seconds: float, plays: in
             achieved = walk.play(seconds)
             for k, run in enumerate(chosen):
                 part = slice(k * plays, (k + 1) * plays)
-                measured[run] = Measured.of(achieved[part], helped=int(walk.helped[part].sum()))
+                measured[run] = PlaceResult.of(achieved[part], helped=int(walk.helped[part].sum()))
         write_measured(file, measured, place=name, seconds=seconds)
         print(
             f"{name}: {len(runs)} policies walked {plays} × {seconds:.0f} s in {time.monotonic() - begun:.0f} s",

@@ -15,7 +15,7 @@ from pathlib import Path
 from campaign import Campaign
 from fuzz_transactions import KINDS, faults, transact
 
-from openant_tools.comms.bus import Bus, Timing
+from openant_tools.comms.bus import Bus, BusTiming
 from openant_tools.comms.clock import RealClock
 from openant_tools.comms.faults import HardwareFault, NeverSilent
 from openant_tools.comms.line import SerialLine
@@ -62,7 +62,7 @@ def campaigns() -> list[Campaign]:
 def _transactions(kinds: dict[str, float], seed: int) -> bool:
     chance = random.Random(seed)
     line = FaultyLine(faults=kinds, seed=seed)
-    bus = Bus(line, line, Timing(return_delay_s=0.0, latency_timer_s=chance.choice((1e-3, 16e-3))))
+    bus = Bus(line, line, BusTiming(return_delay_s=0.0, latency_timer_s=chance.choice((1e-3, 16e-3))))
     return not transact(bus, line, chance, TRANSACTIONS, Counter())
 
 
@@ -84,7 +84,7 @@ def _babble(seed: int) -> bool:
 
     talker = threading.Thread(target=talk)
     talker.start()
-    bus = Bus(line, RealClock(), Timing(return_delay_s=0.0, latency_timer_s=1e-3))
+    bus = Bus(line, RealClock(), BusTiming(return_delay_s=0.0, latency_timer_s=1e-3))
     longest, said = 0.0, False
     try:
         for ask in (

@@ -123,7 +123,7 @@ VALUES: tuple[Any, ...] = (
 )  # fmt: skip
 #: messages that do not switch torque off by themselves, nor record
 KINDS: tuple[Any, ...] = (
-    messages.Ramp, messages.Play, messages.Hold, messages.Goal, messages.Look, messages.ReadRegister, messages.WriteRegister,
+    messages.Ramp, messages.Play, messages.Hold, messages.Goal, messages.LetPass, messages.ReadRegister, messages.WriteRegister,
 )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from openant_agents.sac import Actor, Critics, Sac, Settings
+from openant_agents.sac import Actor, Critics, Sac, SacSettings
 
 OBSERVATIONS, ACTIONS = 24, 8
 ROUNDS, UPDATES = 12, 20
@@ -28,7 +28,7 @@ TARGET, TARGET_PLAIN, ACTION_US = 1.5, 1.4, (60, 120)
 class Usual(Sac):
     """The same equations without any of the means that make them quick."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: SacSettings) -> None:
         super().__init__(OBSERVATIONS, ACTIONS, settings, seed=0)
         self.actor = Actor(OBSERVATIONS, ACTIONS, settings)
         self.critics, self.targets = (Critics(OBSERVATIONS, ACTIONS, settings) for _ in range(2))
@@ -76,7 +76,7 @@ class Usual(Sac):
                 target_weight.copy_(settings.tau * weight + (1 - settings.tau) * target_weight)
 
 
-def learner(settings: Settings) -> Sac:
+def learner(settings: SacSettings) -> Sac:
     """Ours, with something to learn from."""
     agent = Sac(OBSERVATIONS, ACTIONS, settings, seed=0)
     agent.replay.restore(np.random.default_rng(0).normal(size=(4096, agent.replay.width)).astype(np.float32), 4096)
@@ -131,7 +131,7 @@ def action_us(agent: Sac) -> tuple[float, float]:
 
 def main() -> None:
     torch.set_num_threads(1)
-    settings = Settings(buffer=4096)
+    settings = SacSettings(buffer=4096)
     ours = learner(settings)
     mine, theirs, ratio = compared(ours.update, Usual(settings).update)
     print(f"updates/s: ours {mine:.0f}, usual structure {theirs:.0f}, ratio {ratio:.2f} (target {TARGET})")

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from openant_agents.sarsa import Sarsa, Settings
+from openant_agents.sarsa import Sarsa, SarsaSettings
 from openant_agents.tile_coding import TileCoder
 
 #: decisions of one coder before it is the other's turn
@@ -23,7 +23,7 @@ TURN = 50
 
 
 def ours(observations: np.ndarray) -> Callable[[int], None]:
-    settings = Settings()
+    settings = SarsaSettings()
     coder = TileCoder(np.full(24, -1.0), np.ones(24), tiles=4, tilings=192, rows=2**25)
     agent = Sarsa(coder, 8, settings, seed=0)
     state = {"rows": coder.rows_of(observations[0]), "action": 0}
@@ -38,7 +38,7 @@ def ours(observations: np.ndarray) -> Callable[[int], None]:
 
 
 def plain(observations: np.ndarray) -> Callable[[int], None]:
-    settings = Settings()
+    settings = SarsaSettings()
     index: dict[tuple[int, ...], int] = {}
     weights = [[0.0] * 2**20 for _ in range(8)]
     traces: list[tuple[list[int], int, float]] = []

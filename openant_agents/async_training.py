@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_agents.learner import Job, SharedWeights
-from openant_agents.sac import CURVE_EVERY, Sac, Settings, device_of, one_thread, run_facts_of, sizes
-from openant_agents.training import Progress, Training, finite_or_raise, reset_or_stop, training_run
+from openant_agents.sac import CURVE_EVERY, Sac, SacSettings, device_of, one_thread, run_facts_of, sizes
+from openant_agents.training import Training, TrainingProgress, finite_or_raise, reset_or_stop, training_run
 from openant_tools.errors import BadInput, HardwareFault, StorageFault
 
 __all__ = ["LearnerProcess", "train_async"]
@@ -132,13 +132,13 @@ def train_async(
     folder: Path,
     steps: int,
     seed: int,
-    settings: Settings | None = None,
+    settings: SacSettings | None = None,
     env_facts: Mapping[str, Any] | None = None,
     device: str = "cpu",
     tensorboard: bool = False,
-    report: Callable[[Progress], None] | None = None,
+    report: Callable[[TrainingProgress], None] | None = None,
     updates_per_step: float = 1.0,
-) -> Progress:
+) -> TrainingProgress:
     """As `sac.train`, with the updates in a process of their own.
 
     Args:
@@ -149,7 +149,7 @@ def train_async(
         HardwareFault: the robot cannot go on, or the learner has died; the same call goes on from there.
         KeyboardInterrupt: asked for by SIGINT or SIGTERM; the run is saved.
     """
-    settings = settings or Settings()
+    settings = settings or SacSettings()
     observations, actions = sizes(env)
     # Its replay stays empty and its critics are not used: the learner has both.
     agent = Sac(observations, actions, replace(settings, buffer=1), seed=seed)
@@ -172,7 +172,7 @@ class _Acting:
     """The acting half: observation, action, transition, again and again."""
 
     def __init__(
-        self, training: Training, agent: Sac, settings: Settings, learner: LearnerProcess, events: Any
+        self, training: Training, agent: Sac, settings: SacSettings, learner: LearnerProcess, events: Any
     ) -> None:
         self.training, self._agent, self._settings, self._learner = training, agent, settings, learner
         self._events = events

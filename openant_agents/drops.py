@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from openant_agents.interventions import read_interventions
 from openant_agents.runs import CurvePoint, load_checkpoint, read_facts
-from openant_agents.training import Progress
+from openant_agents.training import TrainingProgress
 from openant_env.metrics import WINDOW_S
 from openant_tools.files import json_text, write_bytes, write_text
 
@@ -217,7 +217,7 @@ class DropWatch:
         self._finder = DropFinder()
         self._copying: threading.Thread | None = None
 
-    def see(self, progress: Progress) -> Drop | None:
+    def see(self, progress: TrainingProgress) -> Drop | None:
         """The drop that has just begun, if one has."""
         if not self._finder.add(CurvePoint(progress.step, progress.robot_seconds, progress.average_reward_m_s)):
             return None

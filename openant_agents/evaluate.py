@@ -21,7 +21,7 @@ from openant_agents.policies import Policy
 from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput
 
-__all__ = ["LIKELIEST", "SAMPLED", "Frame", "Play", "Plays", "Way", "evaluate", "film"]
+__all__ = ["LIKELIEST", "SAMPLED", "Frame", "Plays", "PolicyPlay", "Way", "evaluate", "film"]
 
 Way = Literal["sampled", "likeliest"]
 SAMPLED: Way = "sampled"
@@ -36,7 +36,7 @@ Report = Callable[[float, float], None]
 
 
 @dataclass(frozen=True)
-class Play:
+class PolicyPlay:
     """What a policy achieved from one start.
 
     Attributes:
@@ -69,7 +69,7 @@ class Plays:
     """What a policy achieved in one way of acting, from all starts."""
 
     way: Way
-    plays: tuple[Play, ...]
+    plays: tuple[PolicyPlay, ...]
 
     @property
     def rewards(self) -> NDArray[np.float64]:
@@ -102,7 +102,7 @@ class Plays:
         return sum(play.stood_still for play in self.plays)
 
     @property
-    def typical(self) -> Play:
+    def typical(self) -> PolicyPlay:
         """The play whose reward is nearest to the median."""
         return min(self.plays, key=lambda play: abs(play.average_reward_m_s - self.median))
 
@@ -142,7 +142,7 @@ def evaluate(
     if not seconds > 0.0 or starts < 1:
         raise BadInput(f"there is nothing to evaluate in {starts} × {seconds:g} s", remedy="give a time above 0")
 
-    def played(number: int) -> Play:
+    def played(number: int) -> PolicyPlay:
         def tell(done: float, average: float) -> None:
             if report is not None:
                 report(number * seconds + done, average)
@@ -167,7 +167,7 @@ def _play(
     seed: int,
     report: Report,
     draw: Callable[[], None],
-) -> Play:
+) -> PolicyPlay:
     act = policy.sample if way == SAMPLED else policy.likeliest
     average = AverageReward(math.inf)
     helped: Counter[str] = Counter()
@@ -196,7 +196,7 @@ def _play(
             observation, info = env.reset()
             policy.begin()
     still = stands_still(times, places)
-    return Play(average.value, average.seconds, steps, progress, path, turns, late, dict(helped), still, seed)
+    return PolicyPlay(average.value, average.seconds, steps, progress, path, turns, late, dict(helped), still, seed)
 
 
 def stands_still(times: Sequence[float], places: Sequence[NDArray[np.float64]]) -> bool:

@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 
 from openant_agents.runs import load_checkpoint, save_checkpoint
-from openant_agents.sac import Sac, Settings
+from openant_agents.sac import Sac, SacSettings
 from openant_agents.training import CHECKPOINT_EVERY_S
 from openant_tools.errors import OpenAntError
 from openant_tools.files import shared_memory
@@ -51,7 +51,7 @@ class Job:
     """
 
     folder: Path
-    settings: Settings
+    settings: SacSettings
     observations: int
     actions: int
     seed: int

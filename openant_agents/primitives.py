@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 
-__all__ = ["LEGS", "PRIMITIVES", "SECONDS", "Gait"]
+__all__ = ["LEGS", "PRIMITIVES", "SECONDS", "PrimitiveGait"]
 
 #: s, the length of a primitive (the paper's agent step).
 SECONDS = 0.5
@@ -45,7 +45,7 @@ _WORDS: Mapping[str, tuple[int, int]] = MappingProxyType(
 Array = NDArray[np.float64]
 
 
-class Gait:
+class PrimitiveGait:
     """Turns primitives into actions of an environment, and remembers where each joint was last sent.
 
     Args:

@@ -23,14 +23,15 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from openant_agents.evaluate import LIKELIEST, SAMPLED, evaluate
-from openant_agents.exploits import Twitch
+from openant_agents.exploits import TwitchCounter
 from openant_agents.policies import load_policy
 from openant_agents.runs import read_facts
 from openant_tools.errors import BadInput
 from openant_tools.files import json_text, read_json, write_text
+from openant_tools.procedure.intervals import Interval
 
 __all__ = [
-    "Agreement", "Interval", "Measured", "agreement", "find_policies", "kendall", "play", "rank_violation", "read_measured", "regret",
+    "Agreement", "PlaceResult", "agreement", "find_policies", "kendall", "play", "rank_violation", "read_measured", "regret",
     "spearman", "write_measured",
 ]  # fmt: skip
 
@@ -41,7 +42,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Measured:
+class PlaceResult:
     """What a policy achieved in one place, with actions drawn as in training (`evaluate.SAMPLED`), by which it is ranked.
 
     Attributes:
@@ -68,7 +69,7 @@ class Measured:
         reversals_hz: float = math.nan,
         helped: int = 0,
         likeliest: Mapping[str, float] | None = None,
-    ) -> Measured:
+    ) -> PlaceResult:
         n = len(plays)
         error = float(np.std(plays, ddof=1) / math.sqrt(n)) if n > 1 else 0.0
         return cls(float(np.mean(plays)), error, tuple(plays), reversals_hz, helped, likeliest)
@@ -77,15 +78,6 @@ class Measured:
     def median(self) -> float:
         """m/s, over plays."""
         return float(np.median(self.plays))
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A figure and its interval of 95 %."""
-
-    value: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -141,7 +133,7 @@ def regret(simulated: Array, real: Array) -> float:
     return float(real.max() - real[int(np.argmax(simulated))])
 
 
-def agreement(simulated: Sequence[Measured], real: Sequence[Measured], *, seed: int = 0) -> Agreement:
+def agreement(simulated: Sequence[PlaceResult], real: Sequence[PlaceResult], *, seed: int = 0) -> Agreement:
     """Compare the rewards of the same policies in a simulation and on the robot.
 
     Raises:
@@ -208,7 +200,7 @@ def play(
     starts: int,
     likeliest: bool = False,
     report: Callable[[float], None] | None = None,
-) -> Measured:
+) -> PlaceResult:
     """Play a policy from some starts, with other headings each.
 
     Args:
@@ -223,7 +215,7 @@ def play(
         BadInput: no such policy, or one that does not fit the place.
     """
     ways = (SAMPLED, LIKELIEST) if likeliest else (SAMPLED,)
-    env = Twitch(make_env(read_facts(run)["env"]))
+    env = TwitchCounter(make_env(read_facts(run)["env"]))
     try:
         policy = load_policy(run, env)
         done, reversals_hz = [], math.nan
@@ -237,7 +229,7 @@ def play(
             if way == SAMPLED:
                 reversals_hz = env.reversals_hz
         sampled = done[0]
-        return Measured.of(
+        return PlaceResult.of(
             sampled.rewards.tolist(), reversals_hz, sampled.helped.total(), done[1].as_dict() if likeliest else None
         )
     finally:
@@ -247,13 +239,13 @@ def play(
 # ------------------------------------------------------------------------------------------------------------- files
 
 
-def write_measured(file: Path, measured: Mapping[str, Measured], **facts: Any) -> None:
+def write_measured(file: Path, measured: Mapping[str, PlaceResult], **facts: Any) -> None:
     """Write what policies achieved in one place, with whatever says where that was."""
     policies = {name: asdict(one) for name, one in measured.items()}
     write_text(file, json_text({"schema": SCHEMA, **facts, "policies": policies}))
 
 
-def read_measured(file: Path) -> dict[str, Measured]:
+def read_measured(file: Path) -> dict[str, PlaceResult]:
     """What `write_measured` wrote, or rewards by name from elsewhere.
 
     Raises:
@@ -266,7 +258,7 @@ def read_measured(file: Path) -> dict[str, Measured]:
             one = {"average_reward_m_s": one} if isinstance(one, int | float) else one
             one = {key: said for key, said in one.items() if said is not None}  # a number that is not known
             value = float(one["average_reward_m_s"])
-            found[name] = Measured(
+            found[name] = PlaceResult(
                 value, float(one.get("standard_error_m_s", 0.0)), tuple(one.get("plays", (value,))),
                 float(one.get("reversals_hz", math.nan)), int(one.get("helped", 0)), _likeliest(one.get("likeliest")),
             )  # fmt: skip

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from openant_agents.curves import COLOURS
-from openant_agents.ranking import Agreement, Measured
+from openant_agents.ranking import Agreement, PlaceResult
 from openant_tools.files import write_bytes
 
 __all__ = ["draw_ranking"]
@@ -15,8 +15,8 @@ __all__ = ["draw_ranking"]
 
 def draw_ranking(
     names: Sequence[str],
-    real: Mapping[str, Measured],
-    simulated: Mapping[str, Mapping[str, Measured]],
+    real: Mapping[str, PlaceResult],
+    simulated: Mapping[str, Mapping[str, PlaceResult]],
     found: Mapping[str, Agreement],
     flagged: Collection[str],
     file: Path,

@@ -39,7 +39,7 @@ from openant_tools.lock import Claim
 __all__ = [
     "SCHEMA",
     "CurvePoint",
-    "Run",
+    "TrainingRun",
     "load_checkpoint",
     "making_sense",
     "read_curve",
@@ -68,7 +68,7 @@ class CurvePoint:
     average_reward_m_s: float
 
 
-class Run:
+class TrainingRun:
     """The folder of one training run.
 
     Args:

@@ -39,8 +39,8 @@ from openant_agents.adam import Adam
 from openant_agents.by_hand import Gradients, acting, flatten, squashed
 from openant_agents.runs import load_checkpoint, making_sense, read_facts
 from openant_agents.training import (
-    Progress,
     Training,
+    TrainingProgress,
     check_trained_on,
     described,
     finite_or_raise,
@@ -51,7 +51,7 @@ from openant_agents.training import (
 from openant_tools.errors import BadInput, HardwareFault
 
 __all__ = [
-    "Actor", "Critics", "Progress", "Replay", "Sac", "Settings", "device_of", "load_policy", "one_thread",
+    "Actor", "Critics", "Replay", "Sac", "SacSettings", "device_of", "load_policy", "one_thread",
     "run_facts_of", "sizes", "train",
 ]  # fmt: skip
 
@@ -59,7 +59,7 @@ Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Settings:
+class SacSettings:
     """The paper's parameters of SAC (its table of parameters, and CleanRL's defaults where it names none).
 
     Attributes:
@@ -100,7 +100,7 @@ class Settings:
 LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
 
 
-def _network(inputs: int, outputs: int, settings: Settings) -> nn.Sequential:
+def _network(inputs: int, outputs: int, settings: SacSettings) -> nn.Sequential:
     """Two hidden layers, each normalised before its ReLU."""
     layers: list[nn.Module] = []
     for size in (inputs, settings.hidden):
@@ -114,7 +114,7 @@ def _network(inputs: int, outputs: int, settings: Settings) -> nn.Sequential:
 class Actor(nn.Module):
     """A tanh-squashed Gaussian policy: mean and standard deviation of each action from an observation."""
 
-    def __init__(self, observations: int, actions: int, settings: Settings) -> None:
+    def __init__(self, observations: int, actions: int, settings: SacSettings) -> None:
         super().__init__()
         self.network = _network(observations, 2 * actions, settings)
 
@@ -148,7 +148,7 @@ class Actor(nn.Module):
 class Critics(nn.Module):
     """Two action-value functions of their own; the smaller estimate counts."""
 
-    def __init__(self, observations: int, actions: int, settings: Settings) -> None:
+    def __init__(self, observations: int, actions: int, settings: SacSettings) -> None:
         super().__init__()
         self.first = _network(observations + actions, 1, settings)
         self.second = _network(observations + actions, 1, settings)
@@ -268,7 +268,7 @@ class Sac:
         self,
         observations: int,
         actions: int,
-        settings: Settings,
+        settings: SacSettings,
         *,
         seed: int,
         device: str | torch.device = "cpu",
@@ -427,7 +427,7 @@ CURVE_EVERY = 100
 
 
 def run_facts_of(
-    env: gymnasium.Env[Any, Any], settings: Settings, seed: int, env_facts: Mapping[str, Any] | None
+    env: gymnasium.Env[Any, Any], settings: SacSettings, seed: int, env_facts: Mapping[str, Any] | None
 ) -> dict[str, Any]:
     """What `run.json` says of a run of SAC."""
     return run_facts("sac", env, settings.as_dict(), seed, env_facts, sizes(env), {"torch": torch.__version__})
@@ -450,12 +450,12 @@ def train(
     folder: Path,
     steps: int,
     seed: int,
-    settings: Settings | None = None,
+    settings: SacSettings | None = None,
     env_facts: Mapping[str, Any] | None = None,
     device: str = "cpu",
     tensorboard: bool = False,
-    report: Callable[[Progress], None] | None = None,
-) -> Progress:
+    report: Callable[[TrainingProgress], None] | None = None,
+) -> TrainingProgress:
     """Train on one environment, or go on with the run that the folder holds.
 
     Args:
@@ -475,7 +475,7 @@ def train(
         HardwareFault: the robot cannot go on; the run is saved.
         KeyboardInterrupt: asked for by SIGINT or SIGTERM; the run is saved and goes on with the same call.
     """
-    settings = settings or Settings()
+    settings = settings or SacSettings()
     observations, actions = sizes(env)
     agent = Sac(observations, actions, settings, seed=seed, device=device_of(device))
     facts = run_facts_of(env, settings, seed, env_facts)
@@ -483,7 +483,7 @@ def train(
         return _train(Training(env, run, steps, report, stop), agent, seed, events)
 
 
-def _train(training: Training, agent: Sac, seed: int, events: Any) -> Progress:
+def _train(training: Training, agent: Sac, seed: int, events: Any) -> TrainingProgress:
     env, run, settings, replay = training.env, training.run, agent.settings, agent.replay
     observation = training.begin(seed)
     checkpoint = run.resume()
@@ -561,7 +561,7 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
             )
         check_trained_on(facts, described(env), ("observation_names", "action_names", "action_range"), folder)
         checkpoint = load_checkpoint(folder)
-        agent = Sac(observations, actions, Settings(**{**facts["settings"], "buffer": 1}), seed=int(facts["seed"]))
+        agent = Sac(observations, actions, SacSettings(**{**facts["settings"], "buffer": 1}), seed=int(facts["seed"]))
         agent.actor.load_state_dict(checkpoint["agent"]["actor"])
         return agent, int(checkpoint["step"])
 

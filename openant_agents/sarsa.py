@@ -36,12 +36,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_agents.compiled import compiled
-from openant_agents.primitives import Gait
+from openant_agents.primitives import PrimitiveGait
 from openant_agents.runs import load_checkpoint, making_sense, read_facts
 from openant_agents.tile_coding import Rows, TileCoder
 from openant_agents.training import (
-    Progress,
     Training,
+    TrainingProgress,
     check_trained_on,
     described,
     finite_or_raise,
@@ -51,7 +51,7 @@ from openant_agents.training import (
 )
 from openant_tools.errors import BadInput, HardwareFault
 
-__all__ = ["Sarsa", "SarsaPolicy", "Settings", "load_policy", "train"]
+__all__ = ["Sarsa", "SarsaPolicy", "SarsaSettings", "load_policy", "train"]
 
 Array = NDArray[np.float32]
 
@@ -64,7 +64,7 @@ TRACES = 256
 
 
 @dataclass(frozen=True)
-class Settings:
+class SarsaSettings:
     """The paper's parameters of SARSA(λ).
 
     Attributes:
@@ -108,7 +108,7 @@ class Sarsa:
         seed: of exploration.
     """
 
-    def __init__(self, coder: TileCoder, actions: int, settings: Settings, *, seed: int) -> None:
+    def __init__(self, coder: TileCoder, actions: int, settings: SarsaSettings, *, seed: int) -> None:
         self.coder, self.actions, self.settings = coder, actions, settings
         self.random = np.random.default_rng(seed)
         # Rows by tile, so that all actions of a tile lie together; the system gives memory only as rows are written. The
@@ -254,7 +254,7 @@ def _pay(weights: Array, rows: Rows, action: np.int64, owed: np.float64) -> None
 
 def _compile() -> None:
     """Have the machine code of all that a decision does: an agent may be made while its robot moves."""
-    agent = Sarsa(TileCoder(np.zeros(1), np.ones(1), tiles=1, tilings=1, rows=2), 1, Settings(), seed=0)
+    agent = Sarsa(TileCoder(np.zeros(1), np.ones(1), tiles=1, tilings=1, rows=2), 1, SarsaSettings(), seed=0)
     rows = agent.rows_of(np.zeros(1, np.float32))
     agent.learn(rows, 0, 0.0, STEP_S, rows, 0)
     agent.settle()
@@ -331,7 +331,7 @@ class _Bounds:
         self.high = np.where(self.known, self.high, np.maximum(self.high, observation))
 
 
-def _agent(bounds: _Bounds, actions: int, settings: Settings, seed: int) -> Sarsa:
+def _agent(bounds: _Bounds, actions: int, settings: SarsaSettings, seed: int) -> Sarsa:
     coder = TileCoder(
         bounds.low, bounds.high, tiles=settings.tiles, tilings=settings.tilings, rows=settings.table
     )  # fmt: skip
@@ -383,11 +383,11 @@ def train(
     folder: Path,
     steps: int,
     seed: int,
-    settings: Settings | None = None,
+    settings: SarsaSettings | None = None,
     env_facts: Mapping[str, Any] | None = None,
     tensorboard: bool = False,
-    report: Callable[[Progress], None] | None = None,
-) -> Progress:
+    report: Callable[[TrainingProgress], None] | None = None,
+) -> TrainingProgress:
     """Train on one environment, or go on with the run that the folder holds.
 
     Args:
@@ -407,7 +407,7 @@ def train(
         HardwareFault: the robot cannot go on; the run is saved and goes on with the same call.
         KeyboardInterrupt: asked for by SIGINT or SIGTERM; the run is saved and goes on with the same call.
     """
-    settings = settings or Settings()
+    settings = settings or SarsaSettings()
     gait = _gait(env, described(env))
     _compile()
     bounds = _Bounds.of(env)
@@ -422,8 +422,14 @@ def train(
 
 
 def _train(
-    training: Training, gait: Gait, bounds: _Bounds, scribe: _Scribe, settings: Settings, seed: int, events: Any
-) -> Progress:
+    training: Training,
+    gait: PrimitiveGait,
+    bounds: _Bounds,
+    scribe: _Scribe,
+    settings: SarsaSettings,
+    seed: int,
+    events: Any,
+) -> TrainingProgress:
     env, run = training.env, training.run
     columns = _Columns(len(bounds.low))
     random = np.random.default_rng(seed)
@@ -528,7 +534,7 @@ def _summary(agent: Sarsa) -> dict[str, Any]:
 
 
 def _learned(
-    folder: Path, checkpoint: Mapping[str, Any], actions: int, settings: Settings, seed: int
+    folder: Path, checkpoint: Mapping[str, Any], actions: int, settings: SarsaSettings, seed: int
 ) -> tuple[_Bounds, Sarsa | None]:
     """Bounds and agent as they were at a checkpoint: its decisions learned again, one after the other.
 
@@ -569,7 +575,7 @@ def _learned(
 class SarsaPolicy:
     """An agent that acts and no longer learns: the action of every environment step."""
 
-    def __init__(self, agent: Sarsa, gait: Gait) -> None:
+    def __init__(self, agent: Sarsa, gait: PrimitiveGait) -> None:
         self._agent, self._gait = agent, gait
         self._commands: deque[Array] = deque()
 
@@ -612,7 +618,7 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[SarsaPolicy
         check_trained_on(facts, here, ("observation_names", "action_names", "action_range", "dt"), folder)
         checkpoint = load_checkpoint(folder)
         _compile()
-        settings, seed = Settings(**facts["settings"]), int(facts["seed"])
+        settings, seed = SarsaSettings(**facts["settings"]), int(facts["seed"])
         _, agent = _learned(folder, checkpoint, len(gait), settings, seed)
         if agent is None:
             raise BadInput(
@@ -624,8 +630,8 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[SarsaPolicy
         return SarsaPolicy(agent, gait), int(checkpoint["step"])
 
 
-def _gait(env: gymnasium.Env[Any, Any], described: Mapping[str, Any]) -> Gait:
+def _gait(env: gymnasium.Env[Any, Any], described: Mapping[str, Any]) -> PrimitiveGait:
     space = env.observation_space
     if not (isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1):
         raise BadInput(f"observations are {space}, not a vector", remedy="wrap it in FlattenObservation")
-    return Gait(described.get("action_names", ()), float(described.get("dt", 0.0)))
+    return PrimitiveGait(described.get("action_names", ()), float(described.get("dt", 0.0)))

@@ -22,13 +22,22 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_agents.runs import CurvePoint, Run
+from openant_agents.runs import CurvePoint, TrainingRun
 from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput
 
 __all__ = [
-    "CHECKPOINT_EVERY_S", "Progress", "Training", "check_trained_on", "described", "event_writer", "finite_or_raise",
-    "reset_or_stop", "run_facts", "stop_on_signal", "training_run",
+    "CHECKPOINT_EVERY_S",
+    "Training",
+    "TrainingProgress",
+    "check_trained_on",
+    "described",
+    "event_writer",
+    "finite_or_raise",
+    "reset_or_stop",
+    "run_facts",
+    "stop_on_signal",
+    "training_run",
 ]  # fmt: skip
 
 Array = NDArray[np.float32]
@@ -40,7 +49,7 @@ REPORT_EVERY_S = 0.25
 
 
 @dataclass(frozen=True)
-class Progress:
+class TrainingProgress:
     """How far a training run is.
 
     Attributes:
@@ -118,13 +127,13 @@ def check_trained_on(facts: Mapping[str, Any], here: Mapping[str, Any], what: tu
 @contextmanager
 def training_run(
     folder: Path, facts: Mapping[str, Any], tensorboard: bool
-) -> Iterator[tuple[Run, Any, threading.Event]]:
+) -> Iterator[tuple[TrainingRun, Any, threading.Event]]:
     """A run's folder, held; its TensorBoard events (None: not asked for); the wish to stop.
 
     Raises:
         BadInput: the folder holds another run, or TensorBoard is not installed.
     """
-    run = Run(folder, facts)
+    run = TrainingRun(folder, facts)
     events = None
     try:
         events = event_writer(folder) if tensorboard else None
@@ -157,9 +166,9 @@ class Training:
     def __init__(
         self,
         env: gymnasium.Env[Any, Any],
-        run: Run,
+        run: TrainingRun,
         steps: int,
-        report: Callable[[Progress], None] | None,
+        report: Callable[[TrainingProgress], None] | None,
         stop: threading.Event,
         write: Callable[..., None] = _at_once,
     ) -> None:
@@ -220,8 +229,8 @@ class Training:
     def save_is_due(self) -> bool:
         return time.monotonic() - self.saved_at > CHECKPOINT_EVERY_S
 
-    def progress(self, learning: bool, updates: int | None = None) -> Progress:
-        return Progress(
+    def progress(self, learning: bool, updates: int | None = None) -> TrainingProgress:
+        return TrainingProgress(
             self.step, self.steps, self.seconds, self.average.value, learning, dict(self.helped), self.late, updates
         )
 
@@ -232,7 +241,7 @@ class Training:
             self._reported_at = now
             self._report(self.progress(learning, updates))
 
-    def end(self, learning: bool, updates: int | None = None) -> Progress:
+    def end(self, learning: bool, updates: int | None = None) -> TrainingProgress:
         """Report for the last time; raises KeyboardInterrupt where someone wanted to stop before the run was long enough."""
         progress = self.progress(learning, updates)
         if self._report is not None:

@@ -25,7 +25,7 @@ import sqlalchemy
 from optuna.storages.journal import JournalFileBackend
 
 from openant_agents import sac, sarsa
-from openant_agents.training import Progress
+from openant_agents.training import TrainingProgress
 from openant_tools.errors import BadInput
 from openant_tools.files import reading
 
@@ -42,10 +42,10 @@ OPENINGS = 6
 RACES = (sqlalchemy.exc.OperationalError, sqlalchemy.exc.IntegrityError, sqlalchemy.exc.ProgrammingError)
 
 
-def _sarsa(trial: optuna.Trial) -> sarsa.Settings:
+def _sarsa(trial: optuna.Trial) -> sarsa.SarsaSettings:
     """The paper's space of SARSA(λ); the step size is a base shared by all tilings."""
     tilings = 24 * trial.suggest_int("tilings_by_24", 2, 8)
-    return sarsa.Settings(
+    return sarsa.SarsaSettings(
         epsilon=trial.suggest_float("epsilon", 0.01, 0.3, log=True),
         gamma=trial.suggest_float("gamma", 0.9, 0.999),
         trace=trial.suggest_float("trace", 0.0, 0.99),
@@ -56,9 +56,9 @@ def _sarsa(trial: optuna.Trial) -> sarsa.Settings:
     )
 
 
-def _sac(trial: optuna.Trial) -> sac.Settings:
+def _sac(trial: optuna.Trial) -> sac.SacSettings:
     """The paper's grid of SAC in simulation; its γ is taken as that of a second, as in the platform's software."""
-    chosen = sac.Settings(
+    chosen = sac.SacSettings(
         gamma_per_s=trial.suggest_categorical("gamma_per_s", [0.98, 0.92]),
         tau=trial.suggest_categorical("tau", [0.005, 0.008]),
         batch=128,
@@ -73,7 +73,7 @@ def _sac(trial: optuna.Trial) -> sac.Settings:
 
 
 #: agent → settings drawn by a trial
-SPACES: Mapping[Agent, Callable[[optuna.Trial], sac.Settings | sarsa.Settings]] = {"sac": _sac, "sarsa": _sarsa}
+SPACES: Mapping[Agent, Callable[[optuna.Trial], sac.SacSettings | sarsa.SarsaSettings]] = {"sac": _sac, "sarsa": _sarsa}
 
 
 class _Sum(gymnasium.Wrapper):  # type: ignore[misc]
@@ -167,7 +167,7 @@ def search(
     trials: int,
     steps: int,
     seeds: Sequence[int],
-    report: Callable[[int, int, Progress], None] | None = None,
+    report: Callable[[int, int, TrainingProgress], None] | None = None,
     done: Callable[[optuna.Study, optuna.trial.FrozenTrial], None] | None = None,
 ) -> None:
     """Try settings until the study has so many trials, those of other processes included.
@@ -205,7 +205,7 @@ def search(
             trial.set_user_attr("average_reward_m_s", averages)
         return sum(averages) / len(averages)
 
-    def _tell(trial: optuna.Trial, seed: int, progress: Progress) -> None:
+    def _tell(trial: optuna.Trial, seed: int, progress: TrainingProgress) -> None:
         if report is not None:
             report(trial.number, seed, progress)
 
@@ -223,7 +223,7 @@ def _train(
     steps: int,
     seed: int,
     settings: Any,
-    report: Callable[[Progress], None],
+    report: Callable[[TrainingProgress], None],
 ) -> None:
     if agent == "sac":
         sac.train(env, folder=folder, steps=steps, seed=seed, settings=settings, report=report)

@@ -284,14 +284,14 @@ class RobotLink:
         if self._engine is not None and not self._engine.ended:
             with contextlib.suppress(HardwareFault):
                 self._engine.telemetry()
-                self._engine.ask(messages.Look(seconds))
+                self._engine.ask(messages.LetPass(seconds))
                 return self._rows()
         self.wait(seconds)
         return None
 
     def picture(self) -> NDArray[np.uint8] | None:
         """The overhead camera's newest picture, (height, width, 3) in RGB; None where there is none."""
-        found: NDArray[np.uint8] | None = self._need_engine().ask(messages.Picture())
+        found: NDArray[np.uint8] | None = self._need_engine().ask(messages.TakePicture())
         return found
 
     def wait(self, seconds: float) -> None:
@@ -363,7 +363,7 @@ class RobotLink:
             return
         with contextlib.suppress(HardwareFault):
             engine.telemetry()
-            engine.ask(messages.Look(SINK_S))
+            engine.ask(messages.LetPass(SINK_S))
             rows = engine.telemetry()
             for servo in self.config.servos:
                 angles = rows[:, self.columns[f"pos.{servo.joint}"]]

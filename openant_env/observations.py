@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-__all__ = ["ORDERS", "Block", "Layout", "layout"]
+__all__ = ["ORDERS", "Block", "ObservationLayout", "layout"]
 
 #: block, named as in run tables → size, None where it is one number a joint.
 BLOCKS: Mapping[str, int | None] = {
@@ -29,7 +29,7 @@ ORDERS: Mapping[str, tuple[Block, ...]] = {
 
 
 @dataclass(frozen=True)
-class Layout:
+class ObservationLayout:
     """Where each block stands in an observation.
 
     Attributes:
@@ -46,7 +46,7 @@ class Layout:
         return len(self.names)
 
 
-def layout(joints: Sequence[str], order: str = "platform") -> Layout:
+def layout(joints: Sequence[str], order: str = "platform") -> ObservationLayout:
     """The layout of an observation of these joints.
 
     Args:
@@ -64,4 +64,4 @@ def layout(joints: Sequence[str], order: str = "platform") -> Layout:
         parts = tuple(joints) if size is None else axes[size]
         slices[block] = slice(len(names), len(names) + len(parts))
         names += [f"{block}.{part}" for part in parts]
-    return Layout(order, slices, tuple(names))
+    return ObservationLayout(order, slices, tuple(names))

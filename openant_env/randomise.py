@@ -20,7 +20,7 @@ from openant_tools.model.plant import Plant
 from openant_tools.robot.config import RobotConfig
 from openant_tools.robot.folder import RobotFolder
 
-__all__ = ["Interval", "Randomiser", "intervals_of"]
+__all__ = ["FittedInterval", "Randomiser", "intervals_of"]
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ SAME = 1e-3
 
 
 @dataclass(frozen=True)
-class Interval:
+class FittedInterval:
     """One fitted value.
 
     Attributes:
@@ -46,7 +46,7 @@ class Interval:
     high: float
 
 
-def intervals_of(folder: RobotFolder, config: RobotConfig) -> tuple[Interval, ...]:
+def intervals_of(folder: RobotFolder, config: RobotConfig) -> tuple[FittedInterval, ...]:
     """What `robot.toml` says was fitted, with intervals.
 
     Raises:
@@ -58,7 +58,7 @@ def intervals_of(folder: RobotFolder, config: RobotConfig) -> tuple[Interval, ..
         for joint, value in values.items() if isinstance(values, Mapping) else ():
             entry = config.provenance_of(f"identified.{kind}.{joint}")
             if entry is not None and entry.how == "fitted" and entry.low is not None and entry.high is not None:
-                found.append(Interval(kind, joint, float(value), entry.low, entry.high))
+                found.append(FittedInterval(kind, joint, float(value), entry.low, entry.high))
     if not found:
         raise BadInput(
             "nothing was identified yet whose interval could be drawn from",
@@ -81,13 +81,13 @@ class Randomiser:
         drawn: (draws,) standard normal numbers behind the robot at hand; zeros for the one that was identified.
     """
 
-    def __init__(self, plant: Plant, intervals: tuple[Interval, ...], effects: EffectValues) -> None:
+    def __init__(self, plant: Plant, intervals: tuple[FittedInterval, ...], effects: EffectValues) -> None:
         # The house keeps one definition of what a stiffness is in a model, and it is the fit's.
         from openant_tools.sysid.kinds import KINDS
 
         self._plant, self._effects = plant, effects
         self._kinds = KINDS
-        varied, fixed = list[Interval](), list[Interval]()
+        varied, fixed = list[FittedInterval](), list[FittedInterval]()
         for interval in intervals:
             kind = KINDS.get(interval.kind)
             known = kind is not None and (kind.body or interval.joint in plant.joints)
@@ -138,10 +138,10 @@ class Randomiser:
                 out[kind.effect][rows] = self._value(interval, self.drawn[k])
         return out
 
-    def _value(self, interval: Interval, number: float) -> float:
+    def _value(self, interval: FittedInterval, number: float) -> float:
         kind = self._kinds[interval.kind]
         side = interval.high - interval.value if number > 0 else interval.value - interval.low
         return float(np.clip(interval.value + number / END * side, kind.low, kind.high))
 
-    def _at(self, interval: Interval) -> int:
+    def _at(self, interval: FittedInterval) -> int:
         return self._plant.joints.index(interval.joint) if interval.joint in self._plant.joints else 0

@@ -13,14 +13,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_env.observations import Layout
+from openant_env.observations import ObservationLayout
 from openant_tools.effects.commands import CommandEffects
 from openant_tools.effects.entries import check_pair, commands_of, sensing_of, values_of
 from openant_tools.effects.rollout import EffectValues
 from openant_tools.effects.sensing import SensingEffects
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, load_plant
-from openant_tools.robot.config import ACTION_PRESETS, ActionRange, Arena, Effect
+from openant_tools.robot.config import ACTION_PRESETS, ActionRange, Arena, EffectEntry
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import ANGLE_LIMIT_RAD
@@ -71,7 +71,7 @@ class SimulatedRobot:
     sensing: SensingEffects | None = None
     joints: tuple[str, ...] = tuple(JOINTS)
     arena: Arena = field(default_factory=Arena)
-    entries: tuple[Effect, ...] | None = None
+    entries: tuple[EffectEntry, ...] | None = None
 
     def load(self) -> Plant:
         """Its model on the floor, with the sensors `pos.J` and `vel.J` added where the file has none.
@@ -102,7 +102,7 @@ class SimulatedRobot:
         """Which model this is: the hash of its file."""
         return hashlib.sha256(self.model_path.read_bytes()).hexdigest()
 
-    def bounds(self, layout: Layout) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def bounds(self, layout: ObservationLayout) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Low and high of each observation, each (len(layout),): measured where they were, else nominal."""
         nominal: dict[str, tuple[float, float]] = {}
         for joint, low, high in zip(self.joints, self.low, self.high, strict=True):
@@ -169,7 +169,7 @@ def _say_once(line: str) -> None:
     _log.warning("%s", line)
 
 
-def _chosen(present: Sequence[Effect], wanted: bool | Sequence[str], folder: RobotFolder) -> list[Effect]:
+def _chosen(present: Sequence[EffectEntry], wanted: bool | Sequence[str], folder: RobotFolder) -> list[EffectEntry]:
     """The entries of robot.toml that are to act."""
     if isinstance(wanted, bool):
         return list(present) if wanted else []

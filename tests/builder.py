@@ -14,11 +14,11 @@ from openant_tools.procedure.step import (
     Answer,
     Ask,
     Bench,
+    Drawing,
     Event,
     Hands,
     Intent,
     Live,
-    Look,
     Procedure,
     Progress,
     Say,
@@ -74,7 +74,7 @@ class Builder:
         words = []
         for event in self.events:
             match event:
-                case Say() | Intent() | Hands() | Progress() | Look() | Live():
+                case Say() | Intent() | Hands() | Progress() | Drawing() | Live():
                     words.append(event.words)
                 case Ask():
                     words.append(event.question)

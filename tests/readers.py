@@ -387,9 +387,9 @@ READERS = {
 
 
 def _trained(folder: Path) -> None:
-    from openant_agents.runs import CurvePoint, Run
+    from openant_agents.runs import CurvePoint, TrainingRun
 
-    run = Run(folder, {"agent": "sac", "observations": 2, "actions": 1, "settings": {}, "seed": 1})
+    run = TrainingRun(folder, {"agent": "sac", "observations": 2, "actions": 1, "settings": {}, "seed": 1})
     run.resume()
     run.add_curve_point(CurvePoint(1, 0.1, 0.2))
     run.add_curve_point(CurvePoint(2, 0.2, 0.2))
@@ -423,10 +423,10 @@ def _interventions(path: Path) -> Any:
 
 
 def _settings(path: Path) -> Any:
-    from openant_agents.sac import Settings
+    from openant_agents.sac import SacSettings
     from openant_tools.cli.learning import settings_of
 
-    return settings_of(Settings, path, "sac", {})
+    return settings_of(SacSettings, path, "sac", {})
 
 
 def _study(folder: Path) -> None:

@@ -128,7 +128,7 @@ class Talker:
                 if asked.error == 3:
                     self._write(id, asked.params[0], asked.params[1:])
                 if asked.error in (1, 3):
-                    yield 1e-3 + id * 1e-4, protocol1.Status(id).encode()
+                    yield 1e-3 + id * 1e-4, protocol1.Protocol1Status(id).encode()
 
     def _write(self, id: int, address: int, data: bytes) -> None:
         self.written.append((id, address, data))

@@ -5,13 +5,12 @@ from __future__ import annotations
 import heapq
 from dataclasses import dataclass, field
 
-from openant_tools.comms.bus import Bus, Timing
+from openant_tools.comms.bus import Bus, BusTiming
 from openant_tools.comms.lateness import Lateness
 from openant_tools.comms.line import PortGone
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import kit
-from openant_tools.virtual.bus import BusSettings
-from openant_tools.virtual.bus import Line as Wire
+from openant_tools.virtual.bus import BusSettings, Wire
 from openant_tools.virtual.servo import ServoDevice
 from openant_tools.virtual.servo_power import Loop, Sensed
 
@@ -127,7 +126,7 @@ class WireLine(MemoryLine):
 
 
 def ant(
-    timing: Timing | None = None, *, firmware: int = 46, settings: BusSettings | None = None, seed: int = 0
+    timing: BusTiming | None = None, *, firmware: int = 46, settings: BusSettings | None = None, seed: int = 0
 ) -> tuple[Bus, WireLine]:
     """A bus with the eight servos of a standard Ant, set up as the guide says."""
     servos = []
@@ -141,6 +140,6 @@ def ant(
     settings.chains = [[0, 1], [2, 3], [4, 5], [6, 7]]
     line = WireLine(wire=Wire(servos, settings, lambda t: None, seed=seed))
     names = {joint.id: joint.name for joint in JOINTS.values()}
-    bus = Bus(line, line, timing or Timing(return_delay_s=0.0, latency_timer_s=1e-3), names)
+    bus = Bus(line, line, timing or BusTiming(return_delay_s=0.0, latency_timer_s=1e-3), names)
     bus.guarded = True  # these servos end with this process
     return bus, line

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from openant_tools.gap import experiment as recorded
 from openant_tools.gap.population import Case, draw, robot_of
-from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.protocol import RunSet
 from openant_tools.gap.sensors import logged_by
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.plant import Setup
@@ -53,7 +53,7 @@ FASTEST_RAD_S = 120.0
 class Experiment:
     """What was recorded, in windows, and what the robot had that did it."""
 
-    protocol: Protocol
+    protocol: RunSet
     truth: Case
 
 
@@ -70,7 +70,7 @@ def experiment(seed: int, folder: Path) -> Experiment:
     setups = _setups(rng, ant=ant)
     lasts = ALONE_S if len(setups) == 1 else (LASTS_S[0], min(LASTS_S[1], WHOLE_S / len(setups)))
     asked = [_asked(rng, setup, joints, rate, lasts) for setup in setups]
-    played = Protocol.of(asked, model, joints, [None] * len(asked)).coarse()
+    played = RunSet.of(asked, model, joints, [None] * len(asked)).coarse()
     truth = draw(played, seed)
     steps = {"pos": encoder, "vel": float(rng.choice([0.024, 0.0, 0.005])), "volt": 0.1 / 12}
     robot, runs = robot_of(played, truth), []

@@ -18,8 +18,7 @@ from openant_tools.blind.sizes import size_table
 from openant_tools.files import write_bytes, write_text
 from openant_tools.numbers import number, percent, span
 from openant_tools.procedure.intervals import wilson
-from openant_tools.report import Answer as FirstScreen
-from openant_tools.report import Figure, KeyFigure, Report, plots
+from openant_tools.report import Figure, KeyFigure, Report, ReportSummary, plots
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -189,7 +188,7 @@ def score_report(found: Score) -> Report:
     rows = [row for mine in found.makers.values() for row in mine]
     below = list(dict.fromkeys(row.words for row in rows if row.reached == "below"))
     worst = "; ".join(f"{truth} taken for {said} ({count} times)" for truth, said, count in _worst(found)[:3])
-    answer = FirstScreen(
+    answer = ReportSummary(
         f"Below what is asked for first: {', '.join(below)}."
         if below
         else "Every figure reaches what is asked for first.",

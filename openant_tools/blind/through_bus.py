@@ -23,7 +23,7 @@ from openant_tools.blind.draw import Answer, Drawn
 from openant_tools.blind.log import facts_of, imu_columns, tracker_columns
 from openant_tools.blind.robot import TrueRobot, true_robot
 from openant_tools.blind.simulate import COPPER_PER_K, WARM_C
-from openant_tools.comms.bus import Bus, Timing
+from openant_tools.comms.bus import Bus, BusTiming
 from openant_tools.comms.lateness import Lateness
 from openant_tools.comms.servos import Block, Servo, Servos
 from openant_tools.recording.run import Run
@@ -209,7 +209,7 @@ class _Host:
 
     def __init__(self, world: World) -> None:
         self.world, self.wire = world, _Wire(world)
-        self.bus = Bus(self.wire, self.wire, Timing(return_delay_s=0.0, latency_timer_s=1e-3))
+        self.bus = Bus(self.wire, self.wire, BusTiming(return_delay_s=0.0, latency_timer_s=1e-3))
         self.bus.guarded = True  # these servos end with this process
         parts = kit("standard")
         self.servos = Servos(

@@ -21,7 +21,7 @@ from openant_tools.bringup.tracking import Moment, draw_moment, worst_moment
 from openant_tools.files import write_bytes
 from openant_tools.numbers import number, percent
 from openant_tools.recording.tables import read_run
-from openant_tools.report import Answer, Figure, KeyFigure, Mark, Picture, Report, Table, Text, plots
+from openant_tools.report import Figure, KeyFigure, Mark, Picture, Report, ReportSummary, Table, Text, plots
 from openant_tools.report.parts import Tone
 from openant_tools.robot.registers import PWM_FULL
 from openant_tools.virtual.scenario import load_scenario
@@ -172,7 +172,7 @@ def write_report(demo: Demo) -> dict[str, Any]:
         )
     ratio = after["gap_full_rad"] / before["gap_full_rad"]
     overview = _keep(demo, "overview", _overview_figure(picture, demo.strip, moment, curve, walking))
-    answer = Answer(
+    answer = ReportSummary(
         f"The calibrated simulation leaves {percent(ratio)} of the data sheets' error"
         + ("." if walking is None else f", and in it the robot {walks_at(walking['sampled']['median'])}."),
         Figure(

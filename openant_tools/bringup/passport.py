@@ -15,7 +15,7 @@ from openant_tools.numbers import number, span
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Bench, Procedure, Progress
 from openant_tools.recording.tables import read_run
-from openant_tools.report import Answer, Figure, KeyFigure, Mark, Part, Picture, Report, plots
+from openant_tools.report import Figure, KeyFigure, Mark, Part, Picture, Report, ReportSummary, plots
 from openant_tools.robot.folder import NOMINAL_MODEL, RobotFolder
 from openant_tools.robot.joints import JOINTS
 
@@ -79,7 +79,7 @@ def passport(folder: RobotFolder) -> Report:
     ]
     left = ", ".join(open_[:4]) + (f" and {len(open_) - 4} more" if len(open_) > 4 else "")
     train = f"openant train sac --robot {folder.path} --out {folder.runs / 'sac-1'}"
-    answer = Answer(
+    answer = ReportSummary(
         f"{config.name} is measured and calibrated: all {len(done)} steps say yes."
         if not open_
         else f"{len(done)} of {len(WALK) - 1} steps of {config.name} say yes; left: {left}.",

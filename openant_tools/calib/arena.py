@@ -33,10 +33,10 @@ from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.files import write_bytes
 from openant_tools.optional import cv2
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.step import Answer, Ask, Bench, Event, Hands, Intent, Look, Procedure, Progress, Say
+from openant_tools.procedure.step import Answer, Ask, Bench, Drawing, Event, Hands, Intent, Procedure, Progress, Say
 from openant_tools.recording.reader import Recording, read_recording
 from openant_tools.recording.run import Facts
-from openant_tools.robot.config import Camera as CameraFacts
+from openant_tools.robot.config import CameraSection as CameraFacts
 from openant_tools.robot.config import Provenance, RobotConfig
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import HOME_RAD
@@ -328,7 +328,7 @@ def _lens(
     board = CharucoBoard()
     sheet = bench.folder.path / "charuco-board.png"
     write_bytes(sheet, cv2.imencode(".png", board.image())[1].tobytes())
-    yield Look(
+    yield Drawing(
         f"The board to print and glue to something flat: its squares must measure {1e3 * board.square_m:.0f} mm.",
         picture=sheet,
     )

@@ -24,11 +24,11 @@ from openant_tools.procedure.step import (
     Answer,
     Ask,
     Bench,
+    Drawing,
     Event,
     Hands,
     Intent,
     Live,
-    Look,
     Procedure,
     Progress,
     Say,
@@ -163,7 +163,7 @@ def bounds(bench: Bench) -> Procedure:
         provenance={"observation": Provenance("measured", COMMAND, recording)},
     )
     picture = coverage_picture(runs, bench.folder.findings / "bounds-coverage.png")
-    yield Look("What the motions covered:", picture=picture)
+    yield Drawing("What the motions covered:", picture=picture)
     ok = not problems
     return Finding(
         "bounds",

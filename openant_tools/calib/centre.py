@@ -19,17 +19,17 @@ from openant_tools.procedure.step import (
     Answer,
     Ask,
     Bench,
+    Drawing,
     Event,
     Hands,
     Intent,
-    Look,
     Procedure,
     Progress,
     RegisterChange,
     Say,
 )  # fmt: skip
 from openant_tools.procedure.unfinished import Parts
-from openant_tools.robot.config import Motor
+from openant_tools.robot.config import MotorSection
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import NOMINAL_ZERO_RAD
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE
@@ -102,7 +102,7 @@ def centre(bench: Bench) -> Procedure:
             servos.set_torque(False)
             mode, at = servos.read_counts("operating_mode", joint), servos.read_counts("present_position", joint)
         changes = [RegisterChange(joint, "operating_mode", mode, POSITION_MODE)] if mode != POSITION_MODE else []
-        yield Look(f"{joint}: how its horn goes on", DRAWINGS[JOINTS[joint].kind])
+        yield Drawing(f"{joint}: how its horn goes on", DRAWINGS[JOINTS[joint].kind])
         yield Intent(
             f"turn {joint} slowly from {math.degrees(at * RAD_PER_PULSE):.0f}° to {math.degrees(NOMINAL_ZERO_RAD):.0f}° "
             "and hold it there; keep the shaft free",
@@ -134,7 +134,7 @@ def centre(bench: Bench) -> Procedure:
     )
 
 
-def _differs(bench: Bench, motor: Motor) -> str:
+def _differs(bench: Bench, motor: MotorSection) -> str:
     """What of a servo whose horn is on does not read as it was left; "" where all does."""
     with opened_bus(bench) as bus:
         found = bus.ping(motor.id, insist=True)
@@ -147,7 +147,7 @@ def _differs(bench: Bench, motor: Motor) -> str:
     return "" if mode == POSITION_MODE else f"its operating mode is {mode}, not {POSITION_MODE}"
 
 
-def _one(bench: Bench, motor: Motor) -> Generator[Event, Answer, tuple[float, str]]:
+def _one(bench: Bench, motor: MotorSection) -> Generator[Event, Answer, tuple[float, str]]:
     """Turn one servo to its mounting angle and hold it while its horn goes on; how far it is off, rad, and what is wrong."""
     joint = motor.joint
     config = bare_config(bench, [Servo(joint, motor.id, motor.servo)], bench.folder.config().bus.baud)

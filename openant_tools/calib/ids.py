@@ -31,7 +31,7 @@ from openant_tools.procedure.step import (
     Say,
 )  # fmt: skip
 from openant_tools.procedure.unfinished import Parts
-from openant_tools.robot.config import Motor, RobotConfig
+from openant_tools.robot.config import MotorSection, RobotConfig
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE
 from openant_tools.robot.servo import baud_code, servo_model
@@ -101,7 +101,7 @@ def ids(bench: Bench) -> Procedure:
 
 
 def _one(
-    bench: Bench, motor: Motor, motors: Sequence[Motor], config: RobotConfig
+    bench: Bench, motor: MotorSection, motors: Sequence[MotorSection], config: RobotConfig
 ) -> Generator[Event, Answer, _Wrong | None]:
     """One servo from the box; None once it is named and has proven it."""
     words = JOINTS[motor.joint].words
@@ -156,7 +156,7 @@ def _one(
     return None
 
 
-def _not_one(found: Scan, motor: Motor, motors: Sequence[Motor], config: RobotConfig) -> _Wrong | None:
+def _not_one(found: Scan, motor: MotorSection, motors: Sequence[MotorSection], config: RobotConfig) -> _Wrong | None:
     """Why what is on the cable cannot become this joint's servo."""
     clash = [one for one in found.servos if one.clash]
     if found.garbled or clash:
@@ -184,7 +184,7 @@ def _not_one(found: Scan, motor: Motor, motors: Sequence[Motor], config: RobotCo
     return None
 
 
-def _rename_to(bench: Bench, bus: Bus, servos: Servos, motor: Motor, config: RobotConfig) -> Servos:
+def _rename_to(bench: Bench, bus: Bus, servos: Servos, motor: MotorSection, config: RobotConfig) -> Servos:
     """Id, then baud rate, each heard again at once under the new one; the servos as they answer afterwards."""
     servo = servos[motor.joint]
     servos.write_counts("id", motor.joint, motor.id)
@@ -204,7 +204,7 @@ def nudge(bench: Bench, servo: Servo, baud: int, angle_rad: float = NUDGE_RAD) -
         for _ in range(BLINKS):
             for on in (1, 0):
                 engine.ask(messages.WriteRegister(servo.joint, "led", on))
-                engine.ask(messages.Look(BLINK_S))
+                engine.ask(messages.LetPass(BLINK_S))
         start = engine.ask(messages.Torque(True))
         engine.ask(messages.WriteRegister(servo.joint, "goal_pwm", round(NUDGE_PWM * PWM_FULL)))
         end = start + angle_rad
@@ -227,7 +227,7 @@ def nudge(bench: Bench, servo: Servo, baud: int, angle_rad: float = NUDGE_RAD) -
 
 
 def _rename(
-    bench: Bench, found: Scan, motors: Sequence[Motor], config: RobotConfig
+    bench: Bench, found: Scan, motors: Sequence[MotorSection], config: RobotConfig
 ) -> Generator[Event, Answer, list[str]]:
     """Ask of each servo which joint it is, park those whose id is another's, and name all; what could not be done."""
     left = [motor.joint for motor in motors]
@@ -273,7 +273,7 @@ def _rename(
     return [f"{joint}: no servo was named so → plug it in and run the step again" for joint in left]
 
 
-def locate(bus: Bus, missing: Sequence[Motor], config: RobotConfig) -> dict[str, int]:
+def locate(bus: Bus, missing: Sequence[MotorSection], config: RobotConfig) -> dict[str, int]:
     """joint → the baud rate at which its id answers instead of the robot's own, for those that are found."""
     before, found = bus.line.baud, dict[str, int]()
     try:
@@ -289,12 +289,12 @@ def locate(bus: Bus, missing: Sequence[Motor], config: RobotConfig) -> dict[str,
     return found
 
 
-def _all_named(found: Scan, motors: Sequence[Motor], config: RobotConfig) -> bool:
+def _all_named(found: Scan, motors: Sequence[MotorSection], config: RobotConfig) -> bool:
     seen = {(one.id, one.baud, one.model_number) for one in found.servos if not one.clash}
     return not found.garbled and {(m.id, config.bus.baud, m.servo.number) for m in motors} <= seen
 
 
-def _finding(named: Sequence[str], motors: Sequence[Motor], problems: Sequence[str], what: str = "") -> Finding:
+def _finding(named: Sequence[str], motors: Sequence[MotorSection], problems: Sequence[str], what: str = "") -> Finding:
     said = " ".join(problems)
     problems = [
         *problems,

@@ -24,7 +24,19 @@ from openant_tools.comms.clock import Clock
 from openant_tools.comms.imu import STANDARD_GRAVITY, Imu
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.step import Answer, Ask, Bench, Event, Hands, Intent, Live, Look, Procedure, Progress, Say
+from openant_tools.procedure.step import (
+    Answer,
+    Ask,
+    Bench,
+    Drawing,
+    Event,
+    Hands,
+    Intent,
+    Live,
+    Procedure,
+    Progress,
+    Say,
+)
 from openant_tools.robot.config import Provenance
 
 __all__ = ["POSES", "Mounting", "Pose", "imu", "mounting"]
@@ -148,7 +160,7 @@ def imu(bench: Bench) -> Procedure:
             yield Say(note, "warn")
             if "gravity decides" in note.lower() or "Gravity says" in note:
                 problems.append(f"IMU scale: {note} → {info.acc_lsb_per_g:.0f} LSB/g is used")
-        yield Look("Three poses, each held still for a second.", DRAWING)
+        yield Drawing("Three poses, each held still for a second.", DRAWING)
         for attempt in range(TRIES):
             rests = list[_Rest]()
             for k, pose in enumerate(POSES):

@@ -11,7 +11,7 @@ from dataclasses import replace
 from openant_tools.calib.ids import locate
 from openant_tools.calib.mute import let_answer, silenced
 from openant_tools.calib.wires import journalled, opened_bus, robot_servos, wait
-from openant_tools.comms.bus import Bus, Found
+from openant_tools.comms.bus import Bus, FoundServo
 from openant_tools.comms.faults import NoAnswer
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servo, Servos
 from openant_tools.comms.setup import find_bus
@@ -32,7 +32,7 @@ from openant_tools.procedure.step import (
     RegisterChange,
     Say,
 )  # fmt: skip
-from openant_tools.robot.config import Motor, Provenance, RobotConfig
+from openant_tools.robot.config import MotorSection, Provenance, RobotConfig
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.registers import EEPROM_END, Register
 from openant_tools.robot.servo import baud_code, servo_model
@@ -142,7 +142,7 @@ def inventory_by_sdk(bench: Bench) -> Procedure:
     """What the vendor's own SDK finds in every servo: a second opinion, which writes nothing and keeps nothing."""
     config = bench.folder.config()
     problems, table = list[str](), dict[str, dict[str, int]]()
-    found: dict[str, Found] = {}
+    found: dict[str, FoundServo] = {}
     with VendorSdk(find_bus(bench.bus, config), config.bus.baud) as sdk:
         for k, servo in enumerate(robot_servos(config)):
             yield Progress(k / len(config.motors), f"the vendor's SDK asks {servo.joint}")
@@ -204,7 +204,7 @@ def _still_accepted(
     }
 
 
-def _ping_all(bus: Bus, config: RobotConfig) -> tuple[dict[str, Found], list[Motor]]:
+def _ping_all(bus: Bus, config: RobotConfig) -> tuple[dict[str, FoundServo], list[MotorSection]]:
     found = {motor.joint: bus.ping(motor.id, insist=True) for motor in config.motors.values()}
     return (
         {joint: seen for joint, seen in found.items() if seen is not None},
@@ -213,7 +213,7 @@ def _ping_all(bus: Bus, config: RobotConfig) -> tuple[dict[str, Found], list[Mot
 
 
 def _missing(
-    bench: Bench, bus: Bus, config: RobotConfig, missing: Sequence[Motor]
+    bench: Bench, bus: Bus, config: RobotConfig, missing: Sequence[MotorSection]
 ) -> Generator[Event, Answer, list[str]]:
     """Servos that do not answer: left at another baud rate, which is mended, or not there; in words."""
     yield Progress(None, f"looking for {', '.join(m.joint for m in missing)} at other baud rates")
@@ -237,7 +237,7 @@ def _missing(
     return words
 
 
-def silence_words(bus: Bus, silent: Sequence[Motor], config: RobotConfig) -> list[str]:
+def silence_words(bus: Bus, silent: Sequence[MotorSection], config: RobotConfig) -> list[str]:
     """Why servos are silent: what can be asked is asked; else the cable before the first in its leg."""
     if not silent:
         return []
@@ -248,7 +248,7 @@ def silence_words(bus: Bus, silent: Sequence[Motor], config: RobotConfig) -> lis
     return [f"{one.what} → {one.remedy}" for one in (found, *found.rest)]
 
 
-def _set_baud(bench: Bench, bus: Bus, motor: Motor, baud: int, config: RobotConfig) -> None:
+def _set_baud(bench: Bench, bus: Bus, motor: MotorSection, baud: int, config: RobotConfig) -> None:
     bus.line.set_baud(baud)
     found = bus.ping(motor.id, insist=True)
     if found is None:
@@ -258,11 +258,11 @@ def _set_baud(bench: Bench, bus: Bus, motor: Motor, baud: int, config: RobotConf
     servos.write_baud(motor.joint, config.bus.baud)
 
 
-def _wrong(found: Mapping[str, Found], config: RobotConfig, joint: str) -> bool:
+def _wrong(found: Mapping[str, FoundServo], config: RobotConfig, joint: str) -> bool:
     return found[joint].model_number != config.motors[joint].servo.number
 
 
-def _wrong_models(found: Mapping[str, Found], config: RobotConfig) -> list[str]:
+def _wrong_models(found: Mapping[str, FoundServo], config: RobotConfig) -> list[str]:
     """Servos of another model than the place is for; two of one leg that stand in each other's are swapped."""
     wrong = {joint for joint in found if _wrong(found, config, joint)}
     words = []

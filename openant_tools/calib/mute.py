@@ -26,7 +26,7 @@ from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.procedure.step import Answer, Bench, Event, Intent, RegisterChange, Say
-from openant_tools.robot.config import Motor
+from openant_tools.robot.config import MotorSection
 
 __all__ = ["Mute", "in_scan", "let_answer", "scan_and_mend", "silenced"]
 
@@ -59,9 +59,9 @@ class Mute:
         return self.joint if self.joint == f"id {self.id}" else f"{self.joint} (id {self.id})"
 
 
-def silenced(bus: Bus, motors: Iterable[Motor]) -> list[Mute]:
+def silenced(bus: Bus, motors: Iterable[MotorSection]) -> list[Mute]:
     """Those of `motors` that hear at this baud rate and do not answer everything, and those in Protocol 1.0 at any."""
-    found, silent = list[Mute](), list[Motor]()
+    found, silent = list[Mute](), list[MotorSection]()
     for motor in motors:
         status, _ = patient_ping(bus, motor.id, PATIENCE_S[:1])
         if status is None:

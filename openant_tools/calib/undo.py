@@ -7,7 +7,7 @@ from openant_tools.comms.bus import Bus
 from openant_tools.comms.faults import BrokenAnswer, NoAnswer
 from openant_tools.comms.servos import Servo, Servos
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.journal import EepromWrite, Entry, Journal
+from openant_tools.procedure.journal import EepromWrite, Journal, JournalEntry
 from openant_tools.procedure.step import Bench, Intent, Procedure, Progress, RegisterChange, Say
 from openant_tools.procedure.unfinished import forget
 from openant_tools.robot.registers import EEPROM_END
@@ -80,7 +80,7 @@ def _baud_after(write: EepromWrite, now: int) -> int:
     return BAUD_CODES[write.new] if write.register == "baud_rate" else write.baud or now
 
 
-def _take_back(bus: Bus, entry: Entry, model: ServoModel, journal: Journal) -> str:
+def _take_back(bus: Bus, entry: JournalEntry, model: ServoModel, journal: Journal) -> str:
     """Undo one write; what keeps it from being undone, or nothing."""
     write, item = entry.write, model.register(entry.write.register)
     servo = Servo(write.joint, write.id_after, model)

@@ -24,7 +24,7 @@ from openant_tools.comms.state import passport_registers
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.procedure.step import Bench
-from openant_tools.robot.config import Motor, RobotConfig
+from openant_tools.robot.config import MotorSection, RobotConfig
 from openant_tools.robot.registers import RAD_PER_PULSE
 
 __all__ = [
@@ -115,7 +115,7 @@ def robot_servos(config: RobotConfig, joints: Sequence[str] = ()) -> list[Servo]
     return [_servo(motor) for motor in config.motors.values() if not joints or motor.joint in joints]
 
 
-def _servo(motor: Motor) -> Servo:
+def _servo(motor: MotorSection) -> Servo:
     return Servo(motor.joint, motor.id, motor.servo, motor.direction, motor.zero_offset_rad)
 
 

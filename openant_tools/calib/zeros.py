@@ -26,11 +26,11 @@ from openant_tools.procedure.step import (
     Answer,
     Ask,
     Bench,
+    Drawing,
     Event,
     Hands,
     Intent,
     Live,
-    Look,
     Procedure,
     Progress,
     Say,
@@ -149,7 +149,7 @@ def zeros(bench: Bench) -> Procedure:
         servos = Servos(bus, robot_servos(config))
         servos.identify()
         servos.set_torque(False)
-        yield Look("Put all legs straight.", DRAWING)
+        yield Drawing("Put all legs straight.", DRAWING)
         yield Hands("Put every leg straight out and hold still; torque is off.", "straighten")
         wait(bus.clock, SETTLE_S)
         yield Progress(0.1, f"{READINGS} readings of every encoder")

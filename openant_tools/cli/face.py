@@ -14,7 +14,7 @@ from openant_tools.cli.hardware import need_moving, need_terminal
 from openant_tools.cli.log import is_quiet
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Finding
-from openant_tools.procedure.step import Answer, Ask, Event, Hands, Intent, Live, Look, Progress, Say
+from openant_tools.procedure.step import Answer, Ask, Drawing, Event, Hands, Intent, Live, Progress, Say
 
 __all__ = ["CommandFace", "echo_finding"]
 
@@ -48,7 +48,7 @@ class CommandFace:
             case Say(words, level):
                 glyph, style = _GLYPHS[level]
                 self._line(f"[{style}]{glyph}[/{style}] {escape(words)}")
-            case Look(words, drawing, picture):
+            case Drawing(words, drawing, picture):
                 self._line(
                     escape(words) + (f"\n{escape(drawing)}" if drawing else "") + (f" ({picture})" if picture else "")
                 )

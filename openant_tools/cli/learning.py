@@ -18,7 +18,7 @@ from openant_tools.workers import pass_on
 
 if TYPE_CHECKING:
     from openant_agents.drops import DropWatch
-    from openant_agents.training import Progress
+    from openant_agents.training import TrainingProgress
 
 __all__ = ["LearningBar", "kit_option", "need_agents", "robot_argument", "settings_of", "settings_option"]
 
@@ -137,7 +137,7 @@ class LearningBar:
         if self._watch is not None:
             self._watch.finish()
 
-    def show(self, progress: Progress, name: str | None = None) -> None:
+    def show(self, progress: TrainingProgress, name: str | None = None) -> None:
         """Show how far a run is, under its name or else what it is doing."""
         if self._last is None or progress.step < self._last:
             # A run that goes on did not get this far in no time, and the next run begins anew.

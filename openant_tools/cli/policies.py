@@ -16,7 +16,7 @@ from openant_tools.cli.options import SECONDS, json_option, report_option, write
 from openant_tools.errors import BadInput
 
 if TYPE_CHECKING:
-    from openant_agents.ranking import Measured
+    from openant_agents.ranking import PlaceResult
     from openant_tools.report import Report
 
 __all__ = ["policies"]
@@ -146,7 +146,7 @@ def rank(
     chooser = next(iter(places)) if flag_by is None else flag_by
     flags = []
     if chooser != "none":
-        worse: dict[str, dict[str, Measured]] = {}
+        worse: dict[str, dict[str, PlaceResult]] = {}
         if not places[chooser].endswith(".json"):
             few = max(1, (starts or STARTS_IN_SIMULATION) // 5)
             for words, wrapper in DISTURBANCES.items():
@@ -207,14 +207,14 @@ def _print(names: list[str], real: Mapping[str, Any], simulated: Mapping[str, An
 def _page(picture: Path, found: Mapping[str, Any], flags: list[str]) -> Report:
     """The ranking as a report."""
     from openant_tools.numbers import number, percent
-    from openant_tools.report import Answer, Picture, Report
+    from openant_tools.report import Picture, Report, ReportSummary
 
     def words(one: Any, factor: float = 1.0, unit: str = "") -> str:
         return number(factor * one.value, unit, factor * one.low, factor * one.high)
 
     best, agreed = max(found.items(), key=lambda item: item[1].spearman.value)
     told = agreed.spearman.low > 0
-    answer = Answer(
+    answer = ReportSummary(
         f"{best} ranks {agreed.policies} policies most as the robot does (Spearman {words(agreed.spearman)})."
         if told
         else f"Of {agreed.policies} policies, no simulation is known to rank them as the robot does.",
@@ -255,7 +255,7 @@ def _play(
     starts: int | None,
     yes: bool,
     *,
-    known: Mapping[str, Measured] | None = None,
+    known: Mapping[str, PlaceResult] | None = None,
     likeliest: bool = False,
     wrapper: Callable[[Any], Any] | None = None,
 ) -> Any:
@@ -289,7 +289,7 @@ def _play(
             yield name, play_one(run, made, seconds=seconds, starts=starts, likeliest=likeliest, report=tell)
 
 
-def _achieved(measured: Measured) -> str:
+def _achieved(measured: PlaceResult) -> str:
     """Both ways of a policy in a line, in cm/s."""
     plays, starts = measured.plays, len(measured.plays)
     words = f"sampled {100 * measured.median:+6.1f} cm/s"

@@ -12,7 +12,7 @@ from openant_tools.cli.options import robot_folder
 
 if TYPE_CHECKING:
     from openant_tools.recording.run import Run
-    from openant_tools.robot.config import Effect
+    from openant_tools.robot.config import EffectEntry
 
 __all__ = ["checked", "effects_of", "model_of", "read_runs", "say"]
 
@@ -47,7 +47,7 @@ def model_of(runs: Sequence[Run], model: Path | None, robot: Path | None) -> tup
 
 def effects_of(
     runs: Sequence[Run], path: Path, model: Path | None, robot: Path | None, file: Path | None
-) -> tuple[tuple[Effect, ...], Path | None]:
+) -> tuple[tuple[EffectEntry, ...], Path | None]:
     """The `[[effect]]` entries that act with a model, and where they stand: the file's that was named, else the robot's where the
     model is the robot's own. A model that was named by itself is played by itself.
 
@@ -70,7 +70,10 @@ def effects_of(
 
 
 def checked(
-    runs: Sequence[Run], model: Path, joints: Sequence[str], effects: tuple[Sequence[Effect], Path | None] = ((), None)
+    runs: Sequence[Run],
+    model: Path,
+    joints: Sequence[str],
+    effects: tuple[Sequence[EffectEntry], Path | None] = ((), None),
 ) -> list[Run]:
     """Go through the rules before anything is computed, and say what they note; the runs without whole turns.
 

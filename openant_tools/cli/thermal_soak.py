@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from openant_tools.comms.messages import EngineConfig
     from openant_tools.robot.folder import RobotFolder
-    from openant_tools.thermal.soak import Plan, Sample, Soaked
+    from openant_tools.thermal.soak import HeatSoaked, Sample, SoakPlan
 
 __all__ = ["soak"]
 
@@ -128,7 +128,7 @@ def soak(
     from openant_tools.errors import BadInput
     from openant_tools.recording.writer import recording_path
     from openant_tools.robot.joints import JOINT_NAMES
-    from openant_tools.thermal.soak import Plan, pose_angles, resume_plan
+    from openant_tools.thermal.soak import SoakPlan, pose_angles, resume_plan
 
     out = recording_path(out)
     if resume:
@@ -140,7 +140,7 @@ def soak(
             raise BadInput(
                 "there is a recording already", where=out, remedy="record under another name, or --resume it"
             )
-        plan = Plan(
+        plan = SoakPlan(
             load="play" if commands else load,  # type: ignore[arg-type]
             seconds=minutes * 60,
             cool_down_s=cool_down * 60,
@@ -185,7 +185,7 @@ def soak(
 
 def _connected(
     stack: contextlib.ExitStack,
-    plan: Plan,
+    plan: SoakPlan,
     virtual_source: str | None,
     port: str | None,
     folder: RobotFolder | None,
@@ -202,8 +202,8 @@ def _connected(
 
 
 def _run(
-    console: Console, config: EngineConfig, plan: Plan, out: Path, folder: RobotFolder | None, resume: bool
-) -> Soaked:
+    console: Console, config: EngineConfig, plan: SoakPlan, out: Path, folder: RobotFolder | None, resume: bool
+) -> HeatSoaked:
     """Drive the soak and draw it; Ctrl-C says how to go on."""
     from rich.live import Live
 
@@ -230,7 +230,7 @@ def _run(
                     said = now
                     console.print(curves.line(sample), markup=False)
     except StopIteration as end:
-        made: Soaked = end.value
+        made: HeatSoaked = end.value
         return made
     except BaseException:
         steps.close()
@@ -309,7 +309,7 @@ def _joints(names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(joint for joint in JOINT_NAMES if joint in chosen)
 
 
-def _words(plan: Plan) -> str:
+def _words(plan: SoakPlan) -> str:
     if plan.load == "stall":
         return f"the knees press with {plan.effort:.0%} of full duty against a weight that stalls them"
     if plan.load == "play":

@@ -12,7 +12,7 @@ from openant_tools.cli.learning import settings_of, settings_option
 from openant_tools.cli.options import Number, json_option
 from openant_tools.cli.train_sarsa import sarsa
 from openant_tools.cli.training import (
-    Place,
+    TrainingPlace,
     effects_option,
     show_result,
     tensorboard_option,
@@ -63,7 +63,7 @@ def train() -> None:
 @tensorboard_option
 @json_option
 def sac(
-    place: Place,
+    place: TrainingPlace,
     steps: int,
     seed: int,
     out: Path,
@@ -96,11 +96,11 @@ def sac(
         learn = "async" if place.hardware else "sync"
 
     from openant_agents.async_training import train_async
-    from openant_agents.sac import Settings
+    from openant_agents.sac import SacSettings
     from openant_agents.sac import train as train_sac
 
     given = {"learning_start": learning_start, "entropy_start": entropy_start, "batch": batch}
-    settings = settings_of(Settings, settings_file, "sac", given)
+    settings = settings_of(SacSettings, settings_file, "sac", given)
     more: dict[str, Any] = {"updates_per_step": updates_per_step} if learn == "async" else {}
     with training(place, steps, out) as (env, bar):
         result = (train_async if learn == "async" else train_sac)(

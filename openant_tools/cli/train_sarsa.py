@@ -10,7 +10,7 @@ from openant_tools.cli.hardware import Moving
 from openant_tools.cli.learning import settings_of, settings_option
 from openant_tools.cli.options import Number, json_option
 from openant_tools.cli.training import (
-    Place,
+    TrainingPlace,
     effects_option,
     show_result,
     tensorboard_option,
@@ -42,7 +42,7 @@ __all__ = ["sarsa"]
 @tensorboard_option
 @json_option
 def sarsa(
-    place: Place,
+    place: TrainingPlace,
     steps: int,
     seed: int,
     out: Path,
@@ -69,11 +69,11 @@ def sarsa(
     place.options.update(dt=dt, action_range=action_range)
 
     from openant_agents.runs import load_checkpoint
-    from openant_agents.sarsa import Settings
+    from openant_agents.sarsa import SarsaSettings
     from openant_agents.sarsa import train as train_sarsa
 
     given = {"epsilon": epsilon, "step_size": step_size, "reward_scale": reward_scale}
-    settings = settings_of(Settings, settings_file, "sarsa", given)
+    settings = settings_of(SarsaSettings, settings_file, "sarsa", given)
     with training(place, steps, out) as (env, bar):
         result = train_sarsa(
             env,

@@ -24,9 +24,9 @@ from openant_tools.cli.walking import (
 from openant_tools.errors import BadInput, StorageFault
 
 if TYPE_CHECKING:
-    from openant_agents.training import Progress
+    from openant_agents.training import TrainingProgress
 
-__all__ = ["Place", "effects_option", "show_result", "tensorboard_option", "training", "training_options"]
+__all__ = ["TrainingPlace", "effects_option", "show_result", "tensorboard_option", "training", "training_options"]
 
 effects_option = click.option(
     "--effects/--no-effects", default=True, help="Whether the robot's [[effect]] entries act.  [default: on]"
@@ -37,7 +37,7 @@ tensorboard_option = click.option(
 
 
 @dataclass(frozen=True)
-class Place:
+class TrainingPlace:
     """Where an agent trains.
 
     Attributes:
@@ -98,7 +98,7 @@ def training_options(hour: int, step_s: float, leaves: str) -> Callable[[Callabl
         ) -> Any:
             need_agents()
             name, chosen = _place_of(where, robot, kit, virtual_source, clock, task, effects)
-            return command(place=Place(name, chosen, yes), **rest)
+            return command(place=TrainingPlace(name, chosen, yes), **rest)
 
         for option in reversed(options):
             placed = option(placed)
@@ -132,7 +132,7 @@ def _place_of(
 
 
 @contextlib.contextmanager
-def training(place: Place, steps: int, out: Path) -> Iterator[tuple[Any, LearningBar]]:
+def training(place: TrainingPlace, steps: int, out: Path) -> Iterator[tuple[Any, LearningBar]]:
     """The environment, once a robot may move, and the bar; Ctrl-C says how to go on."""
     if place.hardware:
         may_walk(place.options, place.yes)
@@ -155,7 +155,7 @@ def training(place: Place, steps: int, out: Path) -> Iterator[tuple[Any, Learnin
 
 def show_result(
     agent: str,
-    result: Progress,
+    result: TrainingProgress,
     out: Path,
     json_file: Path | None,
     *,

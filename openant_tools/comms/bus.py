@@ -24,7 +24,7 @@ from openant_tools.comms.reply import (
     STATUS_OVERHEAD,
     Answer,
     Edge,
-    Plan,
+    ReplyPlan,
     Request,
     Sorting,
     whole_answers,
@@ -33,7 +33,7 @@ from openant_tools.comms.statistics import BusStatistics
 from openant_tools.comms.ticks import TickClock
 from openant_tools.errors import BadInput
 
-__all__ = ["Answer", "Bus", "Found", "Timing"]
+__all__ = ["Answer", "Bus", "BusTiming", "FoundServo"]
 
 #: What lets a servo move: Startup Configuration, Torque Enable, and the goals of PWM, current, velocity; and position.
 STARTUP, TORQUE, GOALS = 60, 64, (range(100, 108), range(116, 120))
@@ -55,7 +55,7 @@ PING_TURN_S, PING_TURNS = 3e-3, 253
 
 
 @dataclass(frozen=True)
-class Timing:
+class BusTiming:
     """What a deadline is made of.
 
     Attributes:
@@ -74,13 +74,13 @@ class Timing:
     write_read_gap_s: float = 0.2e-3
 
 
-NOTHING_PENDING = Plan()
+NOTHING_PENDING = ReplyPlan()
 #: What becomes of those whose part of a joined reply is missing: they are asked again.
 _BROKEN_OFF = (Cause.TIMEOUT, Cause.SHORT, Cause.CRC)
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundServo:
     """A servo that answered a ping."""
 
     id: int
@@ -95,7 +95,7 @@ class Bus:
 
     Attributes:
         names: id → what to call the servo in messages.
-        timing: see `Timing`; set from what was measured.
+        timing: see `BusTiming`; set from what was measured.
         statistics: every request and every loss so far.
         fast: ids whose firmware knows Fast Sync Read. Where it fails, plain Sync Read is used until that has been
             answered whole for a while.
@@ -106,7 +106,7 @@ class Bus:
 
     line: Line
     clock: Clock
-    timing: Timing = field(default_factory=Timing)
+    timing: BusTiming = field(default_factory=BusTiming)
     names: Mapping[int, str] = field(default_factory=dict)
     statistics: BusStatistics = field(default_factory=BusStatistics)
     fast: set[int] = field(default_factory=set)
@@ -138,7 +138,7 @@ class Bus:
 
     # ---- one instruction each ------------------------------------------------------------------------------------
 
-    def ping(self, id: int, *, insist: bool = False) -> Found | None:
+    def ping(self, id: int, *, insist: bool = False) -> FoundServo | None:
         """The servo with this ID, or None where none answers; asked `retries` times more where we `insist`."""
         again = False
         for attempt in range(1 + self.retries * insist):
@@ -149,7 +149,7 @@ class Bus:
             again = answer.cause is not Cause.LATE
         return None
 
-    def broadcast_ping(self, *, first_s: float = 0.2, quiet_s: float = 0.1) -> list[Found]:
+    def broadcast_ping(self, *, first_s: float = 0.2, quiet_s: float = 0.1) -> list[FoundServo]:
         """Everyone at this baud rate, by ID.
 
         Servos answer in turn of their IDs. How long a turn is nobody publishes; ROBOTIS' SDK allows 3 ms for each of
@@ -163,7 +163,7 @@ class Bus:
         self._settle(self.clock.now())
         started = self._send(p2.ping(p2.BROADCAST).encode())
         self._unsettled = True
-        parser, found, garbage = Parser(), dict[int, Found](), 0
+        parser, found, garbage = Parser(), dict[int, FoundServo](), 0
         deadline = started + first_s + self.wire_s(STATUS_OVERHEAD + PING_SIZE)
         give_up = deadline + PING_TURNS * PING_TURN_S + quiet_s
         while self.clock.wait_readable(self.line, min(deadline, give_up)):
@@ -492,7 +492,7 @@ class Bus:
         request.whole = request.wire + byte_s * request.expected + len(request.ids) * timing.return_delay_s + spare
         request.quiet = byte_s * (max(request.counts) + STATUS_OVERHEAD) + timing.return_delay_s + spare
 
-    def _collect(self, request: Request, started: float, extra_s: float, plan: Plan) -> list[Answer]:
+    def _collect(self, request: Request, started: float, extra_s: float, plan: ReplyPlan) -> list[Answer]:
         """The answers to a request that has been sent, counted."""
         line, clock = self.line, self.clock
         data, edges = b"", list[Edge]()
@@ -625,7 +625,7 @@ class Bus:
             )
 
 
-def _found(answer: Answer) -> Found:
+def _found(answer: Answer) -> FoundServo:
     assert answer.data is not None
     model, firmware = struct.unpack("<HB", answer.data[:3])
-    return Found(answer.id, model, firmware, answer.alert)
+    return FoundServo(answer.id, model, firmware, answer.alert)

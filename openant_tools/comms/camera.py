@@ -35,7 +35,7 @@ from openant_tools.comms.mjpeg import MjpegStream
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.optional import cv2
 
-__all__ = ["Camera", "CameraInfo", "CameraSettings", "CameraStatistics", "DropCounter", "Frame", "Setting"]
+__all__ = ["Camera", "CameraInfo", "CameraSetting", "CameraSettings", "CameraStatistics", "DropCounter", "Frame"]
 
 Image = NDArray[np.uint8]
 
@@ -88,7 +88,7 @@ class CameraSettings:
 
 
 @dataclass(frozen=True)
-class Setting:
+class CameraSetting:
     """One thing asked, and what the camera says it does."""
 
     name: str
@@ -116,7 +116,7 @@ class CameraInfo:
     backend: str
     width: int
     height: int
-    settings: tuple[Setting, ...]
+    settings: tuple[CameraSetting, ...]
     latency_s: float
     latency_source: str
     notes: tuple[str, ...]
@@ -384,7 +384,7 @@ class _Capture:
             ("height", self._settings.height, height),
         ):
             if asked is not None and not self._settings.network:
-                settings.append(Setting(name, float(asked), float(given)))
+                settings.append(CameraSetting(name, float(asked), float(given)))
         refused = [f"{s.name} {s.given} instead of {s.asked}" for s in settings if not s.kept]
         if refused:
             notes.append(f"The camera does not do what was asked: {', '.join(refused)}.")
@@ -507,7 +507,7 @@ class _Capture:
         return None
 
 
-def _open(settings: CameraSettings) -> tuple[Any, list[Setting]]:
+def _open(settings: CameraSettings) -> tuple[Any, list[CameraSetting]]:
     """An opened and set capture, and what it made of what was asked.
 
     Raises:
@@ -541,7 +541,7 @@ def _open(settings: CameraSettings) -> tuple[Any, list[Setting]]:
         capture.release()
         what, remedy = _why_not(settings)
         raise HardwareFault(what, where=settings.name, remedy=remedy)
-    asked: list[Setting] = []
+    asked: list[CameraSetting] = []
     if settings.network:
         return capture, asked
     if settings.fourcc is not None:
@@ -565,11 +565,11 @@ def _open(settings: CameraSettings) -> tuple[Any, list[Setting]]:
         capture.set(prop, value)
         # Sizes are read off the first picture; a driver that keeps more buffers is emptied by the thread.
         if name not in ("width", "height", "buffers"):
-            asked.append(Setting(name, float(value), float(capture.get(prop))))
+            asked.append(CameraSetting(name, float(value), float(capture.get(prop))))
     if settings.fourcc is not None:
         code = int(capture.get(cv2.CAP_PROP_FOURCC))
         given = code.to_bytes(4, "little", signed=code < 0).decode("ascii", "replace")
-        asked.insert(0, Setting("format", settings.fourcc, given))
+        asked.insert(0, CameraSetting("format", settings.fourcc, given))
     return capture, asked
 
 

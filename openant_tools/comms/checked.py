@@ -107,7 +107,7 @@ def _goal(command: messages.Goal, servos: Servos, limits: Any) -> messages.Goal:
     )
 
 
-def _look(command: messages.Look, servos: Servos, limits: Any) -> messages.Look:
+def _look(command: messages.LetPass, servos: Servos, limits: Any) -> messages.LetPass:
     return replace(command, seconds=_seconds("Look.seconds", command.seconds))
 
 
@@ -155,14 +155,14 @@ _CHECKS: Mapping[type, Callable[[Any, Servos, Any], Any]] = {
     messages.Play: _play,
     messages.Hold: _hold,
     messages.Goal: _goal,
-    messages.Look: _look,
+    messages.LetPass: _look,
     messages.Record: _record,
     messages.ReadRegister: _read,
     messages.WriteRegister: _write,
     messages.StopRecording: _as_it_is,
     messages.Stop: _as_it_is,
     messages.Statistics: _as_it_is,
-    messages.Picture: _as_it_is,
+    messages.TakePicture: _as_it_is,
 }
 
 

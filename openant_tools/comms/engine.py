@@ -418,7 +418,7 @@ class Engine:
         if isinstance(command, messages.Stop):
             self._stopped(Trip("stopped by hand", "", cause=StopCause.BY_HAND))
             return messages.Reply(number)
-        if isinstance(command, messages.Look):
+        if isinstance(command, messages.LetPass):
             if self._recorder.stopped is not None:
                 raise self._recorder.stopped
             self._looks.append((number, self._clock.now() + command.seconds))
@@ -436,7 +436,7 @@ class Engine:
             messages.ReadRegister: self._do_read,
             messages.WriteRegister: self._do_write,
             messages.Statistics: lambda number, _: messages.Reply(number, value=self._statistics()),
-            messages.Picture: lambda number, _: messages.Reply(number, value=self._sensors.picture()),
+            messages.TakePicture: lambda number, _: messages.Reply(number, value=self._sensors.picture()),
         }
         return handlers[type(command)](number, command)
 

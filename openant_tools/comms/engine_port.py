@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 
 from openant_tools.comms import protocol2 as p2
-from openant_tools.comms.bus import Bus, Timing
+from openant_tools.comms.bus import Bus, BusTiming
 from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
 from openant_tools.comms.guardian_process import PATIENCE_S, GuardianProcess
 from openant_tools.comms.line import SerialLine
@@ -55,9 +55,9 @@ class EnginePort:
             if control is not None and control.ask("now")["stepped"]:
                 self.clock = SteppedClock(control, bus=self.line)
             self.latency_timer_s = self._set_latency_timer()
-            timing = Timing(
+            timing = BusTiming(
                 write_read_gap_s=config.write_read_gap_s,
-                latency_timer_s=self.latency_timer_s or Timing.latency_timer_s,
+                latency_timer_s=self.latency_timer_s or BusTiming.latency_timer_s,
             )
             self.bus = Bus(self.line, self.clock, timing)
             reader = reader_words(config.port)

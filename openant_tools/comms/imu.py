@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 from openant_tools.comms import msp
 from openant_tools.comms.clock import Clock, portions
 from openant_tools.comms.line import Line, PortGone, SerialLine
-from openant_tools.comms.msp import Command, Direction, Framing, Parser
+from openant_tools.comms.msp import Command, Direction, Framing, MspParser
 from openant_tools.errors import HardwareFault
 
 __all__ = ["Imu", "ImuInfo", "ImuSample", "ImuStatistics", "open_imu"]
@@ -178,7 +178,7 @@ class Imu:
         self._open_line = open_line
         self._clock = clock
         self._line: Line | None = None
-        self._parser = Parser()
+        self._parser = MspParser()
         self._seen = bytearray()
         self._info: ImuInfo | None = None
         self._rotation: tuple[_Poll, ...] = ()
@@ -272,7 +272,7 @@ class Imu:
         firmware = str(msp.FcVersion.decode(self._ask(Command.FC_VERSION)))
         board = msp.BoardInfo.decode(self._ask(Command.BOARD_INFO))
         uid = str(msp.Uid.decode(self._ask(Command.UID)))
-        status = msp.Status.decode(self._ask(Command.STATUS))
+        status = msp.FlightStatus.decode(self._ask(Command.STATUS))
         if not status.has_accelerometer or not status.has_gyro:
             missing = "accelerometer" if status.has_gyro else "gyro"
             raise HardwareFault(
@@ -352,7 +352,7 @@ class Imu:
                 return frame.payload
         raise self._no_answer(first=proof)
 
-    def _frames(self, deadline: float) -> Iterator[msp.Frame]:
+    def _frames(self, deadline: float) -> Iterator[msp.MspFrame]:
         """Frames as they come until the deadline."""
         line = self._port()
         for data in portions(self._clock, line, deadline):
@@ -535,7 +535,7 @@ class Imu:
             elif self._clock.wait_readable(self._line, min(deadline, self._sent_at + REPLY_TIMEOUT_S + 1e-4)):
                 self._empty_at = self._clock.now()  # the bytes came this instant
 
-    def _receive(self, frame: msp.Frame, info: ImuInfo) -> ImuSample | None:
+    def _receive(self, frame: msp.MspFrame, info: ImuInfo) -> ImuSample | None:
         poll = self._outstanding
         if poll is None:
             return None  # a reply that was given up for lost
@@ -583,7 +583,7 @@ class Imu:
         self.statistics.count(t)
         return sample
 
-    def _take(self, poll: _Poll, frame: msp.Frame, sent: float) -> _Reply | None:
+    def _take(self, poll: _Poll, frame: msp.MspFrame, sent: float) -> _Reply | None:
         """The reply to `poll` in this frame; None where it is another frame or cannot be decoded."""
         if frame.command != poll.command or frame.direction is not Direction.REPLY or not self._parser.clean:
             return None
@@ -609,7 +609,7 @@ class Imu:
             earliest = min(now, max(self._empty_at, self._sent_at))
             self._arrived, self._arrived_error = (now + earliest) / 2.0, (now - earliest) / 2.0
 
-    def _prove(self, frame: msp.Frame, info: ImuInfo) -> None:
+    def _prove(self, frame: msp.MspFrame, info: ImuInfo) -> None:
         """After a reopening: is it the same board?"""
         if frame.command != Command.UID or frame.direction is not Direction.REPLY:
             return
@@ -658,7 +658,7 @@ class Imu:
 
     def _forget(self) -> None:
         """A new connection: nothing is under way and nothing is proved."""
-        self._parser = Parser()
+        self._parser = MspParser()
         self._seen.clear()
         self._outstanding = None
         self._proved = self._info is None

@@ -19,7 +19,7 @@ from openant_tools.recording.run import Run
 
 __all__ = ["LATE_S", "REMEDY", "Lateness", "Losses", "late_rows", "lateness_words", "losses", "of_wake"]
 
-#: What a deadline leaves to the operating system (`bus.Timing.margin_s`): later than that, answers are missed.
+#: What a deadline leaves to the operating system (`bus.BusTiming.margin_s`): later than that, answers are missed.
 LATE_S = 4e-3
 #: Fewer late cycles than this say nothing of a whole measurement: every desktop has some.
 SHARE = 0.005

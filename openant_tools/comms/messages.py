@@ -28,9 +28,8 @@ __all__ = [
     "Goal",
     "Hold",
     "ImuConfig",
-    "Look",
+    "LetPass",
     "Notice",
-    "Picture",
     "Play",
     "Ramp",
     "ReadRegister",
@@ -40,6 +39,7 @@ __all__ = [
     "Stop",
     "StopRecording",
     "Stopped",
+    "TakePicture",
     "Torque",
     "WriteRegister",
 ]
@@ -184,7 +184,7 @@ class Goal:
 
 
 @dataclass(frozen=True)
-class Look:
+class LetPass:
     """Let cycles pass for `seconds` and command nothing new; the reply comes when they have.
 
     It is answered while the port is gone, too, so that a face can wait for it to come back.
@@ -246,7 +246,7 @@ class Statistics:
 
 
 @dataclass(frozen=True)
-class Picture:
+class TakePicture:
     """The reply is the overhead camera's newest picture, (height, width, 3) of uint8 in RGB, at most 640 wide; None without one."""
 
 
@@ -256,14 +256,14 @@ Command = (
     | Play
     | Hold
     | Goal
-    | Look
+    | LetPass
     | Record
     | StopRecording
     | Stop
     | ReadRegister
     | WriteRegister
     | Statistics
-    | Picture
+    | TakePicture
 )
 
 

@@ -33,12 +33,12 @@ __all__ = [
     "Command",
     "Direction",
     "FcVersion",
-    "Frame",
+    "FlightStatus",
     "Framing",
     "MspError",
-    "Parser",
+    "MspFrame",
+    "MspParser",
     "RawImu",
-    "Status",
     "Uid",
     "crc8_dvb_s2",
     "decode_multiple",
@@ -140,7 +140,7 @@ def _xor(data: bytes | bytearray) -> int:
 
 
 @dataclass(frozen=True)
-class Frame:
+class MspFrame:
     """One frame. `command` is 0 … 255 in v1 and 0 … 65535 in v2; `flags` exists in v2 only."""
 
     direction: Direction
@@ -150,7 +150,7 @@ class Frame:
     flags: int = 0
 
 
-def encode(frame: Frame) -> bytes:
+def encode(frame: MspFrame) -> bytes:
     """Bytes of one frame, to be sent in one write.
 
     Raises:
@@ -183,13 +183,13 @@ def _encode_v1(direction: Direction, command: int, payload: bytes) -> bytes:
 
 def request(command: int, payload: bytes = b"", framing: Framing = Framing.V1) -> bytes:
     """Bytes of a request."""
-    return encode(Frame(Direction.REQUEST, command, payload, framing))
+    return encode(MspFrame(Direction.REQUEST, command, payload, framing))
 
 
 _DIRECTIONS = {direction.value: direction for direction in Direction}
 
 
-class Parser:
+class MspParser:
     """Turns a stream of bytes, in any portions, into frames.
 
     Args:
@@ -224,10 +224,10 @@ class Parser:
         self._buffer.clear()
         self._flaws = self.broken + self.stray
 
-    def feed(self, data: bytes | bytearray) -> list[Frame]:
+    def feed(self, data: bytes | bytearray) -> list[MspFrame]:
         """Frames completed by these bytes, in order."""
         self._buffer += data
-        frames: list[Frame] = []
+        frames: list[MspFrame] = []
         at = 0
         while at < len(self._buffer):
             start = self._buffer.find(b"$", at)
@@ -273,7 +273,7 @@ class Parser:
         return size + frame if size <= self._limit else 0
 
 
-def _decode(data: bytearray) -> Frame | None:
+def _decode(data: bytearray) -> MspFrame | None:
     """The frame in these bytes, or None where a checksum or an inner length is wrong."""
     direction = _DIRECTIONS[data[2]]
     if data[1:2] == b"X":
@@ -284,17 +284,17 @@ def _decode(data: bytearray) -> Frame | None:
     payload = data[7:-1] if jumbo else data[5:-1]
     if data[4] == V2_FRAME_ID:
         return _decode_v2(direction, payload, Framing.V2_OVER_V1)
-    return Frame(direction, data[4], bytes(payload), Framing.V1)
+    return MspFrame(direction, data[4], bytes(payload), Framing.V1)
 
 
-def _decode_v2(direction: Direction, body: bytearray, framing: Framing) -> Frame | None:
+def _decode_v2(direction: Direction, body: bytearray, framing: Framing) -> MspFrame | None:
     """`body` is flags … crc8."""
     if len(body) < 6 or crc8_dvb_s2(body[:-1]) != body[-1]:
         return None
     flags, command, size = struct.unpack_from("<BHH", body)
     if size != len(body) - 6:
         return None
-    return Frame(direction, command, bytes(body[5:-1]), framing, flags)
+    return MspFrame(direction, command, bytes(body[5:-1]), framing, flags)
 
 
 # --- messages ----------------------------------------------------------------------------------------------------
@@ -481,7 +481,7 @@ class BoardAlignment:
 
 
 @dataclass(frozen=True)
-class Status:
+class FlightStatus:
     """The part of STATUS and STATUS_EX that every firmware sends."""
 
     cycle_us: int
@@ -508,7 +508,7 @@ class Status:
         return bool(self.sensors & 32)
 
     @classmethod
-    def decode(cls, payload: bytes) -> Status:
+    def decode(cls, payload: bytes) -> FlightStatus:
         """Payload of at least 13 bytes; what follows them is kept in `rest`."""
         data = _Payload(Command.STATUS_EX, payload)
         cycle, errors, sensors, flags, profile, load = data.unpack("HHHIBH")

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from openant_tools.comms.faults import Cause
-from openant_tools.comms.reply import Answer, Plan, Request, Shape
+from openant_tools.comms.reply import Answer, ReplyPlan, Request, Shape
 from openant_tools.comms.ticks import LATEST_S
 
 __all__ = ["LATEST_S", "Pending"]
@@ -33,7 +33,9 @@ class Pending:
         self._heard: dict[int, float] = {}
         self._distrust_until = 0.0
 
-    def plan(self, request: Request, now: float, told: Callable[[int], bool], undecided: bool = False) -> Plan | None:
+    def plan(
+        self, request: Request, now: float, told: Callable[[int], bool], undecided: bool = False
+    ) -> ReplyPlan | None:
         """What asking this now needs; None where nothing does.
 
         Args:
@@ -64,7 +66,7 @@ class Pending:
                 elif before[0] != request.packet:
                     listen = True
         may_refuse = frozenset(id for id, until in refusing.items() if until > wait)
-        return Plan(wait, listen, frozenset(doubtful), may_refuse) if wait > now or listen or may_refuse else None
+        return ReplyPlan(wait, listen, frozenset(doubtful), may_refuse) if wait > now or listen or may_refuse else None
 
     def answered(self, request: Request, started: float, undecided: bool = False) -> None:
         """All of them, each once."""

@@ -19,7 +19,7 @@ from typing import Literal
 from openant_tools.comms.troubles import PORT
 from openant_tools.errors import HardwareFault
 
-__all__ = ["FLIGHT_CONTROLLER", "U2D2", "Holder", "Host", "Port", "explain_open_error", "udev_rule"]
+__all__ = ["FLIGHT_CONTROLLER", "U2D2", "Host", "Port", "PortHolder", "explain_open_error", "udev_rule"]
 
 #: USB VID:PID of ROBOTIS' U2D2 (FTDI FT232H) and of STM32 flight controllers (virtual COM port).
 U2D2 = ("0403", "6014")
@@ -64,7 +64,7 @@ class Port:
 
 
 @dataclass(frozen=True)
-class Holder:
+class PortHolder:
     """A process that has a port open."""
 
     pid: int
@@ -148,9 +148,9 @@ class Host:
     def _name(self, path: str) -> str:
         return Path(os.path.realpath(path)).name
 
-    def holders(self, path: str) -> list[Holder]:
+    def holders(self, path: str) -> list[PortHolder]:
         """Processes that have the port open, as far as this user may see them."""
-        name, found = self._name(path), list[Holder]()
+        name, found = self._name(path), list[PortHolder]()
         try:
             processes = sorted(
                 (entry for entry in self.proc.iterdir() if entry.name.isdigit()), key=lambda p: int(p.name)
@@ -164,10 +164,10 @@ class Host:
                 continue  # another user's, or gone meanwhile
             if any(Path(target).name == name and "/dev/" in target for target in targets):
                 words = _bytes(process / "cmdline").replace(b"\0", b" ").decode(errors="replace").strip()
-                found.append(Holder(int(process.name), words or _text(process / "comm")))
+                found.append(PortHolder(int(process.name), words or _text(process / "comm")))
         return found
 
-    def readers(self, path: str) -> list[Holder]:
+    def readers(self, path: str) -> list[PortHolder]:
         """Other programs that have the port open: each takes some of the bytes that come.
 
         This process, its guardian and the far end of a pseudo-terminal are none.

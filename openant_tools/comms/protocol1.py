@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["Status", "ping", "read", "statuses", "write"]
+__all__ = ["Protocol1Status", "ping", "read", "statuses", "write"]
 
 _MARK = b"\xff\xff"
 _PING, _READ, _WRITE = 1, 2, 3
@@ -16,7 +16,7 @@ _MAX_ID, _LONGEST = 253, 250
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class Protocol1Status:
     """One servo's reply; `error` is the raw byte: bits of hardware and packet errors."""
 
     id: int
@@ -40,9 +40,9 @@ def write(id: int, address: int, data: bytes) -> bytes:
     return _frame(id, _WRITE, bytes((address,)) + data)
 
 
-def statuses(data: bytes) -> list[Status]:
+def statuses(data: bytes) -> list[Protocol1Status]:
     """The whole replies in a stream, checksums verified; all else is left out, and so is an echo of what was sent."""
-    found, at = list[Status](), data.find(_MARK)
+    found, at = list[Protocol1Status](), data.find(_MARK)
     while 0 <= at <= len(data) - 6:
         id, length = data[at + 2], data[at + 3]
         end = at + 4 + length
@@ -54,7 +54,7 @@ def statuses(data: bytes) -> list[Status]:
         ):
             at = data.find(_MARK, at + 1)
             continue
-        found.append(Status(id, data[at + 4], data[at + 5 : end - 1]))
+        found.append(Protocol1Status(id, data[at + 4], data[at + 5 : end - 1]))
         at = data.find(_MARK, end)
     return found
 

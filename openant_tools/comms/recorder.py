@@ -17,8 +17,8 @@ from openant_tools.comms.servos import Block, Servo
 from openant_tools.comms.thinning import Thinning
 from openant_tools.errors import BadInput
 from openant_tools.recording.resume import continuation
-from openant_tools.recording.telemetry import Answer as RecordedAnswer
 from openant_tools.recording.telemetry import Cycle, ServoChannel
+from openant_tools.recording.telemetry import RecordedAnswer as RecordedAnswer
 from openant_tools.recording.writer import RecordingStopped, RecordingWriter
 
 __all__ = ["Recorder"]

@@ -13,7 +13,7 @@ from openant_tools.comms.faults import Cause
 from openant_tools.comms.protocol2 import Garbage, Instruction, JoinedStatus, Parser, Reason, Status
 from openant_tools.comms.ticks import LATEST_S, TICK_ADDRESS, TICK_SIZE, TickClock
 
-__all__ = ["Answer", "Edge", "Plan", "Request", "Shape", "Sorting", "whole_answers"]
+__all__ = ["Answer", "Edge", "ReplyPlan", "Request", "Shape", "Sorting", "whole_answers"]
 
 #: 8N1: a byte is ten bits on the wire.
 BITS_PER_BYTE = 10
@@ -136,7 +136,7 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ReplyPlan:
     """What has to be done so that the answers to a question are its own.
 
     Attributes:
@@ -214,7 +214,7 @@ class Sorting:
         doubted: id → (tick, arrival in s) of an answer that is out of step with a clock of which nobody knows if it runs.
     """
 
-    def __init__(self, request: Request, started: float, clocks: Mapping[int, TickClock], plan: Plan) -> None:
+    def __init__(self, request: Request, started: float, clocks: Mapping[int, TickClock], plan: ReplyPlan) -> None:
         self.request = request
         self.surplus: list[int] = []
         self.noise_bytes = 0

@@ -15,7 +15,17 @@ from typing import Literal
 
 from openant_tools.errors import HardwareFault
 
-__all__ = ["POSE_RAD", "RULES", "Face", "Interlock", "MotionStopped", "Restart", "Rule", "StopCause", "restart_page"]
+__all__ = [
+    "POSE_RAD",
+    "RULES",
+    "Face",
+    "Interlock",
+    "MotionStopped",
+    "Restart",
+    "RestartRule",
+    "StopCause",
+    "restart_page",
+]
 
 #: Who goes on by itself at all; any other command ends with the first stop.
 Face = Literal["comms soak", "openant_env"]
@@ -49,7 +59,7 @@ class StopCause(StrEnum):
 
 
 @dataclass(frozen=True)
-class Rule:
+class RestartRule:
     """One row: whether motion may begin again by itself after this.
 
     Attributes:
@@ -71,41 +81,41 @@ class Rule:
 
 _SAME = "the same servos answer anew, every joint that was seen since is where it was seen last"
 
-RULES: Mapping[StopCause, Rule] = {
+RULES: Mapping[StopCause, RestartRule] = {
     rule.cause: rule
     for rule in (
-        Rule(StopCause.STORAGE, "the disk is full, or a recording, checkpoint or log cannot be written"),
-        Rule(StopCause.LIMITS, "a joint is measured outside its limits"),
-        Rule(StopCause.OVERLOAD, "a servo pushes near its stall for longer than it may"),
-        Rule(StopCause.VOLTAGE, "the supply leaves the range of a servo"),
-        Rule(StopCause.NOT_FOLLOWING, "a joint stands where its command does not explain it"),
-        Rule(StopCause.PORT, "the bus adapter is gone, or its line never falls silent"),
-        Rule(StopCause.GUARDIAN, "the guardian process has died"),
-        Rule(StopCause.FALL, "the robot lies on its back or side"),
-        Rule(StopCause.CABLE, "the cable is wound up by two turns"),
-        Rule(StopCause.BY_HAND, "the stop key, or a pause by hand"),
-        Rule(StopCause.UNKNOWN, "anything that is not in this table"),
-        Rule(
+        RestartRule(StopCause.STORAGE, "the disk is full, or a recording, checkpoint or log cannot be written"),
+        RestartRule(StopCause.LIMITS, "a joint is measured outside its limits"),
+        RestartRule(StopCause.OVERLOAD, "a servo pushes near its stall for longer than it may"),
+        RestartRule(StopCause.VOLTAGE, "the supply leaves the range of a servo"),
+        RestartRule(StopCause.NOT_FOLLOWING, "a joint stands where its command does not explain it"),
+        RestartRule(StopCause.PORT, "the bus adapter is gone, or its line never falls silent"),
+        RestartRule(StopCause.GUARDIAN, "the guardian process has died"),
+        RestartRule(StopCause.FALL, "the robot lies on its back or side"),
+        RestartRule(StopCause.CABLE, "the cable is wound up by two turns"),
+        RestartRule(StopCause.BY_HAND, "the stop key, or a pause by hand"),
+        RestartRule(StopCause.UNKNOWN, "anything that is not in this table"),
+        RestartRule(
             StopCause.HARDWARE_ERROR, "a servo has shut itself down", ("openant_env",), 1, 3600.0,
             "after one reboot; one that reports an error again within that time ends motion for good", each_joint=True,
         ),
-        Rule(
+        RestartRule(
             StopCause.SILENCE, "servos are silent, or their answers are broken", FACES, 12, 600.0,
             f"all answer again; in openant_env: {_SAME}",
         ),
-        Rule(
+        RestartRule(
             StopCause.STALL, "this computer stood still, and the servos' Bus Watchdog stopped the motion", FACES, 3, 600.0,
             f"all answer again; in openant_env: {_SAME}",
         ),
-        Rule(
+        RestartRule(
             StopCause.HEAT, "a servo comes near its temperature limit", ("openant_env",), 10, 3600.0,
             "it has rested, torque off, until it is 15 °C cooler",
         ),
-        Rule(
+        RestartRule(
             StopCause.TAG, "the camera does not see the robot", ("openant_env",), 20, 600.0,
             "it is seen again; meanwhile it lies, torque off",
         ),
-        Rule(
+        RestartRule(
             StopCause.IMU, "the IMU sends nothing", ("openant_env",), 20, 600.0,
             "it sends again; meanwhile the robot lies, torque off",
         ),

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from openant_tools.comms.bus import Bus, Found
+from openant_tools.comms.bus import Bus, FoundServo
 from openant_tools.comms.faults import BrokenAnswer, Cause
 from openant_tools.comms.line import SerialLine
 from openant_tools.comms.ports import Host
@@ -156,7 +156,7 @@ class _Rate:
                     self.protocol_1.append(id)
         return [_examined(bus, seen[id], stolen=self.stolen) for id in sorted(seen)]
 
-    def _all(self, wait_s: float) -> dict[int, Found]:
+    def _all(self, wait_s: float) -> dict[int, FoundServo]:
         bus, noise, began = self.bus, self.bus.statistics.noise_bytes, self.bus.clock.now()
         found = {one.id: one for one in bus.broadcast_ping(first_s=wait_s, quiet_s=QUIET_S)}
         noise = bus.statistics.noise_bytes - noise
@@ -166,18 +166,18 @@ class _Rate:
             self.doubts.append(_words("still_coming", baud=bus.line.baud, seconds=wait_s))
         return found
 
-    def _alone(self, id: int) -> Found | None:
+    def _alone(self, id: int) -> FoundServo | None:
         status, _ = patient_ping(self.bus, id, (SINGLE_S,))
         if status is None:
             return None
-        return Found(id, int.from_bytes(status.params[:2], "little"), status.params[2], status.alert)
+        return FoundServo(id, int.from_bytes(status.params[:2], "little"), status.params[2], status.alert)
 
     def _take_protocol_1(self, data: bytes) -> None:
         heard = statuses(data.removeprefix(protocol_1_packet(BROADCAST)))
         self.protocol_1 += [one.id for one in heard if one.id < BROADCAST and not one.params]
 
 
-def _examined(bus: Bus, seen: Found, *, stolen: bool) -> Scanned:
+def _examined(bus: Bus, seen: FoundServo, *, stolen: bool) -> Scanned:
     """Whether the servo's answers are whole, and which questions it answers; what somebody else reads proves neither."""
     reads = [bus.sync_read(PROOF_ADDRESS, PROOF_SIZE, [seen.id])[0] for _ in range(PROOFS)]
     broken = sum(answer.cause in (Cause.CRC, Cause.SHORT) for answer in reads)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from openant_tools.comms.bus import FAST_READ_FIRMWARE, Answer, Bus, Found
+from openant_tools.comms.bus import FAST_READ_FIRMWARE, Answer, Bus, FoundServo
 from openant_tools.comms.faults import BrokenAnswer, Cause, Refused
 from openant_tools.comms.protocol2 import BROADCAST, SyncWriteTemplate, write
 from openant_tools.errors import BadInput, HardwareFault
@@ -107,14 +107,14 @@ class Servos:
 
     # ---- who is there --------------------------------------------------------------------------------------------
 
-    def identify(self) -> dict[str, Found]:
+    def identify(self) -> dict[str, FoundServo]:
         """Ping every servo; joint → what answered.
 
         Raises:
             NoAnswer: some are silent; the message names the cable.
             HardwareFault: one is of another model than expected.
         """
-        found: dict[str, Found] = {}
+        found: dict[str, FoundServo] = {}
         answers: list[Answer] = []
         for servo in self.servos:
             seen = self.bus.ping(servo.id, insist=True)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from openant_tools.comms.bus import Bus, Timing
+from openant_tools.comms.bus import Bus, BusTiming
 from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
 from openant_tools.comms.line import SerialLine
 from openant_tools.comms.messages import EngineConfig, ImuConfig
@@ -55,7 +55,7 @@ def open_bus(port: str, baud: int, control: str | None = None) -> Bus:
     if remote is not None and remote.ask("now")["stepped"]:
         clock = SteppedClock(remote, bus=line)
     latency = Host().latency_timer_ms(port)
-    return Bus(line, clock, Timing(latency_timer_s=Timing.latency_timer_s if latency is None else latency * 1e-3))
+    return Bus(line, clock, BusTiming(latency_timer_s=BusTiming.latency_timer_s if latency is None else latency * 1e-3))
 
 
 def imu_of_robot(robot: RobotConfig | None, port: str | None = None) -> ImuConfig | None:

@@ -16,7 +16,7 @@ from openant_tools.comms import protocol1
 from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.faults import BrokenAnswer, NoAnswer
-from openant_tools.comms.ports import Holder, Host
+from openant_tools.comms.ports import Host, PortHolder
 from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.robot.servo import BAUD_CODES, hardware_errors, servo_model
@@ -178,7 +178,7 @@ def reader_words(path: str, host: Host | None = None) -> str:
     return SILENCE["second_reader"].says.format(who=_programs(readers)) if readers else ""
 
 
-def _programs(readers: Sequence[Holder]) -> str:
+def _programs(readers: Sequence[PortHolder]) -> str:
     return ", ".join(f"{one.command} (process {one.pid})" for one in readers)
 
 

@@ -28,7 +28,7 @@ from openant_tools.recording.run import Facts
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import HOME_RAD
 
-__all__ = ["THIN_S", "Soaked", "soak", "soak_motion", "soaked_seconds"]
+__all__ = ["THIN_S", "BusSoaked", "soak", "soak_motion", "soaked_seconds"]
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ PAUSE_S = 5.0
 
 
 @dataclass(frozen=True)
-class Soaked:
+class BusSoaked:
     """What came of a soak.
 
     Attributes:
@@ -107,7 +107,7 @@ def soak(
     robot_toml: str | None = None,
     progress: Callable[[float, Mapping[str, Any]], None] = lambda share, statistics: None,
     notice: Callable[[str], None] = lambda words: None,
-) -> Soaked:
+) -> BusSoaked:
     """Soak until the log is `seconds` (s) long.
 
     Args:
@@ -148,7 +148,7 @@ def soak(
                     commands = soak_motion(joints, config.limits_rad, config.rate_hz, piece)
                     engine.ask(messages.Play(commands[: max(2, round(length * config.rate_hz))], "soak"))
                 else:
-                    engine.ask(messages.Look(length))
+                    engine.ask(messages.LetPass(length))
                 pause_s = 0.0
             except MotionStopped as fault:
                 stops.append(str(fault))
@@ -174,7 +174,7 @@ def soak(
                 interlock.end(fault.what)
             path, cycles = str(out), _rows_of(out)
     whole = done >= seconds and not interlock.ended
-    return Soaked(Path(path), cycles, done, statistics, tuple(stops), interlock.ended, whole)
+    return BusSoaked(Path(path), cycles, done, statistics, tuple(stops), interlock.ended, whole)
 
 
 def _what_follows(restart: Restart | None) -> str:

@@ -50,7 +50,7 @@ FACTORY_BEFORE: Mapping[tuple[str, str], tuple[int, ...]] = {
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenRegister:
     """One register as it was found, with what bears on it.
 
     Attributes:
@@ -66,7 +66,7 @@ class Seen:
     ids: frozenset[int]
 
 
-def _never(seen: Seen) -> bool:
+def _never(seen: SeenRegister) -> bool:
     return False
 
 
@@ -80,15 +80,15 @@ class Setting:
         factory: whether the factory's value is expected where nobody says otherwise.
     """
 
-    does: str | Callable[[Seen], str]
-    stops: Callable[[Seen], bool] = _never
+    does: str | Callable[[SeenRegister], str]
+    stops: Callable[[SeenRegister], bool] = _never
     factory: bool = True
 
-    def words(self, seen: Seen) -> str:
+    def words(self, seen: SeenRegister) -> str:
         return self.does if isinstance(self.does, str) else self.does(seen)
 
 
-def _drive(seen: Seen) -> str:
+def _drive(seen: SeenRegister) -> str:
     words = [
         what
         for bit, what in (
@@ -101,7 +101,7 @@ def _drive(seen: Seen) -> str:
     return " and ".join(words) or "it turns the way it is mounted"
 
 
-def _narrow(seen: Seen) -> bool:
+def _narrow(seen: SeenRegister) -> bool:
     """Whether the servo refuses a part of the commands that its joint may be given."""
     if seen.table.get("operating_mode", POSITION) != POSITION or seen.limits_rad is None:
         return False
@@ -113,13 +113,13 @@ def _narrow(seen: Seen) -> bool:
     return max(low - turns, 0) < least or min(high - turns, PULSES_PER_TURN - 1) > most
 
 
-def _limit(seen: Seen) -> str:
+def _limit(seen: SeenRegister) -> str:
     if seen.table.get("operating_mode", POSITION) != POSITION:
         return "not in force in extended position mode"
     return "it refuses goals beyond" + (", which this joint needs" if _narrow(seen) else "")
 
 
-def _slow(seen: Seen) -> bool:
+def _slow(seen: SeenRegister) -> bool:
     velocity, table = seen.table.get("profile_velocity", 0), seen.table
     if not velocity:
         return False  # without a velocity there is no profile, whatever the acceleration
@@ -129,7 +129,7 @@ def _slow(seen: Seen) -> bool:
     return bool(model.register("profile_velocity").to_si(velocity) < FASTER * model.no_load_rad_s)
 
 
-def _velocity(seen: Seen) -> str:
+def _velocity(seen: SeenRegister) -> str:
     if not seen.found:
         return "it goes to its goals at once"
     if seen.table.get("drive_mode", 0) & TIME_BASED:
@@ -137,53 +137,53 @@ def _velocity(seen: Seen) -> str:
     return f"it turns no faster than {_si(seen)}"
 
 
-def _acceleration(seen: Seen) -> str:
+def _acceleration(seen: SeenRegister) -> str:
     if not seen.table.get("profile_velocity", 0):
         return "without effect while profile_velocity is 0"
     return "it is slow to start and to stop"
 
 
-def _weak(seen: Seen) -> bool:
+def _weak(seen: SeenRegister) -> bool:
     """Whether it may push less than what it is made to bear for long."""
     return seen.servo.model.stall_torque_at(duty=abs(seen.found) / PWM_FULL) < seen.servo.model.nominal_torque_nm
 
 
-def _push(seen: Seen) -> str:
+def _push(seen: SeenRegister) -> str:
     return f"it pushes with no more than {100 * abs(seen.found) / PWM_FULL:.0f} % of full duty"
 
 
-def _soft(seen: Seen) -> bool:
+def _soft(seen: SeenRegister) -> bool:
     stiffness = seen.servo.model.stiffness_nm_rad(seen.found)
     return stiffness * SOFT_RAD < seen.servo.model.nominal_torque_nm
 
 
-def _stiffness(seen: Seen) -> str:
+def _stiffness(seen: SeenRegister) -> str:
     default = seen.servo.model.register("position_p_gain").default or 1
     return f"it is {seen.found / default:.2g} times as stiff as from the factory"
 
 
-def _shadow(seen: Seen) -> bool:
+def _shadow(seen: SeenRegister) -> bool:
     return seen.found in seen.ids and seen.found != seen.servo.id
 
 
-def _second(seen: Seen) -> str:
+def _second(seen: SeenRegister) -> str:
     return f"it obeys what is told to id {seen.found}, too" if seen.found < 253 else "it obeys its own id alone"
 
 
-def _shutdown(seen: Seen) -> str:
+def _shutdown(seen: SeenRegister) -> str:
     default = seen.servo.model.register("shutdown").default or 0
     names = [error.name for error in hardware_errors(default & ~seen.found)]
     return f"it does not protect itself from {', '.join(names)}" if names else "it also shuts down for other reasons"
 
 
-def _startup(seen: Seen) -> str:
+def _startup(seen: SeenRegister) -> str:
     words = ["its torque comes on with the power"] if seen.found & 1 else []
     return " and ".join([*words, *(["settings in RAM outlive the power"] if seen.found & RESTORES_RAM else [])]) or (
         "nothing outlives the power"
     )
 
 
-def _si(seen: Seen, register: str = "profile_velocity") -> str:
+def _si(seen: SeenRegister, register: str = "profile_velocity") -> str:
     item = seen.servo.model.register(register)
     return f"{item.to_si(seen.found):.3g} {item.unit}"
 
@@ -353,7 +353,7 @@ def differences(
             goal = _goal(register, table, wanted.get(servo.joint, {}))
             if register not in table or goal is None or _alike(servo.model, register, table[register], goal):
                 continue
-            seen = Seen(servo, table[register], table, limits_rad.get(servo.joint), ids)
+            seen = SeenRegister(servo, table[register], table, limits_rad.get(servo.joint), ids)
             out.append(
                 Difference(
                     servo.joint,

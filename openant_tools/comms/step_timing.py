@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.numbers import number, percent
 from openant_tools.recording.run import Run
-from openant_tools.report import Answer, Figure, Report, plots
+from openant_tools.report import Figure, Report, ReportSummary, plots
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
-__all__ = ["Part", "StepTiming", "step_timing", "timing_figure", "timing_report"]
+__all__ = ["StepPart", "StepTiming", "step_timing", "timing_figure", "timing_report"]
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ _COLOURS = {
 
 
 @dataclass(frozen=True)
-class Part:
+class StepPart:
     """One part of a step over all steps, in s.
 
     Attributes:
@@ -63,7 +63,7 @@ class Part:
     share: float
 
     @classmethod
-    def of(cls, name: str, values: Array, step: float) -> Part:
+    def of(cls, name: str, values: Array, step: float) -> StepPart:
         return cls(
             name, float(values.mean()), float(values.std()), float(np.median(values)),
             float(np.quantile(values, 0.99)), float(values.max()), float(values.mean() / step),
@@ -84,9 +84,9 @@ class StepTiming:
 
     name: str
     steps: int
-    parts: tuple[Part, ...]
-    step: Part
-    action_to_observation: Part
+    parts: tuple[StepPart, ...]
+    step: StepPart
+    action_to_observation: StepPart
     computing_share: float
     told_apart: bool
     start: Array
@@ -178,9 +178,9 @@ def step_timing(run: Run) -> StepTiming:
     return StepTiming(
         name=run.name,
         steps=len(starts),
-        parts=tuple(Part.of(name, found, mean) for name, found in arrays.items()),
-        step=Part.of("step", whole, mean),
-        action_to_observation=Part.of("action to observation", values_of(values, ("wait", "read")), mean),
+        parts=tuple(StepPart.of(name, found, mean) for name, found in arrays.items()),
+        step=StepPart.of("step", whole, mean),
+        action_to_observation=StepPart.of("action to observation", values_of(values, ("wait", "read")), mean),
         computing_share=float(computing.mean() / mean),
         told_apart=apart,
         start=np.array(starts),
@@ -250,7 +250,7 @@ def timing_report(found: StepTiming) -> Report:
         then = (
             "Let the agent decide faster (a smaller network, fewer threads), or train with this delay (`action_delay`)."
         )
-    answer = Answer(
+    answer = ReportSummary(
         sentence(found),
         Figure(timing_figure(found), "The mean step, and the spread of its parts."),
         means, then, "warn" if late or jitter else "good",

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Self
 
-from openant_tools.comms.bus import Found
+from openant_tools.comms.bus import FoundServo
 from openant_tools.comms.line import SerialLine
 from openant_tools.errors import HardwareFault
 
@@ -36,13 +36,13 @@ class VendorSdk:
                 f"the vendor's SDK does not know {baud} baud", where=path, remedy="ask with --driver own"
             )
 
-    def ping(self, id: int, tries: int = 1) -> Found | None:
+    def ping(self, id: int, tries: int = 1) -> FoundServo | None:
         """Who has this id; None where nobody answers the SDK."""
         for _ in range(tries):
             model, result, error = self._packets.ping(self._port, id)
             if self._good(id, result):
                 firmware = self.read(id, 6, 1, tries)
-                return Found(id, model, firmware[0] if firmware else 0, bool(error & 0x80))
+                return FoundServo(id, model, firmware[0] if firmware else 0, bool(error & 0x80))
         return None
 
     def read(self, id: int, address: int, size: int, tries: int = 1) -> bytes | None:

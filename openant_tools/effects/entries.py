@@ -17,8 +17,8 @@ from openant_tools.effects.rollout import EffectValues
 from openant_tools.effects.sensing import SensingEffects
 from openant_tools.errors import BadInput
 from openant_tools.files import read_toml
-from openant_tools.robot.config import Effect as Entry
-from openant_tools.robot.config import Problem, parse_effects
+from openant_tools.robot.config import ConfigProblem, parse_effects
+from openant_tools.robot.config import EffectEntry as Entry
 from openant_tools.robot.pair import OTHER_REMEDY, PLAIN, mark_of, stranger_words, strangers
 
 __all__ = ["as_toml", "check_pair", "commands_of", "entries_of", "read_effects", "sensing_of", "values_of"]
@@ -33,7 +33,7 @@ def read_effects(path: Path, joints: Sequence[str]) -> tuple[Entry, ...]:
     Raises:
         BadInput: the file cannot be read, or an entry says something that cannot be.
     """
-    problems: list[Problem] = []
+    problems: list[ConfigProblem] = []
     entries = parse_effects(read_toml(path).get("effect", []), problems, joints)
     errors = [problem for problem in problems if problem.severity == "error"]
     if errors:

@@ -23,7 +23,7 @@ from openant_tools.recording.plausibility import check_time
 from openant_tools.recording.run import Array
 from openant_tools.recording.tables import parquet_table
 
-__all__ = ["ACTION", "STATE", "Dataset", "Episode", "episodes", "open_dataset"]
+__all__ = ["ACTION", "STATE", "DatasetEpisode", "DatasetFacts", "episodes", "open_dataset"]
 
 STATE, ACTION = "observation.state", "action"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -38,7 +38,7 @@ REPEAT = "copy or download the dataset again"
 
 
 @dataclass(frozen=True)
-class Dataset:
+class DatasetFacts:
     """What is known of a dataset before its rows are read.
 
     Attributes:
@@ -62,7 +62,7 @@ class Dataset:
 
 
 @dataclass(frozen=True)
-class Episode:
+class DatasetEpisode:
     """The rows of one episode.
 
     Attributes:
@@ -79,7 +79,7 @@ class Episode:
     counted: bool
 
 
-def open_dataset(root: Path) -> Dataset:
+def open_dataset(root: Path) -> DatasetFacts:
     """What the dataset in the folder `root` says of itself.
 
     Raises:
@@ -117,7 +117,7 @@ def open_dataset(root: Path) -> Dataset:
         total = info.get("total_episodes")
         if isinstance(total, int) and 0 < total <= MOST_EPISODES:
             lengths = dict.fromkeys(range(total), 0)
-    return Dataset(
+    return DatasetFacts(
         root,
         float(fps),
         robot if isinstance(robot, str) else "",
@@ -129,7 +129,7 @@ def open_dataset(root: Path) -> Dataset:
     )
 
 
-def episodes(dataset: Dataset) -> Iterator[Episode]:
+def episodes(dataset: DatasetFacts) -> Iterator[DatasetEpisode]:
     """The episodes one after another, checked; what is held at a time is a file and the episode that it ends with.
 
     Raises:
@@ -233,7 +233,7 @@ def _table(path: Path, columns: Sequence[str], width: int = 1) -> pa.Table:
         raise
 
 
-def _rows(path: Path, dataset: Dataset) -> list[_Rows]:
+def _rows(path: Path, dataset: DatasetFacts) -> list[_Rows]:
     """The rows of a file, cut where another episode begins."""
     needed = ("episode_index", "frame_index", "timestamp", STATE, ACTION)
     table = _table(path, needed, max(len(dataset.state), len(dataset.action)))
@@ -293,7 +293,7 @@ def _matrix(column: pa.ChunkedArray, width: int, path: Path, name: str) -> Array
     return numbers
 
 
-def _episode(parts: Sequence[_Rows], dataset: Dataset) -> Episode:
+def _episode(parts: Sequence[_Rows], dataset: DatasetFacts) -> DatasetEpisode:
     index = parts[0].episode
     where = f"{parts[0].path}, episode {index}"
     frame, timestamp = (np.concatenate([getattr(part, name) for part in parts]) for name in ("frame", "timestamp"))
@@ -316,7 +316,7 @@ def _episode(parts: Sequence[_Rows], dataset: Dataset) -> Episode:
     exact = (frame - frame[0]) / dataset.fps
     elapsed = timestamp - timestamp[0]
     counted = bool((np.abs(elapsed - exact) <= IN_TIME_S + 1e-6 * elapsed).all() and (np.diff(frame) > 0.0).all())
-    return Episode(
+    return DatasetEpisode(
         index,
         exact if counted else elapsed,
         np.concatenate([part.state for part in parts]),

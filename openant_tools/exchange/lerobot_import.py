@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from openant_tools.errors import BadInput
-from openant_tools.exchange.lerobot_dataset import ACTION, STATE, Dataset, episodes, open_dataset
+from openant_tools.exchange.lerobot_dataset import ACTION, STATE, DatasetFacts, episodes, open_dataset
 from openant_tools.exchange.lerobot_units import (
     RESOLUTION_RAD,
     MotorRange,
-    Scale,
-    Seen,
+    SeenRange,
     Unit,
+    UnitScale,
     joint_scale,
     joint_units,
     read_calibration,
@@ -25,7 +25,7 @@ from openant_tools.exchange.lerobot_units import (
 from openant_tools.recording.plausibility import LIMITS
 from openant_tools.recording.run import Facts, Run
 
-__all__ = ["Conversion", "convert", "read_conversion"]
+__all__ = ["DatasetConversion", "convert", "read_conversion"]
 
 #: share of rows at an end of the range from which it is said that positions were cut off there
 CUT_OFF = 0.01
@@ -33,17 +33,17 @@ CALIBRATION = "~/.cache/huggingface/lerobot/calibration/robots/KIND/ID.json"
 
 
 @dataclass(frozen=True)
-class Joint:
+class ImportedJoint:
     """One joint of a dataset: our name, where its numbers stand in `observation.state` and in `action`, what they are."""
 
     name: str
     state: int
     action: int
-    scale: Scale
+    scale: UnitScale
 
 
 @dataclass(frozen=True)
-class Conversion:
+class DatasetConversion:
     """How a dataset is read.
 
     Attributes:
@@ -51,15 +51,15 @@ class Conversion:
         remarks: what was supposed, and what was left out, a line each.
     """
 
-    dataset: Dataset
-    joints: tuple[Joint, ...]
+    dataset: DatasetFacts
+    joints: tuple[ImportedJoint, ...]
     whole: bool
     remarks: tuple[str, ...]
 
 
 def read_conversion(
     root: Path, calibration: Path | None = None, rename: Mapping[str, str] | None = None, unit: Unit | None = None
-) -> Conversion:
+) -> DatasetConversion:
     """Read the dataset in `root` once, check every row, and tell how its numbers become angles.
 
     Args:
@@ -82,7 +82,7 @@ def read_conversion(
         )
     names = _renamed(both, rename or {}, where)
     spans = _spans(both, calibration)
-    seen = {joint: Seen("gripper" in joint.lower()) for joint in both}
+    seen = {joint: SeenRange("gripper" in joint.lower()) for joint in both}
     for episode in episodes(dataset):
         for joint, one in seen.items():
             one.add(episode.state[:, measured[joint]], episode.action[:, commanded[joint]])
@@ -111,9 +111,9 @@ def read_conversion(
                 where=where,
                 remedy="an angle lies within four turns: say what it is in with --units, or mend the dataset",
             )
-        joints.append(Joint(names[joint], measured[joint], commanded[joint], scale))
+        joints.append(ImportedJoint(names[joint], measured[joint], commanded[joint], scale))
     wholes = {joint: seen[joint].whole(units[joint], spans[joint]) for joint in both}
-    return Conversion(
+    return DatasetConversion(
         dataset,
         tuple(joints),
         True in wholes.values() and False not in wholes.values(),
@@ -121,7 +121,7 @@ def read_conversion(
     )
 
 
-def convert(conversion: Conversion) -> Iterator[Run]:
+def convert(conversion: DatasetConversion) -> Iterator[Run]:
     """The dataset's episodes as runs `episode_000`, …, in SI units."""
     dataset = conversion.dataset
     names = tuple(joint.name for joint in conversion.joints)
@@ -178,10 +178,10 @@ def _spans(joints: list[str], calibration: Path | None) -> dict[str, MotorRange 
 
 
 def _remarks(
-    dataset: Dataset,
+    dataset: DatasetFacts,
     both: list[str],
     without: list[str],
-    seen: Mapping[str, Seen],
+    seen: Mapping[str, SeenRange],
     units: Mapping[str, Unit],
     certain: bool,
     wholes: Mapping[str, bool | None],

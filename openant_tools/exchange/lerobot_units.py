@@ -22,7 +22,16 @@ from openant_tools.errors import BadInput
 from openant_tools.files import read_json
 from openant_tools.recording.run import Array
 
-__all__ = ["RESOLUTION_RAD", "MotorRange", "Scale", "Seen", "Unit", "joint_scale", "joint_units", "read_calibration"]
+__all__ = [
+    "RESOLUTION_RAD",
+    "MotorRange",
+    "SeenRange",
+    "Unit",
+    "UnitScale",
+    "joint_scale",
+    "joint_units",
+    "read_calibration",
+]
 
 Unit = Literal["degrees", "normalised", "radians", "percent"]
 
@@ -51,7 +60,7 @@ class MotorRange:
 
 
 @dataclass(frozen=True)
-class Scale:
+class UnitScale:
     """How a number becomes an angle: (number − middle) · per_unit, in rad."""
 
     per_unit: float
@@ -62,7 +71,7 @@ class Scale:
 
 
 @dataclass
-class Seen:
+class SeenRange:
     """What a whole dataset shows of one joint.
 
     Attributes:
@@ -140,7 +149,7 @@ def read_calibration(path: Path) -> dict[str, MotorRange]:
 
 
 def joint_units(
-    seen: Mapping[str, Seen], spans: Mapping[str, MotorRange | None], robot: str, said: Unit | None = None
+    seen: Mapping[str, SeenRange], spans: Mapping[str, MotorRange | None], robot: str, said: Unit | None = None
 ) -> tuple[dict[str, Unit], bool]:
     """The unit of each joint, and whether the numbers themselves, or the user, say so.
 
@@ -163,7 +172,7 @@ def joint_units(
     return {joint: unit if joint in body else "percent" for joint in seen}, certain
 
 
-def _body_unit(seen: Sequence[Seen], spans: Sequence[MotorRange | None], robot: str) -> tuple[Unit, bool]:
+def _body_unit(seen: Sequence[SeenRange], spans: Sequence[MotorRange | None], robot: str) -> tuple[Unit, bool]:
     if not seen:
         return "normalised", True
     units: tuple[Unit, ...] = ("degrees", "normalised")
@@ -189,14 +198,14 @@ def _body_unit(seen: Sequence[Seen], spans: Sequence[MotorRange | None], robot: 
     return "degrees", False
 
 
-def joint_scale(unit: Unit, span: MotorRange | None, robot: str) -> Scale | None:
+def joint_scale(unit: Unit, span: MotorRange | None, robot: str) -> UnitScale | None:
     """How a joint's numbers become angles; None where that takes its calibration."""
     if unit == "radians":
-        return Scale(1.0)
+        return UnitScale(1.0)
     if unit == "degrees":
-        return Scale(math.pi / 180.0)
+        return UnitScale(math.pi / 180.0)
     if span is None:
         return None
     turned = -1.0 if span.reversed and not robot.startswith(DYNAMIXEL) else 1.0
     whole = turned * (span.high - span.low) * RESOLUTION_RAD
-    return Scale(whole / 100.0, 50.0) if unit == "percent" else Scale(whole / 200.0)
+    return UnitScale(whole / 100.0, 50.0) if unit == "percent" else UnitScale(whole / 200.0)

@@ -29,7 +29,7 @@ Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Episode:
+class MinariEpisode:
     """(n + 1) observations and n steps: (n, actions), (n,) rewards, and whether the last one ended the task."""
 
     observations: Floats
@@ -59,7 +59,7 @@ def write_minari(paths: Sequence[Path], out: Path) -> tuple[int, int]:
     """
     if (out / "data" / "metadata.json").exists():
         raise BadInput("there is a dataset already", where=out, remedy="name another folder with --out")
-    episodes: list[Episode] = []
+    episodes: list[MinariEpisode] = []
     names: Names | None = None
     runs, notes, folder = [], list[str](), None
     for path in paths:
@@ -99,7 +99,7 @@ def _box(low: Array, high: Array) -> str:
     return json.dumps(space)  # Python's own: infinities are words there, as Minari reads them
 
 
-def _write(folder: Path, number: int, episode: Episode) -> None:
+def _write(folder: Path, number: int, episode: MinariEpisode) -> None:
     """Steps stand with the observation before them; the last observation has a row of its own, padded."""
     n = len(episode.rewards)
 
@@ -122,7 +122,7 @@ def _write(folder: Path, number: int, episode: Episode) -> None:
     write_text(folder / "metadata.json", json_text({"id": number, "total_steps": n}))
 
 
-Found = tuple[list[Episode], Names, RobotFolder | None, list[str]]
+Found = tuple[list[MinariEpisode], Names, RobotFolder | None, list[str]]
 
 
 def _recorded(path: Path) -> Found:
@@ -143,7 +143,7 @@ def _recorded(path: Path) -> Found:
     said = ["the reward is how far the body came along x, m, not that of a task"]
     said += [] if np.isfinite(along).all() else ["no tracker saw the body: rewards are NaN"]
     said.append("where a sample was missing, the one before stands")
-    episode = Episode(seen.astype(np.float32), actions[:-1].astype(np.float32), np.diff(along), False)
+    episode = MinariEpisode(seen.astype(np.float32), actions[:-1].astype(np.float32), np.diff(along), False)
     return [episode], names, source.folder, said
 
 
@@ -190,13 +190,13 @@ def _trained(folder: Path) -> Found:
     return list(_episodes(rows, o, a)), names, robot, [f"actions of −1…1 are of {trained_on.get('action_range')}"]
 
 
-def _episodes(rows: Floats, o: int, a: int) -> Iterator[Episode]:
+def _episodes(rows: Floats, o: int, a: int) -> Iterator[MinariEpisode]:
     """Cut where a step does not begin where the one before ended: someone helped, or the task began anew."""
     seen, after, ended = rows[:, :o], rows[:, o + a + 3 :], rows[:, o + a + 2] > 0
     cuts = np.flatnonzero((seen[1:] != after[:-1]).any(axis=1) | ended[:-1]) + 1
     for part in np.split(np.arange(len(rows)), cuts):
         observations = np.concatenate([seen[part], after[part[-1:]]])
-        yield Episode(observations, rows[part, o : o + a], rows[part, o + a].astype(float), bool(ended[part[-1]]))
+        yield MinariEpisode(observations, rows[part, o : o + a], rows[part, o + a].astype(float), bool(ended[part[-1]]))
 
 
 def _folder_of(facts: Mapping[str, Any]) -> RobotFolder | None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.exchange.scene import Scene, Track, base_track
+from openant_tools.exchange.scene import DrawnRobot, Track, base_track
 from openant_tools.exchange.source import Source
 from openant_tools.optional import rerun as rr
 from openant_tools.recording.run import JOINT_SIGNALS
@@ -116,7 +116,7 @@ def _scalars(stream: Any, source: Source, path: str, t: Array, values: Array) ->
         stream.send_columns(path, _columns(source, t[there]), rr.Scalars.columns(scalars=values[there]))
 
 
-def _robot(stream: Any, source: Source, root: str, scene: Scene, track: Track, rgba: Any) -> None:
+def _robot(stream: Any, source: Source, root: str, scene: DrawnRobot, track: Track, rgba: Any) -> None:
     for k, body in enumerate(scene.bodies):
         for n, one in enumerate(body.shapes):
             colors = [rgba or [round(255 * part) for part in one.rgba]]

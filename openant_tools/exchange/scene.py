@@ -15,7 +15,7 @@ from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.recording.reader import Recording
 from openant_tools.recording.run import Run
 
-__all__ = ["Body", "Scene", "Shape", "Track", "base_track", "load_scene"]
+__all__ = ["DrawnBody", "DrawnRobot", "Shape", "Track", "base_track", "load_scene"]
 
 Array = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class Shape:
 
 
 @dataclass(frozen=True)
-class Body:
+class DrawnBody:
     """A body that is drawn: its number in the model, its name, its shapes."""
 
     number: int
@@ -79,11 +79,11 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Scene:
+class DrawnRobot:
     """A robot as it is drawn."""
 
     plant: Plant
-    bodies: tuple[Body, ...]
+    bodies: tuple[DrawnBody, ...]
 
     def track(self, run: Run, joints_rad: Array, base: Array | None = None) -> Track:
         """Where each body was, at most `DRAWN_HZ` times a second.
@@ -110,7 +110,7 @@ class Scene:
         return Track(run.t[rows], position, quaternion)
 
 
-def load_scene(path: Path, run: Run) -> Scene:
+def load_scene(path: Path, run: Run) -> DrawnRobot:
     """The robot of an MJCF, set up as it stood in `run`, moved by the joints that both have; BadInput where there are none."""
     setup = setup_of(run.facts.setup)
     joints = [joint for joint in load_plant(path, None, setup).joints if joint in run.joints]
@@ -126,11 +126,11 @@ def load_scene(path: Path, run: Run) -> Scene:
     for number in range(1, model.nbody):
         shapes = tuple(_shapes(model, number))
         if shapes:
-            bodies.append(Body(number, model.body(number).name or f"body_{number}", shapes))
-    return Scene(plant, tuple(bodies))
+            bodies.append(DrawnBody(number, model.body(number).name or f"body_{number}", shapes))
+    return DrawnRobot(plant, tuple(bodies))
 
 
-def base_track(recording: Recording | None, run: Run, scene: Scene) -> Array | None:
+def base_track(recording: Recording | None, run: Run, scene: DrawnRobot) -> Array | None:
     """(rows, 7) where a robot on the floor was by its tracker; None on a stand, or where no tracker saw it."""
     free = scene.plant.free_joint
     if scene.plant.setup is not Setup.FLOOR or free is None:

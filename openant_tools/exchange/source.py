@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from openant_tools.errors import BadInput
-from openant_tools.exchange.scene import Scene, load_scene
+from openant_tools.exchange.scene import DrawnRobot, load_scene
 from openant_tools.files import read_json
 from openant_tools.model.of_run import own_model
 from openant_tools.recording.reader import Recording, Samples, read_recording
@@ -46,7 +46,7 @@ class Source:
 
     run: Run
     recording: Recording | None
-    scene: Scene | None
+    scene: DrawnRobot | None
     folder: RobotFolder | None
     wall_ns: int | None
 

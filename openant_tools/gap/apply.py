@@ -28,7 +28,7 @@ from openant_tools.model.body import floor_contacts
 from openant_tools.model.engines import carries, elsewhere, state
 from openant_tools.model.mjcf import document_text, write_model
 from openant_tools.model.plant import Plant, Setup, load_plant
-from openant_tools.robot.config import Effect, Provenance
+from openant_tools.robot.config import EffectEntry, Provenance
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.pair import PLAIN, mark_of
 
@@ -212,13 +212,13 @@ def _lengthen_keys(root: etree._Element, plant: Plant, done: Document) -> None:
                 key.set(name, " ".join(numbers))
 
 
-def _entries(plant: Plant, selected: list[Found], robot: Robot) -> list[Effect]:
+def _entries(plant: Plant, selected: list[Found], robot: Robot) -> list[EffectEntry]:
     """What stands beside the model: laws that act between steps, and what acts on commands and sensors."""
     laws: dict[tuple[str, str], NDArray[np.float64]] = {
         key: values for key, values in robot.laws.items() if not catalogue()[key[0]].native
     }
     entries = [
-        Effect(entry.effect, "all" if acting()[entry.effect].shared else entry.joints, entry.parameters)
+        EffectEntry(entry.effect, "all" if acting()[entry.effect].shared else entry.joints, entry.parameters)
         for entry in entries_of(laws, plant.joints)
     ]
     for one in selected:
@@ -228,11 +228,13 @@ def _entries(plant: Plant, selected: list[Found], robot: Robot) -> list[Effect]:
     return entries
 
 
-def _entry(one: Found) -> Effect:
-    return Effect(one.effect, one.joints, {name: float(f"{span.value:.6g}") for name, span in one.parameters.items()})
+def _entry(one: Found) -> EffectEntry:
+    return EffectEntry(
+        one.effect, one.joints, {name: float(f"{span.value:.6g}") for name, span in one.parameters.items()}
+    )
 
 
-def _others(folder: RobotFolder, found: Diagnosis, given: str | None) -> list[Effect]:
+def _others(folder: RobotFolder, found: Diagnosis, given: str | None) -> list[EffectEntry]:
     """The robot's entries that a diagnosis says nothing of, but for those that were fitted with another model than was diagnosed.
 
     Args:
@@ -246,14 +248,14 @@ def _others(folder: RobotFolder, found: Diagnosis, given: str | None) -> list[Ef
     ]
 
 
-def _mark(found: Diagnosis, model: Path, acts: Sequence[Effect]) -> str:
+def _mark(found: Diagnosis, model: Path, acts: Sequence[EffectEntry]) -> str:
     """The mark of an improved model and its effects (`robot.pair`)."""
     told = [[entry.effect, entry.joints, dict(entry.parameters)] for entry in acts]
     text = json_text({"model": model.name, "calibration": found.calibration, "effects": told})
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def _into_folder(folder: RobotFolder, out: Path, effects: Sequence[Effect], found: Diagnosis) -> None:
+def _into_folder(folder: RobotFolder, out: Path, effects: Sequence[EffectEntry], found: Diagnosis) -> None:
     now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
     folder.update(
         {"model": folder.relative(out.resolve())},

@@ -24,7 +24,7 @@ from openant_tools.gap.evidence import Evidence, Layouts, RunLayout, Scale, anom
 from openant_tools.gap.features import Floats
 from openant_tools.gap.population import Case
 from openant_tools.gap.posterior import NONE, OUTSIDE, features_of, log_posterior
-from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.protocol import RunSet
 from openant_tools.gap.refine import refined
 from openant_tools.gap.templates import Template
 from openant_tools.workers import tied
@@ -82,7 +82,7 @@ class Assessment:
 
 
 def assess(
-    protocol: Protocol, progress: Callable[[float, str], None] = lambda share, words: None, jobs: int = -1
+    protocol: RunSet, progress: Callable[[float, str], None] = lambda share, words: None, jobs: int = -1
 ) -> Assessment:
     """Assess a recording (`Experiment.protocol`).
 
@@ -132,7 +132,7 @@ def assess(
     )
 
 
-def layouts_of(protocol: Protocol) -> Layouts:
+def layouts_of(protocol: RunSet) -> Layouts:
     """What the features of its runs are of."""
     runs = []
     for one in protocol.runs:
@@ -143,7 +143,7 @@ def layouts_of(protocol: Protocol) -> Layouts:
 
 
 def _simulated(
-    protocol: Protocol, name: str, bank: list[Case], progress: Callable[[float, str], None], jobs: int
+    protocol: RunSet, name: str, bank: list[Case], progress: Callable[[float, str], None], jobs: int
 ) -> tuple[Floats, Floats]:
     """(templates, features) and (healthy robots, features), of all runs side by side."""
 
@@ -164,7 +164,7 @@ def _simulated(
     return stored["templates"], stored["healthy"]
 
 
-def _more(protocol: Protocol, name: str, cases: Sequence[Case], jobs: int) -> Floats:
+def _more(protocol: RunSet, name: str, cases: Sequence[Case], jobs: int) -> Floats:
     """(cases, features) of more templates."""
 
     def make() -> dict[str, Floats]:
@@ -175,7 +175,7 @@ def _more(protocol: Protocol, name: str, cases: Sequence[Case], jobs: int) -> Fl
     return _kept(f"{name}-{asked[:12]}", make)["templates"]
 
 
-def _of_templates(protocol: Protocol, cases: Sequence[Case]) -> list[object]:
+def _of_templates(protocol: RunSet, cases: Sequence[Case]) -> list[object]:
     # As many parts on any computer, so that they come to the same.
     step = -(-len(cases) // PARTS)
     return [joblib.delayed(tied(templates_at))(protocol, cases[n : n + step]) for n in range(0, len(cases), step)]
@@ -197,7 +197,7 @@ def _kept(name: str, make: Callable[[], dict[str, Floats]]) -> Mapping[str, Floa
     return made
 
 
-def _name(protocol: Protocol) -> str:
+def _name(protocol: RunSet) -> str:
     """Of everything that simulations of a recording follow from."""
     state = hashlib.sha256(f"{VERSION} {protocol.fingerprint()}".encode())
     for one in protocol.runs:

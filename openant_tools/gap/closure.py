@@ -19,7 +19,7 @@ from openant_tools.effects.effect import Quantity
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.features import Floats, around_switching
 from openant_tools.gap.hypothesis import Hypothesis, Part, bounds_of
-from openant_tools.gap.protocol import Played, Protocol
+from openant_tools.gap.protocol import Played, RunSet
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.tolerance import FACTORS, FLOOR, tolerance_of, torso_kg
 from openant_tools.model.floor import floors
@@ -299,7 +299,7 @@ class Windows:
         found: where a re-fit of `nothing` came to, in tolerances as `names`; 0 before.
     """
 
-    def __init__(self, protocol: Protocol) -> None:
+    def __init__(self, protocol: RunSet) -> None:
         self.protocol = protocol
         self.names = _nuisances(protocol)
         self._before: dict[int, Array] = {}
@@ -601,7 +601,7 @@ def _interval(before: Array, after: Array, counts: Array, floor: float) -> tuple
     return float(low), float(high)
 
 
-def _nuisances(protocol: Protocol) -> list[_Nuisance]:
+def _nuisances(protocol: RunSet) -> list[_Nuisance]:
     """What may move within tolerance: of each joint, of floor and body."""
     out = []
     joints = range(len(protocol.joints))

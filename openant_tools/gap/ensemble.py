@@ -16,7 +16,7 @@ from openant_tools.effects.effect import Cause, Scope
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.features import Floats
 from openant_tools.gap.population import WARMING_C, Case, applicable, robot_of
-from openant_tools.gap.protocol import Played, Protocol, rollouts_of
+from openant_tools.gap.protocol import Played, RunSet, rollouts_of
 from openant_tools.gap.sensors import logged_by, widened
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.plant import Setup
@@ -33,7 +33,7 @@ LARGEST = 1e4
 EXACT = -1
 
 
-def templates_of(protocol: Protocol) -> list[Case]:
+def templates_of(protocol: RunSet) -> list[Case]:
     """Every cause at every place that it may sit, with either sign, on a robot that is else as the model says.
 
     First those of one place at the edge of what robots of one build differ by: what healthy robots do (`gap.whitening`).
@@ -51,7 +51,7 @@ def templates_of(protocol: Protocol) -> list[Case]:
     return edges + out
 
 
-def _places(cause: Cause, protocol: Protocol) -> list[tuple[int, ...]]:
+def _places(cause: Cause, protocol: RunSet) -> list[tuple[int, ...]]:
     """Indices of joints that a cause may sit at, single ones first."""
     everything = tuple(range(len(protocol.joints)))
     out: list[tuple[int, ...]] = []
@@ -64,7 +64,7 @@ def _places(cause: Cause, protocol: Protocol) -> list[tuple[int, ...]]:
     return out
 
 
-def templates_at(protocol: Protocol, bank: Sequence[Case]) -> list[Floats]:
+def templates_at(protocol: RunSet, bank: Sequence[Case]) -> list[Floats]:
     """Of each run, (templates, features): what each does otherwise than the model."""
     out = []
     for k, played in enumerate(protocol.runs):
@@ -87,7 +87,7 @@ def templates_at(protocol: Protocol, bank: Sequence[Case]) -> list[Floats]:
     return out
 
 
-def robots_at(protocol: Protocol, cases: Sequence[Case], seed: int) -> list[Floats]:
+def robots_at(protocol: RunSet, cases: Sequence[Case], seed: int) -> list[Floats]:
     """Of each run, (robots, features): what robots with all the scatter of one build do otherwise than the model, as they log it."""
     rng = np.random.default_rng((551, seed))
     robots = [robot_of(protocol, case) for case in cases]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.gap.folds import FOLDS
-from openant_tools.gap.protocol import Protocol, alike
+from openant_tools.gap.protocol import RunSet, alike
 from openant_tools.gap.windows import AT_MOST_S, Selection, select
 from openant_tools.model.of_run import own_model
 from openant_tools.model.plant import load_plant, setup_of
@@ -40,8 +40,8 @@ class Experiment:
         selection: what was chosen, in the times of the recordings.
     """
 
-    protocol: Protocol
-    parts: Protocol
+    protocol: RunSet
+    parts: RunSet
     training: tuple[int, ...]
     folds: tuple[tuple[int, ...], ...]
     selection: Selection
@@ -101,12 +101,10 @@ def _alike(parts: Sequence[Run], settings: Sequence[str], joints: Sequence[str])
     return [tuple(group) for group in groups] if len(groups) >= FOLDS else [(k,) for k in range(len(parts))]
 
 
-def _protocol(
-    parts: Sequence[tuple[Run, Path | None, Sequence[Window]]], model: Path, joints: Sequence[str]
-) -> Protocol:
+def _protocol(parts: Sequence[tuple[Run, Path | None, Sequence[Window]]], model: Path, joints: Sequence[str]) -> RunSet:
     cut = [_compressed(run, windows) for run, _, windows in parts]
     own = [own for _, own, _ in parts]
-    return Protocol.of([run for run, _ in cut], model, joints, own, [windows for _, windows in cut])
+    return RunSet.of([run for run, _ in cut], model, joints, own, [windows for _, windows in cut])
 
 
 def _compressed(run: Run, windows: Sequence[Window]) -> tuple[Run, tuple[Window, ...]]:

@@ -20,7 +20,7 @@ from openant_tools.model.of_run import plants_of
 from openant_tools.model.plant import Plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
-from openant_tools.robot.config import Effect
+from openant_tools.robot.config import EffectEntry
 from openant_tools.sysid.identify import joints_in_common
 
 __all__ = ["Measurement", "Place", "Played", "difference", "measure"]
@@ -142,7 +142,7 @@ def measure(
     model: Path,
     joints: Sequence[str] | None = None,
     horizon_s: float | None = 0.5,
-    effects: Sequence[Effect] = (),
+    effects: Sequence[EffectEntry] = (),
 ) -> Measurement:
     """Simulate runs with their own commands and say how far off they are, and where.
 

@@ -10,7 +10,7 @@ import numpy as np
 from openant_tools.gap.measure import UNITS, Measurement
 from openant_tools.gap.regime import Regime
 from openant_tools.numbers import exact, number, percent
-from openant_tools.report import Answer, Figure, KeyFigure, Report, plots
+from openant_tools.report import Figure, KeyFigure, Report, ReportSummary, plots
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -41,7 +41,7 @@ def gap_report(found: Measurement) -> Report:
     """Everything about where the gap lies."""
     horizon = "full runs" if found.horizon_s is None else f"re-initialised every {exact(found.horizon_s, 's')}"
     nothing = not found.doubt and (not found.places or found.excess("pos") == 0)
-    answer = Answer(
+    answer = ReportSummary(
         sentence(found),
         Figure(
             worst(found), "Measured and simulated around the moment at which position is farthest off, and the command."

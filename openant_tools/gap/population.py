@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from openant_tools.effects.catalogue import catalogue, enter
 from openant_tools.effects.effect import Cause, Scope
 from openant_tools.effects.robot import Robot
-from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.protocol import RunSet
 from openant_tools.gap.tolerance import random_form, scatter
 
 __all__ = ["Case", "applicable", "draw", "robot_of"]
@@ -44,7 +44,7 @@ class Case:
     seed: int
 
 
-def applicable(protocol: Protocol) -> list[Cause]:
+def applicable(protocol: RunSet) -> list[Cause]:
     """The causes that can show on what this protocol recorded."""
     # What is prepared serves robots with any sensors: what shows only to some is left to the judge.
     floor = protocol.reference.floor
@@ -52,7 +52,7 @@ def applicable(protocol: Protocol) -> list[Cause]:
     return [cause for cause in catalogue().values() if cause.shows(everything)]
 
 
-def draw(protocol: Protocol, seed: int, causes: list[Cause] | None = None) -> Case:
+def draw(protocol: RunSet, seed: int, causes: list[Cause] | None = None) -> Case:
     """A robot at random; the same for the same seed."""
     rng = np.random.default_rng((813, seed))
     causes = applicable(protocol) if causes is None else causes
@@ -69,7 +69,7 @@ def draw(protocol: Protocol, seed: int, causes: list[Cause] | None = None) -> Ca
     return Case(out, seed)
 
 
-def place(cause: Cause, protocol: Protocol, rng: np.random.Generator) -> Ints:
+def place(cause: Cause, protocol: RunSet, rng: np.random.Generator) -> Ints:
     """Joints that a cause may sit at."""
     scope = Scope(rng.choice([str(scope) for scope in cause.scopes]))
     everything = np.arange(len(protocol.joints))
@@ -81,7 +81,7 @@ def place(cause: Cause, protocol: Protocol, rng: np.random.Generator) -> Ints:
     return everything
 
 
-def robot_of(protocol: Protocol, case: Case) -> Robot:
+def robot_of(protocol: RunSet, case: Case) -> Robot:
     """The robot that a case describes."""
     reference = protocol.reference
     robot = Robot(len(protocol.joints), reference.low, reference.high)

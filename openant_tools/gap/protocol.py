@@ -37,7 +37,7 @@ from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Run
 
-__all__ = ["Played", "Players", "Protocol", "alike", "rollouts_of"]
+__all__ = ["Played", "Players", "RunSet", "alike", "rollouts_of"]
 
 Array = NDArray[np.float64]
 
@@ -150,7 +150,7 @@ class Players:
 
 
 @dataclass(frozen=True)
-class Protocol:
+class RunSet:
     """A set of runs to be diagnosed together.
 
     Attributes:
@@ -171,7 +171,7 @@ class Protocol:
         joints: Sequence[str],
         models: Sequence[Path | None],
         windows: Sequence[Sequence[tuple[float, float]]] | None = None,
-    ) -> Protocol:
+    ) -> RunSet:
         """The protocol that these runs played.
 
         Args:
@@ -210,7 +210,7 @@ class Protocol:
             groups.setdefault(str(motors.get(joint, alike)), []).append(j)
         return list(groups.values())
 
-    def coarse(self) -> Protocol:
+    def coarse(self) -> RunSet:
         """The same, simulated in steps as large as populations allow."""
         plants: dict[int, Plant] = {}
         for one in self.runs:

@@ -20,7 +20,7 @@ from openant_tools.model.of_run import plants_of
 from openant_tools.model.rollout import Rollouts
 from openant_tools.numbers import exact, number, percent
 from openant_tools.recording.run import Run
-from openant_tools.report import Answer, Figure, KeyFigure, Report, Table, plots
+from openant_tools.report import Figure, KeyFigure, Report, ReportSummary, Table, plots
 from openant_tools.robot.joints import JOINTS
 from openant_tools.sysid.identify import joints_in_common
 
@@ -49,7 +49,7 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
     gap, share = found.gap, closed(found)
     healthy = found.verdict == NONE
     left = f" {rest_words(found)}" if found.rest and found.verdict != UNEXPLAINED else ""  # there the verdict says it
-    answer = Answer(
+    answer = ReportSummary(
         sentence(found),
         Figure(
             worst(found, held_out or runs, model),

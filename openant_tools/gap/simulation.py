@@ -24,7 +24,7 @@ from openant_tools.gap.initial_state import heats, setpoints
 from openant_tools.gap.laws import Fields, Transmission, back_emf, first_laws, last_laws
 from openant_tools.model.body import torso_body
 from openant_tools.model.plant import Plant, Setup, without_words
-from openant_tools.model.rollout import VELOCITY_SPAN_S, Rollouts, Segment
+from openant_tools.model.rollout import VELOCITY_SPAN_S, Rollouts, RunStretch
 
 __all__ = ["BASE", "Log", "simulate"]
 
@@ -255,7 +255,7 @@ class _Batch:
                 heat[mine] = heats(measured, commands, starts, self._robots, heat[mine[0]], servos)
         return asked.reshape(-1, joints), heat.reshape(-1, joints)
 
-    def _start(self, segment: Segment) -> float:
+    def _start(self, segment: RunStretch) -> float:
         return segment.start - self._led * self._plant.timestep
 
     def _ask(self, step: Step) -> None:
@@ -367,7 +367,7 @@ class _Batch:
                 out[s, r, steps:] = out[s, r, steps - 1]
         return out.reshape(-1, longest, len(plant.joints))
 
-    def _control(self, segment: Segment, robot: Robot, edges: Array) -> Array:
+    def _control(self, segment: RunStretch, robot: Robot, edges: Array) -> Array:
         plant, h = self._plant, self._plant.timestep
         commands = segment.commands
         random = _scatters(robot)

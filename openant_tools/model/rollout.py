@@ -54,7 +54,7 @@ from openant_tools.recording.run import Run
 if TYPE_CHECKING:
     from scipy.interpolate import PchipInterpolator
 
-__all__ = ["Measured", "Rollouts", "Segment", "Staircase", "Trajectories", "initial_velocities"]
+__all__ = ["Measured", "Rollouts", "RunStretch", "Staircase", "Trajectories", "initial_velocities"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -98,7 +98,7 @@ class Trajectories:
 
 
 @dataclass(frozen=True)
-class Segment:
+class RunStretch:
     """A stretch of one run, ready to be stepped."""
 
     run: int
@@ -194,7 +194,7 @@ class Rollouts:
             self._finer[parts] = fine
         return self._finer[parts]
 
-    def _cut(self, segment: Segment, parts: int) -> Segment:
+    def _cut(self, segment: RunStretch, parts: int) -> RunStretch:
         at = (segment.step + segment.fraction) * parts
         step = np.floor(at + 1e-9).astype(np.int64)
         control = np.repeat(segment.control, parts, axis=0)[: int(step[-1]) + 1]
@@ -299,7 +299,7 @@ class Rollouts:
         return tuple(Measured.of(run.t, run.signal("pos", self.plant.joints)) for run in self.runs)
 
     @property
-    def segments(self) -> Sequence[Segment]:
+    def segments(self) -> Sequence[RunStretch]:
         """What is stepped, the longest first."""
         return self._segments
 
@@ -376,7 +376,7 @@ def _measured_around(t: Array, pos: Array, row: int, span: float, neighbours: in
 def _segments(
     plant: Plant, leads: Plant, run: Run, index: int, offset: int, horizon: float | None,
     windows: Sequence[tuple[float, float]] | None,
-) -> list[Segment]:  # fmt: skip
+) -> list[RunStretch]:  # fmt: skip
     t, pos = run.t, run.signal("pos", plant.joints)
     cmd = _held(run.signal("cmd", plant.joints))
     if cmd is None:
@@ -418,7 +418,7 @@ def _segments(
             off[min(nstep - 1, round((t[row] - t[first]) / h))] = torque_off[row]
         velocity = initial_velocities(t, pos, first)
         segments.append(
-            Segment(
+            RunStretch(
                 run=index,
                 first=first,
                 state=_initial_state(

@@ -18,7 +18,7 @@ from typing import Any
 from openant_tools.errors import BadInput
 from openant_tools.files import parse_json
 
-__all__ = ["EepromWrite", "Entry", "Journal", "append_writes"]
+__all__ = ["EepromWrite", "Journal", "JournalEntry", "append_writes"]
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class EepromWrite:
 
 
 @dataclass(frozen=True)
-class Entry:
+class JournalEntry:
     """One line of the journal.
 
     Attributes:
@@ -85,7 +85,7 @@ class Journal:
             file.flush()
             os.fsync(file.fileno())
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[JournalEntry]:
         """All lines in order; torn ones are left out.
 
         Raises:
@@ -103,7 +103,9 @@ class Journal:
                 continue
             try:
                 undoes = content.pop("undoes", None)
-                entry = Entry(number, content.pop("time"), content.pop("command"), EepromWrite(**content), undoes)
+                entry = JournalEntry(
+                    number, content.pop("time"), content.pop("command"), EepromWrite(**content), undoes
+                )
             except (KeyError, TypeError, AttributeError):
                 raise BadInput(
                     "is no line of the journal", where=f"{self.path}, line {number}", remedy="mend or remove the line"
@@ -111,7 +113,7 @@ class Journal:
             found.append(entry)
         return found
 
-    def open_entries(self) -> list[Entry]:
+    def open_entries(self) -> list[JournalEntry]:
         """The writes that nothing has taken back yet, in order."""
         entries = self.entries()
         gone = {entry.undoes for entry in entries}

@@ -24,8 +24,22 @@ if TYPE_CHECKING:  # a manual that lists the steps opens without NumPy
     from openant_tools.robot.folder import RobotFolder
 
 __all__ = [
-    "Answer", "Ask", "Bench", "Declined", "Event", "Face", "Hands", "Intent", "Live", "Look", "Procedure", "Progress",
-    "RegisterChange", "Say", "Step", "drive",
+    "Answer",
+    "Ask",
+    "Bench",
+    "Declined",
+    "Drawing",
+    "Event",
+    "Face",
+    "Hands",
+    "Intent",
+    "Live",
+    "Procedure",
+    "Progress",
+    "RegisterChange",
+    "Say",
+    "Step",
+    "drive",
 ]  # fmt: skip
 
 
@@ -128,7 +142,7 @@ class Live:
 
 
 @dataclass(frozen=True)
-class Look:
+class Drawing:
     """A drawing in characters (80 columns, ASCII only), or a picture's file, that goes with what follows."""
 
     words: str
@@ -136,7 +150,7 @@ class Look:
     picture: Path | None = None
 
 
-Event = Progress | Say | Intent | Ask | Hands | Live | Look
+Event = Progress | Say | Intent | Ask | Hands | Live | Drawing
 Answer = bool | str | float | None
 Procedure = Generator[Event, Answer, Finding]
 

@@ -10,14 +10,14 @@ import numpy as np
 
 from openant_tools.recording.run import BODY_COLUMNS, JOINT_SIGNALS, Run
 
-__all__ = ["Gap", "JointSummary", "RunSummary", "summarize"]
+__all__ = ["JointSummary", "RowGap", "RunSummary", "summarize"]
 
 #: a gap is longer than this many median rows
 GAP_ROWS = 3.0
 
 
 @dataclass(frozen=True)
-class Gap:
+class RowGap:
     """A stretch without rows: the row before it, its start (s) and its length (s)."""
 
     row: int
@@ -50,7 +50,7 @@ class RunSummary:
     period_low_s: float
     period_high_s: float
     period_longest_s: float
-    gaps: tuple[Gap, ...]
+    gaps: tuple[RowGap, ...]
     joints: tuple[JointSummary, ...]
     body: tuple[str, ...]
     other: tuple[str, ...]
@@ -91,7 +91,7 @@ def summarize(run: Run) -> RunSummary:
         period_low_s=float(np.quantile(spacing, 0.01)),
         period_high_s=float(np.quantile(spacing, 0.99)),
         period_longest_s=float(spacing.max()),
-        gaps=tuple(Gap(int(row), float(run.t[row]), float(spacing[row])) for row in wide),
+        gaps=tuple(RowGap(int(row), float(run.t[row]), float(spacing[row])) for row in wide),
         joints=tuple(joints),
         body=tuple(name for name in BODY_COLUMNS if name in run.columns),
         other=tuple(name for name in run.columns if name not in of_joints and name not in BODY_COLUMNS),

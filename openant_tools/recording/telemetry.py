@@ -23,8 +23,8 @@ __all__ = [
     "AGENT_TIMES",
     "IMU_FIELDS",
     "POSE_FIELDS",
-    "Answer",
     "Cycle",
+    "RecordedAnswer",
     "ServoChannel",
     "Telemetry",
     "message_classes",
@@ -81,7 +81,7 @@ class ServoChannel:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class RecordedAnswer:
     """What one servo answered in one cycle.
 
     Attributes:
@@ -116,7 +116,7 @@ class Cycle:
     goals: Sequence[int | None]
     cmd_t: float | None
     wake: float | None
-    answers: Sequence[Answer]
+    answers: Sequence[RecordedAnswer]
     torque: Sequence[bool]
     obs_t: float | None = None
     act_t: float | None = None

@@ -26,13 +26,13 @@ from openant_tools.report.parts import (
     Table,
     Text,
     Tone,
-    Verdict,
+    VerdictLine,
 )  # fmt: skip
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
-__all__ = ["Answer", "Report", "Section"]
+__all__ = ["Report", "ReportSummary", "Section"]
 
 _PAGE = Template("""<!DOCTYPE html>
 <html lang="en">
@@ -78,7 +78,7 @@ class Section:
 
 
 @dataclass(frozen=True)
-class Answer:
+class ReportSummary:
     """What a report's first screen says, always in this order.
 
     Attributes:
@@ -97,7 +97,7 @@ class Answer:
 
     @property
     def parts(self) -> list[Part]:
-        found = [Verdict(self.verdict, self.tone), self.picture, KeyFigures(self.figures) if self.figures else None]
+        found = [VerdictLine(self.verdict, self.tone), self.picture, KeyFigures(self.figures) if self.figures else None]
         found += [Text(f"**What it means.** {self.means}") if self.means else None]
         found += [Text(f"**What to do next.** {self.then}") if self.then else None]
         return [part for part in found if part is not None]
@@ -106,7 +106,7 @@ class Answer:
 class Report:
     """A report begins with its answer; what is added to it are details, folded section by section.
 
-        Report("Fit of ant12", "stand protocol, 3 runs", Answer(
+        Report("Fit of ant12", "stand protocol, 3 runs", ReportSummary(
             "The model leaves 12 % of the error.", Figure(figure, "Held-out run, measured and simulated"), "…", "…", "good"
         )).section("What was found").table(columns, rows).write(folder / "report.html")
 
@@ -118,7 +118,13 @@ class Report:
     """
 
     def __init__(
-        self, title: str, subtitle: str, answer: Answer, *, made_by: str = "", recordings: Sequence[str | Path] = ()
+        self,
+        title: str,
+        subtitle: str,
+        answer: ReportSummary,
+        *,
+        made_by: str = "",
+        recordings: Sequence[str | Path] = (),
     ) -> None:
         self.title = title
         self.subtitle = subtitle

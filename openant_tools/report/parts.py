@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Code", "Details", "Figure", "Files", "KeyFigure", "KeyFigures", "Mark", "Part", "Picture", "SavePicture", "Table",
-    "Text", "Tone", "Verdict",
+    "Text", "Tone", "VerdictLine",
 ]  # fmt: skip
 
 #: What a value says: all is well, look here, this is bad, or nothing.
@@ -59,7 +59,7 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class VerdictLine:
     """The sentence that a report is opened for."""
 
     text: str

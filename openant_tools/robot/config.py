@@ -18,15 +18,32 @@ from tomlkit.exceptions import TOMLKitError
 
 from openant_tools.errors import BadInput
 from openant_tools.files import decoded, parse_toml
-from openant_tools.robot.fields import Problem, choice, number, port, read, stranger, switch, text, vector, whole
+from openant_tools.robot.fields import ConfigProblem, choice, number, port, read, stranger, switch, text, vector, whole
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS, Kind
 from openant_tools.robot.kit import KITS, PLATFORM_PWM_LIMIT
 from openant_tools.robot.servo import BAUD_CODES, SERVO_MODELS, ServoModel
 
 __all__ = [
-    "ACTION_PRESETS", "CONFIG_NAME", "ActionRange", "Actions", "Arena", "Bus", "Camera", "Effect", "Imu", "Motor", "Ports",
-    "Problem", "Provenance", "RobotConfig", "Timing", "covers", "editable_document",
-    "parse_config", "parse_effects", "read_document",
+    "ACTION_PRESETS",
+    "CONFIG_NAME",
+    "ActionRange",
+    "Actions",
+    "Arena",
+    "BusSection",
+    "CameraSection",
+    "ConfigProblem",
+    "EffectEntry",
+    "ImuSection",
+    "MotorSection",
+    "Ports",
+    "Provenance",
+    "RobotConfig",
+    "TimingSection",
+    "covers",
+    "editable_document",
+    "parse_config",
+    "parse_effects",
+    "read_document",
 ]  # fmt: skip
 
 CONFIG_NAME = "robot.toml"
@@ -58,7 +75,7 @@ class Ports:
 
 
 @dataclass(frozen=True)
-class Bus:
+class BusSection:
     """How the servos are spoken to.
 
     Attributes:
@@ -80,7 +97,7 @@ class Bus:
 
 
 @dataclass(frozen=True)
-class Motor:
+class MotorSection:
     """One joint's servo and how it is mounted: joint angle = direction · (servo angle − zero offset).
 
     Attributes:
@@ -130,7 +147,7 @@ class Motor:
 
 
 @dataclass(frozen=True)
-class Imu:
+class ImuSection:
     """The flight controller in the torso.
 
     Attributes:
@@ -148,7 +165,7 @@ class Imu:
 
 
 @dataclass(frozen=True)
-class Camera:
+class CameraSection:
     """The overhead camera and the tags that it looks for.
 
     Attributes:
@@ -196,7 +213,7 @@ class Arena:
 
 
 @dataclass(frozen=True)
-class Timing:
+class TimingSection:
     """The control loop.
 
     Attributes:
@@ -260,7 +277,7 @@ class Actions:
 
 
 @dataclass(frozen=True)
-class Effect:
+class EffectEntry:
     """One `[[effect]]` that acts in simulation (formats, section 4).
 
     Attributes:
@@ -318,15 +335,15 @@ class RobotConfig:
     kit: str = choice(tuple(KITS), "kit")
     model: str = text()
     ports: Ports = Ports()
-    bus: Bus = Bus()
-    motors: Mapping[str, Motor] = field(default_factory=dict)
-    imu: Imu = Imu()
-    camera: Camera = Camera()
+    bus: BusSection = BusSection()
+    motors: Mapping[str, MotorSection] = field(default_factory=dict)
+    imu: ImuSection = ImuSection()
+    camera: CameraSection = CameraSection()
     arena: Arena = Arena()
-    timing: Timing = Timing()
+    timing: TimingSection = TimingSection()
     actions: Actions = Actions()
     observation: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    effects: tuple[Effect, ...] = ()
+    effects: tuple[EffectEntry, ...] = ()
     provenance: Mapping[str, Provenance] = field(default_factory=dict)
     unknown: tuple[str, ...] = ()
 
@@ -335,7 +352,7 @@ class RobotConfig:
         """The servos' ids in the order of the joints."""
         return tuple(motor.id for motor in self.motors.values())
 
-    def motor_with_id(self, id: int) -> Motor | None:
+    def motor_with_id(self, id: int) -> MotorSection | None:
         return next((motor for motor in self.motors.values() if motor.id == id), None)
 
     def provenance_of(self, path: str) -> Provenance | None:
@@ -353,7 +370,7 @@ def covers(entry: str, path: str) -> bool:
 
 
 _SECTIONS: Mapping[str, type[Any]] = {
-    "ports": Ports, "bus": Bus, "imu": Imu, "camera": Camera, "arena": Arena, "timing": Timing,
+    "ports": Ports, "bus": BusSection, "imu": ImuSection, "camera": CameraSection, "arena": Arena, "timing": TimingSection,
     "actions": Actions,
 }  # fmt: skip
 #: settings of files of before that are read no more → why
@@ -379,11 +396,11 @@ def _suggest(name: str, names: Sequence[str]) -> str:
     return f"did you mean {close[0]!r}?" if close else f"the joints are {', '.join(names)}"
 
 
-def _motors(table: Any, problems: list[Problem]) -> dict[str, Motor]:
-    motors: dict[str, Motor] = {}
+def _motors(table: Any, problems: list[ConfigProblem]) -> dict[str, MotorSection]:
+    motors: dict[str, MotorSection] = {}
     if not isinstance(table, Mapping):
         problems.append(
-            Problem(
+            ConfigProblem(
                 "motors",
                 "is missing" if table is None else "is no table",
                 "each joint needs a table [motors.JOINT]; a file cut short has lost them",
@@ -392,18 +409,18 @@ def _motors(table: Any, problems: list[Problem]) -> dict[str, Motor]:
         return motors
     for joint in table:
         if joint not in JOINTS:
-            problems.append(Problem(f"motors.{joint}", "there is no such joint", _suggest(joint, JOINT_NAMES)))
+            problems.append(ConfigProblem(f"motors.{joint}", "there is no such joint", _suggest(joint, JOINT_NAMES)))
     for joint in JOINT_NAMES:
         if joint not in table:
-            problems.append(Problem(f"motors.{joint}", "is missing", f"add a table [motors.{joint}]"))
+            problems.append(ConfigProblem(f"motors.{joint}", "is missing", f"add a table [motors.{joint}]"))
             continue
-        motor = read(Motor, table[joint], f"motors.{joint}", problems, joint=joint)
+        motor = read(MotorSection, table[joint], f"motors.{joint}", problems, joint=joint)
         if motor is not None:
             motors[joint] = motor
     for motor in motors.values():
         if motor.min_rad >= motor.max_rad:
             problems.append(
-                Problem(
+                ConfigProblem(
                     f"motors.{motor.joint}.min_rad",
                     f"{motor.min_rad:.6g} is not below max_rad, {motor.max_rad:.6g}",
                     "swap them",
@@ -414,7 +431,7 @@ def _motors(table: Any, problems: list[Problem]) -> dict[str, Motor]:
         first = owners.setdefault(motor.id, motor.joint)
         if first != motor.joint:
             problems.append(
-                Problem(
+                ConfigProblem(
                     f"motors.{motor.joint}.id",
                     f"{motor.id} is also the id of {first}",
                     "two servos cannot share an id on one bus",
@@ -424,23 +441,23 @@ def _motors(table: Any, problems: list[Problem]) -> dict[str, Motor]:
 
 
 def _joint_names(
-    value: list[Any], path: str, problems: list[Problem], known: Sequence[str] = JOINT_NAMES
+    value: list[Any], path: str, problems: list[ConfigProblem], known: Sequence[str] = JOINT_NAMES
 ) -> tuple[str, ...]:
     """The joints in a list; what is none, or stands in it twice, is a problem."""
     joints: list[str] = []
     for joint in value:
         if not isinstance(joint, str) or joint not in known:
-            problems.append(Problem(path, f"there is no joint {joint!r}", _suggest(str(joint), known)))
+            problems.append(ConfigProblem(path, f"there is no joint {joint!r}", _suggest(str(joint), known)))
         elif joint in joints:
-            problems.append(Problem(path, f"{joint} stands in it twice"))
+            problems.append(ConfigProblem(path, f"{joint} stands in it twice"))
         else:
             joints.append(joint)
     return tuple(joints)
 
 
-def _chain(value: Any, problems: list[Problem]) -> tuple[tuple[str, ...], ...]:
+def _chain(value: Any, problems: list[ConfigProblem]) -> tuple[tuple[str, ...], ...]:
     if not (isinstance(value, list) and all(isinstance(cable, list) for cable in value)):
-        problems.append(Problem("bus.chain", "is no list of lists of joints"))
+        problems.append(ConfigProblem("bus.chain", "is no list of lists of joints"))
         return ()
     _joint_names([joint for cable in value for joint in cable], "bus.chain", problems)
     return tuple(tuple(str(joint) for joint in cable) for cable in value)
@@ -455,10 +472,10 @@ def _leaves(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any
             yield full, value
 
 
-def _observation(table: Any, problems: list[Problem]) -> dict[str, tuple[float, float]]:
+def _observation(table: Any, problems: list[ConfigProblem]) -> dict[str, tuple[float, float]]:
     bounds: dict[str, tuple[float, float]] = {}
     if not isinstance(table, Mapping):
-        problems.append(Problem("observation", "is no table"))
+        problems.append(ConfigProblem("observation", "is no table"))
         return bounds
     for column, value in _leaves(table):
         signal, _, part = column.partition(".")
@@ -466,7 +483,7 @@ def _observation(table: Any, problems: list[Problem]) -> dict[str, tuple[float, 
         known = part in JOINTS if signal in ("pos", "vel") else part in "xyz" and len(part) == 1
         if signal not in OBSERVED or not known:
             problems.append(
-                Problem(
+                ConfigProblem(
                     f"observation.{column}",
                     "is no signal that is observed",
                     "known are pos.JOINT, vel.JOINT, acc.x|y|z and gyro.x|y|z",
@@ -478,10 +495,10 @@ def _observation(table: Any, problems: list[Problem]) -> dict[str, tuple[float, 
             and len(value) == 2
             and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
         ):
-            problems.append(Problem(f"observation.{column}", "needs two numbers, [low, high]"))
+            problems.append(ConfigProblem(f"observation.{column}", "needs two numbers, [low, high]"))
         elif not -largest <= value[0] < value[1] <= largest:
             problems.append(
-                Problem(
+                ConfigProblem(
                     f"observation.{column}",
                     f"{value[0]:.6g} to {value[1]:.6g} {unit} cannot be",
                     f"low must be below high, both within ±{largest:.4g} {unit}",
@@ -492,16 +509,18 @@ def _observation(table: Any, problems: list[Problem]) -> dict[str, tuple[float, 
     return bounds
 
 
-def parse_effects(entries: Any, problems: list[Problem], known: Sequence[str] = JOINT_NAMES) -> tuple[Effect, ...]:
+def parse_effects(
+    entries: Any, problems: list[ConfigProblem], known: Sequence[str] = JOINT_NAMES
+) -> tuple[EffectEntry, ...]:
     """What the `[[effect]]` tables of a document say; what cannot be goes to `problems`.
 
     Args:
         known: the robot's joints.
     """
     if not isinstance(entries, list):
-        problems.append(Problem("effect", "is no list of tables", "write each effect as a table [[effect]]"))
+        problems.append(ConfigProblem("effect", "is no list of tables", "write each effect as a table [[effect]]"))
         return ()
-    effects: list[Effect] = []
+    effects: list[EffectEntry] = []
     for n, entry in enumerate(entries):
         path = f"effect[{n + 1}]"
         table = entry if isinstance(entry, Mapping) else {}
@@ -511,22 +530,22 @@ def parse_effects(entries: Any, problems: list[Problem], known: Sequence[str] = 
         elif joints not in ("all", "body"):
             remedy = f'write ["{joints}"]' if isinstance(joints, str) and joints in known else None
             problems.append(
-                Problem(f"{path}.joints", f'{joints!r} is neither "all" nor "body" nor a list of joints', remedy)
+                ConfigProblem(f"{path}.joints", f'{joints!r} is neither "all" nor "body" nor a list of joints', remedy)
             )
         parameters = table.get("parameters", {})
         if not isinstance(parameters, Mapping):
-            problems.append(Problem(f"{path}.parameters", "is no table", "write { delay_s = 0.02 }"))
+            problems.append(ConfigProblem(f"{path}.parameters", "is no table", "write { delay_s = 0.02 }"))
             parameters = {}
-        effect = read(Effect, entry, path, problems, joints=joints, parameters=dict(parameters))
+        effect = read(EffectEntry, entry, path, problems, joints=joints, parameters=dict(parameters))
         if effect is not None:
             effects.append(effect)
     return tuple(effects)
 
 
-def _provenance(table: Any, problems: list[Problem]) -> dict[str, Provenance]:
+def _provenance(table: Any, problems: list[ConfigProblem]) -> dict[str, Provenance]:
     entries: dict[str, Provenance] = {}
     if not isinstance(table, Mapping):
-        problems.append(Problem("provenance", "is no table"))
+        problems.append(ConfigProblem("provenance", "is no table"))
         return entries
     for path, value in table.items():
         key = f'provenance."{path}"'
@@ -534,7 +553,9 @@ def _provenance(table: Any, problems: list[Problem]) -> dict[str, Provenance]:
         if isinstance(date, datetime.date) and not isinstance(date, datetime.datetime):
             date = datetime.datetime(date.year, date.month, date.day)
         elif date is not None and not isinstance(date, datetime.datetime):
-            problems.append(Problem(f"{key}.date", "is no date", "write it as 2026-01-31T12:00:00Z, without quotes"))
+            problems.append(
+                ConfigProblem(f"{key}.date", "is no date", "write it as 2026-01-31T12:00:00Z, without quotes")
+            )
             date = None
         entry = read(Provenance, value, key, problems, date=date)
         if entry is not None:
@@ -562,13 +583,13 @@ def editable_document(data: bytes, where: str | Path) -> tomlkit.TOMLDocument:
         raise BadInput(f"cannot be edited: {error}", where=where, remedy="mend it by hand") from None
 
 
-def retired(problem: Problem) -> Problem:
+def retired(problem: ConfigProblem) -> ConfigProblem:
     """A key that nobody reads any more says so, instead of that nobody knows it."""
     why = RETIRED.get(problem.key)
-    return problem if why is None else Problem(problem.key, f"is read no more: {why}", "the line can go", "note")
+    return problem if why is None else ConfigProblem(problem.key, f"is read no more: {why}", "the line can go", "note")
 
 
-def parse_config(document: Mapping[str, Any]) -> tuple[RobotConfig | None, list[Problem]]:
+def parse_config(document: Mapping[str, Any]) -> tuple[RobotConfig | None, list[ConfigProblem]]:
     """What a document says, and everything in it that cannot be or is probably not meant.
 
     Args:
@@ -578,11 +599,11 @@ def parse_config(document: Mapping[str, Any]) -> tuple[RobotConfig | None, list[
         The configuration, None where an error stands among the problems; and the problems in the file's order of
         sections.
     """
-    problems: list[Problem] = []
+    problems: list[ConfigProblem] = []
     schema = document.get("schema", "openant.robot/1")
     if schema != "openant.robot/1":
         problems.append(
-            Problem(
+            ConfigProblem(
                 "schema", f"{schema!r} is not known", "this software reads openant.robot/1; update it, or mend the line"
             )
         )

@@ -18,11 +18,11 @@ from typing import Any
 
 from openant_tools.errors import BadInput
 
-__all__ = ["Derating", "Joint", "derating_of"]
+__all__ = ["DeratedJoint", "Derating", "derating_of"]
 
 
 @dataclass(frozen=True)
-class Joint:
+class DeratedJoint:
     """The rule of one joint.
 
     Attributes:
@@ -46,7 +46,7 @@ class Joint:
 class Derating:
     """The rules of a robot: joint → rule; joints without one keep all of their torque."""
 
-    joints: Mapping[str, Joint]
+    joints: Mapping[str, DeratedJoint]
 
     def share(self, temperature_c: Mapping[str, float]) -> dict[str, float]:
         """Joint → share of torque, for joints whose temperature is given."""
@@ -85,5 +85,5 @@ def derating_of(table: Mapping[str, Any], where: str = "robot.toml") -> Derating
             raise BadInput("start_c, stop_c and least are numbers", where=place)
         if not (rule["start_c"] < rule["stop_c"] and 0 <= rule["least"] <= 1):
             raise BadInput("start_c is below stop_c, and least is 0 … 1", where=place, remedy="mend it there")
-        joints[str(name)] = Joint(float(rule["start_c"]), float(rule["stop_c"]), float(rule["least"]))
+        joints[str(name)] = DeratedJoint(float(rule["start_c"]), float(rule["stop_c"]), float(rule["least"]))
     return Derating(joints)

@@ -13,13 +13,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from typing import Any, Literal, TypeVar
 
-__all__ = ["Problem", "choice", "number", "port", "read", "stranger", "switch", "text", "vector", "whole"]
+__all__ = ["ConfigProblem", "choice", "number", "port", "read", "stranger", "switch", "text", "vector", "whole"]
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Problem:
+class ConfigProblem:
     """Something in a configuration that cannot be, or (a note) that is probably not meant.
 
     Attributes:
@@ -173,15 +173,15 @@ def vector(size: int, low: float, high: float, unit: str = "", default: Any = MI
     return _field(parse, default, key)
 
 
-def stranger(path: str, key: str, known: Sequence[str]) -> Problem:
+def stranger(path: str, key: str, known: Sequence[str]) -> ConfigProblem:
     """The note about a key that nobody reads: it stays in the file, and does nothing."""
     close = difflib.get_close_matches(key, list(known), n=1, cutoff=0.8)
-    return Problem(
+    return ConfigProblem(
         path, f"is not known; is {close[0]!r} meant?" if close else "is not known: nothing reads it", None, "note"
     )
 
 
-def read(kind: type[T], table: Any, path: str, problems: list[Problem], **given: Any) -> T | None:
+def read(kind: type[T], table: Any, path: str, problems: list[ConfigProblem], **given: Any) -> T | None:
     """An instance of the dataclass `kind` from a TOML table, or None where a field stayed empty.
 
     Args:
@@ -195,7 +195,7 @@ def read(kind: type[T], table: Any, path: str, problems: list[Problem], **given:
         return f"{path}.{key}" if path else key
 
     if not isinstance(table, Mapping):
-        problems.append(Problem(path, f"is {_a(table)}, but a table is needed"))
+        problems.append(ConfigProblem(path, f"is {_a(table)}, but a table is needed"))
         return None
     declared = {field.metadata.get("key") or field.name: field for field in dataclasses.fields(kind) if field.metadata}  # type: ignore[arg-type]
     strangers = [key for key in table if key not in declared]
@@ -207,10 +207,12 @@ def read(kind: type[T], table: Any, path: str, problems: list[Problem], **given:
             try:
                 values[field.name] = field.metadata["parse"](table[key])
             except Unfit as unfit:
-                problems.append(Problem(full(key), unfit.what, unfit.remedy))
+                problems.append(ConfigProblem(full(key), unfit.what, unfit.remedy))
                 whole_instance = False
         elif field.default is MISSING:
-            problems.append(Problem(full(key), "is missing", f"is {full(slip[0])!r} a slip of it?" if slip else None))
+            problems.append(
+                ConfigProblem(full(key), "is missing", f"is {full(slip[0])!r} a slip of it?" if slip else None)
+            )
             whole_instance = False
     named = list(given) + [field.name for field in dataclasses.fields(kind) if not field.metadata]  # type: ignore[arg-type]
     if path:

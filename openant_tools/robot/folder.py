@@ -19,8 +19,8 @@ from openant_tools.files import parse_toml, write_bytes, write_text
 from openant_tools.lock import Claim, Holder, held, holder
 from openant_tools.robot.config import (
     CONFIG_NAME,
-    Effect,
-    Problem,
+    ConfigProblem,
+    EffectEntry,
     Provenance,
     RobotConfig,
     covers,
@@ -49,7 +49,7 @@ Document = TypeVar("Document", bound=Mapping[str, Any])
 class Located:
     """A problem and the line of `robot.toml` that it stands in, if it stands anywhere."""
 
-    problem: Problem
+    problem: ConfigProblem
     line: int | None
     file: Path
 
@@ -156,7 +156,7 @@ class RobotFolder:
         finally:
             claim.release()
 
-    def effects_beside(self, models: Iterable[Path]) -> tuple[tuple[Effect, ...], Path | None]:
+    def effects_beside(self, models: Iterable[Path]) -> tuple[tuple[EffectEntry, ...], Path | None]:
         """The robot's `[[effect]]` entries and where they stand, if all these models are its own; else none.
 
         Raises:
@@ -206,7 +206,7 @@ class RobotFolder:
         text = data.decode("utf-8")
         if not text.endswith("\n"):
             what = "the last line has no end: is the file cut short?"
-            problems.append(Problem("", what, "compare it with the newest file in backups/", "note"))
+            problems.append(ConfigProblem("", what, "compare it with the newest file in backups/", "note"))
         located = [Located(problem, _line_of(text, problem.key), self.config_file) for problem in problems]
         located.sort(key=lambda entry: entry.line or math.inf)
         return config, located
@@ -231,7 +231,7 @@ class RobotFolder:
         values: Mapping[str, Any] | None = None,
         *,
         provenance: Provenance | Mapping[str, Provenance] | None = None,
-        effects: Sequence[Effect] | None = None,
+        effects: Sequence[EffectEntry] | None = None,
     ) -> RobotConfig:
         """Change values in `robot.toml`; comments, order, unknown keys and everything else stay byte for byte.
 
@@ -298,9 +298,9 @@ class RobotFolder:
             remedy = f"mend it by hand, or bring back {backup}" if backup else "mend it by hand"
             raise BadInput(error.what, where=error.where, remedy=remedy) from None
 
-    def _model_problems(self, path: Path, simulate: bool, effects: Sequence[Effect]) -> list[Problem]:
+    def _model_problems(self, path: Path, simulate: bool, effects: Sequence[EffectEntry]) -> list[ConfigProblem]:
         if not path.is_file():
-            return [Problem("model", f"there is no file {path}", "name the MJCF relative to the robot's folder")]
+            return [ConfigProblem("model", f"there is no file {path}", "name the MJCF relative to the robot's folder")]
         if not simulate:
             return []
         import mujoco
@@ -312,20 +312,20 @@ class RobotFolder:
             check_model_file(path)
             model = mujoco.MjModel.from_xml_path(str(path))
         except BadInput as error:
-            return [Problem("model", f"{error.where}: {error.what}", error.remedy)]
+            return [ConfigProblem("model", f"{error.where}: {error.what}", error.remedy)]
         except (ValueError, mujoco.FatalError) as error:
-            return [Problem("model", f"MuJoCo cannot load {path}: {' '.join(str(error).split())}")]
+            return [ConfigProblem("model", f"MuJoCo cannot load {path}: {' '.join(str(error).split())}")]
         driven = {int(model.actuator_trnid[k, 0]) for k in range(model.nu)}
         problems = []
         for joint in JOINTS:
             index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
             if index < 0:
-                problems.append(Problem("model", f"{path} has no joint {joint}"))
+                problems.append(ConfigProblem("model", f"{path} has no joint {joint}"))
             elif index not in driven:
-                problems.append(Problem("model", f"no actuator of {path} drives {joint}"))
+                problems.append(ConfigProblem("model", f"no actuator of {path} drives {joint}"))
         others = strangers(effects, model)
         problems += [
-            Problem(f"effect[{n}]", stranger_words([one], path), OTHER_REMEDY)
+            ConfigProblem(f"effect[{n}]", stranger_words([one], path), OTHER_REMEDY)
             for n, one in enumerate(effects, 1)
             if one in others
         ]
@@ -382,7 +382,7 @@ def _edited(
     where: Path,
     values: Mapping[str, Any],
     provenance: Mapping[str, Provenance],
-    effects: Sequence[Effect] | None = None,
+    effects: Sequence[EffectEntry] | None = None,
 ) -> tuple[bytes | None, RobotConfig]:
     """A document's bytes after a change, None where nothing changes, and what they then say.
 
@@ -453,7 +453,7 @@ def _provenance_item(entry: Provenance) -> InlineTable:
     return item
 
 
-def _effect_table(effect: Effect) -> Table:
+def _effect_table(effect: EffectEntry) -> Table:
     table = tomlkit.table()
     table.append("effect", effect.effect)
     table.append("joints", _plain(effect.joints))
@@ -466,7 +466,7 @@ def _effect_table(effect: Effect) -> Table:
     return table
 
 
-def _set_effects(document: tomlkit.TOMLDocument, effects: Sequence[Effect]) -> None:
+def _set_effects(document: tomlkit.TOMLDocument, effects: Sequence[EffectEntry]) -> None:
     _, problems = parse_config(document.unwrap())
     if any(problem.key.startswith("effect") and problem.severity == "error" for problem in problems):
         raise BadInput("the effects that stand in it cannot be read", where=CONFIG_NAME, remedy="mend them first")

@@ -19,14 +19,14 @@ from openant_tools.robot.control_table import control_table
 from openant_tools.robot.gains import P_DIVISOR, Rating
 from openant_tools.robot.registers import PWM_FULL
 
-__all__ = ["GAIN_MODELS", "Figure", "GainModel", "Registers", "gain_model"]
+__all__ = ["GAIN_MODELS", "GainModel", "Registers", "SourcedFigure", "gain_model"]
 
 _RPM = 2 * math.pi / 60
 _MANUAL = "https://emanual.robotis.com/docs/en/dxl/"
 
 
 @dataclass(frozen=True)
-class Figure:
+class SourcedFigure:
     """A number, its unit, and who says so."""
 
     value: float
@@ -67,8 +67,8 @@ class GainModel:
     nominal_voltage_v: float
     supply_range_v: tuple[float, float]
     factory: Registers
-    p_divisors: tuple[Figure, ...]
-    measured: Mapping[str, tuple[Figure, ...]] = field(default_factory=dict)
+    p_divisors: tuple[SourcedFigure, ...]
+    measured: Mapping[str, tuple[SourcedFigure, ...]] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
 
     @property
@@ -86,9 +86,9 @@ class GainModel:
         return self.p_divisors[0].value
 
 
-def _divisors(page: str, *measured: tuple[float, str]) -> tuple[Figure, ...]:
-    manual = Figure(P_DIVISOR, "1", f"manual: {_MANUAL}{page}/, Position PID Gain(80, 82, 84)")
-    return (*(Figure(value, "1", f"measured: {source}") for value, source in measured), manual)
+def _divisors(page: str, *measured: tuple[float, str]) -> tuple[SourcedFigure, ...]:
+    manual = SourcedFigure(P_DIVISOR, "1", f"manual: {_MANUAL}{page}/, Position PID Gain(80, 82, 84)")
+    return (*(SourcedFigure(value, "1", f"measured: {source}") for value, source in measured), manual)
 
 
 _XL330 = (
@@ -102,11 +102,13 @@ _WEIGHED = (
 )
 
 
-def _bam(name: str, kt: tuple[float, float], ohm: tuple[float, float], what: str) -> dict[str, tuple[Figure, ...]]:
+def _bam(
+    name: str, kt: tuple[float, float], ohm: tuple[float, float], what: str
+) -> dict[str, tuple[SourcedFigure, ...]]:
     """kt and R that Rhoban/bam fitted to a pendulum: with constant friction (m1), and with friction that grows with load (m6)."""
     return {
         quantity: tuple(
-            Figure(value, unit, f"fitted: Rhoban/bam, bam/params/{name}/{law}.json, {what}")
+            SourcedFigure(value, unit, f"fitted: Rhoban/bam, bam/params/{name}/{law}.json, {what}")
             for value, law in zip(values, ("m1", "m6"), strict=True)
         )
         for quantity, unit, values in (("torque constant kt", "N·m/A", kt), ("resistance R", "Ω", ohm))
@@ -133,7 +135,7 @@ def _model(
     supply_range_v: tuple[float, float],
     factory: Registers,
     *divisors: tuple[float, str],
-    measured: Mapping[str, tuple[Figure, ...]] | None = None,
+    measured: Mapping[str, tuple[SourcedFigure, ...]] | None = None,
     remarks: tuple[str, ...] = (),
 ) -> GainModel:
     """An entry; `lines` are (V, stall N·m, stall A, no-load rpm) as data sheets print them."""
@@ -158,8 +160,8 @@ def _delivered(name: str) -> Registers:
     return Registers(*(table[f"position_{letter}_gain"].default or 0 for letter in "pid"))
 
 
-def _weighed(stiffness: float) -> dict[str, tuple[Figure, ...]]:
-    return {"stiffness": (Figure(stiffness, "N·m/rad", _WEIGHED),)}
+def _weighed(stiffness: float) -> dict[str, tuple[SourcedFigure, ...]]:
+    return {"stiffness": (SourcedFigure(stiffness, "N·m/rad", _WEIGHED),)}
 
 
 _5V, _11V, _12V = (3.7, 6.0), (6.5, 12.0), (10.0, 14.8)

@@ -14,7 +14,7 @@ from pathlib import Path
 import mujoco
 from lxml import etree
 
-from openant_tools.robot.config import Effect
+from openant_tools.robot.config import EffectEntry
 
 __all__ = ["OTHER_REMEDY", "PLAIN", "TEXT", "mark", "mark_of", "stranger_words", "strangers"]
 
@@ -49,13 +49,13 @@ def mark(root: etree._Element, word: str) -> None:
     etree.SubElement(custom, "text", name=TEXT, data=word).tail = "\n  "
 
 
-def strangers(effects: Sequence[Effect], model: mujoco.MjModel) -> list[Effect]:
+def strangers(effects: Sequence[EffectEntry], model: mujoco.MjModel) -> list[EffectEntry]:
     """The enabled effects that were fitted with another model than this."""
     own = mark_of(model)
     return [one for one in effects if one.enabled and one.pair is not None and one.pair != own]
 
 
-def stranger_words(effects: Sequence[Effect], model: Path) -> str:
+def stranger_words(effects: Sequence[EffectEntry], model: Path) -> str:
     """What is wrong with these beside a model."""
     names = ", ".join(dict.fromkeys(one.effect for one in effects))
     return f"{names} was fitted with another model than {model}: beside this one it would count twice"

@@ -17,7 +17,7 @@ from openant_tools.robot import gains
 from openant_tools.robot.config import Provenance
 from openant_tools.robot.control_table import GAIN_MAX
 from openant_tools.robot.folder import RobotFolder
-from openant_tools.robot.gain_models import Figure, GainModel, Registers
+from openant_tools.robot.gain_models import GainModel, Registers, SourcedFigure
 from openant_tools.robot.gains import CONTROL_PERIOD_S, D_DIVISOR, I_DIVISOR
 from openant_tools.robot.registers import PULSES_PER_TURN, PWM_FULL
 
@@ -102,7 +102,7 @@ class Conversion:
     wanted: Wanted
     mjcf: Mjcf
     back_emf: BackEmf
-    by_divisor: tuple[tuple[Figure, int, float], ...]
+    by_divisor: tuple[tuple[SourcedFigure, int, float], ...]
     notes: tuple[str, ...]
 
     @property
@@ -311,7 +311,7 @@ class Constant:
     """A constant of a servo, and whether the numbers of a `Conversion` rest on it; what does not is there to be compared."""
 
     quantity: str
-    figure: Figure
+    figure: SourcedFigure
     used: bool
 
 
@@ -330,32 +330,34 @@ def constants(model: GainModel, supply_v: float) -> list[Constant]:
             f"derived: torque per volt of the nearest lines times {supply_v:g} V; {sheet}, {torques} N·m at {volts} V"
         )
     found = [
-        Constant("stall torque", Figure(gains.stall_torque_nm(ratings, supply_v), "N·m", stall), True),
-        Constant("no-load speed", Figure(rating.no_load_rad_s, "rad/s", f"{sheet}, {line}"), True),
+        Constant("stall torque", SourcedFigure(gains.stall_torque_nm(ratings, supply_v), "N·m", stall), True),
+        Constant("no-load speed", SourcedFigure(rating.no_load_rad_s, "rad/s", f"{sheet}, {line}"), True),
         Constant(
             "back-EMF damping",
-            Figure(
+            SourcedFigure(
                 gains.back_emf_damping_nm_s_rad(rating), "N·m·s/rad", f"{derived}: τ_stall / ω_no-load, at any supply"
             ),
             True,
         ),
         *(Constant("P divisor", figure, k == 0) for k, figure in enumerate(model.p_divisors)),
-        Constant("I divisor", Figure(I_DIVISOR, "1", pid), True),
-        Constant("D divisor", Figure(D_DIVISOR, "1", pid), True),
+        Constant("I divisor", SourcedFigure(I_DIVISOR, "1", pid), True),
+        Constant("D divisor", SourcedFigure(D_DIVISOR, "1", pid), True),
         Constant(
             "control period",
-            Figure(
+            SourcedFigure(
                 CONTROL_PERIOD_S,
                 "s",
                 "assumed: not published; of velocity control ROBOTIS says much faster than 1 kHz (DynamixelSDK issue 534)",
             ),
             True,
         ),
-        Constant("PWM full range", Figure(PWM_FULL, "counts", f"manual: {model.url}, PWM Limit(36)"), True),
-        Constant("pulses per turn", Figure(PULSES_PER_TURN, "pulses", sheet), True),
+        Constant("PWM full range", SourcedFigure(PWM_FULL, "counts", f"manual: {model.url}, PWM Limit(36)"), True),
+        Constant("pulses per turn", SourcedFigure(PULSES_PER_TURN, "pulses", sheet), True),
         *(
             Constant(
-                f"{letter} gain as delivered", Figure(count, "counts", f"manual: {model.url}, Control Table"), True
+                f"{letter} gain as delivered",
+                SourcedFigure(count, "counts", f"manual: {model.url}, Control Table"),
+                True,
             )
             for letter, count in (
                 ("P", model.factory.position_p),
@@ -363,15 +365,17 @@ def constants(model: GainModel, supply_v: float) -> list[Constant]:
                 ("D", model.factory.position_d),
             )
         ),
-        Constant("stall current", Figure(rating.stall_current_a, "A", f"{sheet}, {line}"), False),
+        Constant("stall current", SourcedFigure(rating.stall_current_a, "A", f"{sheet}, {line}"), False),
     ]
     kt, ke, resistance = (
         law(rating) for law in (gains.torque_constant_nm_a, gains.emf_constant_v_s_rad, gains.resistance_ohm)
     )
     compared = {
-        "torque constant kt": (Figure(kt, "N·m/A", f"{derived}: τ_stall / I_stall"),),
-        "EMF constant ke": (Figure(ke, "V·s/rad", f"{derived}: V / ω_no-load; kt but for friction and rounding"),),
-        "resistance R": (Figure(resistance, "Ω", f"{derived}: V / I_stall"),),
+        "torque constant kt": (SourcedFigure(kt, "N·m/A", f"{derived}: τ_stall / I_stall"),),
+        "EMF constant ke": (
+            SourcedFigure(ke, "V·s/rad", f"{derived}: V / ω_no-load; kt but for friction and rounding"),
+        ),
+        "resistance R": (SourcedFigure(resistance, "Ω", f"{derived}: V / I_stall"),),
     }
     for quantity in dict.fromkeys((*compared, *model.measured)):
         figures = (*compared.get(quantity, ()), *model.measured.get(quantity, ()))

@@ -14,7 +14,7 @@ import numpy as np
 from openant_tools.model.gap import Gap
 from openant_tools.model.plant import Setup
 from openant_tools.recording.run import Run
-from openant_tools.robot.config import Effect as Entry
+from openant_tools.robot.config import EffectEntry as Entry
 from openant_tools.sysid.choice import pays, pooled
 from openant_tools.sysid.dataset import sensor_floor
 from openant_tools.sysid.declared import Declaration

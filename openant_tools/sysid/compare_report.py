@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from openant_tools.numbers import number, readable
-from openant_tools.report import Answer, Figure, KeyFigure, Mark, Report, plots
+from openant_tools.report import Figure, KeyFigure, Mark, Report, ReportSummary, plots
 from openant_tools.report.parts import Tone
 from openant_tools.sysid.compare import FAMILY_ERROR, Change, Comparison, Estimate
 
@@ -28,7 +28,7 @@ def comparison_report(result: Comparison) -> Report:
     if surest is not None:
         figures.append(KeyFigure("surest difference", surest.name, f"by chance alone: p {_chance(surest.p_holm)}"))
     where = ", ".join(result.joints_changed) or "the robot"
-    answer = Answer(
+    answer = ReportSummary(
         result.sentence,
         Figure(
             dots(_telling(result)),

@@ -14,7 +14,7 @@ from openant_tools.model.gap import HORIZON_S, gap, share_closed
 from openant_tools.model.rollout import Rollouts
 from openant_tools.numbers import exact, number, percent, span
 from openant_tools.recording.run import Run
-from openant_tools.report import Answer, Figure, KeyFigure, Mark, Report, plots
+from openant_tools.report import Figure, KeyFigure, Mark, Report, ReportSummary, plots
 from openant_tools.report.parts import Tone
 from openant_tools.sysid.data_sheet import data_sheet_model
 from openant_tools.sysid.dataset import Dataset
@@ -64,7 +64,7 @@ def fit_report(result: Identification) -> Report:
     for value in result.values:
         if value.record_next:
             wanted.setdefault(value.record_next, []).append(f"{value.name} ({value.words})")
-    answer = Answer(
+    answer = ReportSummary(
         _sentence(result),
         Figure(
             worst.figure,

@@ -28,7 +28,7 @@ from openant_tools.model.gap import HORIZON_S, Gap, share_closed
 from openant_tools.model.of_run import own_model, plants_of
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
 from openant_tools.recording.run import Run
-from openant_tools.robot.config import Effect as Entry
+from openant_tools.robot.config import EffectEntry as Entry
 from openant_tools.sysid.choice import Choice, Fold, Settled, by_gain, by_motion, pays, pooled, settle
 from openant_tools.sysid.dataset import Dataset, gaps, sensor_floor
 from openant_tools.sysid.declared import Declaration, declared_parameters

@@ -26,7 +26,7 @@ from openant_tools.recording.facts import with_facts
 from openant_tools.recording.plausibility import check_run
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import read_run, run_of_columns
-from openant_tools.robot.config import Effect
+from openant_tools.robot.config import EffectEntry
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.pair import strangers
 from openant_tools.sysid.beyond import brakes_alike, with_effects
@@ -304,7 +304,9 @@ def _modelled(
     return models_of(runs, None if model is None else Path(model), folder)
 
 
-def _beside(plants: Sequence[Plant], file: File | None, robot: File | None) -> tuple[tuple[Effect, ...], Path | None]:
+def _beside(
+    plants: Sequence[Plant], file: File | None, robot: File | None
+) -> tuple[tuple[EffectEntry, ...], Path | None]:
     """The effects that act, and where they stand: the file's, else the robot's where the model of all runs is the robot's own."""
     if file is not None:
         return read_effects(Path(file), plants[0].joints), Path(file)

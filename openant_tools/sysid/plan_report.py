@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from openant_tools.numbers import exact, number, percent, span
-from openant_tools.report import Answer, Figure, KeyFigure, Mark, Report, plots
+from openant_tools.report import Figure, KeyFigure, Mark, Report, ReportSummary, plots
 from openant_tools.report.parts import Tone
 from openant_tools.sysid.forecast import NEAR_M, Forecast
 from openant_tools.sysid.plan import Expectation, Plan
@@ -40,7 +40,7 @@ def plan_report(plan: Plan) -> Report:
     nearest = min(plan.forecasts, key=lambda one: one.clearance_m)
     open_ = [one.name for one in plan.expectations if one.verdict != "identified"]
     near = number(min(nearest.clearance_m, NEAR_M), "m", decimals=0)
-    answer = Answer(
+    answer = ReportSummary(
         f"Do not play it: {'; '.join(objections)}."
         if objections
         else f"It may be played, and will identify {good} of {len(plan.expectations)} parameters in {number(plan.seconds, 's', decimals=0)}.",

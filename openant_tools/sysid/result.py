@@ -21,7 +21,7 @@ from openant_tools.errors import BadInput
 from openant_tools.files import json_text, read_json, write_text
 from openant_tools.model.gap import HORIZON_S
 from openant_tools.model.mjcf import write_model
-from openant_tools.robot.config import Effect, Provenance
+from openant_tools.robot.config import EffectEntry, Provenance
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.pair import PLAIN, mark_of
 from openant_tools.sysid.beyond import TRIED, better, chosen_in_turn
@@ -231,13 +231,13 @@ def write_robot(result: Identification, folder: RobotFolder) -> None:
         folder.update(values, provenance=provenance, effects=[*effects_beside(result, folder), *found])
 
 
-def effects_beside(result: Identification, folder: RobotFolder) -> list[Effect]:
+def effects_beside(result: Identification, folder: RobotFolder) -> list[EffectEntry]:
     """The robot's `[[effect]]` entries that were not fitted, which stay as they are; of one that was, the joints that were
     not. What was fitted with an earlier model stays where this fit went on from that one, and is of the new pair then; else it
     goes with its model."""
     fitted = {kind.effect[0] for kind in (KINDS[p.kind] for p in result.parameters if p.kind in KINDS) if kind.effect}
     acted, given = {name for name, _ in result.acting}, mark_of(result.datasets[0].plant.model)
-    config, beside = folder.config(), list[Effect]()
+    config, beside = folder.config(), list[EffectEntry]()
     for entry in config.effects:
         mine = tuple(config.motors) if isinstance(entry.joints, str) else entry.joints
         rest = tuple(joint for joint in mine if joint not in result.joints)

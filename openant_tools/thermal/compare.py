@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.procedure.intervals import Interval
 from openant_tools.thermal.fit import Fit
-from openant_tools.thermal.forecast import Interval, forecast, present_load, settled, torque_load
+from openant_tools.thermal.forecast import forecast, present_load, settled, torque_load
 
-__all__ = ["PAPER", "ROOM_C", "AgainstPaper", "Difference", "Paper", "against_paper", "compare"]
+__all__ = ["PAPER", "ROOM_C", "AgainstPaper", "JointDifference", "Paper", "against_paper", "compare"]
 
 Array = NDArray[np.float64]
 
@@ -27,7 +28,7 @@ DRAWS = 800
 
 
 @dataclass(frozen=True)
-class Difference:
+class JointDifference:
     """One joint in both.
 
     Attributes:
@@ -49,7 +50,7 @@ class Difference:
         return self.difference_k.low > 0 or self.difference_k.high < 0
 
 
-def compare(a: Fit, b: Fit, *, joints: Mapping[str, str] | None = None) -> list[Difference]:
+def compare(a: Fit, b: Fit, *, joints: Mapping[str, str] | None = None) -> list[JointDifference]:
     """B against A at the torques that A held.
 
     Args:
@@ -76,7 +77,7 @@ def compare(a: Fit, b: Fit, *, joints: Mapping[str, str] | None = None) -> list[
         )
         tau_a, tau_b = _time_constant(a, one, 0), _time_constant(b, other, 1)
         out.append(
-            Difference(
+            JointDifference(
                 one if one == other else f"{one} / {other}",
                 torque,
                 Interval.of(end_a),

@@ -10,7 +10,7 @@ from openant_tools.robot.kit import Kit
 from openant_tools.robot.servo import ServoModel
 from openant_tools.sysid.bench.knee_torque import knee_loads
 from openant_tools.thermal.fit import Fit, HeldOut
-from openant_tools.thermal.forecast import Forecast, Rest
+from openant_tools.thermal.forecast import HeatForecast, RestPlan
 
 __all__ = ["STEP", "thermal_finding", "torque_warning"]
 
@@ -21,7 +21,7 @@ BELIEVED_K = 2.0
 
 
 def thermal_finding(
-    found: Fit, told: Forecast, *, command: str, recording: str, held: HeldOut | None = None, rest: Rest | None = None,
+    found: Fit, told: HeatForecast, *, command: str, recording: str, held: HeldOut | None = None, rest: RestPlan | None = None,
     warning: str | None = None,
 ) -> Finding:  # fmt: skip
     """Evidence: where each servo goes, when it would shut down, what it can hold; yes where nothing shuts down.

@@ -23,9 +23,9 @@ from openant_tools.errors import BadInput
 from openant_tools.files import read_json
 from openant_tools.robot.joints import JOINTS
 from openant_tools.thermal.inputs import Inputs
-from openant_tools.thermal.physics import Servos, State, advance, by_duty
+from openant_tools.thermal.physics import ServoHeat, State, advance, by_duty
 
-__all__ = ["ALIKE", "PRIORS", "Estimate", "Fit", "HeldOut", "Known", "Prior", "Variants", "fit", "held_out"]
+__all__ = ["ALIKE", "PRIORS", "Fit", "HeatEstimate", "HeatPrior", "HeldOut", "Known", "Variants", "fit", "held_out"]
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ ITERATIONS = 25
 
 
 @dataclass(frozen=True)
-class Prior:
+class HeatPrior:
     """What is known of a parameter before any run.
 
     Attributes:
@@ -61,18 +61,18 @@ class Prior:
 
 #: Of each servo. Sizes: an X430 weighs 57 to 82 g at about 0.8 J/(g·K); the platform's own temperature log shows time
 #: constants of 390 to 550 s and 14 K of rise from electronics alone (facts/robot, section 9).
-PRIORS: Mapping[str, Prior] = {
-    "case_j_k": Prior(55.0, 0.35, 0.12, "J/K", "heat capacity of the case"),
-    "air_w_k": Prior(1 / 12.0, 0.5, 0.2, "W/K", "case to air, at 30 K over the room"),
-    "winding_j_k": Prior(7.5, 0.4, 0.1, "J/K", "heat capacity of the winding"),
-    "winding_w_k": Prior(1 / 4.5, 0.4, 0.1, "W/K", "winding to case"),
-    "scale": Prior(1.0, 0.15, 0.08, "1", "heat made over what current or duty says"),
-    "idle": Prior(1.0, 0.3, 0.1, "1", "electronics over the data sheet's standby"),
+PRIORS: Mapping[str, HeatPrior] = {
+    "case_j_k": HeatPrior(55.0, 0.35, 0.12, "J/K", "heat capacity of the case"),
+    "air_w_k": HeatPrior(1 / 12.0, 0.5, 0.2, "W/K", "case to air, at 30 K over the room"),
+    "winding_j_k": HeatPrior(7.5, 0.4, 0.1, "J/K", "heat capacity of the winding"),
+    "winding_w_k": HeatPrior(1 / 4.5, 0.4, 0.1, "W/K", "winding to case"),
+    "scale": HeatPrior(1.0, 0.15, 0.08, "1", "heat made over what current or duty says"),
+    "idle": HeatPrior(1.0, 0.3, 0.1, "1", "electronics over the data sheet's standby"),
 }
 #: Of each leg, and of all together.
-LEG_PRIOR = Prior(0.03, 0.8, 0.8, "W/K", "hip to knee of one leg")
-EXPONENT_PRIOR = Prior(0.12, 0.10, 0.0, "1", "power by which the air takes more than in proportion", log=False)
-GEAR_PRIOR = Prior(0.5, 0.25, 0.0, "1", "share of the gear's power that stays in the servo", log=False)
+LEG_PRIOR = HeatPrior(0.03, 0.8, 0.8, "W/K", "hip to knee of one leg")
+EXPONENT_PRIOR = HeatPrior(0.12, 0.10, 0.0, "1", "power by which the air takes more than in proportion", log=False)
+GEAR_PRIOR = HeatPrior(0.5, 0.25, 0.0, "1", "share of the gear's power that stays in the servo", log=False)
 #: name → what it is, for people
 PARAMETER_WORDS: Mapping[str, str] = {
     **{name: prior.words for name, prior in PRIORS.items()},
@@ -85,14 +85,14 @@ ROOM_KNOWN_K, ROOM_GUESSED_K, ROOM_BELOW_K = 1.0, 3.5, 1.5
 #: At a run's start: the case against its first reading, the winding against the case (K).
 START_SD_K, START_WINDING_K = 0.5, 2.0
 #: Heat of unknown cause, W: ln median and spread
-UNKNOWN_W = Prior(1.0, 1.0, 1.0, "W", "heat of a pose whose load nobody logged")
+UNKNOWN_W = HeatPrior(1.0, 1.0, 1.0, "W", "heat of a pose whose load nobody logged")
 
 #: parameters that pass from one run of a robot to the next
 ALIKE = (*PRIORS, "leg_w_k", "exponent", "gear")
 
 
 @dataclass(frozen=True)
-class Estimate:
+class HeatEstimate:
     """One parameter with its 95 % interval.
 
     Attributes:
@@ -153,7 +153,7 @@ class Variants:
         held: (b, joints) W of unknown heat in the last pose, 0 where heat is known.
     """
 
-    servos: Servos
+    servos: ServoHeat
     state: State
     offset: Array
     held: Array
@@ -243,7 +243,7 @@ class Fit:
         return replace(self, inputs=self.inputs.until(t))
 
     @property
-    def estimates(self) -> tuple[Estimate, ...]:
+    def estimates(self) -> tuple[HeatEstimate, ...]:
         """All parameters, the servos' first."""
         deviation = np.sqrt(np.diag(self.covariance))
         out = []
@@ -256,10 +256,10 @@ class Fit:
             if self.layout.log[k]:
                 value, low, high = np.exp(value), np.exp(low), np.exp(high)
             share = float(np.clip(informed, 0.0, 1.0))
-            out.append(Estimate(name, joint, float(value), float(low), float(high), unit, share))
+            out.append(HeatEstimate(name, joint, float(value), float(low), float(high), unit, share))
         return tuple(out)
 
-    def estimate(self, name: str, joint: str = "") -> Estimate:
+    def estimate(self, name: str, joint: str = "") -> HeatEstimate:
         return next(one for one in self.estimates if (one.name, one.joint) == (name, joint))
 
     def variants(self, count: int, seed: int = 0) -> Variants:
@@ -437,7 +437,7 @@ def _believe(names: list[tuple[str, str]], mean: list[float], covariance: Array,
         mean[k] = float(before.theta[place])
 
 
-def _servos(run: Inputs, layout: _Layout, theta: Array) -> tuple[Servos, State]:
+def _servos(run: Inputs, layout: _Layout, theta: Array) -> tuple[ServoHeat, State]:
     """(b, p) parameter vectors as servos and their start."""
 
     def each(name: str) -> Array:
@@ -452,7 +452,7 @@ def _servos(run: Inputs, layout: _Layout, theta: Array) -> tuple[Servos, State]:
     case = theta[:, layout.columns("start_k")]
     scale = each("scale")
     scale[:, unknown] = 1.0
-    servos = Servos(
+    servos = ServoHeat(
         each("case_j_k"), each("air_w_k"), each("winding_j_k"), each("winding_w_k"), scale, each("idle"), legs,
         theta[:, layout.columns("room_c")], np.clip(theta[:, layout.columns("exponent")], 0.0, 0.5),
         np.clip(theta[:, layout.columns("gear")], 0.0, 1.0), np.where(unknown, 1.0, resistance), by_duty(run.source),
@@ -461,7 +461,7 @@ def _servos(run: Inputs, layout: _Layout, theta: Array) -> tuple[Servos, State]:
     return servos, State(case + theta[:, layout.columns("start_winding_k")], case.copy())
 
 
-def _simulated(run: Inputs, layout: _Layout, theta: Array, servos: Servos, start: State) -> tuple[Array, State]:
+def _simulated(run: Inputs, layout: _Layout, theta: Array, servos: ServoHeat, start: State) -> tuple[Array, State]:
     """(b, m, joints) °C of the cases at the cells' ends, and the state at the last."""
     out = np.empty((len(theta), len(run.edges) - 1, len(run.joints)))
     state = start
@@ -470,7 +470,7 @@ def _simulated(run: Inputs, layout: _Layout, theta: Array, servos: Servos, start
     return out, state
 
 
-def _states(run: Inputs, layout: _Layout, theta: Array, servos: Servos, start: State) -> Iterator[State]:
+def _states(run: Inputs, layout: _Layout, theta: Array, servos: ServoHeat, start: State) -> Iterator[State]:
     """The state at each cell's end."""
     state, steps = start, np.diff(run.edges)
     unknown = sorted({k for k, _ in layout.held})

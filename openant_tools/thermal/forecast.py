@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
-from openant_tools.robot.derating import Derating, Joint
+from openant_tools.procedure.intervals import Interval
+from openant_tools.robot.derating import DeratedJoint, Derating
 from openant_tools.thermal.fit import Fit, Variants
-from openant_tools.thermal.physics import COPPER_PER_K, Servos, State, advance, by_duty, steady_drive
+from openant_tools.thermal.physics import COPPER_PER_K, ServoHeat, State, advance, by_duty, steady_drive
 
 __all__ = [
-    "COOLED_K", "HORIZON_S", "Forecast", "Interval", "JointForecast", "Load", "cool_down", "derating", "forecast", "present_load",
+    "COOLED_K", "HORIZON_S", "HeatForecast", "JointForecast", "Workload", "cool_down", "derating", "forecast", "present_load",
     "rest_advice", "settled", "torque_load",
 ]  # fmt: skip
 
@@ -48,25 +49,7 @@ DERATED_SHARE = 0.9
 
 
 @dataclass(frozen=True)
-class Interval:
-    """A value with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, draws: Array) -> Interval:
-        """Median and the middle 95 % of (b,) draws."""
-        low, value, high = np.quantile(draws, [0.025, 0.5, 0.975])
-        return cls(float(value), float(low), float(high))
-
-    def as_json(self) -> dict[str, float]:
-        return {"value": self.value, "low": self.low, "high": self.high}
-
-
-@dataclass(frozen=True)
-class Load:
+class Workload:
     """What the servos do from now on.
 
     A pose that holds a weight needs a torque, and so a current; a joint pressed against a stop has a duty, from which less
@@ -154,7 +137,7 @@ def _about(interval: Interval) -> str:
 
 
 @dataclass(frozen=True)
-class Forecast:
+class HeatForecast:
     """Of all joints, with the fan for pictures.
 
     Attributes:
@@ -163,7 +146,7 @@ class Forecast:
     """
 
     joints: tuple[JointForecast, ...]
-    load: Load
+    load: Workload
     t: Array
     fan: Mapping[float, Array]
 
@@ -174,7 +157,7 @@ class Forecast:
         return min(due, key=lambda one: (one.seconds_to_limit.value, -one.probability), default=None)  # type: ignore[union-attr]
 
 
-def present_load(found: Fit, *, whole: bool = False) -> Load:
+def present_load(found: Fit, *, whole: bool = False) -> Workload:
     """The load at the end of the fitted run, over as long as it has been like this; over all of the run if `whole`."""
     run = found.inputs
     width = max(1, round(BLOCK_S / float(np.diff(run.edges).mean())))
@@ -189,7 +172,7 @@ def present_load(found: Fit, *, whole: bool = False) -> Load:
     current = np.where(duty, run.drive / ohm**2, run.drive)
     # Heat of unknown cause is a number of each draw; the load is one of it.
     current = np.where(np.array([source == "unknown" for source in run.source]), 1.0, current)
-    return Load(
+    return Workload(
         np.array([current[block].mean(axis=0) for block in rows[:count]]),
         np.array([push[block].mean(axis=0) for block in rows[:count]]),
         run.gear[first:].mean(axis=0), run.idle[first:].mean(axis=0), _held_by_duty(found, ohm, slice(first, len(push))),
@@ -252,7 +235,7 @@ def _drift(t: Array, values: Array) -> tuple[float, float]:
     return slope, float(math.sqrt(max(rest @ rest, 0.0) / max(len(t) - 2, 1) / float(x @ x)) * 2.0)
 
 
-def torque_load(found: Fit, torque_nm: Mapping[str, float]) -> Load:
+def torque_load(found: Fit, torque_nm: Mapping[str, float]) -> Workload:
     """Joints that hold a torque at standstill, the others at their present load.
 
     Raises:
@@ -282,9 +265,9 @@ def torque_load(found: Fit, torque_nm: Mapping[str, float]) -> Load:
 
 
 def forecast(
-    found: Fit, load: Load | None = None, *, horizon_s: float = HORIZON_S, draws: int = DRAWS, seed: int = 0,
+    found: Fit, load: Workload | None = None, *, horizon_s: float = HORIZON_S, draws: int = DRAWS, seed: int = 0,
     from_cold: bool = False, torques: bool = True,
-) -> Forecast:  # fmt: skip
+) -> HeatForecast:  # fmt: skip
     """Bring every draw forward under a load.
 
     Args:
@@ -326,10 +309,12 @@ def forecast(
         )
     every = max(1, steps // 400)
     fan = {q: np.quantile(paths[:, ::every], q, axis=0) - 0.5 for q in (0.025, 0.25, 0.5, 0.75, 0.975)}
-    return Forecast(tuple(joints), load, t[::every], fan)
+    return HeatForecast(tuple(joints), load, t[::every], fan)
 
 
-def _paths(found: Fit, variants: Variants, load: Load, steps: int, seed: int, from_cold: bool) -> tuple[Array, Array]:
+def _paths(
+    found: Fit, variants: Variants, load: Workload, steps: int, seed: int, from_cold: bool
+) -> tuple[Array, Array]:
     """(n,) s and (b, n, joints) °C, disturbance and the room's own way included."""
     random = np.random.default_rng(seed + 1)
     servos, state, offset = variants.servos, variants.state, variants.offset
@@ -358,7 +343,9 @@ def _paths(found: Fit, variants: Variants, load: Load, steps: int, seed: int, fr
     return t, out
 
 
-def _going_on(found: Fit, variants: Variants, load: Load, random: np.random.Generator) -> tuple[Servos, Array, Array]:
+def _going_on(
+    found: Fit, variants: Variants, load: Workload, random: np.random.Generator
+) -> tuple[ServoHeat, Array, Array]:
     """Servos in which each draw keeps duty or current, as the load is believed to do, and (b, joints) scales of both.
 
     One of the two was measured; the other follows with the resistance that a draw believes in.
@@ -372,14 +359,14 @@ def _going_on(found: Fit, variants: Variants, load: Load, random: np.random.Gene
     return replace(servos, by_duty=keeps), current, np.where(servos.by_duty, 1.0, ratio**2)
 
 
-def _mean_drive(found: Fit, variants: Variants, load: Load) -> tuple[Servos, Array]:
+def _mean_drive(found: Fit, variants: Variants, load: Workload) -> tuple[ServoHeat, Array]:
     """Servos that keep their mean current, and (b, joints) that current squared; heat of unknown cause in W."""
     current = np.broadcast_to(load.current.mean(axis=0), variants.state.case.shape)
     unknown = np.array([source == "unknown" for source in found.inputs.source])
     return replace(variants.servos, by_duty=np.zeros(len(unknown), bool)), np.where(unknown, variants.held, current)
 
 
-def settled(found: Fit, load: Load, room_c: float, draws: int, seed: int = 0) -> Array:
+def settled(found: Fit, load: Workload, room_c: float, draws: int, seed: int = 0) -> Array:
     """(draws, joints) °C as read, where the cases come to rest under a mean load in a room of that temperature."""
     variants = found.variants(draws, seed)
     servos, drive = _mean_drive(found, variants, load)
@@ -398,7 +385,7 @@ def _torque(found: Fit, k: int, square: Array) -> Interval | None:
     return Interval.of(model.kt_nm_a * np.sqrt(np.maximum(square, 0.0)))
 
 
-def _continuous(found: Fit, variants: Variants, load: Load) -> Array:
+def _continuous(found: Fit, variants: Variants, load: Workload) -> Array:
     """(b, joints) A² that each joint could bear for ever, its neighbour at the load given."""
     run = found.inputs
     servos, drive = _mean_drive(found, variants, load)
@@ -420,7 +407,7 @@ def _continuous(found: Fit, variants: Variants, load: Load) -> Array:
 SETTLING, SETTLING_S = 12, 900.0
 
 
-def _for_an_hour(found: Fit, variants: Variants, load: Load) -> Array:
+def _for_an_hour(found: Fit, variants: Variants, load: Workload) -> Array:
     """(b, joints) A² under which a cold servo comes to its limit in just an hour, its neighbour at the load given."""
     run, shape = found.inputs, variants.state.case.shape
     servos, present = _mean_drive(found, variants, load)
@@ -450,7 +437,7 @@ MOST_A2, BISECTIONS, HOUR_STEP_S = 25.0, 14, 60.0
 
 
 @dataclass(frozen=True)
-class Rest:
+class RestPlan:
     """How to work so that no servo shuts down: `work_s`, then `rest_s` with torque off; None for no end of work.
 
     Attributes:
@@ -474,7 +461,7 @@ class Rest:
         )
 
 
-def rest_advice(found: Fit, load: Load | None = None, *, draws: int = 100, seed: int = 0) -> Rest:
+def rest_advice(found: Fit, load: Workload | None = None, *, draws: int = 100, seed: int = 0) -> RestPlan:
     """Work until the earliest likely shutdown less a margin, rest until the decider has cooled.
 
     The times are for the cautious end of the interval: 19 of 20 robots believed in come through.
@@ -484,7 +471,7 @@ def rest_advice(found: Fit, load: Load | None = None, *, draws: int = 100, seed:
     told = forecast(found, load, draws=draws, seed=seed, from_cold=True, torques=False)
     due = [(one.seconds_to_limit.low, one.joint) for one in told.joints if one.seconds_to_limit is not None]
     if not due:
-        return Rest(None, 0.0, 1.0, None)
+        return RestPlan(None, 0.0, 1.0, None)
     work, joint = min(due)
     work *= 0.9
     k = run.joints.index(joint)
@@ -504,7 +491,7 @@ def rest_advice(found: Fit, load: Load | None = None, *, draws: int = 100, seed:
     while again < work and np.quantile(state.case[:, k], 0.95) < run.limit_c[k]:
         state = advance(servos, state, STEP_S, drive, load.gear, load.idle)
         again += STEP_S
-    return Rest(again, rest, again / max(again + rest, 1e-9), joint)
+    return RestPlan(again, rest, again / max(again + rest, 1e-9), joint)
 
 
 def cool_down(found: Fit, joint: str, *, below_k: float = COOLED_K, draws: int = 200, seed: int = 0) -> Interval:
@@ -531,7 +518,7 @@ def cool_down(found: Fit, joint: str, *, below_k: float = COOLED_K, draws: int =
 
 
 def derating(
-    found: Fit, load: Load | None = None, *, told: Forecast | None = None, joints: Sequence[str] = ()
+    found: Fit, load: Workload | None = None, *, told: HeatForecast | None = None, joints: Sequence[str] = ()
 ) -> Derating:
     """The rule under which this load can go on for ever: torque falls towards what each joint can bear.
 
@@ -551,5 +538,5 @@ def derating(
         # The cautious end of what can be borne, with a tenth in hand, so that the servo cools at the hot end.
         least = DERATED_SHARE * one.continuous_torque_nm.low / asked.value
         stop = one.limit_c - DERATED_BELOW_K
-        rules[one.joint] = Joint(stop - DERATED_OVER_K, stop, float(np.clip(least, 0.0, 1.0)))
+        rules[one.joint] = DeratedJoint(stop - DERATED_OVER_K, stop, float(np.clip(least, 0.0, 1.0)))
     return Derating(rules)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from openant_tools.thermal.inputs import Source
 
-__all__ = ["AIR_RISE_K", "COPPER_PER_K", "Servos", "State", "advance", "by_duty", "steady_drive", "winding_heat"]
+__all__ = ["AIR_RISE_K", "COPPER_PER_K", "ServoHeat", "State", "advance", "by_duty", "steady_drive", "winding_heat"]
 
 Array = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ _LEAST_RISE_K = 0.5
 
 
 @dataclass(frozen=True)
-class Servos:
+class ServoHeat:
     """Heat of the servos of one robot, b variants of it at once: arrays (b, joints), or (b, 1) where all share one.
 
     Attributes:
@@ -83,14 +83,14 @@ def by_duty(source: Sequence[Source]) -> NDArray[np.bool_]:
     return np.array([one == "duty" for one in source])
 
 
-def winding_heat(servos: Servos, winding: Array, drive: Array) -> Array:
+def winding_heat(servos: ServoHeat, winding: Array, drive: Array) -> Array:
     """(b, joints) W made in the windings at (b, joints) °C by a drive, A² or V²; heat of unknown cause is W itself."""
     resistance = servos.resistance * (1 + COPPER_PER_K * (winding - 25.0))
     return servos.scale * drive * np.where(servos.by_duty, 1.0 / resistance, resistance)
 
 
 def advance(
-    servos: Servos, state: State, seconds: float, drive: Array, gear: Array, idle: Array, room: Array | None = None
+    servos: ServoHeat, state: State, seconds: float, drive: Array, gear: Array, idle: Array, room: Array | None = None
 ) -> State:
     """The state after `seconds` of constant drive (A² or V²), gear and idle power (W), each (joints,) or (b, joints).
 
@@ -118,7 +118,7 @@ def advance(
     return State(winding + (case - state.case) * faded, case)
 
 
-def steady_drive(servos: Servos, case: Array, idle: Array, others: Array) -> Array:
+def steady_drive(servos: ServoHeat, case: Array, idle: Array, others: Array) -> Array:
     """(b, joints) the drive (A² or V²) that keeps a case at (joints,) °C for ever, its neighbour at (b, joints) °C.
 
     0 where it is warmer than that without any.

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from openant_tools.numbers import number, percent
-from openant_tools.report import Answer, Figure, KeyFigure, Mark, Report, plots
+from openant_tools.procedure.intervals import Interval
+from openant_tools.report import Figure, KeyFigure, Mark, Report, ReportSummary, plots
 from openant_tools.report.parts import Tone
-from openant_tools.thermal.compare import ROOM_C, Difference
+from openant_tools.thermal.compare import ROOM_C, JointDifference
 from openant_tools.thermal.finding import BELIEVED_K
 from openant_tools.thermal.fit import PARAMETER_WORDS, Fit, HeldOut
-from openant_tools.thermal.forecast import HORIZON_S, Forecast, Interval
+from openant_tools.thermal.forecast import HORIZON_S, HeatForecast
 from openant_tools.thermal.inputs import Inputs
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def temperature_picture(found: Fit, run: Inputs, *, split_s: float | None = None
 
 
 def forecast_picture(
-    found: Fit, told: Forecast, *, run: Inputs | None = None, joints: Sequence[str] = ()
+    found: Fit, told: HeatForecast, *, run: Inputs | None = None, joints: Sequence[str] = ()
 ) -> MatplotlibFigure:
     """What was read until now, the fan of what comes, and the limit; what came after all, where `run` has it."""
     names = list(joints) or _interesting(told)
@@ -95,20 +96,20 @@ def forecast_picture(
     return figure
 
 
-def _interesting(told: Forecast) -> list[str]:
+def _interesting(told: HeatForecast) -> list[str]:
     """At most four joints, those nearest to their limit."""
     order = sorted(told.joints, key=lambda one: (-one.probability, one.limit_c - one.settles_c.value))
     return [one.joint for one in order[:4]]
 
 
-def _shown_min(told: Forecast, run: Inputs | None, now: float) -> float:
+def _shown_min(told: HeatForecast, run: Inputs | None, now: float) -> float:
     ends = [one.seconds_to_limit.high for one in told.joints if one.seconds_to_limit is not None]
     wanted = 1.3 * min(max(ends, default=3600.0), HORIZON_S) / 60
     past = 0.0 if run is None else run.duration_s / 60 - now
     return min(max(wanted, past, 20.0), SHOWN_MIN)
 
 
-def fit_report(found: Fit, told: Forecast, runs: Sequence[Inputs], held: HeldOut | None) -> Report:
+def fit_report(found: Fit, told: HeatForecast, runs: Sequence[Inputs], held: HeldOut | None) -> Report:
     """Whether a servo shuts down under this load, what was read beside the model, and how far to believe it.
 
     Args:
@@ -133,7 +134,7 @@ def fit_report(found: Fit, told: Forecast, runs: Sequence[Inputs], held: HeldOut
             else f"Fitted to the first part of the run, the model misses the later one by more than {number(BELIEVED_K, 'K')}: do "
             "not plan with it."
         )
-    answer = Answer(
+    answer = ReportSummary(
         _shutdown(told),
         Figure(
             temperature_picture(found, runs[-1]),
@@ -167,7 +168,7 @@ def fit_report(found: Fit, told: Forecast, runs: Sequence[Inputs], held: HeldOut
     return report
 
 
-def _shutdown(told: Forecast) -> str:
+def _shutdown(told: HeatForecast) -> str:
     """Will it shut down, and when?"""
     if told.first is not None:
         return f"Under this load {told.first.words}, and shuts down."
@@ -179,22 +180,22 @@ def _shutdown(told: Forecast) -> str:
     )
 
 
-def _shutdown_tone(told: Forecast) -> Tone:
+def _shutdown_tone(told: HeatForecast) -> Tone:
     likely = max(one.probability for one in told.joints)
     return "bad" if likely > 0.5 else "warn" if likely > 0.05 else "good"
 
 
-def _first_figure(told: Forecast) -> KeyFigure:
+def _first_figure(told: HeatForecast) -> KeyFigure:
     first = told.first
     if first is None:
         return KeyFigure("shuts down", "never", "within 8 hours of this load", "good")
     return KeyFigure("shuts down after", _minutes(first.seconds_to_limit), first.joint, _shutdown_tone(told))
 
 
-def forecast_report(found: Fit, told: Forecast, rest: str, run: Inputs | None = None) -> Report:
+def forecast_report(found: Fit, told: HeatForecast, rest: str, run: Inputs | None = None) -> Report:
     """When each servo shuts down under this load, and what it could bear."""
     likely = max(told.joints, key=lambda one: one.probability)
-    answer = Answer(
+    answer = ReportSummary(
         _shutdown(told),
         Figure(
             forecast_picture(found, told, run=run),
@@ -237,7 +238,7 @@ def _minutes(interval: Interval | None) -> str:
     )
 
 
-def compare_report(differences: Sequence[Difference], a: str, b: str) -> Report:
+def compare_report(differences: Sequence[JointDifference], a: str, b: str) -> Report:
     """Where each servo settles in both, and the difference."""
     figure, axes = plots.figure(1, 1, height=0.6 + 0.35 * len(differences))
     with plots.style():
@@ -256,7 +257,7 @@ def compare_report(differences: Sequence[Difference], a: str, b: str) -> Report:
         f"{'hotter' if one.difference_k.value > 0 else 'cooler'}"
         for one in certain
     )  # fmt: skip
-    answer = Answer(
+    answer = ReportSummary(
         f"Under one torque in one room B differs from A: {words}."
         if certain
         else f"Whether B is cooler or hotter than A, these two soaks cannot tell, at none of {len(differences)} joints.",

@@ -32,7 +32,17 @@ from openant_tools.robot.registers import PULSES_PER_TURN, PWM_FULL
 from openant_tools.thermal.thermometer import Thermometer, clean
 
 __all__ = [
-    "COOL_DOWN_S", "POSES", "Load", "Phase", "Plan", "Sample", "Soaked", "pose_angles", "resume_plan", "soak", "soak_config",
+    "COOL_DOWN_S",
+    "POSES",
+    "HeatSoaked",
+    "Load",
+    "Phase",
+    "Sample",
+    "SoakPlan",
+    "pose_angles",
+    "resume_plan",
+    "soak",
+    "soak_config",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -65,7 +75,7 @@ POSES: Mapping[str, Mapping[str, float]] = {
 
 
 @dataclass(frozen=True)
-class Plan:
+class SoakPlan:
     """What a soak is to do.
 
     Attributes:
@@ -126,7 +136,7 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Soaked:
+class HeatSoaked:
     """What came of a soak.
 
     Attributes:
@@ -147,7 +157,7 @@ class Soaked:
     glitches: Mapping[str, int]
 
 
-Soaking = Generator[Sample, None, Soaked]
+Soaking = Generator[Sample, None, HeatSoaked]
 
 
 def pose_angles(pose: str, joints: Sequence[str]) -> Array:
@@ -174,7 +184,7 @@ def pose_angles(pose: str, joints: Sequence[str]) -> Array:
     return angles
 
 
-def soak_config(config: EngineConfig, rate_hz: float, margin_k: float = Plan.margin_k) -> EngineConfig:
+def soak_config(config: EngineConfig, rate_hz: float, margin_k: float = SoakPlan.margin_k) -> EngineConfig:
     """The engine's config for hours at a few cycles a second: silence is borne longer.
 
     Heat is watched here, by one who knows telemetry errors; half way from there to the limit the engine stops by itself,
@@ -196,7 +206,7 @@ def soak_config(config: EngineConfig, rate_hz: float, margin_k: float = Plan.mar
     return replace(config, rate_hz=rate_hz, guards=guards, watchdog_s=watchdog, imu=None, camera=None)
 
 
-def resume_plan(path: Path) -> Plan:
+def resume_plan(path: Path) -> SoakPlan:
     """The plan of a soak that was cut short, as its recording has it.
 
     Raises:
@@ -206,8 +216,8 @@ def resume_plan(path: Path) -> Plan:
     table = recording.run.facts.extra.get("soak")
     if not isinstance(table, dict):
         raise BadInput("this is no recording of a soak", where=path, remedy="record under another name")
-    known = {name: table[name] for name in Plan.__dataclass_fields__ if name in table}
-    return Plan(**{**known, "poses": tuple(known["poses"]), "heat_sinks": tuple(known["heat_sinks"])})
+    known = {name: table[name] for name in SoakPlan.__dataclass_fields__ if name in table}
+    return SoakPlan(**{**known, "poses": tuple(known["poses"]), "heat_sinks": tuple(known["heat_sinks"])})
 
 
 @dataclass
@@ -268,7 +278,7 @@ RATE_S = 180.0
 
 def soak(
     config: EngineConfig,
-    plan: Plan,
+    plan: SoakPlan,
     out: Path,
     *,
     robot_toml: str | None = None,
@@ -334,12 +344,12 @@ def soak(
     peaks = {name: float(value) for name, value in zip(joints, log.peak, strict=True)}
     peaks = {name: float(np.nanmax([value, before.peak_c.get(name, np.nan)])) for name, value in peaks.items()}
     glitches = {name: thermometer.glitches for name, thermometer in zip(joints, log.thermometers, strict=True)}
-    return Soaked(Path(made), cycles, end.why, end.joint, end.words, end.loaded_s, peaks, glitches)
+    return HeatSoaked(Path(made), cycles, end.why, end.joint, end.words, end.loaded_s, peaks, glitches)
 
 
 @dataclass(frozen=True)
 class _End:
-    """How the load ended: as `Soaked` has it, and whether torque went off with it."""
+    """How the load ended: as `HeatSoaked` has it, and whether torque went off with it."""
 
     loaded_s: float
     why: Why = "time"
@@ -349,10 +359,10 @@ class _End:
 
 
 def _look_around(
-    engine: EngineProcess, log: _Log, limits: Array, plan: Plan, before: _SoFar, resume: bool
+    engine: EngineProcess, log: _Log, limits: Array, plan: SoakPlan, before: _SoFar, resume: bool
 ) -> Generator[Sample, None, None]:
     """Read temperatures before anything moves; a soak that begins hot says nothing and risks a servo."""
-    engine.ask(messages.Look(1.0))
+    engine.ask(messages.LetPass(1.0))
     log.take(engine.telemetry())
     temperature = log.temperature
     hot = [k for k in range(len(log.joints)) if temperature[k] >= limits[k] - BEGIN_K]
@@ -371,7 +381,7 @@ def _look_around(
 def _under_load(
     engine: EngineProcess,
     config: EngineConfig,
-    plan: Plan,
+    plan: SoakPlan,
     log: _Log,
     limits: Array,
     loaded: float,
@@ -432,7 +442,7 @@ def _why_stopped(engine: EngineProcess, log: _Log, limits: Array, loaded: float,
 
 
 def _press(
-    engine: EngineProcess, config: EngineConfig, plan: Plan, log: _Log, limits: Array
+    engine: EngineProcess, config: EngineConfig, plan: SoakPlan, log: _Log, limits: Array
 ) -> Generator[Sample, None, None]:
     """Let the knees press down with the wanted duty; the position loop makes it of the error that it sees.
 
@@ -483,7 +493,7 @@ def _press(
 
 def _cooling(
     engine: EngineProcess,
-    plan: Plan,
+    plan: SoakPlan,
     log: _Log,
     limits: Array,
     loaded: float,
@@ -496,7 +506,7 @@ def _cooling(
     total = plan.seconds + plan.cool_down_s
     begun, at = log.t, cooled
     while cooled < plan.cool_down_s:
-        engine.ask(messages.Look(min(look, plan.cool_down_s - cooled)))
+        engine.ask(messages.LetPass(min(look, plan.cool_down_s - cooled)))
         log.take(engine.telemetry())
         cooled = at + max(log.t - begun, 1e-6)
         yield _sample(log, limits, "cool-down", loaded + cooled, min(1.0, (plan.seconds + cooled) / total), words)
@@ -525,12 +535,12 @@ def _within(angles: Array, config: EngineConfig) -> Array:
     return np.clip(angles, [low for low, _ in limits], [high for _, high in limits])
 
 
-def _first_pose(plan: Plan, joints: Sequence[str], found: Array) -> Array | None:
+def _first_pose(plan: SoakPlan, joints: Sequence[str], found: Array) -> Array | None:
     """Where the load begins; stalled joints press from where they lie."""
     return None if plan.load == "stall" else pose_angles(plan.poses[0], joints)
 
 
-def _commands(plan: Plan, joints: Sequence[str], config: EngineConfig) -> Array | None:
+def _commands(plan: SoakPlan, joints: Sequence[str], config: EngineConfig) -> Array | None:
     """(n, joints) rad at the engine's rate, of the recording that is to be played; None for held poses."""
     if plan.load != "play":
         for pose in plan.poses:

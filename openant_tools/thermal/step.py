@@ -14,7 +14,7 @@ from openant_tools.thermal.finding import thermal_finding, torque_warning
 from openant_tools.thermal.fit import fit, held_out
 from openant_tools.thermal.forecast import forecast, rest_advice
 from openant_tools.thermal.inputs import inputs_of
-from openant_tools.thermal.soak import Plan, soak, soak_config
+from openant_tools.thermal.soak import SoakPlan, soak, soak_config
 
 __all__ = ["thermal_soak"]
 
@@ -47,7 +47,7 @@ def thermal_soak(bench: Bench) -> Procedure:
     )
     path = bench.folder.recordings / "soak.mcap"
     path.unlink(missing_ok=True)
-    plan = Plan(load="hang", seconds=60 * minutes, cool_down_s=60 * cooling)
+    plan = SoakPlan(load="hang", seconds=60 * minutes, cool_down_s=60 * cooling)
     engine = soak_config(engine_config(bench, imu=None), RATE_HZ)
     steps = soak(engine, plan, path, robot_toml=bench.folder.config_file.read_text(encoding="utf-8"))
     try:

@@ -11,7 +11,7 @@ from openant_tools.comms.ring import ERR_CODES
 from openant_tools.tui.feeds import History
 from openant_tools.tui.marks import Name
 
-__all__ = ["Condition", "Fault", "Faults", "condition"]
+__all__ = ["Condition", "FaultList", "ShownFault", "condition"]
 
 #: the engine's own idea of a servo that is lost
 SILENT_S = Guards().silent_s or 0.25
@@ -56,7 +56,7 @@ def _condition(history: History, joint: str) -> Condition:
 
 
 @dataclass(frozen=True)
-class Fault:
+class ShownFault:
     """One thing that went wrong.
 
     Attributes:
@@ -72,25 +72,25 @@ class Fault:
         return ": ".join(part for part in (self.where, self.words) if part) + (" (over now)" if self.over else "")
 
 
-class Faults:
+class FaultList:
     """The faults that nobody has acknowledged, oldest first; the same one twice counts once."""
 
     def __init__(self) -> None:
-        self._open: dict[str, Fault] = {}
+        self._open: dict[str, ShownFault] = {}
 
     @property
-    def unseen(self) -> tuple[Fault, ...]:
+    def unseen(self) -> tuple[ShownFault, ...]:
         return tuple(self._open.values())
 
     def note(self, where: str, words: str) -> None:
         """Something went wrong; it stays until `see`."""
-        self._open[where or words] = Fault(where, words)
+        self._open[where or words] = ShownFault(where, words)
 
     def is_over(self, where: str) -> None:
         """It has gone by itself; it still has to be seen."""
         fault = self._open.get(where)
         if fault is not None and not fault.over:
-            self._open[where] = Fault(fault.where, fault.words, over=True)
+            self._open[where] = ShownFault(fault.where, fault.words, over=True)
 
     def watch(self, history: History) -> None:
         """Take in what the newest rows say of each joint; where most are silent it is the bus."""

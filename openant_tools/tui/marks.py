@@ -10,7 +10,7 @@ from typing import Literal
 
 from rich.text import Text
 
-__all__ = ["BLUE", "MARKS", "Mark", "Name", "can_unicode", "mark", "marked", "plain", "spelled"]
+__all__ = ["BLUE", "MARKS", "Name", "StateMark", "can_unicode", "mark", "marked", "plain", "spelled"]
 
 Name = Literal["ok", "warn", "fail", "unsure", "wait", "todo", "stale", "info", "off", "on"]
 
@@ -19,7 +19,7 @@ GREEN, ORANGE, VERMILION, BLUE, GREY = "#009E73", "#E69F00", "#D55E00", "#56B4E9
 
 
 @dataclass(frozen=True)
-class Mark:
+class StateMark:
     """How one state looks.
 
     Attributes:
@@ -32,17 +32,17 @@ class Mark:
     colour: str
 
 
-MARKS: Mapping[Name, Mark] = {
-    "ok": Mark("✓", "+", "ok", GREEN),
-    "warn": Mark("▲", "!", "look", ORANGE),
-    "fail": Mark("✗", "x", "no", VERMILION),
-    "unsure": Mark("?", "?", "doubt", ORANGE),
-    "wait": Mark("…", "~", "running", BLUE),
-    "todo": Mark("·", ".", "to do", GREY),
-    "stale": Mark("↻", "o", "again", ORANGE),
-    "info": Mark("›", ">", "", BLUE),
-    "off": Mark("○", "-", "off", GREY),
-    "on": Mark("●", "*", "ON", ORANGE),
+MARKS: Mapping[Name, StateMark] = {
+    "ok": StateMark("✓", "+", "ok", GREEN),
+    "warn": StateMark("▲", "!", "look", ORANGE),
+    "fail": StateMark("✗", "x", "no", VERMILION),
+    "unsure": StateMark("?", "?", "doubt", ORANGE),
+    "wait": StateMark("…", "~", "running", BLUE),
+    "todo": StateMark("·", ".", "to do", GREY),
+    "stale": StateMark("↻", "o", "again", ORANGE),
+    "info": StateMark("›", ">", "", BLUE),
+    "off": StateMark("○", "-", "off", GREY),
+    "on": StateMark("●", "*", "ON", ORANGE),
 }
 
 

@@ -18,10 +18,10 @@ from openant_tools.procedure.step import Bench
 from openant_tools.robot.config import CONFIG_NAME
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
-from openant_tools.tui.faults import Faults
+from openant_tools.tui.faults import FaultList
 from openant_tools.tui.feeds import Feed, History, LiveFeed, ReplayFeed
 from openant_tools.tui.process import Process
-from openant_tools.tui.training import Play, Training
+from openant_tools.tui.training import PlayProcess, TrainingProcess
 from openant_tools.virtual.process import VIRTUAL_DEFAULT, virtual_robot
 
 __all__ = ["Session"]
@@ -47,11 +47,11 @@ class Session:
         self.virtual: Mapping[str, str | None] | None = None
         self.feed: Feed | None = None
         self.history = History(JOINT_NAMES)
-        self.faults = Faults()
+        self.faults = FaultList()
         self.selected = JOINT_NAMES[0]
         self.notices: list[str] = []
         self.doing = ""
-        self.training: Training | Play | None = None
+        self.training: TrainingProcess | PlayProcess | None = None
         self.diagnosing: Process | None = None
         self._engine: EngineProcess | None = None
         self._virtual_process = contextlib.ExitStack()

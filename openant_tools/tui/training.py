@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import csv
 import importlib.util
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from openant_agents.runs import CurvePoint, read_curve
+from openant_tools.errors import BadInput
 from openant_tools.tui.process import Process
 
-__all__ = ["AGENTS", "CurvePoint", "Place", "Play", "Training", "read_curve"]
+__all__ = ["AGENTS", "Place", "PlayProcess", "TrainingProcess", "curve_so_far"]
 
 #: where it walks; what is not `sim` moves a robot, and the stop key reaches it
 Place = Literal["sim", "robot", "virtual"]
 #: last lines of what a command said
-
 SAID = 6
 #: agents that this version has
 AGENTS: tuple[str, ...] = tuple(
@@ -24,17 +23,8 @@ AGENTS: tuple[str, ...] = tuple(
 )
 
 
-@dataclass(frozen=True)
-class CurvePoint:
-    """One row of learning_curve.csv: steps, s of robot time, m/s over the last 120 s."""
-
-    step: int
-    seconds: float
-    average_reward_m_s: float
-
-
 @dataclass
-class Training(Process):
+class TrainingProcess(Process):
     """One `openant train`.
 
     Attributes:
@@ -62,7 +52,7 @@ class Training(Process):
         super().__init__(arguments, self.folder / "train.log")
 
 
-class Play(Process):
+class PlayProcess(Process):
     """What is done with trained agents: evaluated, played, compared."""
 
     def __init__(self, arguments: tuple[str, ...], folder: Path, where: Place = "sim") -> None:
@@ -78,18 +68,9 @@ class Play(Process):
             return []
 
 
-def read_curve(folder: Path) -> list[CurvePoint]:
-    """The learning curve so far; a last line that is half written, or no file at all, is none."""
-    points = []
+def curve_so_far(folder: Path) -> list[CurvePoint]:
+    """The learning curve of a run that is under way; none where there is no file yet."""
     try:
-        with (folder / "learning_curve.csv").open(encoding="utf-8", newline="") as stream:
-            for row in csv.DictReader(stream):
-                try:
-                    point = CurvePoint(int(row["step"]), float(row["seconds"]), float(row["average_reward_m_s"]))
-                except (KeyError, TypeError, ValueError):
-                    continue
-                if math.isfinite(point.average_reward_m_s):
-                    points.append(point)
-    except OSError:
-        pass
-    return points
+        return read_curve(folder)
+    except BadInput:
+        return []

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.mjcf import nominal_mjcf
 
-__all__ = ["Body", "BodySettings", "Cable", "Payload"]
+__all__ = ["Body", "BodySettings", "Payload", "Tether"]
 
 Array = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ class Payload:
 
 
 @dataclass(frozen=True)
-class Cable:
+class Tether:
     """A tether on the torso: a constant force, a damper and a spring to an anchor, all in the world's frame."""
 
     force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -78,7 +78,7 @@ class BodySettings:
     floor_friction: float | None = None
     contact_time_s: float | None = None
     adhesion_n: float = 0.0
-    cable: Cable | None = None
+    cable: Tether | None = None
 
 
 class Body:

@@ -28,7 +28,7 @@ from openant_tools.comms.protocol2 import (
 )  # fmt: skip
 from openant_tools.virtual.servo import ServoDevice, read_requests
 
-__all__ = ["Answer", "BusSettings", "Line", "Reply", "Tap"]
+__all__ = ["Arrival", "BusSettings", "Tap", "TransactionPart", "Wire"]
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ class BusSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class Arrival:
     """Bytes that reach the host at `t` (s)."""
 
     t: float
@@ -90,7 +90,7 @@ class Reply:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class TransactionPart:
     """One servo's part in a transaction: its status, or why there is none ("timeout", "crc"), known at `t` (s)."""
 
     id: int
@@ -120,7 +120,7 @@ class _Burst:
         return self.start + len(self.data) * byte_s
 
 
-class Line:
+class Wire:
     """The wire between adapter and servos.
 
     Args:
@@ -160,7 +160,7 @@ class Line:
 
     # ---- host → servos ----
 
-    def receive(self, data: bytes, t: float, baud: int, *, late_s: float = 0.0) -> list[Reply]:
+    def receive(self, data: bytes, t: float, baud: int, *, late_s: float = 0.0) -> list[Arrival]:
         """Bytes that the host wrote at `t` (s) with its port at `baud`; what comes back of it, by rising time.
 
         Args:
@@ -185,7 +185,7 @@ class Line:
         self._host_end = start + len(data) * byte_s
         self._late_s = late_s
         at = start - pending * byte_s
-        replies: list[Reply] = []
+        replies: list[Arrival] = []
         for packet in found:
             began = at
             at += _wire_length(packet) * byte_s
@@ -331,7 +331,7 @@ class Line:
 
     # ---- the same without bytes ----
 
-    def transact(self, packet: Instruction, t: float) -> tuple[list[Answer], float]:
+    def transact(self, packet: Instruction, t: float) -> tuple[list[TransactionPart], float]:
         """One instruction without its bytes: what each servo asked answers, and when the host knows.
 
         For soaks of hours, where packets need not be spelled. Devices, order, faults and times are those of `receive`
@@ -351,7 +351,7 @@ class Line:
             said, acted = {}, []  # type: dict[int, Status], list[ServoDevice]
         else:
             said, acted = self._obey(packet, began, ended)
-        answers: list[Answer] = []
+        answers: list[TransactionPart] = []
         at = ended + self.settings.response_s
         for turn in self._turns(packet, said):
             if not turn:
@@ -363,9 +363,9 @@ class Line:
             broken = max(self.settings.broken.get(k, 0.0) for k, _ in turn)
             right = (1 - broken) * (1 - noise) ** length
             if clean and (right == 1 or self._random.random() < right):
-                answers.append(Answer(turn[0][1].id, turn[0][1], "", self._tick_after(at)))
+                answers.append(TransactionPart(turn[0][1].id, turn[0][1], "", self._tick_after(at)))
             else:
-                answers.append(Answer(turn[0][1].id, None, "crc", self._tick_after(at)))
+                answers.append(TransactionPart(turn[0][1].id, None, "crc", self._tick_after(at)))
             at += self.settings.response_s
         if answers:
             self._answer_end = at
@@ -373,7 +373,7 @@ class Line:
         heard = {answer.id for answer in answers}
         asked = [id for id, _, _ in read_requests(packet)] if packet.code in (*_SYNC, *_FAST) else [packet.id]
         missing = [id for id in asked if id not in heard and id != BROADCAST]
-        answers += [Answer(id, None, "timeout", ended) for id in missing]
+        answers += [TransactionPart(id, None, "timeout", ended) for id in missing]
         return answers, max([ended, *(answer.t for answer in answers)])
 
     def _tick_after(self, t: float) -> float:
@@ -384,7 +384,7 @@ class Line:
         tick = (math.floor(t / period - self._phase) + 1 + self._phase) * period
         return max(tick, self._held_until)
 
-    def _deliver(self, bursts: list[_Burst], byte_s: float) -> list[Reply]:
+    def _deliver(self, bursts: list[_Burst], byte_s: float) -> list[Arrival]:
         """What the host gets: the line's bytes, cut at the ticks of the latency timer."""
         if not bursts:
             return []
@@ -408,28 +408,28 @@ class Line:
         starts = [0, *(np.flatnonzero(np.diff(ticks)) + 1).tolist()]
         stops = [*starts[1:], len(data)]
         at = np.maximum(ends[np.array(stops) - 1] if at_tick is None else at_tick[starts], stalled).tolist()
-        replies: list[Reply] = []
+        replies: list[Arrival] = []
         for start, stop, tick in zip(starts, stops, at, strict=True):
             # A full buffer goes out at once.
             while stop - start >= ADAPTER_BUFFER:
                 full = start + ADAPTER_BUFFER
-                replies.append(Reply(max(float(ends[full - 1]), stalled), data[start:full]))
+                replies.append(Arrival(max(float(ends[full - 1]), stalled), data[start:full]))
                 start = full
             if start < stop:
-                replies.append(Reply(tick, data[start:stop]))
+                replies.append(Arrival(tick, data[start:stop]))
         return replies
 
-    def _pieces(self, bursts: list[_Burst], byte_s: float) -> list[Reply]:
+    def _pieces(self, bursts: list[_Burst], byte_s: float) -> list[Arrival]:
         """Without a timer: what comes in one piece is handed over in one piece."""
-        replies: list[Reply] = []
+        replies: list[Arrival] = []
         piece, until = bursts[0].data, bursts[0].end(byte_s)
         for burst in bursts[1:]:
             if burst.start > until + byte_s / 2:
-                replies.append(Reply(max(until, self._held_until), piece))
+                replies.append(Arrival(max(until, self._held_until), piece))
                 piece = b""
             piece += burst.data
             until = burst.end(byte_s)
-        replies.append(Reply(max(until, self._held_until), piece))
+        replies.append(Arrival(max(until, self._held_until), piece))
         return replies
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json, write_text
 from openant_tools.robot.registers import EEPROM_END
-from openant_tools.virtual.servo_power import Snapshot
+from openant_tools.virtual.servo_power import ServoSnapshot
 from openant_tools.virtual.world import World
 
 __all__ = ["EepromFile"]
@@ -38,14 +38,14 @@ class EepromFile:
             }
         write_text(self.path, json.dumps(content, indent=1) + "\n")
 
-    def _read(self, world: World) -> dict[str, Snapshot]:
+    def _read(self, world: World) -> dict[str, ServoSnapshot]:
         try:
             content = read_json(self.path, "remove it")
         except FileNotFoundError:
             return {}
         except OSError as error:
             raise BadInput(f"not a file of EEPROMs ({error})", where=self.path, remedy="remove it") from None
-        snapshots: dict[str, Snapshot] = {}
+        snapshots: dict[str, ServoSnapshot] = {}
         for joint, servo in zip(world.joints, world.servos, strict=True):
             entry = content.get(joint) if isinstance(content, dict) else None
             if entry is None:
@@ -54,7 +54,7 @@ class EepromFile:
                 if entry.get("model") != servo.model.name:
                     continue
                 eeprom, backup = bytes.fromhex(entry["eeprom"]), entry.get("backup")
-                snapshots[joint] = Snapshot(eeprom, None if backup is None else bytes.fromhex(backup))
+                snapshots[joint] = ServoSnapshot(eeprom, None if backup is None else bytes.fromhex(backup))
             except (AttributeError, KeyError, ValueError, TypeError):
                 raise BadInput(f"the EEPROM of {joint} is broken", where=self.path, remedy="remove the file") from None
             if len(eeprom) != EEPROM_END:

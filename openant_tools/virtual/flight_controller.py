@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.comms import msp
-from openant_tools.comms.msp import Command, Direction, Frame
+from openant_tools.comms.msp import Command, Direction, MspFrame
 
 __all__ = ["BodyState", "FlightController", "FlightControllerSettings"]
 
@@ -169,8 +169,8 @@ class FlightController:
     def _start(self, t: float) -> None:
         """Power-on: everything that is not stored is new."""
         self.mode = "msp"
-        self._parser = msp.Parser(msp.DEVICE_RECEIVE_LIMIT, rescan=False)
-        self._requests: deque[Frame] = deque()
+        self._parser = msp.MspParser(msp.DEVICE_RECEIVE_LIMIT, rescan=False)
+        self._requests: deque[MspFrame] = deque()
         self._out: deque[tuple[float, bytes]] = deque()
         self._lone: tuple[int, float] | None = None
         self._typed = bytearray()
@@ -317,10 +317,10 @@ class FlightController:
     def _level(self) -> Array:
         return np.array([1.0, 0.0, 0.0, 0.0]) if self._attitude is None else self._attitude
 
-    def _answer(self, request: Frame, t: float) -> bytes | None:
+    def _answer(self, request: MspFrame, t: float) -> bytes | None:
         payload = None if request.command in self.refused else self._payload(request.command, request.payload, t)
         direction = Direction.ERROR if payload is None else Direction.REPLY
-        reply = msp.encode(Frame(direction, request.command, payload or b"", request.framing, request.flags))
+        reply = msp.encode(MspFrame(direction, request.command, payload or b"", request.framing, request.flags))
         if request.command == Command.REBOOT and payload is not None:
             self._boot(t)
         return reply
@@ -358,7 +358,7 @@ class FlightController:
         if command in (Command.STATUS, Command.STATUS_EX):
             # The controller is never armed: no receiver is bound (bit 2 of the arming-disable flags).
             rest = bytes([3, 0, 0, 29]) + (4).to_bytes(4, "little")
-            return msp.Status(125, 0, sensors, 0, 0, 12, rest).encode()
+            return msp.FlightStatus(125, 0, sensors, 0, 0, 12, rest).encode()
         if command == Command.RAW_IMU:
             return self._raw().encode()
         if command == Command.ATTITUDE:

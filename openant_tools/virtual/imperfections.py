@@ -14,16 +14,16 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from openant_tools.errors import BadInput
-from openant_tools.virtual.body import Cable, Payload
+from openant_tools.virtual.body import Payload, Tether
 from openant_tools.virtual.camera_scene import OverheadCameraSettings
 from openant_tools.virtual.motor import MotorSettings
 from openant_tools.virtual.world import WorldSettings
 
-__all__ = ["CATALOGUE", "Entry", "apply_entry", "nearest"]
+__all__ = ["CATALOGUE", "ScenarioEffect", "apply_entry", "nearest"]
 
 
 @dataclass(frozen=True)
-class Entry:
+class ScenarioEffect:
     """One `[[effect]]` of a scenario: name, joints (or "all", "body"), parameters in SI units."""
 
     effect: str
@@ -209,7 +209,7 @@ def _cable_drag(
 ) -> None:  # fmt: skip
     x, y, z = anchor_m
     force = (force_n * math.cos(direction), force_n * math.sin(direction), 0.0)
-    w.body.cable = Cable(force, damping_n_s_m, stiffness_n_m, (x, y, z))
+    w.body.cable = Tether(force, damping_n_s_m, stiffness_n_m, (x, y, z))
 
 
 def _imu_misalignment(w: WorldSettings, joints: Sequence[str], rotation_rad: Sequence[float]) -> None:
@@ -282,7 +282,7 @@ _NEEDS_ROBOT = frozenset({"link_mass", "payload", "blocked_joint", "floor_fricti
 _VECTORS = {"position_m": 3, "anchor_m": 3, "rotation_rad": 3, "rad_s": 3, "m_s2": 3, "coefficients": 0}
 
 
-def apply_entry(settings: WorldSettings, entry: Entry, where: str) -> None:
+def apply_entry(settings: WorldSettings, entry: ScenarioEffect, where: str) -> None:
     """Build one effect into a world's settings; every servo's `motor` must be filled in.
 
     Raises:
@@ -304,7 +304,7 @@ def apply_entry(settings: WorldSettings, entry: Entry, where: str) -> None:
         effect.world(settings, joints, **parameters)
 
 
-def _scope(settings: WorldSettings, entry: Entry, where: str) -> tuple[str, ...]:
+def _scope(settings: WorldSettings, entry: ScenarioEffect, where: str) -> tuple[str, ...]:
     known = [setup.joint for setup in settings.servos]
     if isinstance(entry.joints, str):
         if entry.joints in ("all", "body"):
@@ -316,7 +316,7 @@ def _scope(settings: WorldSettings, entry: Entry, where: str) -> tuple[str, ...]
     return entry.joints
 
 
-def _parameters(entry: Entry, effect: _Effect, where: str) -> dict[str, Any]:
+def _parameters(entry: ScenarioEffect, effect: _Effect, where: str) -> dict[str, Any]:
     for name in entry.parameters:
         if name not in effect.parameters:
             raise BadInput(

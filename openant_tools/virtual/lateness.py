@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 
-__all__ = ["HOP_S", "Lateness"]
+__all__ = ["HOP_S", "WaitTimer"]
 
 #: s from a write to our reading on an idle machine: pseudo-terminal and waking up (measured: 0.02 to 0.06 ms).
 HOP_S = 6e-5
@@ -22,7 +22,7 @@ _SCHEDSTAT = "/proc/thread-self/schedstat"
 _LOADAVG = "/proc/loadavg"
 
 
-class Lateness:
+class WaitTimer:
     """A stop watch for one wait; where the system tells nothing it shows `HOP_S`."""
 
     def __init__(self) -> None:

@@ -13,7 +13,7 @@ import tty
 from pathlib import Path
 from typing import Protocol
 
-__all__ = ["Port", "PtyPort", "TcpPort"]
+__all__ = ["ClientPort", "PtyPort", "TcpPort"]
 
 #: Linux: struct termios2 = 4 flags, line, 19 control characters, input and output speed (bits/s as numbers).
 _TCGETS2 = 0x802C542A
@@ -22,7 +22,7 @@ _HAS_TERMIOS2 = platform.system() == "Linux"
 _CHUNK = 65536
 
 
-class Port(Protocol):
+class ClientPort(Protocol):
     """One end of a byte stream to a client."""
 
     @property

@@ -18,7 +18,7 @@ from openant_tools.robot.servo import baud_code, servo_model
 from openant_tools.virtual.camera_scene import OverheadCameraSettings, TagOnFloor, TagOnRobot
 from openant_tools.virtual.faults import Fault
 from openant_tools.virtual.flight_controller import FlightControllerSettings
-from openant_tools.virtual.imperfections import Entry, apply_entry, nearest
+from openant_tools.virtual.imperfections import ScenarioEffect, apply_entry, nearest
 from openant_tools.virtual.motor import MotorSettings
 from openant_tools.virtual.seal import KEY_VARIABLE, is_sealed, open_sealed, read_key, seal
 from openant_tools.virtual.world import ServoSetup, WorldSettings, standard_servos
@@ -381,4 +381,4 @@ def _read_effect(entry: Mapping[str, Any], world: WorldSettings, where: str) -> 
     if not isinstance(parameters, dict):
         raise BadInput("parameters is not a table", where=where, remedy="parameters = { delay_s = 0.02 }")
     scope = joints if isinstance(joints, str) else _joints(joints, [servo.joint for servo in world.servos], where)
-    apply_entry(world, Entry(str(entry.get("effect")), scope, parameters), where)
+    apply_entry(world, ScenarioEffect(str(entry.get("effect")), scope, parameters), where)

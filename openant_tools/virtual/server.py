@@ -56,8 +56,8 @@ from typing import Any, Protocol
 from openant_tools.errors import OpenAntError
 from openant_tools.files import write_text
 from openant_tools.virtual.camera_scene import Scene
-from openant_tools.virtual.lateness import HOP_S, Lateness
-from openant_tools.virtual.ports import Port, PtyPort, TcpPort
+from openant_tools.virtual.lateness import HOP_S, WaitTimer
+from openant_tools.virtual.ports import ClientPort, PtyPort, TcpPort
 from openant_tools.virtual.world import World
 
 __all__ = ["Device", "Server"]
@@ -86,7 +86,7 @@ class Device(Protocol):
     def next_event(self, t: float) -> float: ...
 
 
-class Camera(Protocol):
+class CameraProcess(Protocol):
     """The camera's process, as the robot sees it."""
 
     def wait(self) -> str: ...
@@ -148,7 +148,7 @@ class Server:
         *,
         stepped: bool = False,
         imu: Device | None = None,
-        camera: Camera | None = None,
+        camera: CameraProcess | None = None,
         tcp: bool = False,
         folder: Path | None = None,
     ) -> None:
@@ -167,7 +167,7 @@ class Server:
         self._unplugged: set[str] = set()
         self._own_folder = folder is None
         self.folder = Path(tempfile.mkdtemp(prefix="openant-")) if folder is None else folder
-        self.ports: dict[str, Port] = {"bus": TcpPort() if tcp else PtyPort(self.folder / "bus")}
+        self.ports: dict[str, ClientPort] = {"bus": TcpPort() if tcp else PtyPort(self.folder / "bus")}
         if imu is not None:
             self.ports["imu"] = PtyPort(self.folder / "imu")
         self.received = dict.fromkeys(("bus", "imu"), 0)
@@ -175,7 +175,7 @@ class Server:
         #: (when read, how much earlier it may have been written, port, bytes, baud)
         self._held: list[tuple[float, float, str, bytes, int]] = []
         #: waiting for a processor; when nothing was last seen to read; how late what is read now may be
-        self._lateness, self._empty_at, self._late_s = Lateness(), time.monotonic(), 0.0
+        self._lateness, self._empty_at, self._late_s = WaitTimer(), time.monotonic(), 0.0
         self._outbox: list[tuple[float, int, str, bytes]] = []
         self._count = 0
         #: when bytes of the bus last came or went, s

@@ -25,7 +25,7 @@ from openant_tools.virtual.servo_registers import (
     ServoRegisters,
 )
 
-__all__ = ["Loop", "Motor", "PoweredServo", "Sensed", "Snapshot"]
+__all__ = ["Loop", "Motor", "PoweredServo", "Sensed", "ServoSnapshot"]
 
 VOLTAGE_ERROR, HEAT_ERROR, ENCODER_ERROR, SHOCK_ERROR, OVERLOAD_ERROR = 0x01, 0x04, 0x08, 0x10, 0x20
 
@@ -117,7 +117,7 @@ class Motor(Protocol):
 
 
 @dataclass(slots=True)
-class Snapshot:
+class ServoSnapshot:
     """What survives a power cut: the EEPROM area and the backup."""
 
     eeprom: bytes
@@ -139,7 +139,7 @@ class PoweredServo(ServoRegisters):
         model: its control table and ratings.
         motor: the motor behind it.
         firmware: its version; decides which registers and instructions exist.
-        persist: called with a `Snapshot` whenever what survives a power cut has changed.
+        persist: called with a `ServoSnapshot` whenever what survives a power cut has changed.
         reboot_s: how long it is mute after a reboot or power-on (unpublished; 0.3…0.5 s).
         clock_ppm: parts per million by which the servo's crystal runs fast.
 
@@ -152,7 +152,7 @@ class PoweredServo(ServoRegisters):
         model: ServoModel,
         motor: Motor,
         firmware: int = 46,
-        persist: Callable[[Snapshot], None] | None = None,
+        persist: Callable[[ServoSnapshot], None] | None = None,
         reboot_s: float = 0.4,
         clock_ppm: float = 0.0,
     ) -> None:
@@ -225,10 +225,10 @@ class PoweredServo(ServoRegisters):
         self.powered = True
         self.boot(now)
 
-    def snapshot(self) -> Snapshot:
-        return Snapshot(bytes(self.memory[:EEPROM_END]), self._backup)
+    def snapshot(self) -> ServoSnapshot:
+        return ServoSnapshot(bytes(self.memory[:EEPROM_END]), self._backup)
 
-    def load(self, snapshot: Snapshot, now: float = 0.0) -> None:
+    def load(self, snapshot: ServoSnapshot, now: float = 0.0) -> None:
         """Take the EEPROM of a servo that ran before, and start from power-on without the mute time."""
         self.memory[:EEPROM_END] = snapshot.eeprom
         self.memory[0:2] = self.model.number.to_bytes(2, "little")

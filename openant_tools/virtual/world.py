@@ -18,7 +18,7 @@ from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import kit as kit_by_name
 from openant_tools.robot.servo import ServoModel, baud_code
 from openant_tools.virtual.body import Body, BodySettings
-from openant_tools.virtual.bus import BusSettings, Line
+from openant_tools.virtual.bus import BusSettings, Wire
 from openant_tools.virtual.drives import Drive, Drives
 from openant_tools.virtual.hands import Grip, Tilting
 from openant_tools.virtual.motor import MotorSettings
@@ -120,7 +120,7 @@ class World:
         self.joints = tuple(joints)
         self._build_body()
         self.servos = [self._build(setup, Drive(self.drives, k)) for k, setup in enumerate(settings.servos)]
-        self.line = Line(self.servos, settings.bus, self.advance, seed=settings.seed + 1)
+        self.line = Wire(self.servos, settings.bus, self.advance, seed=settings.seed + 1)
         if not settings.bus.chains:
             settings.bus.chains = _chains_by_leg(joints)
         self.events: list[Callable[[float], None]] = []

@@ -21,11 +21,11 @@ from openant_agents.async_training import train_async  # noqa: E402
 from openant_agents.interventions import read_interventions  # noqa: E402
 from openant_agents.learner import SharedWeights  # noqa: E402
 from openant_agents.runs import load_checkpoint, read_curve  # noqa: E402
-from openant_agents.sac import Replay, Settings, load_policy, train  # noqa: E402
+from openant_agents.sac import Replay, SacSettings, load_policy, train  # noqa: E402
 from openant_tools.errors import BadInput, HardwareFault  # noqa: E402
 
 torch.set_num_threads(1)
-SMALL = Settings(learning_start=20, batch=16, hidden=16)
+SMALL = SacSettings(learning_start=20, batch=16, hidden=16)
 WIDTH = Replay(1, 1, 1).width
 
 
@@ -180,7 +180,7 @@ def test_nothing_is_learned_from_what_is_no_number(tmp_path):
         train_async(Robot(nan_at=25), folder=tmp_path / "a", steps=60, seed=0, settings=SMALL)
     assert np.isfinite(rows(tmp_path / "a")).all()
     assert load_checkpoint(tmp_path / "a")["transitions"] == 24
-    huge = Settings(learning_start=20, batch=16, hidden=16, reward_scale=1e38)
+    huge = SacSettings(learning_start=20, batch=16, hidden=16, reward_scale=1e38)
     with pytest.raises(BadInput, match="weights or losses are no finite numbers any more"):
         train_async(Robot(2e-2), folder=tmp_path / "b", steps=3000, seed=0, settings=huge)
     with pytest.raises(BadInput, match="weights or losses are no finite numbers any more"):

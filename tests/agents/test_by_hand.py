@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 torch = pytest.importorskip("torch")
 
 from openant_agents.by_hand import flatten  # noqa: E402
-from openant_agents.sac import Sac, Settings  # noqa: E402
+from openant_agents.sac import Sac, SacSettings  # noqa: E402
 
 torch.set_num_threads(1)
 SMALL = {"batch": 12, "hidden": 20, "buffer": 50}
@@ -18,7 +18,7 @@ SMALL = {"batch": 12, "hidden": 20, "buffer": 50}
 
 def pair(seed: int, layer_norm: bool) -> tuple[Sac, Sac]:
     """Two agents alike, one by hand and one by autograd, with the same transitions."""
-    chosen = Settings(layer_norm=layer_norm, **SMALL)
+    chosen = SacSettings(layer_norm=layer_norm, **SMALL)
     agents = Sac(5, 3, chosen, seed=seed), Sac(5, 3, chosen, seed=seed, by_hand=False)
     random = np.random.default_rng(seed)
     rows = random.normal(size=(50, agents[0].replay.width)).astype(np.float32)

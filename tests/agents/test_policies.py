@@ -18,16 +18,16 @@ pytest.importorskip("torch")
 import openant_env  # noqa: F401
 from openant_agents.curves import band, group_runs, read_run_curve
 from openant_agents.drops import DropWatch, find_drops, preceding
-from openant_agents.exploits import Late, Lossy, Smoothed, Twitch, flag
+from openant_agents.exploits import Late, Lossy, Smoothed, TwitchCounter, flag
 from openant_agents.interventions import Intervention, read_interventions
-from openant_agents.ranking import Measured, agreement, kendall, rank_violation, read_measured, regret, spearman
+from openant_agents.ranking import PlaceResult, agreement, kendall, rank_violation, read_measured, regret, spearman
 from openant_agents.runs import CurvePoint
-from openant_agents.sac import Settings, train
-from openant_agents.training import Progress
+from openant_agents.sac import SacSettings, train
+from openant_agents.training import TrainingProgress
 from openant_tools.cli import main
 from openant_tools.errors import BadInput
 
-SMALL = Settings(learning_start=60, batch=16, hidden=16)
+SMALL = SacSettings(learning_start=60, batch=16, hidden=16)
 
 
 def run_command(*arguments) -> int:
@@ -42,7 +42,7 @@ def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     facts = {"id": "openant/Ant-v0", "options": {"kit": "standard", "dt": 0.02}}
     for name, seed, chosen in (
-        ("one", 0, SMALL), ("two", 1, SMALL), ("three", 2, SMALL), ("bare", 0, Settings(**{**SMALL.as_dict(), "layer_norm": False})),
+        ("one", 0, SMALL), ("two", 1, SMALL), ("three", 2, SMALL), ("bare", 0, SacSettings(**{**SMALL.as_dict(), "layer_norm": False})),
     ):  # fmt: skip
         env = gymnasium.make("openant/Ant-v0", kit="standard", dt=0.02)
         train(env, folder=folder / name, steps=220, seed=seed, settings=chosen, env_facts=facts)
@@ -101,7 +101,7 @@ def test_the_checkpoint_before_a_drop_is_kept(tmp_path):
     (tmp_path / "checkpoint.pt").write_bytes(b"as it was")
     watch = DropWatch(tmp_path)
     found = [
-        watch.see(Progress(point.step, 10**6, point.seconds, point.average_reward_m_s, True, {}))
+        watch.see(TrainingProgress(point.step, 10**6, point.seconds, point.average_reward_m_s, True, {}))
         for point in curve_of((0.1, 10), (0.0, 5))
     ]
     watch.finish()
@@ -134,13 +134,13 @@ def test_figures_of_a_case_done_by_hand():
     # 0 ≻ 1 and 0 ≻ 2 in the simulation, the other way round on the robot; 1 ≻ 2 in both
     assert rank_violation(simulated, real) == pytest.approx((2 + 2 + 1) / 3)
     assert regret(simulated, real) == 2.0
-    found = agreement([Measured.of([v]) for v in simulated], [Measured.of([v]) for v in real])
+    found = agreement([PlaceResult.of([v]) for v in simulated], [PlaceResult.of([v]) for v in real])
     assert found.spearman.value == pytest.approx(-0.5)
     assert found.kendall.value == pytest.approx(-1 / 3)
     assert found.regret_share == pytest.approx(2 / 3)
     assert found.best_is == 3
     with pytest.raises(BadInput, match="2 policies cannot be ranked"):
-        agreement([Measured.of([1.0])] * 2, [Measured.of([1.0])] * 2)
+        agreement([PlaceResult.of([1.0])] * 2, [PlaceResult.of([1.0])] * 2)
 
 
 @settings(max_examples=30)
@@ -169,8 +169,8 @@ def test_correlations_are_scipys_ties_included():
 def test_intervals_grow_with_what_is_not_known():
     random = np.random.default_rng(0)
     truth = np.linspace(0.0, 0.2, 12)
-    sure = [Measured.of(v + random.normal(0, 0.001, 3)) for v in truth]
-    unsure = [Measured.of(v + random.normal(0, 0.1, 3)) for v in truth]
+    sure = [PlaceResult.of(v + random.normal(0, 0.001, 3)) for v in truth]
+    unsure = [PlaceResult.of(v + random.normal(0, 0.1, 3)) for v in truth]
     known, unknown = agreement(sure, sure), agreement(sure, unsure)
     assert known.spearman.low > 0.9
     assert unknown.spearman.high - unknown.spearman.low > known.spearman.high - known.spearman.low
@@ -214,7 +214,7 @@ def test_twitching_is_counted_and_flagged():
         (iter(np.sin(np.arange(0, 40, 0.2))), 2 / (2 * np.pi / 0.2 * 0.1)),
         (itertools.repeat(0.3), 0.0),
     ):
-        twitch = Twitch(Echo())
+        twitch = TwitchCounter(Echo())
         twitch.reset()
         for _ in range(200):
             twitch.step(np.full(2, next(actions)))

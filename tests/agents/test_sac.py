@@ -25,17 +25,17 @@ import openant_env  # noqa: E402, F401
 from openant_agents import adam, runs, sac, training  # noqa: E402
 from openant_agents.curves import plot_curves  # noqa: E402
 from openant_agents.runs import CurvePoint, load_checkpoint, read_curve  # noqa: E402
-from openant_agents.sac import Actor, Replay, Sac, Settings, load_policy, train  # noqa: E402
+from openant_agents.sac import Actor, Replay, Sac, SacSettings, load_policy, train  # noqa: E402
 from openant_tools.cli import main  # noqa: E402
 from openant_tools.errors import BadInput  # noqa: E402
-from openant_tools.robot.config import Effect  # noqa: E402
+from openant_tools.robot.config import EffectEntry  # noqa: E402
 from openant_tools.robot.folder import create_robot  # noqa: E402
 
 # As `train` does; two threads on a busy machine wait for each other most of the time.
 torch.set_num_threads(1)
 
 #: small enough for a test, otherwise the real thing
-SMALL = Settings(learning_start=60, batch=32, hidden=32)
+SMALL = SacSettings(learning_start=60, batch=32, hidden=32)
 
 
 class Reach(gymnasium.Env):
@@ -72,7 +72,7 @@ def run_command(*arguments) -> int:
 @given(st.integers(0, 10_000))
 def test_log_pi_is_that_of_a_squashed_gaussian(seed):
     torch.manual_seed(seed)
-    actor = Actor(5, 3, Settings(hidden=16)).double()
+    actor = Actor(5, 3, SacSettings(hidden=16)).double()
     observation, noise = torch.randn(7, 5).double(), torch.randn(7, 3).double()
     action, log_pi = actor(observation, noise)
     mean, log_std = actor._gaussian(observation)
@@ -84,7 +84,7 @@ def test_log_pi_is_that_of_a_squashed_gaussian(seed):
 
 def test_log_pi_does_not_cancel_where_tanh_saturates():
     # In single precision tanh(12) is 1, and log(1 − tanh²) the logarithm of nothing; the exact value is −22.6.
-    actor = Actor(1, 1, Settings(hidden=4))
+    actor = Actor(1, 1, SacSettings(hidden=4))
     with torch.no_grad():
         actor.network[-1].weight.zero_()
         actor.network[-1].bias.copy_(torch.tensor([12.0, -100.0]))
@@ -94,7 +94,7 @@ def test_log_pi_does_not_cancel_where_tanh_saturates():
 
 
 def test_the_settings_are_the_papers():
-    paper = Settings()
+    paper = SacSettings()
     assert paper.gamma_per_s**0.12 == pytest.approx(0.99, abs=5e-4)
     assert (paper.tau, paper.batch, paper.buffer, paper.learning_start) == (0.005, 256, 1_000_000, 2_000)
     assert (paper.reward_scale, paper.actor_step, paper.critic_step, paper.entropy_step) == (100.0, 3e-4, 1e-3, 1e-3)
@@ -104,7 +104,7 @@ def test_critics_learn_the_return_with_each_step_weighed_by_its_time():
     # One state and a reward that collects 1 a second: in steps of Δt the value is Σ_k Δt·Δt·γ^(kΔt) = Δt²/(1 − γ^Δt),
     # as the platform's agent has it.
     for dt in (0.1, 0.2):
-        chosen = Settings(
+        chosen = SacSettings(
             batch=64, hidden=32, gamma_per_s=0.02, reward_scale=1.0, tau=0.1, entropy_start=1e-9, policy_every=10_000
         )
         agent = Sac(1, 1, chosen, seed=0)
@@ -164,7 +164,7 @@ def test_a_checkpoint_of_other_networks_or_versions_is_refused():
 
 
 def test_it_learns_to_reach(tmp_path):
-    chosen = Settings(learning_start=100, batch=64, hidden=32, entropy_start=0.1, actor_step=3e-3, gamma_per_s=0.01)
+    chosen = SacSettings(learning_start=100, batch=64, hidden=32, entropy_start=0.1, actor_step=3e-3, gamma_per_s=0.01)
     train(Reach(), folder=tmp_path, steps=600, seed=0, settings=chosen)
     agent, _ = load_policy(tmp_path, Reach())
     for start in (-1.0, 1.5):
@@ -253,7 +253,7 @@ from openant_agents import sac, training
 training.CHECKPOINT_EVERY_S = 0.05
 env = gymnasium.make("openant/Ant-v0", dt=0.02)
 sac.train(env, folder=__import__("pathlib").Path({str(tmp_path)!r}), steps=100_000, seed=3,
-          settings=sac.Settings(**{dataclasses.asdict(SMALL)!r}))
+          settings=sac.SacSettings(**{dataclasses.asdict(SMALL)!r}))
 """
     process = subprocess.Popen([sys.executable, "-c", program])
     try:
@@ -284,7 +284,7 @@ def test_another_run_does_not_write_into_this_folder(tmp_path):
 
 def test_one_process_at_a_time_trains_in_a_folder(tmp_path):
     train(ant(), folder=tmp_path, steps=5, seed=3, settings=SMALL)
-    there = runs.Run(tmp_path, {k: v for k, v in runs.read_facts(tmp_path).items() if k != "schema"})
+    there = runs.TrainingRun(tmp_path, {k: v for k, v in runs.read_facts(tmp_path).items() if k != "schema"})
     with pytest.raises(
         BadInput,
         match=r"another process trains in this folder: .*\(process \d+\) → wait for it, stop it, or name another --out",
@@ -359,7 +359,7 @@ def test_commands_refuse_in_one_line(trained, tmp_path, capsys, monkeypatch):
     damaged.mkdir()
     (damaged / "run.json").write_text((out / "run.json").read_text())
     other = create_robot(tmp_path / "other")
-    other.update(effects=[Effect("action_delay", ("knee_fl",), {"delay_s": 0.1})])
+    other.update(effects=[EffectEntry("action_delay", ("knee_fl",), {"delay_s": 0.1})])
     cases = [
         (("train", "sac", "--out", "x"), "there is no robot.toml here"),
         (("train", "sac", "--robot", robot.path, "--env", "hardware", "--out", "x"), "nobody is there to ask"),

@@ -25,9 +25,9 @@ import openant_env  # noqa: E402, F401
 from openant_agents import sarsa, tile_coding, training  # noqa: E402
 from openant_agents.interventions import read_interventions  # noqa: E402
 from openant_agents.policies import load_policy  # noqa: E402
-from openant_agents.primitives import LEGS, PRIMITIVES, Gait  # noqa: E402
+from openant_agents.primitives import LEGS, PRIMITIVES, PrimitiveGait  # noqa: E402
 from openant_agents.runs import load_checkpoint, read_curve  # noqa: E402
-from openant_agents.sarsa import Sarsa, Settings, train  # noqa: E402
+from openant_agents.sarsa import Sarsa, SarsaSettings, train  # noqa: E402
 from openant_agents.tile_coding import TileCoder  # noqa: E402
 from openant_tools.cli import main  # noqa: E402
 from openant_tools.errors import BadInput, HardwareFault  # noqa: E402
@@ -35,7 +35,7 @@ from openant_tools.robot.folder import create_robot  # noqa: E402
 
 JOINTS = tuple(f"{part}_{leg}" for leg in LEGS for part in ("hip", "knee"))
 #: bounds are known after five decisions; a small table, otherwise the real thing
-QUICK = Settings(bounds_from_s=2.5, table=2**17, tilings=24)
+QUICK = SarsaSettings(bounds_from_s=2.5, table=2**17, tilings=24)
 
 
 def ant(**options):
@@ -138,7 +138,7 @@ def test_bounds_that_leave_no_room_are_refused(change, words):
 
 
 def test_no_joint_ever_jumps_and_idle_joints_hold():
-    gait = Gait(JOINTS, 0.05)
+    gait = PrimitiveGait(JOINTS, 0.05)
     random = np.random.default_rng(0)
     hip = np.array([joint.startswith("hip") for joint in JOINTS])
     last = np.zeros(8)
@@ -165,11 +165,11 @@ def test_no_joint_ever_jumps_and_idle_joints_hold():
 
 def test_primitives_follow_the_order_of_the_joints_and_refuse_others():
     reordered = tuple(reversed(JOINTS))
-    assert (Gait(reordered, 0.1).actions(3) == Gait(JOINTS, 0.1).actions(3)[:, ::-1]).all()
+    assert (PrimitiveGait(reordered, 0.1).actions(3) == PrimitiveGait(JOINTS, 0.1).actions(3)[:, ::-1]).all()
     with pytest.raises(BadInput, match="not pole"):
-        Gait(("pole",), 0.05)
+        PrimitiveGait(("pole",), 0.05)
     with pytest.raises(BadInput, match=r"steps of 0\.12 s do not divide a motion primitive of 0\.5 s"):
-        Gait(JOINTS, 0.12)
+        PrimitiveGait(JOINTS, 0.12)
 
 
 # ------------------------------------------------------------------------------------------------------------ update
@@ -194,7 +194,7 @@ def plain_sarsa(transitions, rows, actions, settings):
 @given(st.integers(0, 10_000))
 def test_the_update_is_that_of_the_book(seed):
     random = np.random.default_rng(seed)
-    chosen = Settings(step_size=0.01, trace=0.9, gamma=0.99)
+    chosen = SarsaSettings(step_size=0.01, trace=0.9, gamma=0.99)
     coder = TileCoder(np.zeros(1), np.ones(1), tiles=4, tilings=6, rows=50)
     agent = Sarsa(coder, 3, chosen, seed=0)
 
@@ -225,7 +225,7 @@ def test_no_decision_waits_for_a_compiler(monkeypatch):
     sarsa._compile()
     before = [len(function.signatures) for function in made]
     monkeypatch.setattr(tile_coding, "PLACES", 64)  # so that names need more room on the way
-    agent = Sarsa(TileCoder(np.full(3, -1.0), np.ones(3), tiles=4, tilings=24, rows=2**12), 8, Settings(), seed=0)
+    agent = Sarsa(TileCoder(np.full(3, -1.0), np.ones(3), tiles=4, tilings=24, rows=2**12), 8, SarsaSettings(), seed=0)
     seen = np.random.default_rng(0).uniform(-1, 1, (60, 3)).astype(np.float32)
     for here, there in itertools.pairwise(seen):
         rows, following = agent.rows_of(here), agent.rows_of(there)
@@ -237,20 +237,20 @@ def test_no_decision_waits_for_a_compiler(monkeypatch):
 
 def test_chance_and_ties():
     coder = TileCoder(np.zeros(1), np.ones(1), tiles=1, tilings=4, rows=10)
-    agent = Sarsa(coder, 8, Settings(epsilon=0.0), seed=0)
+    agent = Sarsa(coder, 8, SarsaSettings(epsilon=0.0), seed=0)
     rows = np.arange(4)
     assert {agent.choose(rows) for _ in range(200)} == set(range(8))
-    better = Sarsa(coder, 8, Settings(epsilon=0.0), seed=0)
+    better = Sarsa(coder, 8, SarsaSettings(epsilon=0.0), seed=0)
     better.weights[0, 5] = 1e-6
     assert {better.choose(rows) for _ in range(50)} == {5}
-    often = Sarsa(coder, 8, Settings(epsilon=0.255), seed=0)
+    often = Sarsa(coder, 8, SarsaSettings(epsilon=0.255), seed=0)
     often.weights[0, 5] = 1.0
     picks = np.array([often.choose(rows) for _ in range(4000)])
     assert np.mean(picks != 5) == pytest.approx(0.255 * 7 / 8, abs=0.03)
 
 
 def test_the_settings_are_the_papers():
-    paper = Settings()
+    paper = SarsaSettings()
     assert (paper.gamma, paper.trace, paper.epsilon, paper.step_size) == (0.998, 0.964, 0.255, 1e-4)
     assert (paper.tiles, paper.tilings, paper.table) == (4, 192, 2**25)
 
@@ -279,7 +279,7 @@ def test_kill_minus_nine_costs_no_more_than_since_the_last_save(tmp_path):
         "from openant_agents import sarsa, training\n"
         "training.CHECKPOINT_EVERY_S = 0.05\n"
         "env = gymnasium.make('openant/Ant-v0', dt=0.05, action_range='sarsa')\n"
-        f"chosen = sarsa.Settings(bounds_from_s={QUICK.bounds_from_s}, table={QUICK.table}, tilings={QUICK.tilings})\n"
+        f"chosen = sarsa.SarsaSettings(bounds_from_s={QUICK.bounds_from_s}, table={QUICK.table}, tilings={QUICK.tilings})\n"
         f"sarsa.train(env, folder=pathlib.Path({str(tmp_path)!r}), steps=10**6, seed=1, settings=chosen)\n"
     )
     process = subprocess.Popen([sys.executable, "-c", script], env={**os.environ, "OMP_NUM_THREADS": "1"})
@@ -394,7 +394,7 @@ def test_a_decision_never_waits_for_the_disk(tmp_path, monkeypatch):
     from openant_agents import runs
 
     released, saves = threading.Event(), []
-    real = runs.Run.save
+    real = runs.TrainingRun.save
 
     def hanging(self, *arguments):
         saves.append(self)
@@ -410,7 +410,7 @@ def test_a_decision_never_waits_for_the_disk(tmp_path, monkeypatch):
                 released.set()
             return self.env.step(action)
 
-    monkeypatch.setattr(runs.Run, "save", hanging)
+    monkeypatch.setattr(runs.TrainingRun, "save", hanging)
     monkeypatch.setattr(training, "CHECKPOINT_EVERY_S", 0.0)
     train(Counted(ant()), folder=tmp_path, steps=250, seed=0, settings=QUICK)
     assert len(saves) == 26  # one after each primitive, and the last
@@ -423,7 +423,7 @@ def test_a_full_disk_is_told_and_not_passed_over(tmp_path, monkeypatch):
     def full(self, *arguments):
         raise OSError(28, "No space left on device", str(tmp_path))
 
-    monkeypatch.setattr(runs.Run, "save", full)
+    monkeypatch.setattr(runs.TrainingRun, "save", full)
     with pytest.raises(OSError, match="No space left"):
         train(ant(), folder=tmp_path, steps=30, seed=0, settings=QUICK)
 

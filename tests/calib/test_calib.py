@@ -41,7 +41,7 @@ from openant_tools.procedure.step import Ask, Bench, Declined, Event, Hands, Int
 from openant_tools.procedure.unfinished import unfinished
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
-from openant_tools.robot.config import Camera
+from openant_tools.robot.config import CameraSection
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
 
@@ -611,7 +611,7 @@ def test_three_poses_give_back_any_mounting(vector):
 
 def heights(body: float = 1.0, origin: float = 1.0) -> tuple[str, float | None]:
     """What is judged where the declared sizes are this many times the true ones."""
-    setup, camera, tag = Camera(), 2.0, 0.085
+    setup, camera, tag = CameraSection(), 2.0, 0.085
 
     def seen(true_m: float) -> float:
         return origin * camera - body * (camera - true_m - tag) - tag

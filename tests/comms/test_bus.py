@@ -9,7 +9,7 @@ import pytest
 from wire import IDS, ant
 
 from openant_tools.comms import protocol2 as p2
-from openant_tools.comms.bus import FAST_AGAIN, Answer, Timing
+from openant_tools.comms.bus import FAST_AGAIN, Answer, BusTiming
 from openant_tools.comms.faults import BrokenAnswer, Cause, NoAnswer, Refused
 from openant_tools.comms.guards import Guards, Trip, Watch
 from openant_tools.comms.line import PortGone
@@ -192,7 +192,7 @@ def test_every_retry_is_counted() -> None:
 
 
 def test_a_late_answer_is_late_not_lost() -> None:
-    bus, line = ant(Timing(return_delay_s=0.0, latency_timer_s=1e-3, margin_s=0.1e-3))
+    bus, line = ant(BusTiming(return_delay_s=0.0, latency_timer_s=1e-3, margin_s=0.1e-3))
     line.wire.servos[0].set("return_delay_time", 254)
     line.wire.settings.response_s = 2.5e-3
     [answer] = bus.sync_read(132, 4, [10])
@@ -221,7 +221,7 @@ def test_the_write_to_read_gap_is_kept() -> None:
         left = bus.sync_write(116, 4, dict.fromkeys(IDS, bytes(4)))
         assert all(answer.ok for answer in bus.sync_read(132, 4, IDS))
         assert bus.request_at >= left + 0.2e-3 - 1e-9
-    bus, _ = ant(Timing(return_delay_s=0.0, latency_timer_s=1e-3, write_read_gap_s=0.0))
+    bus, _ = ant(BusTiming(return_delay_s=0.0, latency_timer_s=1e-3, write_read_gap_s=0.0))
     heard = [all(answer.ok for answer in bus.sync_read(120, 27, IDS))]
     for _ in range(50):
         bus.sync_write(116, 4, dict.fromkeys(IDS, bytes(4)))

@@ -23,7 +23,7 @@ from openant_tools.errors import BadInput
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run, write_table
-from openant_tools.recording.telemetry import Answer, Cycle
+from openant_tools.recording.telemetry import Cycle, RecordedAnswer
 from openant_tools.virtual.process import virtual_robot
 from openant_tools.virtual.scenario import parse_scenario
 
@@ -131,7 +131,7 @@ def test_bytes_show_each_fault(cause: str, stepped_robot: Mapping[str, str | Non
 
 
 def _cycle(t: float, err: str = "", wake: float = 0.0, volt: int = 120) -> Cycle:
-    return Cycle(t, [None], None, wake, [Answer(None if err else {"volt": volt}, not err, err)], [False])
+    return Cycle(t, [None], None, wake, [RecordedAnswer(None if err else {"volt": volt}, not err, err)], [False])
 
 
 def test_thinning_keeps_what_is_strange_with_what_was_around_it() -> None:

@@ -211,7 +211,7 @@ def test_a_full_disk_ends_motion_until_the_builder_says_otherwise(stepped: dict[
         assert not any(torques(stepped))
         with pytest.raises(HardwareFault, match="does not begin again by itself"):
             engine.ask(messages.Torque(True))
-        for command in (messages.Look(0.1), messages.StopRecording()):  # neither overlooks that nothing is recorded
+        for command in (messages.LetPass(0.1), messages.StopRecording()):  # neither overlooks that nothing is recorded
             with pytest.raises(MotionStopped, match="the recording stopped"):
                 engine.ask(command)
         assert not any(torques(stepped))
@@ -324,7 +324,7 @@ def test_a_computer_that_stood_still_takes_the_blame_for_what_it_missed(live: di
             os.kill(engine.description["pid"], signal.SIGSTOP)
             time.sleep(0.06)
             os.kill(engine.description["pid"], signal.SIGCONT)
-            engine.ask(messages.Look(0.2))
+            engine.ask(messages.LetPass(0.2))
         engine.ask(messages.StopRecording())
         said = engine.ask(messages.Statistics())["late"]
     assert "this computer was late by up to" in said

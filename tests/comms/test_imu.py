@@ -155,9 +155,9 @@ def test_the_platforms_own_scales_read_one_g_from_the_default_board() -> None:
     bench = Bench()
 
     def ask(command: msp.Command) -> bytes:
-        bench.fc.receive(msp.encode(msp.Frame(msp.Direction.REQUEST, command)), bench.t)
+        bench.fc.receive(msp.encode(msp.MspFrame(msp.Direction.REQUEST, command)), bench.t)
         bench.t += 0.1
-        return msp.Parser().feed(bench.fc.transmit(bench.t))[0].payload
+        return msp.MspParser().feed(bench.fc.transmit(bench.t))[0].payload
 
     board = msp.BoardInfo.decode(ask(msp.Command.BOARD_INFO)).board
     z = msp.RawImu.decode(ask(msp.Command.RAW_IMU)).acc[2]
@@ -391,8 +391,8 @@ def test_the_driver_never_sends_a_byte_outside_a_frame() -> None:
     bench.fc.silent = True
     collect(bench, imu, 2.0)
     for data in sent:  # one write is one whole frame
-        assert len(msp.Parser().feed(data)) == 1
-        assert msp.encode(msp.Parser().feed(data)[0]) == data
+        assert len(msp.MspParser().feed(data)) == 1
+        assert msp.encode(msp.MspParser().feed(data)[0]) == data
 
 
 @settings(max_examples=60)

@@ -17,7 +17,7 @@ import pytest
 from faulty_line import IDS, FaultyLine, register_bytes
 from places import ROOT
 
-from openant_tools.comms.bus import Bus, Timing
+from openant_tools.comms.bus import Bus, BusTiming
 from openant_tools.comms.clock import RealClock, portions
 from openant_tools.comms.faults import BrokenAnswer, Cause, NeverSilent, NoAnswer
 from openant_tools.comms.line import PortGone, SerialLine
@@ -29,7 +29,7 @@ from fuzz_transactions import TICK_GRAIN_S, faults, transact
 
 
 def bus_of(line: FaultyLine, latency_timer_s: float = 1e-3) -> Bus:
-    return Bus(line, line, Timing(return_delay_s=0.0, latency_timer_s=latency_timer_s))
+    return Bus(line, line, BusTiming(return_delay_s=0.0, latency_timer_s=latency_timer_s))
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -231,7 +231,7 @@ def babble(terminal: tuple[int, SerialLine]) -> Iterator[SerialLine]:
 
 
 def test_every_question_ends_on_a_line_that_never_falls_silent_and_says_so(babble: SerialLine) -> None:
-    bus = Bus(babble, RealClock(), Timing(return_delay_s=0.0, latency_timer_s=1e-3))
+    bus = Bus(babble, RealClock(), BusTiming(return_delay_s=0.0, latency_timer_s=1e-3))
     began = time.monotonic()
     with pytest.raises(NeverSilent, match=r"the line never falls silent: \d+ bytes that are no answer"):
         bus.read(10, 31, 1)
@@ -265,7 +265,7 @@ def test_listening_until_a_deadline_ends_whatever_comes(babble: SerialLine) -> N
 def test_an_answer_that_somebody_else_has_read_is_no_hang_up(terminal: tuple[int, SerialLine]) -> None:
     _, line = terminal
     assert line.read() == b"", "nothing is there, as after another program was quicker"
-    bus = Bus(line, RealClock(), Timing(return_delay_s=0.0, latency_timer_s=1e-3))
+    bus = Bus(line, RealClock(), BusTiming(return_delay_s=0.0, latency_timer_s=1e-3))
     assert bus.ping(10) is None
 
 

@@ -88,7 +88,7 @@ def test_what_cannot_be_is_refused_by_name_and_nothing_moves(standing: Standing)
         for make, name in (
             (lambda s: messages.Goal(HOME, s), "Goal.seconds"),
             (messages.Hold, "Hold.seconds"),
-            (messages.Look, "Look.seconds"),
+            (messages.LetPass, "Look.seconds"),
         ):
             refusals.append((make(seconds), (name,)))
     rows = np.repeat(HOME[None, :], 5, axis=0)
@@ -136,7 +136,7 @@ def test_bytes_that_are_no_message_are_told_and_the_engine_lives(standing: Stand
     for data in (b"", b"\x80", b"no pickle", b"\x80\x04K\x07.", b"\x80\x04cos\nnothing_there\n."):
         standing.engine._connection.send_bytes(data)
     with pytest.raises(BadInput, match="Look cannot be sent to the engine"):
-        standing.engine.ask(messages.Look(lambda: 1.0))  # type: ignore[arg-type]
+        standing.engine.ask(messages.LetPass(lambda: 1.0))  # type: ignore[arg-type]
     assert standing.engine.ask(messages.Statistics())["cycles"] > 0
     told = [event.text for event in standing.engine.events() if isinstance(event, messages.Notice)]
     assert sum("was refused" in text for text in told) == 5
@@ -181,7 +181,7 @@ VALUES: tuple[Any, ...] = (
 
 def random_message(chance: np.random.Generator) -> Any:
     """One that switches nothing off and records nothing, with any value in any field."""
-    kinds = (messages.Ramp, messages.Play, messages.Hold, messages.Goal, messages.Look, messages.ReadRegister,
+    kinds = (messages.Ramp, messages.Play, messages.Hold, messages.Goal, messages.LetPass, messages.ReadRegister,
              messages.WriteRegister)  # fmt: skip
     kind: Any = kinds[chance.integers(len(kinds))]
     fields = [VALUES[chance.integers(len(VALUES))] for _ in kind.__dataclass_fields__]

@@ -27,7 +27,7 @@ from openant_tools.errors import OpenAntError
 from openant_tools.recording.reader import read_recording
 from openant_tools.sysid.protocols import protocol
 from openant_tools.sysid.record import Take, record_takes
-from openant_tools.thermal.soak import Plan, soak_config
+from openant_tools.thermal.soak import SoakPlan, soak_config
 from openant_tools.thermal.soak import soak as soak_servos
 from openant_tools.virtual.process import virtual_robot
 
@@ -157,7 +157,7 @@ def test_a_soak_of_the_servos_tells_a_full_disk_in_one_line(
     robot: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "warm.mcap"
-    plan = Plan(load="hang", seconds=600.0, cool_down_s=10.0)
+    plan = SoakPlan(load="hang", seconds=600.0, cool_down_s=10.0)
     with disk_of(monkeypatch, 60_000), pytest.raises(MotionStopped, match=r"kept, \d+ rows") as stopped:
         for _ in soak_servos(soak_config(config(robot), 20.0), plan, out):
             pass

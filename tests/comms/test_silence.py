@@ -276,7 +276,9 @@ def test_protocol_1_packets_are_the_vendors() -> None:
     assert protocol1.ping(1).hex(" ") == "ff ff 01 02 01 fb"  # e-manual's example
     assert protocol1.read(1, 0x2B, 1).hex(" ") == "ff ff 01 04 02 2b 01 cc"  # e-manual's example
     reply = bytes.fromhex("ff ff 01 03 00 20 db")
-    assert protocol1.statuses(b"\xff" + reply + b"\xff\xff\x01\x02\x00\x00") == [protocol1.Status(1, 0, b"\x20")]
+    assert protocol1.statuses(b"\xff" + reply + b"\xff\xff\x01\x02\x00\x00") == [
+        protocol1.Protocol1Status(1, 0, b"\x20")
+    ]
 
 
 # ---- this computer was late ----------------------------------------------------------------------------------------------

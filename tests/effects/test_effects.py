@@ -26,7 +26,7 @@ from openant_tools.model.rollout import Rollouts
 from openant_tools.model.servo import read_electrical, usual_torque, write_electrical
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import write_table
-from openant_tools.robot.config import Effect as Entry
+from openant_tools.robot.config import EffectEntry as Entry
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path

@@ -29,7 +29,7 @@ from openant_tools.procedure.finding import Finding, keep
 from openant_tools.procedure.step import Bench
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import write_table
-from openant_tools.robot.config import Effect
+from openant_tools.robot.config import EffectEntry
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.pair import PLAIN, mark_of
@@ -156,7 +156,7 @@ def test_effects_that_nobody_fitted_act_beside_any_model_and_a_doubt_is_said(
 ) -> None:
     log, by_hand = tmp_path / "log.csv", tmp_path / "mine.effects.toml"
     write_table(runs[1], log)
-    by_hand.write_text(as_toml([Effect("load_friction", ("knee_fl",), {"coefficient": 0.3})]))
+    by_hand.write_text(as_toml([EffectEntry("load_friction", ("knee_fl",), {"coefficient": 0.3})]))
     assert command("gap", "measure", log, "--model", given, "--effects", by_hand) == 0
     assert "counts twice" not in capsys.readouterr().err
     assert command("gap", "measure", log, "--model", written / "calibrated.xml", "--effects", by_hand) == 0
@@ -176,8 +176,8 @@ def test_a_fit_goes_on_from_a_pair_and_its_entries_go_along(
 ) -> None:
     robot = create_robot(tmp_path / "ant")
     other, off = (
-        Effect("dead_zone", ("hip_fl",), {"width_rad": 0.01}),
-        Effect("cogging", "all", {"amplitude_nm": 0.1}, False),
+        EffectEntry("dead_zone", ("hip_fl",), {"width_rad": 0.01}),
+        EffectEntry("cogging", "all", {"amplitude_nm": 0.1}, False),
     )
     robot.update(effects=[other, off])
     write_robot(fits[1], robot)
@@ -238,7 +238,7 @@ def ant(tmp_path: Path) -> RobotFolder:
     model = load_plant(nominal, setup=Setup.FLOOR).model
     write_model(nominal, model, folder.path / "plain.xml", pair=PLAIN)
     write_model(nominal, model, folder.path / "calibrated.xml", pair="0123456789ab")
-    rubbing = Effect("load_friction", KNEES, {"coefficient": 0.3}, pair="0123456789ab")
+    rubbing = EffectEntry("load_friction", KNEES, {"coefficient": 0.3}, pair="0123456789ab")
     folder.update({"model": "calibrated.xml"}, effects=[rubbing])
     return folder
 

@@ -24,7 +24,7 @@ from openant_env.rendering import NoOpenGL, write_strip
 from openant_env.tasks import BackAndForth
 from openant_env.wrappers import NormaliseByBounds
 from openant_tools.errors import BadInput
-from openant_tools.robot.config import Effect
+from openant_tools.robot.config import EffectEntry
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_mjcf, nominal_model_path
@@ -367,7 +367,9 @@ def test_an_argument_that_cannot_be_is_refused_in_one_line(options, words):
 
 
 def test_effects_that_the_model_carries_are_refused_by_name_unless_left_out(robot):
-    robot.update(effects=[Effect("action_delay", ("knee_fl",), {"delay_s": 0.1}), Effect("voltage_sag", enabled=False)])
+    robot.update(
+        effects=[EffectEntry("action_delay", ("knee_fl",), {"delay_s": 0.1}), EffectEntry("voltage_sag", enabled=False)]
+    )
     with pytest.raises(
         BadInput, match=r"robot\.toml: the effect action_delay does not act as an entry.* `--no-effects`"
     ):
@@ -469,7 +471,7 @@ def test_effects_of_the_robots_file_act(robot):
         return np.array([env.step(rng.uniform(-1, 1, 8))[0] for _ in range(20)])
 
     before = walk()
-    robot.update(effects=[Effect("load_friction", ("knee_fl",), {"coefficient": 0.3})])
+    robot.update(effects=[EffectEntry("load_friction", ("knee_fl",), {"coefficient": 0.3})])
     rubbed = walk()
     assert np.abs(rubbed - before).max() > 0.01
     np.testing.assert_array_equal(rubbed, walk())

@@ -22,7 +22,7 @@ from openant_tools.gap import simulation
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run
-from openant_tools.robot.config import Effect, Provenance
+from openant_tools.robot.config import EffectEntry, Provenance
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 
@@ -66,16 +66,16 @@ def lossy(robot: Robot) -> None:
 
 
 #: how robot.toml says it, and how the diagnosis simulates it
-SAME: dict[str, tuple[Effect, Callable[[Robot], None]]] = {
+SAME: dict[str, tuple[EffectEntry, Callable[[Robot], None]]] = {
     "thermal_derating": (
-        Effect("thermal_derating", ("knee_fl",), {"loss_per_c": 0.03, "time_constant_s": 1.5}), heated
+        EffectEntry("thermal_derating", ("knee_fl",), {"loss_per_c": 0.03, "time_constant_s": 1.5}), heated
     ),
-    "imu_bias": (Effect("imu_bias", "body", {"gyro_x": 0.01, "gyro_y": -0.02, "gyro_z": 0.03}), biased),
-    "tracker_scale": (Effect("tracker_scale", "body", {"scale": 1.2, "yaw_rad": 0.1, "latency_s": 0.15}), tracked),
-    "clock_jitter": (Effect("clock_jitter", "all", {"std_s": 0.012}), late),
-    "command_dropout": (Effect("command_dropout", "all", {"fraction": 0.3, "longest_s": 0.1}), lossy),
+    "imu_bias": (EffectEntry("imu_bias", "body", {"gyro_x": 0.01, "gyro_y": -0.02, "gyro_z": 0.03}), biased),
+    "tracker_scale": (EffectEntry("tracker_scale", "body", {"scale": 1.2, "yaw_rad": 0.1, "latency_s": 0.15}), tracked),
+    "clock_jitter": (EffectEntry("clock_jitter", "all", {"std_s": 0.012}), late),
+    "command_dropout": (EffectEntry("command_dropout", "all", {"fraction": 0.3, "longest_s": 0.1}), lossy),
     "voltage_sag": (
-        Effect("voltage_sag", "all", {"resistance_ohm": 1.5}),
+        EffectEntry("voltage_sag", "all", {"resistance_ohm": 1.5}),
         lambda robot: robot.law("voltage_sag", "resistance_ohm").__setitem__(slice(None), 1.5),
     ),
 }  # fmt: skip
@@ -202,12 +202,12 @@ def test_a_command_acts_in_the_end_however_it_is_delayed():
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
-        (Effect("clock_jitter", "all", {"std": 0.1}), "clock_jitter has no parameter 'std' → it has std_s"),
-        (Effect("command_dropout", "all", {"fraction": 1.5}), "command_dropout.fraction = 1.5 is not physical"),
-        (Effect("imu_bias", "body", {"rad_s": [0.1, 0.2]}), "imu_bias.rad_s is no vector of three"),
-        (Effect("imu_bias", "body", {"m_s2": "much"}), "imu_bias.m_s2 is no number: 'much'"),
-        (Effect("tracker_scale", "body", {"scale": 0.0}), "tracker_scale.scale = 0 is not physical"),
-        (Effect("thermal_derating", "all", {"gain": 0.1}), "thermal_derating has no parameter 'gain'"),
+        (EffectEntry("clock_jitter", "all", {"std": 0.1}), "clock_jitter has no parameter 'std' → it has std_s"),
+        (EffectEntry("command_dropout", "all", {"fraction": 1.5}), "command_dropout.fraction = 1.5 is not physical"),
+        (EffectEntry("imu_bias", "body", {"rad_s": [0.1, 0.2]}), "imu_bias.rad_s is no vector of three"),
+        (EffectEntry("imu_bias", "body", {"m_s2": "much"}), "imu_bias.m_s2 is no number: 'much'"),
+        (EffectEntry("tracker_scale", "body", {"scale": 0.0}), "tracker_scale.scale = 0 is not physical"),
+        (EffectEntry("thermal_derating", "all", {"gain": 0.1}), "thermal_derating has no parameter 'gain'"),
     ],
 )
 def test_entries_that_cannot_be_are_refused_in_one_line(entry, words, robot):
@@ -223,7 +223,7 @@ def test_robots_are_drawn_from_the_intervals_of_the_identification_and_nothing_e
     nominal = gymnasium.make("openant/Ant-v0", robot=robot.path).unwrapped
     knee = int(nominal._plant.actuator[KNEE])
     stiffness = float(-nominal.model.actuator_biasprm[knee, 1])
-    effect = Effect("load_friction", ("knee_fl",), {"coefficient": 0.1})
+    effect = EffectEntry("load_friction", ("knee_fl",), {"coefficient": 0.1})
     fitted = Provenance("fitted", "openant sysid fit", low=0.9 * stiffness, high=1.05 * stiffness)
     robot.update(
         {

@@ -423,7 +423,7 @@ def test_sac_learns_on_the_robot_beside_acting_with_a_cable_that_comes_off_in_th
     pytest.importorskip("torch")
     from openant_agents.async_training import train_async
     from openant_agents.interventions import read_interventions
-    from openant_agents.sac import Settings
+    from openant_agents.sac import SacSettings
 
     class Tripping(gymnasium.Wrapper):
         """The cable is off from the tenth step until someone has looked."""
@@ -440,7 +440,7 @@ def test_sac_learns_on_the_robot_beside_acting_with_a_cable_that_comes_off_in_th
             walker._control.ask("fault", cause="broken_wire", on=False, where="hip_rl")
             return super().reset(**options)
 
-    small = Settings(learning_start=5, batch=8, hidden=8)
+    small = SacSettings(learning_start=5, batch=8, hidden=8)
     done = train_async(Tripping(walker.env), folder=tmp_path, steps=18, seed=0, settings=small)
     assert done.step == 18
     assert done.updates is not None

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from openant_tools.cli import main
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
-from openant_tools.recording.telemetry import Answer, Cycle, ServoChannel, message_classes
+from openant_tools.recording.telemetry import Cycle, RecordedAnswer, ServoChannel, message_classes
 from openant_tools.recording.writer import RecordingWriter
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINTS
@@ -42,7 +42,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for k in range(ROWS):
             t = start + 0.02 * k
             goal = round(200 * math.sin(0.3 * k))
-            answers = tuple(Answer({"pos": goal - 20}, True) for _ in channels)
+            answers = tuple(RecordedAnswer({"pos": goal - 20}, True) for _ in channels)
             writer.cycle(Cycle(t, (goal,) * 8, t + 1e-4, 0.0, answers, (True,) * 8))
             writer.imu(t, (0.0, 0.0, 0.1), (0.0, 0.0, 9.81))
             writer.pose(t, position=(0.01 * k, 0.0, 0.12), quaternion=(1.0, 0.0, 0.0, 0.0))

@@ -14,7 +14,7 @@ from openant_tools.gap.ensemble import robots_at, templates_at, templates_of
 from openant_tools.gap.evidence import COLUMN_NAMES, Layouts, RunLayout, Scale, anomalies, evidence_of, unknown_signals
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.population import Case, draw
-from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.protocol import RunSet
 from openant_tools.gap.refine import refined
 from openant_tools.recording.run import Facts, Run
 
@@ -29,7 +29,7 @@ TWO_LEGS = """
 <mujoco model="legs"><option timestep="0.002" integrator="implicitfast"/><worldbody>{}</worldbody><actuator>{}</actuator></mujoco>"""
 
 
-def _recorded(model: Path, joints: tuple[str, ...], seconds: float, *, torque: bool = True) -> Protocol:
+def _recorded(model: Path, joints: tuple[str, ...], seconds: float, *, torque: bool = True) -> RunSet:
     """Runs of a robot that goes where it is told to, exactly."""
     runs = []
     for seed in range(2):
@@ -49,17 +49,17 @@ def _recorded(model: Path, joints: tuple[str, ...], seconds: float, *, torque: b
 
 
 @pytest.fixture(scope="module")
-def pendulum(tmp_path_factory: pytest.TempPathFactory) -> Protocol:
+def pendulum(tmp_path_factory: pytest.TempPathFactory) -> RunSet:
     model = tmp_path_factory.mktemp("model") / "pendulum.xml"
     model.write_text(PENDULUM)
     return _recorded(model, ("hinge",), 4.0)
 
 
-def _healthy(protocol: Protocol, count: int, first: int = 0) -> list[Case]:
+def _healthy(protocol: RunSet, count: int, first: int = 0) -> list[Case]:
     return [Case({}, seed) for seed in range(first, first + count)]
 
 
-def _with(protocol: Protocol, cause: str, count: int) -> list[Case]:
+def _with(protocol: RunSet, cause: str, count: int) -> list[Case]:
     """Robots at random that have one cause alone, clearly."""
     found = (draw(protocol, seed) for seed in range(10_000))
     alone = (case for case in found if list(case.causes) == [cause])
@@ -67,7 +67,7 @@ def _with(protocol: Protocol, cause: str, count: int) -> list[Case]:
 
 
 @pytest.fixture(scope="module")
-def simulated(pendulum: Protocol) -> tuple[list[Case], NDArray[np.float32], NDArray[np.float32]]:
+def simulated(pendulum: RunSet) -> tuple[list[Case], NDArray[np.float32], NDArray[np.float32]]:
     """The bank, what it shows, and a few healthy robots."""
     bank = templates_of(pendulum)
     return (
@@ -79,7 +79,7 @@ def simulated(pendulum: Protocol) -> tuple[list[Case], NDArray[np.float32], NDAr
 
 @pytest.mark.parametrize(("cause", "x"), [("torque_limit", -0.9), ("actuator_lag", 1.0), ("dead_zone", 1.0)])
 def test_a_size_that_no_template_has_is_found_and_explains_the_rest(
-    pendulum: Protocol,
+    pendulum: RunSet,
     simulated: tuple[list[Case], NDArray[np.float32], NDArray[np.float32]],
     cause: str,
     x: float,
@@ -128,7 +128,7 @@ def _features(parts: list[NDArray[np.float32]]) -> NDArray[np.float32]:
 
 
 @pytest.mark.slow
-def test_each_cause_is_among_the_first_by_what_it_would_do_to_this_very_recording(pendulum: Protocol) -> None:
+def test_each_cause_is_among_the_first_by_what_it_would_do_to_this_very_recording(pendulum: RunSet) -> None:
     bank, layouts = templates_of(pendulum), layouts_of(pendulum)
     templates = _features(templates_at(pendulum, bank))
     healthy = _features(robots_at(pendulum, _healthy(pendulum, 60), 1))
@@ -159,7 +159,7 @@ def test_each_cause_is_among_the_first_by_what_it_would_do_to_this_very_recordin
         ), "what is fitted to some folds foretells the others"
 
 
-def test_a_signal_in_which_no_robot_differs_says_nothing(pendulum: Protocol) -> None:
+def test_a_signal_in_which_no_robot_differs_says_nothing(pendulum: RunSet) -> None:
     """A supply that never sags, in whatever log it is."""
     rng = np.random.default_rng(0)
     layouts, bank = layouts_of(pendulum), templates_of(pendulum)[:8]

@@ -34,7 +34,7 @@ from openant_tools.model.mjcf import write_model
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run
-from openant_tools.robot.config import Effect
+from openant_tools.robot.config import EffectEntry
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.pair import PLAIN, mark_of
 
@@ -267,7 +267,7 @@ def test_what_a_diagnosis_says_nothing_of_goes_along_with_the_robots_model(tmp_p
         nominal, load_plant(nominal, None, Setup.FLOOR).model, robot.path / "calibrated.xml", pair="0123456789ab"
     )
     here, strange = (
-        Effect("load_friction", ("knee_fl",), {"coefficient": 0.2}, pair=pair)
+        EffectEntry("load_friction", ("knee_fl",), {"coefficient": 0.2}, pair=pair)
         for pair in ("0123456789ab", "fedcba987654")
     )
     robot.update({"model": "calibrated.xml"}, effects=[here, replace(strange, joints=("knee_fr",))])

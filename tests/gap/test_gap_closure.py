@@ -19,7 +19,7 @@ from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.closure import Closure, Refit, Windows, calibration_of, closures, heat_loss_of, nothing
 from openant_tools.gap.hypothesis import Part
-from openant_tools.gap.protocol import Played, Protocol
+from openant_tools.gap.protocol import Played, RunSet
 from openant_tools.gap.simulation import Log, simulate
 from openant_tools.model.plant import load_plant
 from openant_tools.model.rollout import Rollouts
@@ -27,7 +27,7 @@ from openant_tools.model.rollout import Rollouts
 T = 2.0 + np.arange(150) / 50
 
 
-def protocol(folder: Path, *, kp: float, dry: float) -> Protocol:
+def protocol(folder: Path, *, kp: float, dry: float) -> RunSet:
     """Two sweeps of a robot with another stiffness and friction than its model's 8 N·m/rad and 0.03 N·m."""
     robot = mujoco.MjModel.from_xml_string(
         pendulum(
@@ -43,7 +43,7 @@ def protocol(folder: Path, *, kp: float, dry: float) -> Protocol:
     model = pendulum(
         f'<position {SERVO} kp="8" forcerange="-4 4"/>', joint='damping="0.12" armature="0.006" frictionloss="0.03"'
     )
-    return Protocol.of(runs, write(folder / "given.xml", model), ["joint"], [None, None])
+    return RunSet.of(runs, write(folder / "given.xml", model), ["joint"], [None, None])
 
 
 def test_a_refit_stays_within_tolerance_and_is_the_best_there(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_a_warm_motor_is_weaker_and_the_refit_says_by_how_much(tmp_path: Path) -
         columns["temp.joint"] = np.full(len(T), 30.0 + warm)
         runs.append(run_of(columns, T, ["joint"], f"sweep-{n}"))
     model = write(tmp_path / "given.xml", pendulum(f'<position {SERVO} kp="8" forcerange="-4 4"/>'))
-    windows = Windows(Protocol.of(runs, model, ["joint"], [None] * 3))
+    windows = Windows(RunSet.of(runs, model, ["joint"], [None] * 3))
     (left,) = closures(windows, [nothing(windows)], [(2,)], [0, 1])
     assert left.closed > 0.8
     warmest = calibration_of(windows, left.refit, [2])["stiffness"]["joint"]
@@ -91,7 +91,7 @@ def test_a_warm_motor_is_weaker_and_the_refit_says_by_how_much(tmp_path: Path) -
     unmeasured = [
         dataclasses.replace(run, columns={k: v for k, v in run.columns.items() if k != "temp.joint"}) for run in runs
     ]
-    assert "heat_loss" not in [one.name for one in Windows(Protocol.of(unmeasured, model, ["joint"], [None] * 3)).names]
+    assert "heat_loss" not in [one.name for one in Windows(RunSet.of(unmeasured, model, ["joint"], [None] * 3)).names]
 
 
 @pytest.mark.parametrize("name", ["actuator_lag", "action_delay", "load_friction", "backlash"])

@@ -16,7 +16,7 @@ from openant_tools.blind.simulate import simulate as simulate_truth
 from openant_tools.effects.catalogue import catalogue, enter
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.features import TAKES_UP_S, around_switching
-from openant_tools.gap.protocol import Players, Protocol
+from openant_tools.gap.protocol import Players, RunSet
 from openant_tools.recording.run import Facts, Run
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
@@ -38,7 +38,7 @@ def moved_by(
     healthy, ill = (
         logged(robot, motion, 0, trace) for robot, trace in zip(robots, simulate_truth(robots, motion, 0), strict=True)
     )
-    protocol = Protocol.of([healthy], nominal_model_path(), JOINT_NAMES, [None]).coarse()
+    protocol = RunSet.of([healthy], nominal_model_path(), JOINT_NAMES, [None]).coarse()
     at = np.array([JOINT_NAMES.index(joint)])
     cause = catalogue()[effect]
     x = {q.name: q.back(parameters[q.name], q.scale(protocol.reference, at)) for q in cause.quantities}

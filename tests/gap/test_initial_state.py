@@ -14,7 +14,7 @@ from openant_tools.effects.robot import Robot
 from openant_tools.effects.step import Step
 from openant_tools.effects.thermal_derating import FULL_HEAT_C
 from openant_tools.gap.initial_state import heats, setpoints
-from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.protocol import RunSet
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.rollout import Measured, Rollouts, Staircase
 
@@ -22,16 +22,16 @@ T = 2.0 + np.arange(300) / 50
 
 
 @pytest.fixture(scope="module")
-def protocol(tmp_path_factory: pytest.TempPathFactory) -> Protocol:
+def protocol(tmp_path_factory: pytest.TempPathFactory) -> RunSet:
     model = write(
         tmp_path_factory.mktemp("memory") / "given.xml", pendulum(f'<position {SERVO} kp="8" forcerange="-1 1"/>')
     )
     command = sweep(T, 1)[:, 0]
     run = run_of({"cmd.joint": command, "pos.joint": 0.9 * command}, T, ["joint"])
-    return Protocol.of([run], model, ["joint"], [None])
+    return RunSet.of([run], model, ["joint"], [None])
 
 
-def anew(protocol: Protocol, robot: Robot) -> float:
+def anew(protocol: RunSet, robot: Robot) -> float:
     """rad: by how much a robot that begins anew every half second, where it was itself, differs from itself."""
     one = protocol.runs[0]
     whole = simulate(Rollouts(one.plant, [one.run]), [robot], signals=["pos"]).signals["pos"][0, :, 0].astype(float)
@@ -49,7 +49,7 @@ def anew(protocol: Protocol, robot: Robot) -> float:
     ],
 )
 def test_a_robot_that_begins_anew_amid_its_run_goes_on_as_it_did(
-    cause: str, values: dict[str, float], protocol: Protocol, monkeypatch: pytest.MonkeyPatch
+    cause: str, values: dict[str, float], protocol: RunSet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at, definition = np.array([0]), catalogue()[cause]
     x = {q.name: q.back(values[q.name], q.scale(protocol.reference, at)) for q in definition.quantities}
@@ -66,7 +66,7 @@ def test_a_robot_that_begins_anew_amid_its_run_goes_on_as_it_did(
     ("cause", "x"), [("joint_compliance", {"stiffness_nm_rad": 2.0}), ("backlash", {"gap_rad": 0.02})]
 )
 def test_a_joint_that_rests_stays_where_it_is_however_its_zero_is_off(
-    cause: str, x: dict[str, float], protocol: Protocol
+    cause: str, x: dict[str, float], protocol: RunSet
 ) -> None:
     """What the servo asks for at rest says little of the spring behind it: its friction takes any part."""
     given = protocol.runs[0]
@@ -90,7 +90,7 @@ def test_a_setpoint_of_limited_rate_is_under_way() -> None:
     assert np.isnan(begun[:, 1]).all()
 
 
-def test_a_servo_that_gives_all_it_has_warms_up_with_its_time_constant(protocol: Protocol) -> None:
+def test_a_servo_that_gives_all_it_has_warms_up_with_its_time_constant(protocol: RunSet) -> None:
     one = protocol.runs[0]
     robot = Robot(1)
     robot.derating[:], robot.derating_s = 1e-6, 2.0

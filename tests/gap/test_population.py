@@ -12,7 +12,7 @@ from openant_tools.effects.robot import Form, Robot
 from openant_tools.gap.ensemble import templates_at, templates_of
 from openant_tools.gap.features import COLUMNS
 from openant_tools.gap.population import Case, draw, robot_of
-from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.protocol import RunSet
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
@@ -38,9 +38,9 @@ def commanded(setup: str, seconds: float = 2.0, seed: int = 0) -> Run:
 
 
 @pytest.fixture(scope="module")
-def protocol() -> Protocol:
+def protocol() -> RunSet:
     runs = [commanded("stand"), commanded("floor", 1.6)]
-    return Protocol.of(runs, MODEL, JOINT_NAMES, [None, None]).coarse()
+    return RunSet.of(runs, MODEL, JOINT_NAMES, [None, None]).coarse()
 
 
 MODEL = nominal_model_path()
@@ -80,7 +80,7 @@ def test_commands_that_come_by_chance_come_so_to_no_other_robot() -> None:
     assert np.array_equal(again, plain)
 
 
-def test_every_cause_of_the_catalogue_shows(protocol: Protocol) -> None:
+def test_every_cause_of_the_catalogue_shows(protocol: RunSet) -> None:
     strongest: dict[str, Case] = {}
     for case in templates_of(protocol):
         ((name, (joints, _)),) = case.causes.items()
@@ -103,7 +103,7 @@ def test_a_run_that_was_warmer_begins_warmer() -> None:
         columns[f"temp.{joint}"] = np.full(len(warm.t), 40.0 if joint == "knee_fl" else 28.0)
     columns["temp.hip_rr"][3] = 127.0  # a glitch
     warm = dataclasses.replace(warm, columns=columns)
-    protocol = Protocol.of([cool, warm, commanded("stand", 1.0, seed=2)], MODEL, JOINT_NAMES, [None] * 3)
+    protocol = RunSet.of([cool, warm, commanded("stand", 1.0, seed=2)], MODEL, JOINT_NAMES, [None] * 3)
     knee = JOINT_NAMES.index("knee_fl")
     assert [one.warm_c.tolist() for one in protocol.runs] == [
         [0.0] * 8,
@@ -120,7 +120,7 @@ def test_a_run_that_was_warmer_begins_warmer() -> None:
     assert np.abs(known[:, knee] - hot[:, knee]).max() < 1e-3 < np.abs(known[:, knee] - cold[:, knee]).max()
 
 
-def test_the_same_seed_draws_the_same_robot(protocol: Protocol) -> None:
+def test_the_same_seed_draws_the_same_robot(protocol: RunSet) -> None:
     assert draw(protocol, 5) == draw(protocol, 5)
     one, other = robot_of(protocol, draw(protocol, 5)), robot_of(protocol, draw(protocol, 5))
     assert np.array_equal(one.factor("stiffness"), other.factor("stiffness"))

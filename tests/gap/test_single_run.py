@@ -15,7 +15,7 @@ from openant_tools.errors import BadInput
 from openant_tools.gap import cache
 from openant_tools.gap.cache import CACHE_VARIABLE
 from openant_tools.gap.diagnose import diagnose
-from openant_tools.gap.protocol import Protocol
+from openant_tools.gap.protocol import RunSet
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run
@@ -47,7 +47,7 @@ def _recorded(model: Path, cause: str | None = None, x: dict[str, float] | None 
     t = np.arange(0.0, seconds, 1 / 80)
     wave = 0.5 * np.sin(2 * np.pi * 0.7 * t) + 0.3 * np.sign(np.sin(2 * np.pi * 0.4 * t)) * (t > 1)
     asked = Run("swing", Facts(joints=("hinge",), setup="stand"), t, {"cmd.hinge": wave, "pos.hinge": wave})
-    played = Protocol.of([asked], model, ["hinge"], [None])
+    played = RunSet.of([asked], model, ["hinge"], [None])
     robot = Robot(1, played.reference.low, played.reference.high)
     if cause is not None:
         enter(robot, played.reference, [(cause, (0,), x or {})])

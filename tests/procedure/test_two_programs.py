@@ -132,7 +132,7 @@ def test_of_trainers_that_start_together_one_trains(tmp_path: Path) -> None:
         for k in range(20):
             together.wait()
             try:
-                own.append((k, runs.Run(tmp_path / f"run{k}", {"agent": "sac"})))
+                own.append((k, runs.TrainingRun(tmp_path / f"run{k}", {"agent": "sac"})))
             except BadInput as error:
                 refused.append(str(error))
 

@@ -34,7 +34,7 @@ from openant_tools.recording.repair import repair
 from openant_tools.recording.resume import continuation
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run, read_table, write_table
-from openant_tools.recording.telemetry import Answer, Cycle, ServoChannel, Telemetry
+from openant_tools.recording.telemetry import Cycle, RecordedAnswer, ServoChannel, Telemetry
 from openant_tools.recording.writer import RecordingStopped, RecordingWriter
 
 REALDATA = SHARED / "realdata"
@@ -47,11 +47,11 @@ CHANNELS = (
 FACTS = Facts(joints=("hip_rr", "knee_rr"), setup="stand", protocol="steps")
 
 
-def answer(k: int, servo: int) -> Answer:
+def answer(k: int, servo: int) -> RecordedAnswer:
     if k % 10 == 7 and servo == 1:
-        return Answer(None, False, "timeout")
+        return RecordedAnswer(None, False, "timeout")
     raw = {"pos": 512 + k % 100, "vel": -k % 50, "load": 40, "volt": 118, "temp": 31, "tick": 20 * k % 32768}
-    return Answer(raw, True, "alert" if (k, servo) == (3, 0) else "", 0.0011 + 1e-4 * servo)
+    return RecordedAnswer(raw, True, "alert" if (k, servo) == (3, 0) else "", 0.0011 + 1e-4 * servo)
 
 
 def cycle(k: int, goals: tuple[int | None, ...] | None = None, torque: bool = True) -> Cycle:
@@ -199,7 +199,7 @@ def test_any_joint_names_make_a_schema(names: list[str]) -> None:
     channels = [ServoChannel(name, "m", k, scales={"pos": RAD}) for k, name in enumerate(names)]
     telemetry = Telemetry(channels)
     assert len(set(telemetry.joint_fields.values())) == len(names)
-    answers = [Answer({"pos": k}, True) for k in range(len(names))]
+    answers = [RecordedAnswer({"pos": k}, True) for k in range(len(names))]
     assert telemetry.cycle(Cycle(1.0, [None] * len(names), None, None, answers, [True] * len(names)))
 
 

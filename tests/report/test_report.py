@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openant_tools.report import Answer, Details, Figure, KeyFigure, KeyFigures, Mark, Report, Table, Text, plots
+from openant_tools.report import Details, Figure, KeyFigure, KeyFigures, Mark, Report, ReportSummary, Table, Text, plots
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 
@@ -71,7 +71,7 @@ def a_report() -> Report:
         Report(
             "Fit of ant12 & friends",
             "3 runs, `calibrated.xml`",
-            Answer(
+            ReportSummary(
                 "It leaves 12 % of the error.",
                 Figure(a_figure(), "The worst moment."),
                 "Of *use*.",
@@ -165,7 +165,7 @@ def test_twins_in_markdown_and_json(tmp_path: Path) -> None:
 @given(st.text(max_size=60), st.text(max_size=60))
 def test_no_text_can_break_the_page(words: str, cell: str) -> None:
     report = (
-        Report(words, words, Answer(words, None, words, words))
+        Report(words, words, ReportSummary(words, None, words, words))
         .section(words)
         .text(words)
         .table([cell], [[cell], [Mark(cell, "warn")]], words)
@@ -215,7 +215,7 @@ def test_a_full_disk_leaves_the_old_report(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OSError, match="No space left"):
-        Report("New", "", Answer("No.", None, "", "")).write(path)
+        Report("New", "", ReportSummary("No.", None, "", "")).write(path)
     monkeypatch.undo()
     assert path.read_bytes() == before
     assert len(list(tmp_path.iterdir())) == 1

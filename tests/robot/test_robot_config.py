@@ -24,8 +24,8 @@ from openant_tools.errors import BadInput
 from openant_tools.robot.config import _SECTIONS as SECTIONS
 from openant_tools.robot.config import (
     ACTION_PRESETS,
-    Effect,
-    Motor,
+    EffectEntry,
+    MotorSection,
     Provenance,
     RobotConfig,
     parse_config,
@@ -261,7 +261,7 @@ def test_no_setting_is_read_by_nobody() -> None:
     declared = {
         **{name: {field.metadata.get("key") or field.name for field in dataclasses.fields(kind) if field.metadata}
            for name, kind in SECTIONS.items()},
-        "motors": {field.name for field in dataclasses.fields(Motor) if field.metadata},
+        "motors": {field.name for field in dataclasses.fields(MotorSection) if field.metadata},
     }  # fmt: skip
     idle = [f"{section}.{name}" for section, names in declared.items() for name in sorted(names - read[section])]
     assert not idle, f"settings of robot.toml that no code reads: {', '.join(idle)}; let them act, or take them away"
@@ -402,13 +402,13 @@ def test_provenance_covers_whole_tables_and_every_joint(ant: RobotFolder) -> Non
 
 
 def test_effects_are_added_changed_and_taken_away(ant: RobotFolder) -> None:
-    delay = Effect("action_delay", "all", {"delay_s": 0.02})
-    friction = Effect("load_friction", ("knee_fl", "knee_rl"), {"coefficient": 0.12}, enabled=False)
-    cable = Effect("cable_drag", "body", {"force_n": 0.2, "direction": [1.0, 0.0, 0.0]})
+    delay = EffectEntry("action_delay", "all", {"delay_s": 0.02})
+    friction = EffectEntry("load_friction", ("knee_fl", "knee_rl"), {"coefficient": 0.12}, enabled=False)
+    cable = EffectEntry("cable_drag", "body", {"force_n": 0.2, "direction": [1.0, 0.0, 0.0]})
     before = ant.config_file.read_text(encoding="utf-8")
     assert ant.update(effects=[delay, friction, cable]).effects == (delay, friction, cable)
     rewrite(ant, ('effect = "action_delay"', 'effect = "action_delay"  # measured twice'))
-    changed = Effect("action_delay", "all", {"delay_s": 0.021})
+    changed = EffectEntry("action_delay", "all", {"delay_s": 0.021})
     assert ant.update(effects=[changed, friction, cable]).effects == (changed, friction, cable)
     assert "# measured twice" in ant.config_file.read_text(encoding="utf-8")
     assert ant.update(effects=[cable]).effects == (cable,)
@@ -522,7 +522,7 @@ def test_no_value_anywhere_breaks_the_reader(junk: Any, path: str) -> None:
 def test_joint_and_servo_angles_are_inverse_over_any_turn(
     direction: int, offset: float, angle: float, turns: int
 ) -> None:
-    motor = Motor("knee_fl", 31, "XM430-W350-T", offset, -1.22, 1.22, direction)
+    motor = MotorSection("knee_fl", 31, "XM430-W350-T", offset, -1.22, 1.22, direction)
     servo = motor.to_servo(angle, turns)
     assert motor.to_joint(servo, turns) == pytest.approx(angle, abs=1e-12)
     assert motor.turns_at(servo) == turns

@@ -28,9 +28,9 @@ from openant_tools.recording.reader import read_recording
 from openant_tools.recording.resume import continuation
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run, write_table
-from openant_tools.recording.telemetry import Answer, Cycle, ServoChannel
+from openant_tools.recording.telemetry import Cycle, RecordedAnswer, ServoChannel
 from openant_tools.recording.writer import RecordingWriter
-from openant_tools.robot.derating import Derating, Joint, derating_of
+from openant_tools.robot.derating import DeratedJoint, Derating, derating_of
 from openant_tools.robot.kit import KITS
 from openant_tools.robot.servo import servo_model
 from openant_tools.thermal.compare import against_paper, compare
@@ -46,7 +46,7 @@ from openant_tools.thermal.forecast import (
     torque_load,
 )  # fmt: skip
 from openant_tools.thermal.inputs import Inputs, inputs_of
-from openant_tools.thermal.soak import Plan, pose_angles, resume_plan, soak, soak_config
+from openant_tools.thermal.soak import SoakPlan, pose_angles, resume_plan, soak, soak_config
 from openant_tools.thermal.step import thermal_soak
 from openant_tools.thermal.thermometer import Thermometer, clean
 from openant_tools.virtual.scenario import parse_scenario
@@ -302,7 +302,7 @@ def test_derating_leaves_what_can_be_borne(lite: Inputs) -> None:
     assert rule.least < rule.share(66) < 1.0
     assert rule.share(float("nan")) == 1.0
     assert derating_of({"derating": rules.as_table()}) == Derating(
-        {name: Joint(**table) for name, table in rules.as_table().items()}
+        {name: DeratedJoint(**table) for name, table in rules.as_table().items()}
     )
     assert rules.share({"hip_rr": 79.0, "knee_fl": 90.0}) == {"hip_rr": 1.0, "knee_fl": rule.least}
 
@@ -367,7 +367,7 @@ def test_a_finding_says_it_all_and_the_table_warns_while_cold(lite: Inputs, whol
 # ---- soaks through the real driver ----
 
 
-def run_soak(plan: Plan, out: Path, robot_: object, *, resume: bool = False, rate_hz: float = 4.0):  # type: ignore[no-untyped-def]
+def run_soak(plan: SoakPlan, out: Path, robot_: object, *, resume: bool = False, rate_hz: float = 4.0):  # type: ignore[no-untyped-def]
     bench = robot_.bench  # type: ignore[attr-defined]
     config = soak_config(config_of_unknown_robot(bench.bus, bench.control), rate_hz, plan.margin_k)
     return soak(config, plan, out, resume=resume)
@@ -383,7 +383,7 @@ def finished(steps):  # type: ignore[no-untyped-def]
 
 def test_a_soak_survives_kill_9_and_is_one_recording(tmp_path: Path) -> None:
     out = tmp_path / "soak.mcap"
-    plan = Plan(load="hang", seconds=90.0, cool_down_s=30.0, poses=("home", "knee=-0.5"), heat_sinks=("knee_fl",))
+    plan = SoakPlan(load="hang", seconds=90.0, cool_down_s=30.0, poses=("home", "knee=-0.5"), heat_sinks=("knee_fl",))
     glitch = {"cause": "temperature_glitch", "where": "knee_rr", "fraction": 0.02}
     with robot(tmp_path / "ant", fault=[glitch], **DOZING) as there:
         steps = run_soak(plan, out, there)
@@ -434,7 +434,7 @@ def test_a_soak_ends_below_the_limit_that_the_servo_has(tmp_path: Path) -> None:
     with robot(
         tmp_path / "ant", servo=[servo], room={"ambient_c": 29.0}, **DOZING, **motor(case_j_k=4.0, standby_a=0.1)
     ) as there:
-        made = finished(run_soak(Plan(load="hang", seconds=600.0, cool_down_s=5.0), tmp_path / "soak.mcap", there))
+        made = finished(run_soak(SoakPlan(load="hang", seconds=600.0, cool_down_s=5.0), tmp_path / "soak.mcap", there))
     assert made.why == "margin"
     assert made.joint == "hip_fl"
     assert made.loaded_s < 300
@@ -463,7 +463,7 @@ def test_a_hot_robot_is_left_to_cool(tmp_path: Path) -> None:
         with pytest.raises(
             HardwareFault, match=r"knee_rr is at 7\d °C, 80 °C is its limit.* → let it cool below 70 °C"
         ):
-            finished(run_soak(Plan(load="hang", seconds=60.0), tmp_path / "soak.mcap", there))
+            finished(run_soak(SoakPlan(load="hang", seconds=60.0), tmp_path / "soak.mcap", there))
         assert not any(there.torque())
         assert not (tmp_path / "soak.mcap").exists()
 
@@ -471,7 +471,7 @@ def test_a_hot_robot_is_left_to_cool(tmp_path: Path) -> None:
 def test_knees_that_move_are_not_stalled(tmp_path: Path) -> None:
     with robot(tmp_path / "ant", **DOZING) as there:
         with pytest.raises(BadInput, match=r"knee_\w\w is not stalled: it presses with .* → let the robot lie"):
-            finished(run_soak(Plan(load="stall", seconds=60.0), tmp_path / "soak.mcap", there))
+            finished(run_soak(SoakPlan(load="stall", seconds=60.0), tmp_path / "soak.mcap", there))
         assert not any(there.torque())
         assert not (tmp_path / "soak.mcap").exists()
 
@@ -485,7 +485,7 @@ def test_a_stalled_robot_presses_until_a_servo_shuts_down(tmp_path: Path) -> Non
         **motor(case_j_k=6.0, winding_j_k=2.0),
     }
     with robot(tmp_path / "ant", kit="lite", **table) as there:
-        plan = Plan(load="stall", seconds=900.0, cool_down_s=20.0, margin_k=-1.0)
+        plan = SoakPlan(load="stall", seconds=900.0, cool_down_s=20.0, margin_k=-1.0)
         made = finished(run_soak(plan, tmp_path / "stress.mcap", there))
     assert made.why == "shutdown"
     assert made.joint is not None
@@ -519,7 +519,7 @@ def record(path: Path, start: float, rows: int, **more: object) -> None:
         path, facts=Facts(("knee_fl",)), channels=[channel("knee_fl")], clock=lambda: start, **more
     ) as writer:  # type: ignore[arg-type]
         for k in range(rows):
-            answer = Answer({"pos": k, "temp": 30}, True)
+            answer = RecordedAnswer({"pos": k, "temp": 30}, True)
             writer.cycle(Cycle(start + 0.1 * k, [None], None, None, [answer], [True]))
 
 
@@ -597,11 +597,11 @@ def test_a_trained_policy_is_a_load(tmp_path: Path) -> None:
     import gymnasium
 
     import openant_env  # noqa: F401  (registers the environments)
-    from openant_agents.sac import Settings, train
+    from openant_agents.sac import SacSettings, train
 
     env = gymnasium.make("openant/Ant-v0", kit="lite")
     facts = {"id": "openant/Ant-v0", "options": {"kit": "lite"}}
-    small = Settings(learning_start=60, batch=16, hidden=16)
+    small = SacSettings(learning_start=60, batch=16, hidden=16)
     train(env, folder=tmp_path / "policy", steps=30, seed=0, settings=small, env_facts=facts)
     out = tmp_path / "walked.mcap"
     code, said = command(

@@ -38,7 +38,7 @@ from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.app import SCENARIOS, SCREENS, OpenAnt
 from openant_tools.tui.choices import Choices
-from openant_tools.tui.faults import Faults, condition
+from openant_tools.tui.faults import FaultList, condition
 from openant_tools.tui.feeds import History, ReplayFeed
 from openant_tools.tui.leg_map import REST_S
 from openant_tools.tui.marks import plain
@@ -49,7 +49,7 @@ from openant_tools.tui.screens.gap import GapScreen
 from openant_tools.tui.screens.live import LiveScreen
 from openant_tools.tui.screens.step import StepScreen
 from openant_tools.tui.screens.walk import WalkScreen
-from openant_tools.tui.training import Training, read_curve
+from openant_tools.tui.training import TrainingProcess, curve_so_far
 from openant_tools.virtual.process import virtual_robot
 
 SIZES = [(80, 24), (120, 40)]
@@ -435,7 +435,7 @@ def test_an_observation_outside_its_bounds_is_shown_and_stays_until_seen(robot: 
         if name.startswith("ok."):
             rows[0, columns(JOINT_NAMES).index(name)] = 1.0
     history = History(JOINT_NAMES, robot.config().observation)
-    faults = Faults()
+    faults = FaultList()
     history.add(rows)
     faults.watch(history)
     assert faults.unseen == ()
@@ -778,9 +778,9 @@ def test_training_on_the_robot_asks_before_it_moves_and_the_stop_key_reaches_it(
     robot: RobotFolder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = list[str]()
-    monkeypatch.setattr(Training, "start", lambda self: told.append(f"start {self.where}"))
-    monkeypatch.setattr(Training, "running", property(lambda self: "stop" not in told))
-    monkeypatch.setattr(Training, "stop", lambda self: told.append("stop"))
+    monkeypatch.setattr(TrainingProcess, "start", lambda self: told.append(f"start {self.where}"))
+    monkeypatch.setattr(TrainingProcess, "running", property(lambda self: "stop" not in told))
+    monkeypatch.setattr(TrainingProcess, "stop", lambda self: told.append("stop"))
 
     async def look() -> None:
         app = OpenAnt(robot.path, ticking=False)
@@ -838,14 +838,14 @@ def test_what_was_learned_is_evaluated_played_compared_and_diagnosed_from_its_sc
 
 
 def test_training_is_the_command_that_one_would_type(robot: RobotFolder) -> None:
-    training = Training("sac", robot.path, 2000, 1, robot.runs / "sac-1")
+    training = TrainingProcess("sac", robot.path, 2000, 1, robot.runs / "sac-1")
     assert (
         training.command == f"openant train sac --robot {robot.path} --steps 2000 --seed 1 --out {robot.runs / 'sac-1'}"
     )
-    assert read_curve(robot.runs / "sac-1") == []
+    assert curve_so_far(robot.runs / "sac-1") == []
     real = replace(training, where="robot")
     assert real.command == f"{training.command} --env hardware --yes"
     assert replace(training, where="virtual").command == f"{real.command} --virtual"
     training.folder.mkdir(parents=True)
     (training.folder / "learning_curve.csv").write_text("step,seconds,average_reward_m_s\n100,12.0,0.01\n200,2")
-    assert [point.step for point in read_curve(training.folder)] == [100]
+    assert [point.step for point in curve_so_far(training.folder)] == [100]

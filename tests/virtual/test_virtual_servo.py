@@ -13,7 +13,7 @@ from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.protocol2 import ALERT_BIT, BROADCAST, Error, Instruction, Status
 from openant_tools.robot.servo import SERVO_MODELS, servo_model
 from openant_tools.virtual.servo import ServoDevice
-from openant_tools.virtual.servo_power import HEAT_ERROR, Loop, Sensed, Snapshot
+from openant_tools.virtual.servo_power import HEAT_ERROR, Loop, Sensed, ServoSnapshot
 
 XM, XC, XL = servo_model("XM430-W350"), servo_model("XC430-W240"), servo_model("XL430-W250")
 
@@ -47,7 +47,7 @@ class Desk:
 
     def __init__(self, model=XM, firmware=46):
         self.motor = Bench()
-        self.kept: list[Snapshot] = []
+        self.kept: list[ServoSnapshot] = []
         self.servo = ServoDevice(model, self.motor, firmware=firmware, persist=self.kept.append)
         self.now = 0.0
 

@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-__all__ = ["CAUSES", "OTHERWISE", "Cause", "Spread", "separating_test"]
+__all__ = ["CAUSES", "OTHERWISE", "DropoutCause", "Spread", "separating_test"]
 
 #: a, b of a Beta density
 Spread = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Cause:
+class DropoutCause:
     """One explanation.
 
     Attributes:
@@ -49,8 +49,8 @@ _LOSES = (0.0006, 0.025, 0.975)
 _ALL = {"all": 0.86, "behind": 0.04, "one": 0.02, "pair": 0.02, "scattered": 0.06}
 _SILENT = (0.6, 12.0)
 
-CAUSES: Mapping[str, Cause] = {
-    "power_connector": Cause(
+CAUSES: Mapping[str, DropoutCause] = {
+    "power_connector": DropoutCause(
         "a power connector that loses contact",
         "take the barrel plug away and screw the supply's wires into the board's terminals",
         "wiggle the power plug, and each power connector, while `openant comms watch` runs",
@@ -62,7 +62,7 @@ CAUSES: Mapping[str, Cause] = {
             "angle": (0.6, 5.0),
         },
     ),
-    "supply_weak": Cause(
+    "supply_weak": DropoutCause(
         "a supply, or its cable, too weak for the load",
         "use a supply of more current (12 V 8 A for the standard robot) and thicker, shorter cables",
         "hold the robot still in the air: losses that end then came of the load; measure the supply under load",
@@ -74,7 +74,7 @@ CAUSES: Mapping[str, Cause] = {
             "angle": (0.8, 1.4),
         },
     ),
-    "broken_wire": Cause(
+    "broken_wire": DropoutCause(
         "a wire that breaks at a joint's angle",
         "replace the cable that runs over this joint, and give it slack",
         "bend this joint slowly by hand with torque off while `openant comms watch` runs",
@@ -85,7 +85,7 @@ CAUSES: Mapping[str, Cause] = {
             "dip": (0.35, 6.0), "reset": (0.35, 3.0), "angle": (4.5, 0.8), "load": (0.6, 1.8), "low": (0.5, 1.6), "motion": (0.6, 3.5),
         },
     ),
-    "bad_servo": Cause(
+    "bad_servo": DropoutCause(
         "one bad servo, or its own connector",
         "press both its plugs home, then replace the servo",
         "swap this servo with another: does the loss go with it?",
@@ -96,7 +96,7 @@ CAUSES: Mapping[str, Cause] = {
             "dip": (0.35, 8.0),
         },
     ),
-    "bad_cable": Cause(
+    "bad_cable": DropoutCause(
         "a bad cable or plug in the chain",
         "replace the cable before the first servo concerned; press its plugs home",
         "wiggle the cable before the first servo concerned, then swap it for another",
@@ -107,7 +107,7 @@ CAUSES: Mapping[str, Cause] = {
             "reset": (0.35, 4.0), "dip": (0.35, 6.0), "motion": (0.6, 3.5),
         },
     ),
-    "line_noise": Cause(
+    "line_noise": DropoutCause(
         "noise on the line, or a missing termination",
         "keep motor and data cables apart, shorten the bus, and lower the baud rate",
         "record at half the baud rate: noise breaks fewer answers there",
@@ -118,7 +118,7 @@ CAUSES: Mapping[str, Cause] = {
             "baud": (3.0, 1.0),
         },
     ),
-    "return_delay": Cause(
+    "return_delay": DropoutCause(
         "a return delay that servos still have from the factory",
         "set Return Delay Time (9) of these servos to 0: `openant calib ids` does",
         "read register 9 of every servo (`openant config check`)",
@@ -126,7 +126,7 @@ CAUSES: Mapping[str, Cause] = {
         {"all": 0.32, "behind": 0.2, "one": 0.22, "pair": 0.06, "scattered": 0.2},
         {"crc": _SILENT, "late": (0.7, 0.55), "stairs": (6.0, 0.6), "together": (1.5, 1.5), "comb": (0.35, 9.0)},
     ),
-    "latency_timer": Cause(
+    "latency_timer": DropoutCause(
         "the adapter's latency timer of 16 ms",
         "set it to 1 ms: `openant comms ports` prints the udev rule",
         "`openant comms ports` shows the timer of each adapter",
@@ -137,7 +137,7 @@ CAUSES: Mapping[str, Cause] = {
             "stairs": (0.35, 6.0),
         },
     ),
-    "host_stall": Cause(
+    "host_stall": DropoutCause(
         "a host that stands still now and then",
         "close what competes for the processor, switch off power saving, and record from a process of its own",
         "run `openant comms soak` with nothing else running, and look at `wake`",
@@ -148,7 +148,7 @@ CAUSES: Mapping[str, Cause] = {
             "rate": (0.4, 14.0), "single": (0.8, 1.0), "long": (1.0, 3.0),
         },
     ),
-    "usb_unplug": Cause(
+    "usb_unplug": DropoutCause(
         "a USB plug that came loose",
         "fix the USB plug with a strap or screws, and use a shorter cable without a hub",
         "wiggle the USB plug; `dmesg -w` says when the adapter goes and comes",
@@ -159,7 +159,7 @@ CAUSES: Mapping[str, Cause] = {
             "long": (3.5, 2.0), "often": (1.2, 3.5), "stall": (0.35, 2.5), "host": (0.35, 5.0),
         },
     ),
-    "duplicate_id": Cause(
+    "duplicate_id": DropoutCause(
         "two servos with one id",
         "unplug one of the two and give it its own id: `openant calib ids`",
         "`openant comms scan` with only one of the two plugged in",
@@ -170,7 +170,7 @@ CAUSES: Mapping[str, Cause] = {
             "baud": (1.0, 1.6),
         },
     ),
-    "write_read_gap": Cause(
+    "write_read_gap": DropoutCause(
         "reads that follow a write too closely",
         "leave 1 ms between the end of a write and the next read (bus.write_read_gap_s in robot.toml)",
         "`openant comms bench` measures the gap that these servos need",

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from openant_tools.comms.dropouts.causes import CAUSES, OTHERWISE, Cause, Spread, separating_test
+from openant_tools.comms.dropouts.causes import CAUSES, OTHERWISE, DropoutCause, Spread, separating_test
 from openant_tools.comms.dropouts.episodes import cables
 from openant_tools.comms.dropouts.log import read_log
 from openant_tools.comms.dropouts.measures import Measures, measure
@@ -40,12 +40,12 @@ _OF_MOMENTS = frozenset({"dip", "sag", "angle", "load", "low", "motion"})
 #: lossy reads that say whom losses concern
 ENOUGH = 6
 
-_HEALTHY = Cause(
+_HEALTHY = DropoutCause(
     "nothing wrong", "", "", (0.78, 0.2197, 0.0003),
     {"all": 0.25, "behind": 0.05, "one": 0.4, "pair": 0.1, "scattered": 0.2},
     {"stall": (0.35, 12.0), "rate": (0.3, 60.0)}, prior=8.0,
 )  # fmt: skip
-_UNKNOWN = Cause(
+_UNKNOWN = DropoutCause(
     "something else", "", "", (0.002, 0.05, 0.95),
     {"all": 0.3, "behind": 0.15, "one": 0.3, "pair": 0.1, "scattered": 0.15},
     {"crc": (1.0, 1.0), "late": (0.5, 2.5), "dip": (0.5, 3.5), "reset": (0.5, 4.0), "angle": (0.7, 2.5),
@@ -166,7 +166,7 @@ def diagnose_dropouts(runs: Sequence[Run]) -> DropoutDiagnosis:
 
 def judge(measures: Measures) -> DropoutDiagnosis:
     """The diagnosis of what was measured."""
-    everything: dict[str, Cause] = {**CAUSES, "none": _HEALTHY, "unknown": _UNKNOWN}
+    everything: dict[str, DropoutCause] = {**CAUSES, "none": _HEALTHY, "unknown": _UNKNOWN}
     terms = {name: _terms(cause, measures) for name, cause in everything.items()}
     logs = {name: math.log(cause.prior) + sum(terms[name].values()) / TEMPER for name, cause in everything.items()}
     top = max(logs.values())
@@ -205,7 +205,7 @@ def _density(value: float, spread: Spread) -> float:
     return math.log(FLOOR + (1 - FLOOR) * float(beta.pdf(x, *spread)))
 
 
-def _terms(cause: Cause, measures: Measures) -> dict[str, float]:
+def _terms(cause: DropoutCause, measures: Measures) -> dict[str, float]:
     """Mark → log likelihood under a cause."""
     kinds = ("no", "stray", "yes")
     terms = {"losses": math.log(cause.losses[kinds.index(measures.losses)])}

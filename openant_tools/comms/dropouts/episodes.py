@@ -10,7 +10,7 @@ import numpy as np
 from openant_tools.comms.dropouts.log import WORDS, Array, BusLog, Flags
 from openant_tools.robot.joints import JOINTS
 
-__all__ = ["Episode", "Reach", "cables", "episodes_of", "reach_of"]
+__all__ = ["DropoutEpisode", "Reach", "cables", "episodes_of", "reach_of"]
 
 #: A servo belongs to those concerned where it loses at least this share of what the worst one loses.
 CONCERNED = 0.2
@@ -21,7 +21,7 @@ ALONE = 0.12
 
 
 @dataclass(frozen=True)
-class Episode:
+class DropoutEpisode:
     """Losses in a row, at most one good row between them.
 
     Attributes:
@@ -37,7 +37,7 @@ class Episode:
     words: tuple[str, ...]
 
 
-def episodes_of(log: BusLog) -> list[Episode]:
+def episodes_of(log: BusLog) -> list[DropoutEpisode]:
     """All of them, in order of time."""
     rows = np.flatnonzero(log.lossy)
     if not len(rows):
@@ -51,7 +51,7 @@ def episodes_of(log: BusLog) -> list[Episode]:
         joints = tuple(np.flatnonzero(word.any(axis=0)).tolist())
         codes = set(word.ravel().tolist())
         found.append(
-            Episode(
+            DropoutEpisode(
                 first, last + 1, float(log.t[first]), float(log.t[last]), joints,
                 tuple(WORDS[code] for code in sorted(codes) if code),
             )

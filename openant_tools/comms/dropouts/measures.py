@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.comms.dropouts.episodes import Episode, Reach, episodes_of, reach_of
+from openant_tools.comms.dropouts.episodes import DropoutEpisode, Reach, episodes_of, reach_of
 from openant_tools.comms.dropouts.log import WORDS, Array, BusLog, Flags
 
 __all__ = ["Measure", "Measures", "measure"]
@@ -67,7 +67,7 @@ class Measures:
     """
 
     log: BusLog
-    episodes: list[Episode]
+    episodes: list[DropoutEpisode]
     reach: Reach
     losses: str
     marks: Mapping[str, Measure]
@@ -93,7 +93,7 @@ def measure(log: BusLog) -> Measures:
 Look = Iterator[tuple[str, Measure, tuple[int, ...]]]
 
 
-def _kind_of_losses(log: BusLog, episodes: Sequence[Episode], reach: Reach, marks: Mapping[str, Measure]) -> str:
+def _kind_of_losses(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach, marks: Mapping[str, Measure]) -> str:
     if not episodes:
         return "no"
     lost, asked = int(log.lost.sum()), max(1, int(log.answers.sum()))
@@ -113,7 +113,7 @@ def _kind_of_losses(log: BusLog, episodes: Sequence[Episode], reach: Reach, mark
     return "stray" if few and not concentrated else "yes"
 
 
-def _words(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+def _words(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     if not episodes:
         return
     codes = log.word[log.word > 0]
@@ -131,7 +131,7 @@ def _words(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     )
 
 
-def _extent(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+def _extent(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     if not episodes:
         return
     names = [log.joints[k] for k in reach.joints]
@@ -146,7 +146,7 @@ def _extent(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     yield "rate", Measure(rate, f"{rate:.2%} of the answers of {whom} are lost"), reach.joints
 
 
-def _rhythm(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+def _rhythm(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     if not episodes:
         return
     runs = _lengths(np.asarray(reach.lost.any(axis=1), bool))
@@ -182,7 +182,7 @@ def _supply(log: BusLog) -> Array:
     return np.where(np.isfinite(lowest), lowest, np.nan)
 
 
-def _near(log: BusLog, episodes: Sequence[Episode], values: Array, worst: Callable[[Array], float]) -> Array:
+def _near(log: BusLog, episodes: Sequence[DropoutEpisode], values: Array, worst: Callable[[Array], float]) -> Array:
     """The worst of `values` around each episode; NaN where none is known."""
     out = np.full(len(episodes), np.nan)
     for k, one in enumerate(episodes):
@@ -194,7 +194,7 @@ def _near(log: BusLog, episodes: Sequence[Episode], values: Array, worst: Callab
     return out
 
 
-def _dips(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+def _dips(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     volts = _supply(log)
     good = np.isfinite(volts)
     if not episodes or good.sum() < FEWEST:
@@ -222,7 +222,7 @@ def _dips(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     yield "dip", Measure(max(0.0, share - chance), words), joints
 
 
-def _empty(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+def _empty(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     """Whether the supply, with next to no load on it, is below what servos need: they begin anew again and again."""
     volts = _supply(log)
     known = volts[np.isfinite(volts)]
@@ -233,7 +233,7 @@ def _empty(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     yield "empty", Measure(value, f"the supply stands at {usual:.1f} V, servos need {NEEDED_V:.0f} V"), ()
 
 
-def _sag(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+def _sag(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     with np.errstate(invalid="ignore"):
         seen = np.isfinite(log.volt)
         volts = np.where(seen, log.volt, 0.0).sum(axis=1) / seen.sum(axis=1)
@@ -251,7 +251,7 @@ def _sag(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     yield "sag", Measure(drop / SAG_V, f"full load pulls the supply down by {drop:.2f} V (correlation {r:.2f})"), ()
 
 
-def _resets(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+def _resets(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     restarts = np.zeros(log.lost.shape, bool)
     usable = False
     for k in range(len(log.joints)):
@@ -288,7 +288,7 @@ def _resets(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
 # ---- what the moments of loss have in common ----
 
 
-def _explained(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+def _explained(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     """How much of the timing of losses an angle, the load or shaking explains, beyond what chance does."""
     lossy = np.asarray(reach.lost.any(axis=1), bool)
     if not episodes or lossy.mean() > 0.97:
@@ -343,7 +343,7 @@ def _around(values: Array) -> Array:
     return least
 
 
-def _elsewhere(log: BusLog, episodes: Sequence[Episode]) -> NDArray[np.int64]:
+def _elsewhere(log: BusLog, episodes: Sequence[DropoutEpisode]) -> NDArray[np.int64]:
     """(SHIFTS, n) rows by which each row's losses are moved to another time, those close together as one."""
     random = np.random.default_rng(len(log.t))
     n = len(log.t)
@@ -401,7 +401,7 @@ def _half_lines(
 # ---- the host's clock ----
 
 
-def _host(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+def _host(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     n = len(log.t)
     if n < FEWEST:
         return
@@ -519,7 +519,7 @@ def _beat(log: BusLog) -> _Beat | None:
     return _Beat(wait, period, best)
 
 
-def _comb(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+def _comb(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     """Whether answers wait for the beat of a latency timer."""
     beat = _beat(log)
     if beat is None:
@@ -570,7 +570,7 @@ def _at_all_phases(rtt: Array, period_s: float) -> bool:
     return bool(count.min() > EVEN * count.mean())
 
 
-def _staircase(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+def _staircase(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     """What each servo waits before it answers, from one answer's end to the next."""
     steps, wire, portions = _waits(log)
     if not np.isfinite(steps).any():
@@ -595,7 +595,7 @@ def _staircase(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     yield "stairs", Measure(value, words), tuple(int(k) for k in joints)
 
 
-def _gap(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+def _gap(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     """Whether reads are lost that follow a write too closely."""
     fresh = np.isfinite(log.cmd_t) & np.r_[True, np.diff(log.cmd_t) != 0]
     gap = log.t - log.cmd_t
@@ -641,7 +641,7 @@ def _gap(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
     yield "gap", Measure(value, words), ()
 
 
-def _baud(log: BusLog, episodes: Sequence[Episode], reach: Reach) -> Look:
+def _baud(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     """Whether broken answers grow with the rate of the line, over runs at several."""
     rates = np.unique(log.baud[np.isfinite(log.baud)])
     if len(rates) < 2:

@@ -9,7 +9,7 @@ import numpy as np
 from openant_tools.comms.dropouts.diagnose import LISTED, DropoutDiagnosis
 from openant_tools.comms.dropouts.log import WORDS
 from openant_tools.numbers import number, percent
-from openant_tools.report import Answer, Figure, KeyFigure, Report, plots
+from openant_tools.report import Figure, KeyFigure, Report, ReportSummary, plots
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -63,7 +63,7 @@ def dropouts_report(found: DropoutDiagnosis) -> Report:
     named = found.verdict not in ("none", "unknown")
     then = f"{best.remedy}.\n\nTo make sure: {found.next_test}." if named else f"{found.next_test}."
     then = then[:1].upper() + then[1:]
-    answer = Answer(
+    answer = ReportSummary(
         f"{found.what[:1].upper()}{found.what[1:]}.",
         Figure(loss_figure(found), f"{shows}, the supply where it was logged, and how late the loop was."),
         _meaning(found, lost, asked),

@@ -8,7 +8,7 @@ import numpy as np
 
 from openant_tools.numbers import number
 from openant_tools.procedure.finding import Finding
-from openant_tools.report import Answer, Figure, KeyFigure, Report, plots
+from openant_tools.report import Figure, KeyFigure, Report, ReportSummary, plots
 from openant_tools.robot.servo import servo_model
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2
 from openant_tools.sysid.bench.stiffness import DIVISORS
@@ -24,7 +24,7 @@ def stiffness_report(finding: Finding) -> Report:
     shown = [
         e for e in finding.evidence if e.value is not None and "divisor 1" not in e.name and "divisor 2" not in e.name
     ]
-    answer = Answer(
+    answer = ReportSummary(
         finding.what,
         Figure(
             _lines(finding),

@@ -21,7 +21,7 @@ from openant_tools.tui.curve import PAPER_CM_S, curve_lines
 from openant_tools.tui.dialogs import Question
 from openant_tools.tui.marks import marked, plain, spelled
 from openant_tools.tui.page import Page
-from openant_tools.tui.training import AGENTS, Place, Play, Training, read_curve
+from openant_tools.tui.training import AGENTS, Place, PlayProcess, TrainingProcess, curve_so_far
 
 __all__ = ["LearnScreen"]
 
@@ -139,7 +139,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         if self.session.learning:
             self.notify("one at a time: stop what runs first", severity="warning")
             return
-        self.session.training = Play(arguments, folder, where)
+        self.session.training = PlayProcess(arguments, folder, where)
         self.session.training.start()
         self.draw_progress()
 
@@ -152,7 +152,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
             else sorted(folder.runs.glob("*/recordings/*.mcap"), key=lambda path: path.stat().st_mtime)
         )
         if not played:
-            self.notify("no policy was played on the robot yet: Play it there first", severity="warning")
+            self.notify("no policy was played on the robot yet: play it there first", severity="warning")
             return
         self.ant.diagnose(played[-1])
 
@@ -201,7 +201,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
             progress.update(marked("fail", "steps and seed are whole numbers"))
             return
         out = folder.runs / (f"{agent}-{seed}" if where == "sim" else f"{agent}-{where}-{seed}")
-        training = Training(agent, folder.path, int(steps), int(seed), out, where)
+        training = TrainingProcess(agent, folder.path, int(steps), int(seed), out, where)
         training.start()
         self.session.training = training
         self.draw_progress()
@@ -228,7 +228,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
                     else marked("fail", training.last_words)
                 )  # fmt: skip
             text.append(f"   {training.command}\n")
-            if isinstance(training, Training):
+            if isinstance(training, TrainingProcess):
                 self._curve(text, training.folder, training.steps)
             else:
                 text.append("\n".join(training.said))
@@ -242,7 +242,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         self.query_one("#progress", Static).update(text)
 
     def _curve(self, text: Text, run: Path, steps: int | None) -> None:
-        points = read_curve(run)
+        points = curve_so_far(run)
         if not points:
             text.append("  no point of the curve yet\n")
             return

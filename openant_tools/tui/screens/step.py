@@ -18,7 +18,7 @@ from openant_tools.errors import OpenAntError
 from openant_tools.numbers import number, percent, span
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.journal import Journal
-from openant_tools.procedure.step import Answer, Ask, Event, Hands, Intent, Live, Look, Progress, Say, Step
+from openant_tools.procedure.step import Answer, Ask, Drawing, Event, Hands, Intent, Live, Progress, Say, Step
 from openant_tools.procedure.unfinished import forget, unfinished
 from openant_tools.tui.bars import bars
 from openant_tools.tui.choices import Choices
@@ -39,7 +39,7 @@ _LEVELS: Mapping[str, Name] = {"info": "info", "ok": "ok", "warn": "warn", "fail
 
 
 @dataclass(frozen=True)
-class Choice:
+class StepChoice:
     """One line to choose, and what choosing it does."""
 
     words: str
@@ -69,7 +69,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
         self.step = step
         self.title = step.title
         self._run: StepRun | None = None
-        self.choices: list[Choice] = []
+        self.choices: list[StepChoice] = []
         self._pending: Event | None = None
         self._progress: Progress | None = None
         self._live: Live | None = None
@@ -158,7 +158,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
             self.say(
                 marked("warn", f"there is no robot's folder at {self.session.path.resolve()}: make one in Settings (s)")
             )
-            self.offer("", [Choice("Settings", lambda: self.ant.action_go("settings")), self._back()])
+            self.offer("", [StepChoice("Settings", lambda: self.ant.action_go("settings")), self._back()])
             return
         one = standing(folder).get(step.name)
         if one is not None and one.waits_for:
@@ -169,20 +169,20 @@ and can be begun again: what it found or wrote before stays, and every write to 
         self.offer("", [*self._beginnings("Begin"), self._back()])
         self.draw()
 
-    def _beginnings(self, words: str) -> list[Choice]:
+    def _beginnings(self, words: str) -> list[StepChoice]:
         """To begin; where it was left in the middle, first of all to go on there."""
         folder = self.session.folder
         left = None if folder is None else unfinished(folder, self.step.name)
         if left is None:
-            return [Choice(words, self.begin)]
+            return [StepChoice(words, self.begin)]
         self.say(
             marked(
                 "warn",
                 f"it was left at {left.words}: {', '.join(left.done)} {'is' if len(left.done) == 1 else 'are'} done",
             )
         )
-        onwards = Choice(f"Go on at {len(left.done) + 1} of {len(left.of)}: {left.next}", self.begin)
-        return [onwards, Choice(f"{words} from the first", self.begin_anew)]
+        onwards = StepChoice(f"Go on at {len(left.done) + 1} of {len(left.of)}: {left.next}", self.begin)
+        return [onwards, StepChoice(f"{words} from the first", self.begin_anew)]
 
     def begin_anew(self) -> None:
         """Run it from its start, whatever of it was done before."""
@@ -227,10 +227,14 @@ and can be begun again: what it found or wrote before stays, and every write to 
             following = names[after] if after < len(names) else None
             choices = [*ahead, again, self._back()]
             if following is not None:
-                forward = Choice(f"Next: {WALK[following].title}", lambda: self.ant.open_step(following, instead=True))
+                forward = StepChoice(
+                    f"Next: {WALK[following].title}", lambda: self.ant.open_step(following, instead=True)
+                )
                 choices = [forward, *choices] if finding.ok else [*ahead, again, forward, self._back()]
             if self._wrote():
-                choices.append(Choice("Undo what was written last", lambda: self.ant.open_step("undo", instead=True)))
+                choices.append(
+                    StepChoice("Undo what was written last", lambda: self.ant.open_step("undo", instead=True))
+                )
             self.offer("", choices)
         self.draw()
 
@@ -270,7 +274,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
             self._progress = event
         elif isinstance(event, Say):
             self.say(marked(_LEVELS[event.level], event.words))
-        elif isinstance(event, Look):
+        elif isinstance(event, Drawing):
             self.say(Text("\n".join(part for part in (event.words, event.drawing) if part)))
             if event.picture is not None:
                 self.say(Text(f"picture: {event.picture}"))
@@ -297,11 +301,11 @@ and can be begun again: what it found or wrote before stays, and every write to 
         # Torque alone is asked for like a motion.
         motion = f" {mark('warn')} {'The robot moves' if self.step.moves else 'Torque goes on'}." if event.moves else ""
         choices = [
-            Choice("Yes, do it", lambda: self.reply(True, "granted")),
-            Choice("No, leave everything as it is", lambda: self.reply(False, "not granted")),
+            StepChoice("Yes, do it", lambda: self.reply(True, "granted")),
+            StepChoice("No, leave everything as it is", lambda: self.reply(False, "not granted")),
         ]
         if event.registers and not event.moves:
-            choices.insert(1, Choice("Yes, and all further writes of this step", self._grant_all))
+            choices.insert(1, StepChoice("Yes, and all further writes of this step", self._grant_all))
         self.ask(event, f"May it?{count}{motion}", choices)
 
     def _grant_all(self) -> None:
@@ -311,7 +315,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
     def _ask(self, event: Ask) -> None:
         self._now = event.question
         if event.choices:
-            choices = [Choice(word, lambda word=word: self.reply(word, word)) for word in event.choices]  # type: ignore[misc]
+            choices = [StepChoice(word, lambda word=word: self.reply(word, word)) for word in event.choices]  # type: ignore[misc]
             default = event.choices.index(str(event.default)) if event.default in event.choices else 0
             self.ask(event, event.question, choices, default)
             return
@@ -348,17 +352,17 @@ and can be begun again: what it found or wrote before stays, and every write to 
         self.say(Text(f"{mark('info')} {event.words}", style="bold"))
         if event.while_watching:
             return
-        choices = [Choice("Done", lambda: self.reply(True, "done"))]
+        choices = [StepChoice("Done", lambda: self.reply(True, "done"))]
         if self.session.virtual is not None:
-            by_hand = Choice(
+            by_hand = StepChoice(
                 "Let the virtual robot's hands do it", lambda: self.reply(BY_VIRTUAL_HANDS, "done by virtual hands")
             )
-            choices = [by_hand, Choice("It is done already", choices[0].do)]
+            choices = [by_hand, StepChoice("It is done already", choices[0].do)]
         self.ask(event, "Your hands are needed.", choices)
 
     # ---- to the procedure ----------------------------------------------------------------------------------------
 
-    def ask(self, event: Event, words: str, choices: list[Choice], chosen: int = 0) -> None:
+    def ask(self, event: Event, words: str, choices: list[StepChoice], chosen: int = 0) -> None:
         self._pending = event
         self.offer(words, choices, chosen)
         self.draw()
@@ -377,7 +381,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
         if self._run is not None:
             self._run.reply(answer)
 
-    def offer(self, words: str, choices: list[Choice], chosen: int = 0) -> None:
+    def offer(self, words: str, choices: list[StepChoice], chosen: int = 0) -> None:
         """Put lines to choose from below the log."""
         self.choices = choices
         question = self.query_one("#question", Static)
@@ -436,8 +440,8 @@ and can be begun again: what it found or wrote before stays, and every write to 
     def on_unmount(self) -> None:
         self.end()
 
-    def _back(self) -> Choice:
-        return Choice("Back to the walk", self.action_leave)
+    def _back(self) -> StepChoice:
+        return StepChoice("Back to the walk", self.action_leave)
 
     # ---- the log -------------------------------------------------------------------------------------------------
 
