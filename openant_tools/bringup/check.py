@@ -8,7 +8,7 @@ lost, a horn that slipped and a plug that works itself loose each change one of 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Generator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +28,7 @@ from openant_tools.comms.state import BY_FACTORY, differences_of_robot, passport
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.gap.measure import measure
 from openant_tools.procedure.finding import Evidence, Finding, latest
-from openant_tools.procedure.step import Answer, Ask, Bench, Event, Intent, Procedure, Progress, Say
+from openant_tools.procedure.step import Ask, Bench, Intent, Procedure, Progress, Say, Subroutine
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.config import RobotConfig
@@ -282,7 +282,7 @@ def _lost(run: Run) -> dict[str, float]:
     return dict(zip(run.joints, own.mean(axis=0).tolist(), strict=True))
 
 
-def _of_this_computer(run: Run) -> Generator[Event, Answer, list[str]]:
+def _of_this_computer(run: Run) -> Subroutine[list[str]]:
     """What it missed itself: said, and a problem where nothing is left to judge the connectors by."""
     seen = losses(run)
     if not seen.words:
@@ -386,7 +386,7 @@ def _imu(bench: Bench, config: RobotConfig, evidence: list[Evidence]) -> list[st
     return words
 
 
-def _twitch(bench: Bench) -> Generator[Event, Answer, Run]:
+def _twitch(bench: Bench) -> Subroutine[Run]:
     """A short excitation on the stand, recorded; the recording."""
     path = bench.folder.recordings / "check-twitch.mcap"
     played = protocol("stand", TWITCH_S)
@@ -416,7 +416,7 @@ def _twitch(bench: Bench) -> Generator[Event, Answer, Run]:
 
 def _against_model(
     bench: Bench, run: Run, evidence: list[Evidence], unsure: list[str], known: Collection[str]
-) -> Generator[Event, Answer, list[str]]:
+) -> Subroutine[list[str]]:
     """Joints that the calibrated model simulates much worse than when it was made, besides those named already."""
     gap = latest(bench.folder, "gap")
     if gap is None or "by_joint_rad" not in gap.data:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from typing import TypeVar
 
-from openant_tools.procedure.step import Answer, Event, Progress, Say
+from openant_tools.procedure.step import Event, Progress, Say, Subroutine
 
 __all__ = ["relayed"]
 
@@ -20,7 +20,7 @@ class _Cancelled(Exception):
 
 def relayed(
     work: Callable[[Callable[[str, float], None], Callable[[str], None]], T],
-) -> Generator[Event, Answer, T]:
+) -> Subroutine[T]:
     """Run `work(progress, notice)` and yield what it reports; its result.
 
     A face that closes the procedure ends the work at its next report. What the work raises is raised here.

@@ -9,7 +9,6 @@ last it turns to and fro, and the gyro tells how late the camera's heading is.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -33,7 +32,7 @@ from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.files import write_bytes
 from openant_tools.optional import cv2
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.step import Answer, Ask, Bench, Drawing, Event, Hands, Intent, Procedure, Progress, Say
+from openant_tools.procedure.step import Ask, Bench, Drawing, Hands, Intent, Procedure, Progress, Say, Subroutine
 from openant_tools.recording.reader import Recording, read_recording
 from openant_tools.recording.run import Facts
 from openant_tools.robot.config import CameraSection as CameraFacts
@@ -279,7 +278,7 @@ def _clock(bench: Bench) -> Clock:
 
 def _look(
     bench: Bench, config: RobotConfig, where: str | int
-) -> Generator[Event, Answer, tuple[CameraInfo, Intrinsics, dict[int, Array], list[str]]]:
+) -> Subroutine[tuple[CameraInfo, Intrinsics, dict[int, Array], list[str]]]:
     """What the camera gives, the lens, each tag's corners (4, 2) over a few pictures, and what is odd about the camera."""
     clock = _clock(bench)
     camera = Camera(CameraSettings(where, exposure=config.camera.exposure, focus=config.camera.focus), clock)
@@ -311,7 +310,7 @@ def _look(
 
 def _lens(
     camera: Camera, clock: Clock, bench: Bench, config: RobotConfig, where: str | int, info: CameraInfo
-) -> Generator[Event, Answer, tuple[Intrinsics, list[str]]]:
+) -> Subroutine[tuple[Intrinsics, list[str]]]:
     """The lens: as robot.toml has it, from views of a board, or from the declared field of view; and what is odd."""
     width, height = info.width, info.height
     known = camera_of_robot(
@@ -343,9 +342,7 @@ def _lens(
         return declared, [f"lens: {error}; the declared field of view is used"]
 
 
-def _board_views(
-    camera: Camera, clock: Clock, board: CharucoBoard
-) -> Generator[Event, Answer, list[NDArray[np.uint8]]]:
+def _board_views(camera: Camera, clock: Clock, board: CharucoBoard) -> Subroutine[list[NDArray[np.uint8]]]:
     """Pictures (h, w) of the board in `VIEWS` places and tilts; fewer where no new one comes for `VIEW_S`."""
     pictures, seen = list[NDArray[np.uint8]](), list[Array]()
     give_up = clock.now() + VIEW_S
@@ -372,7 +369,7 @@ def _path(bench: Bench) -> Path:
 
 def _stand_and_wiggle(
     bench: Bench, config: RobotConfig, setup: CameraFacts, where: str | int, lens: Intrinsics
-) -> Generator[Event, Answer, Recording]:
+) -> Subroutine[Recording]:
     """Lie, stand, turn to and fro, lie: one recording, its phases in the facts."""
     seen = camera_of_robot(replace(config, camera=setup), where)
     assert seen is not None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,19 +20,7 @@ from openant_tools.comms.lateness import REMEDY, losses
 from openant_tools.comms.servos import Servos
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.step import (
-    Answer,
-    Ask,
-    Bench,
-    Drawing,
-    Event,
-    Hands,
-    Intent,
-    Live,
-    Procedure,
-    Progress,
-    Say,
-)  # fmt: skip
+from openant_tools.procedure.step import Ask, Bench, Drawing, Hands, Intent, Live, Procedure, Progress, Say, Subroutine
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.config import Provenance
@@ -191,7 +179,7 @@ def _limit(reached_rad: float, kit_rad: float) -> float:
     return kit_rad if reached_rad > kit_rad - KEEP_OFF_RAD else round(max(0.0, reached_rad - KEEP_OFF_RAD), 5)
 
 
-def _by_hand(bus: Bus, servos: Servos, joints: Sequence[str]) -> Generator[Event, Answer, dict[str, Range]]:
+def _by_hand(bus: Bus, servos: Servos, joints: Sequence[str]) -> Subroutine[dict[str, Range]]:
     """joint → its range by hand. Each is led to both stops, twice; the capture ends by itself when nothing new comes."""
     found: dict[str, Range] = {}
     names = list(servos.joints)
@@ -278,7 +266,7 @@ def _sweep_words(sweeps: Mapping[str, JointSweep]) -> list[str]:
     return words
 
 
-def _library(bench: Bench, setup: str) -> Generator[Event, Answer, Run]:
+def _library(bench: Bench, setup: str) -> Subroutine[Run]:
     """Play the motions and record them in one file; the recording."""
     floor = setup == "floor"
     path = bench.folder.recordings / f"bounds-{setup}.mcap"

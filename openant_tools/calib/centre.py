@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
 
 import numpy as np
 
@@ -16,18 +15,17 @@ from openant_tools.comms.servos import Servo, Servos
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import (
-    Answer,
     Ask,
     Bench,
     Drawing,
-    Event,
     Hands,
     Intent,
     Procedure,
     Progress,
     RegisterChange,
     Say,
-)  # fmt: skip
+    Subroutine,
+)
 from openant_tools.procedure.unfinished import Parts
 from openant_tools.robot.config import MotorSection
 from openant_tools.robot.joints import JOINTS
@@ -147,7 +145,7 @@ def _differs(bench: Bench, motor: MotorSection) -> str:
     return "" if mode == POSITION_MODE else f"its operating mode is {mode}, not {POSITION_MODE}"
 
 
-def _one(bench: Bench, motor: MotorSection) -> Generator[Event, Answer, tuple[float, str]]:
+def _one(bench: Bench, motor: MotorSection) -> Subroutine[tuple[float, str]]:
     """Turn one servo to its mounting angle and hold it while its horn goes on; how far it is off, rad, and what is wrong."""
     joint = motor.joint
     config = bare_config(bench, [Servo(joint, motor.id, motor.servo)], bench.folder.config().bus.baud)

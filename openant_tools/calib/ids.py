@@ -6,7 +6,7 @@ write to two at once is heard by both.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from openant_tools.calib.mute import scan_and_mend
@@ -18,10 +18,8 @@ from openant_tools.comms.scan import BAUDS, Scan, Scanned, scan
 from openant_tools.comms.servos import Servo, Servos
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import (
-    Answer,
     Ask,
     Bench,
-    Event,
     Hands,
     Intent,
     Live,
@@ -29,7 +27,8 @@ from openant_tools.procedure.step import (
     Progress,
     RegisterChange,
     Say,
-)  # fmt: skip
+    Subroutine,
+)
 from openant_tools.procedure.unfinished import Parts
 from openant_tools.robot.config import MotorSection, RobotConfig
 from openant_tools.robot.joints import JOINTS
@@ -102,7 +101,7 @@ def ids(bench: Bench) -> Procedure:
 
 def _one(
     bench: Bench, motor: MotorSection, motors: Sequence[MotorSection], config: RobotConfig
-) -> Generator[Event, Answer, _Wrong | None]:
+) -> Subroutine[_Wrong | None]:
     """One servo from the box; None once it is named and has proven it."""
     words = JOINTS[motor.joint].words
     while True:
@@ -193,7 +192,7 @@ def _rename_to(bench: Bench, bus: Bus, servos: Servos, motor: MotorSection, conf
     return servos
 
 
-def nudge(bench: Bench, servo: Servo, baud: int, angle_rad: float = NUDGE_RAD) -> Generator[Event, Answer, float]:
+def nudge(bench: Bench, servo: Servo, baud: int, angle_rad: float = NUDGE_RAD) -> Subroutine[float]:
     """Blink the LED, turn by `angle_rad` and back with little force; how far it went, rad. Torque is off afterwards.
 
     Raises:
@@ -226,9 +225,7 @@ def nudge(bench: Bench, servo: Servo, baud: int, angle_rad: float = NUDGE_RAD) -
 # ---- servos that are wired already -----------------------------------------------------------------------------------
 
 
-def _rename(
-    bench: Bench, found: Scan, motors: Sequence[MotorSection], config: RobotConfig
-) -> Generator[Event, Answer, list[str]]:
+def _rename(bench: Bench, found: Scan, motors: Sequence[MotorSection], config: RobotConfig) -> Subroutine[list[str]]:
     """Ask of each servo which joint it is, park those whose id is another's, and name all; what could not be done."""
     left = [motor.joint for motor in motors]
     chosen: dict[str, Scanned] = {}

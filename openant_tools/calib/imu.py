@@ -11,7 +11,6 @@ use is made again, twice as far: what the hand was off by counts half as much th
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,19 +23,7 @@ from openant_tools.comms.clock import Clock
 from openant_tools.comms.imu import STANDARD_GRAVITY, Imu
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.step import (
-    Answer,
-    Ask,
-    Bench,
-    Drawing,
-    Event,
-    Hands,
-    Intent,
-    Live,
-    Procedure,
-    Progress,
-    Say,
-)
+from openant_tools.procedure.step import Ask, Bench, Drawing, Hands, Intent, Live, Procedure, Progress, Say, Subroutine
 from openant_tools.robot.config import Provenance
 
 __all__ = ["POSES", "Mounting", "Pose", "imu", "mounting"]
@@ -284,7 +271,7 @@ def imu(bench: Bench) -> Procedure:
     )
 
 
-def _pose(driver: Imu, clock: Clock, pose: Pose) -> Generator[Event, Answer, _Rest]:
+def _pose(driver: Imu, clock: Clock, pose: Pose) -> Subroutine[_Rest]:
     """Hold a pose and read at rest."""
     yield Hands(f"Hold the robot {pose.words} and keep still.", "tilt", path_rad=pose.turn_rad)
     wait(clock, SETTLE_S)
@@ -319,7 +306,7 @@ def _samples(driver: Imu, clock: Clock, seconds: float) -> Array:
 
 def _turns(
     driver: Imu, clock: Clock, rotation: Array, level: _Rest, measured: bool
-) -> Generator[Event, Answer, tuple[list[float], GyroScale | None]]:
+) -> Subroutine[tuple[list[float], GyroScale | None]]:
     """What the gyro read of the turns, rad, and the scale that they say together; None where they say none."""
     now = driver.info.gyro_lsb_per_dps
     yield Progress(0.85, "yaw check")
@@ -343,7 +330,7 @@ def _turns(
     return turns, gyro
 
 
-def _turn(driver: Imu, clock: Clock, rotation: Array, level: _Rest, turn_rad: float) -> Generator[Event, Answer, float]:
+def _turn(driver: Imu, clock: Clock, rotation: Array, level: _Rest, turn_rad: float) -> Subroutine[float]:
     """Integral of the body's yaw rate, less its bias, over a turn to the left, rad."""
     much, seconds = ("half a turn", 2 * QUARTER_S) if turn_rad > 2 else ("a quarter turn", QUARTER_S)
     yield Hands(

@@ -5,7 +5,7 @@ How it stands afterwards is the robot's passport: what every later motion compar
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from openant_tools.calib.ids import locate
@@ -20,18 +20,7 @@ from openant_tools.comms.state import Difference, differences_of_robot, passport
 from openant_tools.comms.vendor_sdk import VendorSdk
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.step import (
-    Answer,
-    Ask,
-    Bench,
-    Event,
-    Hands,
-    Intent,
-    Procedure,
-    Progress,
-    RegisterChange,
-    Say,
-)  # fmt: skip
+from openant_tools.procedure.step import Ask, Bench, Hands, Intent, Procedure, Progress, RegisterChange, Say, Subroutine
 from openant_tools.robot.config import MotorSection, Provenance, RobotConfig
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.registers import EEPROM_END, Register
@@ -182,7 +171,7 @@ def _of_settings(odd: Sequence[Difference]) -> list[Difference]:
 
 def _still_accepted(
     bench: Bench, state: Mapping[str, Mapping[str, int]], present: Sequence[Servo], config: RobotConfig
-) -> Generator[Event, Answer, Mapping[str, Mapping[str, int]]]:
+) -> Subroutine[Mapping[str, Mapping[str, int]]]:
     """The passport's registers; without those that were accepted once and are no longer meant."""
     passport = passport_registers(bench.folder)
     plain, kept = (
@@ -212,9 +201,7 @@ def _ping_all(bus: Bus, config: RobotConfig) -> tuple[dict[str, FoundServo], lis
     )
 
 
-def _missing(
-    bench: Bench, bus: Bus, config: RobotConfig, missing: Sequence[MotorSection]
-) -> Generator[Event, Answer, list[str]]:
+def _missing(bench: Bench, bus: Bus, config: RobotConfig, missing: Sequence[MotorSection]) -> Subroutine[list[str]]:
     """Servos that do not answer: left at another baud rate, which is mended, or not there; in words."""
     yield Progress(None, f"looking for {', '.join(m.joint for m in missing)} at other baud rates")
     elsewhere = locate(bus, missing, config)
@@ -318,7 +305,7 @@ def _values(stretch: Sequence[Register], data: bytes) -> dict[str, int]:
     return {r.name: r.decode(data[r.address - start : r.end - start]) for r in stretch}
 
 
-def _mend(servos: Servos, odd: Sequence[Difference]) -> Generator[Event, Answer, list[Difference]]:
+def _mend(servos: Servos, odd: Sequence[Difference]) -> Subroutine[list[Difference]]:
     """Ask what to do with them, do it; what was accepted as it is."""
     for one in odd:
         yield Say(one.what, "warn")
@@ -340,7 +327,7 @@ def _change(one: Difference) -> RegisterChange:
     return RegisterChange(one.joint, one.register, one.found, one.expected)
 
 
-def _sweep(bus: Bus, servos: Servos, present: Sequence[Servo]) -> Generator[Event, Answer, float | None]:
+def _sweep(bus: Bus, servos: Servos, present: Sequence[Servo]) -> Subroutine[float | None]:
     """The smallest return delay, s, at which no read of all servos loses an answer; None where none is clean."""
     if not present:
         return None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from openant_tools.comms.lateness import LATE_S, REMEDY
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servo, Servos
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.step import Answer, Ask, Bench, Event, Hands, Intent, Live, Procedure, Progress, Say
+from openant_tools.procedure.step import Ask, Bench, Hands, Intent, Live, Procedure, Progress, Say, Subroutine
 from openant_tools.procedure.unfinished import Parts
 from openant_tools.robot.config import RobotConfig
 from openant_tools.robot.joints import JOINTS, LEGS, Leg
@@ -84,7 +83,7 @@ def legs(bench: Bench) -> Procedure:
     )
 
 
-def _one(bench: Bench, leg: Leg, config: RobotConfig) -> Generator[Event, Answer, list[Evidence]]:
+def _one(bench: Bench, leg: Leg, config: RobotConfig) -> Subroutine[list[Evidence]]:
     """One leg; raises HardwareFault with what is wrong with it."""
     joints = [f"hip_{leg.name}", f"knee_{leg.name}"]
     for joint in joints:
@@ -103,7 +102,7 @@ def _one(bench: Bench, leg: Leg, config: RobotConfig) -> Generator[Event, Answer
     return evidence
 
 
-def _by_hand(bus: Bus, joints: list[str], config: RobotConfig) -> Generator[Event, Answer, list[Evidence]]:
+def _by_hand(bus: Bus, joints: list[str], config: RobotConfig) -> Subroutine[list[Evidence]]:
     """Each joint's range and its cables, moved and wiggled by hand, torque off."""
     wait(bus.clock, BOOT_S)
     servos = Servos(bus, robot_servos(config, joints))

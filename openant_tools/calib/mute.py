@@ -6,7 +6,7 @@ writes stand in the journal before they are sent, and are proven by what the ser
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from openant_tools.comms import protocol1
@@ -25,7 +25,7 @@ from openant_tools.comms.silence import (
 from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import EepromWrite, Journal
-from openant_tools.procedure.step import Answer, Bench, Event, Intent, RegisterChange, Say
+from openant_tools.procedure.step import Bench, Intent, RegisterChange, Say, Subroutine
 from openant_tools.robot.config import MotorSection
 
 __all__ = ["Mute", "in_scan", "let_answer", "scan_and_mend", "silenced"]
@@ -87,7 +87,7 @@ def in_scan(found: Scan) -> list[Mute]:
     ] + [Mute(f"id {id}", id, baud, "protocol_type", 1) for id, baud in found.protocol_1]
 
 
-def scan_and_mend(bench: Bench, bus: Bus, command: str) -> Generator[Event, Answer, Scan]:
+def scan_and_mend(bench: Bench, bus: Bus, command: str) -> Subroutine[Scan]:
     """Who is on the bus, once those that were told to be silent answer again."""
     found = scan(bus)
     if in_scan(found):
@@ -96,7 +96,7 @@ def scan_and_mend(bench: Bench, bus: Bus, command: str) -> Generator[Event, Answ
     return found
 
 
-def let_answer(bench: Bench, bus: Bus, mute: Sequence[Mute], command: str) -> Generator[Event, Answer, list[str]]:
+def let_answer(bench: Bench, bus: Bus, mute: Sequence[Mute], command: str) -> Subroutine[list[str]]:
     """Set them back, once that is granted; what was done, in words.
 
     Raises:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from openant_tools.comms.guards import Guards
 from openant_tools.comms.lateness import losses
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.errors import HardwareFault
-from openant_tools.procedure.step import Answer, Event, Live, Progress, Say
+from openant_tools.procedure.step import Live, Progress, Say, Subroutine
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.joints import JOINTS
@@ -113,7 +113,7 @@ def _there_and_back(reach: float, rate_hz: float) -> Array:
     return np.asarray(np.interp(np.arange(0.0, times[-1], 1 / rate_hz), times, corners), float)
 
 
-def sweep(config: EngineConfig, path: Path, words: str) -> Generator[Event, Answer, Run]:
+def sweep(config: EngineConfig, path: Path, words: str) -> Subroutine[Run]:
     """Play the sweep on the stand and record it to `path`; the recording.
 
     Raises:
@@ -139,9 +139,7 @@ def sweep(config: EngineConfig, path: Path, words: str) -> Generator[Event, Answ
     return read_run(path)
 
 
-def play_watched(
-    engine: EngineProcess, command: messages.Command, seconds: float, words: str
-) -> Generator[Event, Answer, None]:
+def play_watched(engine: EngineProcess, command: messages.Command, seconds: float, words: str) -> Subroutine[None]:
     """Start a motion and show joints and progress until it ends; raises HardwareFault where it is stopped."""
     number = engine.start(command)
     names = [servo.joint for servo in engine.config.servos]

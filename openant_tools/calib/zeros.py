@@ -8,7 +8,7 @@ proves the other way round that what is commanded is what moves.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,19 +22,7 @@ from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.servos import Servos
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.step import (
-    Answer,
-    Ask,
-    Bench,
-    Drawing,
-    Event,
-    Hands,
-    Intent,
-    Live,
-    Procedure,
-    Progress,
-    Say,
-)  # fmt: skip
+from openant_tools.procedure.step import Ask, Bench, Drawing, Hands, Intent, Live, Procedure, Progress, Say, Subroutine
 from openant_tools.robot.config import Provenance, RobotConfig
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
 from openant_tools.robot.kit import ANGLE_LIMIT_RAD, NOMINAL_ZERO_RAD
@@ -229,7 +217,7 @@ def zeros(bench: Bench) -> Procedure:
     )
 
 
-def _by_hand(bus: Bus, servos: Servos, joints: tuple[str, ...]) -> Generator[Event, Answer, dict[str, Moved]]:
+def _by_hand(bus: Bus, servos: Servos, joints: tuple[str, ...]) -> Subroutine[dict[str, Moved]]:
     """joint → what turned when the builder moved it; a joint at which nothing turned is missing."""
     found: dict[str, Moved] = {}
     for k, joint in enumerate(joints):
@@ -257,9 +245,7 @@ def _by_hand(bus: Bus, servos: Servos, joints: tuple[str, ...]) -> Generator[Eve
     return found
 
 
-def _swapped(
-    owner: Mapping[str, str], config: RobotConfig, values: dict[str, object]
-) -> Generator[Event, Answer, list[str]]:
+def _swapped(owner: Mapping[str, str], config: RobotConfig, values: dict[str, object]) -> Subroutine[list[str]]:
     """Name servos that sit in each other's place, and let robot.toml follow how the robot is built."""
     words = list[str]()
     for joint, other in owner.items():
@@ -308,7 +294,7 @@ class _Nudged:
     evidence: tuple[Evidence, ...]
 
 
-def _nudge_all(bench: Bench, joints: tuple[str, ...]) -> Generator[Event, Answer, _Nudged]:
+def _nudge_all(bench: Bench, joints: tuple[str, ...]) -> Subroutine[_Nudged]:
     """Move each joint a little by its motor, and see that it goes there, comes back, and no other does."""
     problems, evidence = list[str](), list[Evidence]()
     with EngineProcess(engine_config(bench)) as engine:

@@ -15,7 +15,7 @@ import importlib
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol, TypeVar
 
 from openant_tools.errors import OpenAntError
 from openant_tools.procedure.finding import Finding
@@ -41,6 +41,8 @@ __all__ = [
     "Step",
     "drive",
 ]  # fmt: skip
+
+T = TypeVar("T")
 
 
 # ---- what a procedure says -------------------------------------------------------------------------------------------
@@ -152,7 +154,9 @@ class Drawing:
 
 Event = Progress | Say | Intent | Ask | Hands | Live | Drawing
 Answer = bool | str | float | None
-Procedure = Generator[Event, Answer, Finding]
+#: A part of a procedure, with a result of its own: `result = yield from part(...)`.
+Subroutine = Generator[Event, Answer, T]
+Procedure = Subroutine[Finding]
 
 
 # ---- what runs it ----------------------------------------------------------------------------------------------------
