@@ -133,11 +133,11 @@ def train_async(
     steps: int,
     seed: int,
     settings: SacSettings | None = None,
+    updates_per_step: float = 1.0,
     env_facts: Mapping[str, Any] | None = None,
     device: str = "cpu",
     tensorboard: bool = False,
     report: Callable[[TrainingProgress], None] | None = None,
-    updates_per_step: float = 1.0,
 ) -> TrainingProgress:
     """As `sac.train`, with the updates in a process of their own.
 
