@@ -37,6 +37,7 @@ LEAN_FRESH_S = 0.05
 QUEUE = 64
 #: s; an older pose is not where the robot is now. A camera of 30 pictures a second and 0.1 s latency is within it.
 FRESH_S = 0.25
+#: s between two looks for a new picture: a fifteenth of a period at 30 Hz
 POLL_S = 0.002
 
 

@@ -41,12 +41,15 @@ Image = NDArray[np.uint8]
 
 #: A webcam's exposure, USB transfer and decoding, where nothing was measured.
 TYPICAL_LATENCY_S = 0.07
+#: s that a source may take to open, a picture to come, and the first one to come; OpenCV waits 30 s unless told
 OPEN_TIMEOUT_S = 5.0
 READ_TIMEOUT_S = 2.0
 FIRST_FRAME_TIMEOUT_S = 5.0
+#: s between two tries to open a source that is gone
 REOPEN_EVERY_S = 1.0
 #: A sensor's noise makes no two pictures alike: this long without any change, the camera or its driver hangs.
 FROZEN_S = 0.5
+#: and so many pictures at least: a slow camera sends few within that time
 FROZEN_FRAMES = 5
 #: No picture for this long and for this many periods: the stream has stopped.
 STALLED_S = 0.3

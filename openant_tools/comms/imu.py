@@ -33,19 +33,24 @@ from openant_tools.errors import HardwareFault
 
 __all__ = ["Imu", "ImuInfo", "ImuSample", "ImuStatistics", "open_imu"]
 
+#: m/s², by definition
 STANDARD_GRAVITY = 9.80665
 #: The USB port of a flight controller ignores it; boards behind a real UART are set to this.
 IMU_BAUD = 115_200
+#: s that an answer may take, and how often, and for how long, a board that may still be starting is asked first
 REPLY_TIMEOUT_S = 0.05
 HANDSHAKE_TRIES = 3
 HANDSHAKE_TIMEOUT_S = 0.3
 #: Half a second of silence: the port is closed and opened again, which frees a stuck USB endpoint.
 TIMEOUTS_BEFORE_REOPEN = 10
+#: s between two tries to open a port that is gone
 REOPEN_EVERY_S = 0.5
 #: Sensor noise changes the last bits of every reading; this long without any change is a sensor that hangs.
 FROZEN_S = 0.5
+#: s over which the rate of samples is counted
 RATE_WINDOW_S = 2.0
 
+#: samples by which rest is judged, and how often it is tried
 REST_SAMPLES = 40
 REST_TRIES = 3
 #: At rest: the accelerometer's norm scatters less than this share of itself, the gyro less than this.

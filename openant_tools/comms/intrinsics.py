@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 #: Fewer views do not separate focal length from distance; OpenCV's own guide asks for ten.
 MIN_VIEWS = 8
+#: corners of the board that a view must show to count
 MIN_CORNERS = 12
 #: Above this the board was not flat, the pictures were blurred, or its size was declared wrong.
 GOOD_RMS_PX = 1.0

@@ -23,6 +23,7 @@ __all__ = ["LatencyEstimate", "camera_latency"]
 
 Array = NDArray[np.float64]
 
+#: poses that are needed, and s of latency up to which one is looked for
 MIN_FRAMES = 20
 MAX_LATENCY_S = 0.5
 #: The fit knows nothing of what makes neighbouring pictures err alike: its interval is widened by this.

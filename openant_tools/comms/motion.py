@@ -13,6 +13,7 @@ Array = NDArray[np.float64]
 
 #: fastest speed of a ramp: a leg that swings to its start so slowly can be caught by hand
 RAMP_SPEED_RAD_S = 1.0
+#: s; a shorter ramp over a few counts would be a jerk
 SHORTEST_RAMP_S = 0.3
 #: peak speed of the minimum-jerk profile over its mean: 15/8
 _PEAK_OVER_MEAN = 1.875

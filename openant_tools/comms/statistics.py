@@ -20,6 +20,7 @@ LATENCY_BINS = 160
 DEFAULT_TIMER_S = 16e-3
 #: How alike the phases of arrivals must be (1: all the same), and for how long answers must have waited.
 COMB_STRENGTH, COMB_WAIT_S = 0.7, 3e-3
+#: answers by which it is judged
 COMB_MINIMUM = 50
 
 

@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 
 #: bytes of a sync write of n goals: header and rest, and each servo's id and four bytes
 WRITE_BYTES, WRITE_BYTES_A_SERVO = 14, 5
+#: steps below which no quantile means anything
 FEWEST_STEPS = 5
 #: s; pauses longer than this many median steps belong to no step
 PAUSE = 10.0

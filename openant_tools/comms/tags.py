@@ -46,6 +46,7 @@ Gray = NDArray[np.uint8]
 CORNER_PX = 0.1
 #: Whatever the residuals say: neighbouring corners err alike, which no residual shows.
 CORNER_MIN_PX = 0.04
+#: pictures over which it is known, and before which it is not believed
 CORNER_MEMORY = 200
 CORNER_WARM_UP = 20
 #: Median of chi² with two degrees of freedom (eight coordinates, six unknowns).
@@ -60,6 +61,7 @@ IMU_TILT_RAD = math.radians(2.0)
 PRIOR_FREEDOM = 3.0
 #: A square that fits its corners worse than this is not that square.
 MAX_RESIDUAL_PX = 2.0
+#: pictures over which the origin is averaged, and the fewest for one
 ORIGIN_MEMORY = 60
 ORIGIN_MIN = 5
 #: The origin tag seen this far from where it was, this many pictures running: something was moved.

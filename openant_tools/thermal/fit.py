@@ -38,6 +38,7 @@ DISTURBANCE_K = (0.1, 0.2, 0.35, 0.6, 1.0, 1.8)
 DISTURBANCE_S = (120.0, 400.0, 1200.0)
 #: where the disturbance is about, before any run: ln K and how sure
 _DISTURBANCE_PRIOR = (math.log(0.25), 0.8)
+#: Gauss–Newton steps at most
 ITERATIONS = 25
 
 

@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 
 #: s that a forecast looks ahead; what does not happen until then is "not foreseen"
 HORIZON_S = 8 * 3600.0
+#: s of a simulated step, below the time constant of any winding, and draws of the parameters
 STEP_S = 20.0
 DRAWS = 400
 #: s of a block of the present load: several rounds of any gait, short against a case

@@ -23,6 +23,7 @@ __all__ = ["Body", "BodySettings", "Payload", "Tether"]
 
 Array = NDArray[np.float64]
 
+#: m/s²
 GRAVITY = 9.81
 #: kg·m², the horn of a motor that lies in the box.
 HORN_KG_M2 = 2e-5

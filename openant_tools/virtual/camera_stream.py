@@ -53,6 +53,7 @@ START_TIMEOUT_S = 120.0
 MEMORY = 256
 #: As many pictures as a driver's queue holds; what comes while it is full is lost.
 QUEUE = 4
+#: s for which a snapshot may wait for the process that draws
 SNAPSHOT_TIMEOUT_S = 20.0
 #: s between two looks at a stepped robot's time while a picture waits for it
 LOOK_S = 2e-3

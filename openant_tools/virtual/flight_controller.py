@@ -33,8 +33,10 @@ __all__ = ["BodyState", "FlightController", "FlightControllerSettings"]
 
 Array = NDArray[np.float64]
 
+#: m/s², by definition
 STANDARD_GRAVITY = 9.80665
 I16 = 32767
+#: s between two looks at its motion while nobody asks
 IDLE_S = 0.01
 #: Silence after a lone byte outside every frame, until it is taken for a command (facts/imu.md D1).
 LONE_BYTE_SILENCE_S = 0.1
@@ -44,6 +46,7 @@ BOOT_S = 1.5
 ATTITUDE_GAIN = 0.25
 #: Accelerations outside 0.9 … 1.1 g do not correct the attitude.
 ATTITUDE_GATE = 0.1
+#: s that a calibration of the accelerometer takes
 ACC_CALIBRATION_S = 1.0
 #: Full speed USB hands over once a millisecond; half of that on average.
 USB_LATENCY_S = 0.5e-3

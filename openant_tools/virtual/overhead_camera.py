@@ -40,6 +40,7 @@ FLOOR_TEXEL_M = 0.002
 #: Texels a cell of a tag, and paper around it.
 CELL_TEXELS = 24
 PAPER_CELLS = 1
+#: of the room's light, which flickers at twice that
 MAINS_HZ = 50.0
 
 

@@ -70,6 +70,7 @@ SPIN_S = 2e-4
 ALERT_S = 3e-4
 #: A world that falls behind by more lets the time go: after a laptop's sleep it does not run to catch up.
 MAX_LAG_S = 1.0
+#: s of wall clock for which a stepped robot waits until bytes that were sent have arrived
 SETTLE_TIMEOUT_S = 5.0
 
 

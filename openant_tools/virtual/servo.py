@@ -27,6 +27,7 @@ __all__ = ["READS", "ServoDevice", "read_requests"]
 
 #: Instructions that Status Return Level 1 still answers.
 READS = frozenset({Inst.READ, Inst.SYNC_READ, Inst.FAST_SYNC_READ, Inst.BULK_READ, Inst.FAST_BULK_READ, Inst.PING})
+#: Fast Sync Read came with this firmware (ROBOTIS e-manual).
 FAST_READ_FIRMWARE = 45
 _FAST_READS = (Inst.FAST_SYNC_READ, Inst.FAST_BULK_READ)
 _GROUP_READS = (Inst.SYNC_READ, Inst.BULK_READ, *_FAST_READS)

@@ -27,12 +27,15 @@ from openant_tools.virtual.servo_registers import (
 
 __all__ = ["Loop", "Motor", "PoweredServo", "Sensed", "ServoSnapshot"]
 
+#: Bits of Hardware Error Status (70) and of the mask Shutdown (63).
 VOLTAGE_ERROR, HEAT_ERROR, ENCODER_ERROR, SHOCK_ERROR, OVERLOAD_ERROR = 0x01, 0x04, 0x08, 0x10, 0x20
 
 PULSES_S_PER_COUNT = RAD_S_PER_COUNT * PULSES_PER_TURN / (2 * math.pi)
+#: s, a count of the Bus Watchdog (98)
 WATCHDOG_UNIT_S = 0.02
 #: from here on the Bus Watchdog's one byte is below zero: it has stopped the motion
 TRIPPED = 128
+#: ms after which the Realtime Tick (120) begins anew
 TICK_WRAP = 32768
 #: In position mode an offset beyond a quarter of a turn is ignored (e-manual, Homing Offset).
 HOMING_LIMIT_POSITION = 1024

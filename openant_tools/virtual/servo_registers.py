@@ -14,6 +14,7 @@ __all__ = ["MEMORY", "InstructionRefused", "Item", "ServoRegisters"]
 
 #: bytes of the control table
 MEMORY = 1024
+#: Bits of Drive Mode (10), and values of Operating Mode (11).
 REVERSED, TIME_BASED, TORQUE_BY_GOAL = 0x01, 0x04, 0x08
 POSITION_MODE, EXTENDED_MODE, CURRENT_POSITION_MODE, PWM_MODE, VELOCITY_MODE, CURRENT_MODE = 3, 4, 5, 16, 1, 0
 

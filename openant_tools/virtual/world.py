@@ -29,6 +29,7 @@ __all__ = ["MOUNT_EIGHTHS", "ServoSetup", "SupplySettings", "World", "WorldSetti
 
 #: s between two looks of firmware and supply at themselves.
 POLL_S = 5e-3
+#: s between two steps of heat: a winding takes many seconds
 HEAT_S = 2e-2
 #: s of standstill before mechanics are left out, and for how long at most.
 REST_S, DOZE_S = 0.1, 2.0

@@ -45,6 +45,7 @@ OTHERWISE: Mapping[str, Spread] = {
     "comb": (0.3, 18.0), "stairs": (0.3, 18.0), "gap": (0.35, 7.0), "baud": (1.0, 1.6), "often": (1.0, 1.0),
     "empty": (0.3, 20.0),
 }  # fmt: skip
+#: of a cause by which answers are lost: its `losses`, and its `reach` and silence where nothing says otherwise
 _LOSES = (0.0006, 0.025, 0.975)
 _ALL = {"all": 0.86, "behind": 0.04, "one": 0.02, "pair": 0.02, "scattered": 0.06}
 _SILENT = (0.6, 12.0)
