@@ -27,6 +27,8 @@ Image = NDArray[np.uint8]
 ARROW_RGBA = (0.0, 0.447, 0.698, 1.0)  # Okabe–Ito blue
 CIRCLE_RGBA = (0.337, 0.706, 0.914, 1.0)  # Okabe–Ito sky blue
 CIRCLE_SEGMENTS = 48
+#: pictures side by side in a strip
+STRIP_COLUMNS = 4
 #: bytes that a video may have: it goes into reports
 VIDEO_BYTES = 3_000_000
 #: of WebP, from 0 to 100, in the order in which they are tried until a video is small enough
@@ -191,7 +193,7 @@ class Window:
         self._viewer.close()
 
 
-def write_strip(pictures: Sequence[Image], file: Path, *, seconds_apart: float, columns: int = 4) -> None:
+def write_strip(pictures: Sequence[Image], file: Path, *, seconds_apart: float) -> None:
     """Write pictures side by side, each with its time, as one PNG.
 
     Raises:
@@ -200,7 +202,7 @@ def write_strip(pictures: Sequence[Image], file: Path, *, seconds_apart: float, 
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    columns = min(columns, len(pictures))
+    columns = min(STRIP_COLUMNS, len(pictures))
     rows = -(-len(pictures) // columns)
     height, width, _ = pictures[0].shape
     close_together = ConstrainedLayoutEngine(w_pad=0.01, h_pad=0.01, wspace=0.0, hspace=0.0)

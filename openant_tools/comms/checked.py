@@ -108,7 +108,7 @@ def _goal(command: messages.Goal, servos: Servos, limits: Any) -> messages.Goal:
 
 
 def _look(command: messages.LetPass, servos: Servos, limits: Any) -> messages.LetPass:
-    return replace(command, seconds=_seconds("Look.seconds", command.seconds))
+    return replace(command, seconds=_seconds("LetPass.seconds", command.seconds))
 
 
 def _record(command: messages.Record, servos: Servos, limits: Any) -> messages.Record:

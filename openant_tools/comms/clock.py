@@ -172,7 +172,7 @@ class SteppedClock:
 
     stepped = True
 
-    def __init__(self, control: VirtualControl, *, bus: Line | None = None, imu: Line | None = None) -> None:
+    def __init__(self, control: VirtualControl, *, bus: Line | None = None) -> None:
         self._control = control
         self.lateness = Lateness(real=False)
         self._lines: dict[str, Line] = {}
@@ -189,7 +189,7 @@ class SteppedClock:
                 "this virtual robot runs in real time", where=control.path, remedy='[clock] mode = "stepped"'
             )
         self._t = float(answer["t"])
-        self.attach(bus=bus, imu=imu)
+        self.attach(bus=bus)
 
     def attach(self, *, bus: Line | None = None, imu: Line | None = None) -> None:
         """Take these lines, just opened, as the robot's; those attached before stay, and must be idle."""

@@ -135,13 +135,13 @@ class Host:
         text = _text(self._latency_file(path))
         return int(text) if text.isdigit() else None
 
-    def set_latency_timer_ms(self, path: str, value: int = WANTED_LATENCY_MS) -> bool:
-        """Set it and read it back. False where it did not take: see `udev_rule`."""
+    def set_latency_timer_ms(self, path: str) -> bool:
+        """Set it to what is wanted, and read it back. False where it did not take: see `udev_rule`."""
         try:
-            self._latency_file(path).write_text(str(value))
+            self._latency_file(path).write_text(str(WANTED_LATENCY_MS))
         except OSError:
             pass  # no such timer, or not ours to write: the value read back says so
-        return self.latency_timer_ms(path) == value
+        return self.latency_timer_ms(path) == WANTED_LATENCY_MS
 
     # ---- who holds it, and why it does not open ------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cmath
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from openant_tools.comms.faults import Cause
@@ -39,23 +39,19 @@ class Comb:
     wait_s: float
 
 
-def find_comb(
-    arrivals: Sequence[float], rtt: Sequence[float], wire_s: float = 0.0, period_s: float = DEFAULT_TIMER_S
-) -> Comb | None:
+def find_comb(arrivals: Sequence[float], rtt: Sequence[float]) -> Comb | None:
     """Whether answers come in the beat of a latency timer instead of when they are sent.
 
     Args:
         arrivals: times (s) at which answers were there, one a cycle.
         rtt: s from each request's first byte to that answer.
-        wire_s: what the exchange takes on the wire at least.
-        period_s: of the timer looked for.
     """
     if len(arrivals) < COMB_MINIMUM:
         return None
-    turns = [cmath.exp(2j * math.pi * (t / period_s)) for t in arrivals]
+    turns = [cmath.exp(2j * math.pi * (t / DEFAULT_TIMER_S)) for t in arrivals]
     strength = abs(sum(turns)) / len(turns)
-    wait = sorted(rtt)[len(rtt) // 2] - wire_s
-    return Comb(period_s, strength, wait) if strength > COMB_STRENGTH and wait > COMB_WAIT_S else None
+    wait = sorted(rtt)[len(rtt) // 2]
+    return Comb(DEFAULT_TIMER_S, strength, wait) if strength > COMB_STRENGTH and wait > COMB_WAIT_S else None
 
 
 @dataclass
@@ -148,7 +144,7 @@ class BusStatistics:
             key = ids, tuple(int(one / LATENCY_BIN_S) for one in rtt)
         self._whole[key] = self._whole.get(key, 0) + 1
 
-    def as_dict(self, names: Mapping[int, str] | None = None, ids: Iterable[int] | None = None) -> dict[str, object]:
+    def as_dict(self, names: Mapping[int, str] | None = None) -> dict[str, object]:
         """For JSON: per servo loss, causes, retries and latency quantiles."""
         comb = self.comb
         return {
@@ -171,6 +167,5 @@ class BusStatistics:
                     "latency_p99_s": servo.latency_quantile(0.99),
                 }
                 for id, servo in sorted(self.servos.items())
-                if ids is None or id in ids
             ],
         }

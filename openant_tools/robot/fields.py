@@ -52,7 +52,7 @@ class Unfit(Exception):
 Parse = Callable[[Any], Any]
 
 
-def _field(parse: Parse, default: Any, key: str | None) -> Any:
+def _field(parse: Parse, default: Any, key: str | None = None) -> Any:
     metadata = {"parse": parse, "key": key}
     if isinstance(default, dict | list):
         raise TypeError("a mutable default would be shared")
@@ -97,7 +97,7 @@ def number(
     return _field(_parse_number(low, high, unit, or_zero), default, key)
 
 
-def whole(low: int, high: int, default: Any = MISSING, key: str | None = None) -> Any:
+def whole(low: int, high: int, default: Any = MISSING) -> Any:
     """A whole number from low to high."""
 
     def parse(value: Any) -> int:
@@ -107,7 +107,7 @@ def whole(low: int, high: int, default: Any = MISSING, key: str | None = None) -
             raise Unfit(f"{value} cannot be", f"give a whole number from {low} to {high}")
         return value
 
-    return _field(parse, default, key)
+    return _field(parse, default)
 
 
 def text(default: Any = MISSING, key: str | None = None) -> Any:
@@ -134,7 +134,7 @@ def switch(default: Any = MISSING, key: str | None = None) -> Any:
     return _field(parse, default, key)
 
 
-def choice(options: Sequence[Any], what: str, default: Any = MISSING, key: str | None = None) -> Any:
+def choice(options: Sequence[Any], what: str, default: Any = MISSING) -> Any:
     """One of a few values; `what` they are, for the message."""
 
     def parse(value: Any) -> Any:
@@ -146,10 +146,10 @@ def choice(options: Sequence[Any], what: str, default: Any = MISSING, key: str |
         close = difflib.get_close_matches(value, list(map(str, options)), n=1) if isinstance(value, str) else []
         raise Unfit(f"{value!r} is no {what}", f"did you mean {close[0]!r}?" if close else f"use one of {listed}")
 
-    return _field(parse, default, key)
+    return _field(parse, default)
 
 
-def port(default: Any = "", key: str | None = None) -> Any:
+def port() -> Any:
     """The path of a device, or the number of a camera; empty while it is not known."""
 
     def parse(value: Any) -> str | int:
@@ -157,10 +157,10 @@ def port(default: Any = "", key: str | None = None) -> Any:
             raise Unfit(f"is {_a(value)}, but the path of a device or the number of a camera is needed")
         return value
 
-    return _field(parse, default, key)
+    return _field(parse, "")
 
 
-def vector(size: int, low: float, high: float, unit: str = "", default: Any = MISSING, key: str | None = None) -> Any:
+def vector(size: int, low: float, high: float, unit: str = "", default: Any = MISSING) -> Any:
     """`size` numbers from low to high, in `unit`."""
     element = _parse_number(low, high, unit)
 
@@ -170,7 +170,7 @@ def vector(size: int, low: float, high: float, unit: str = "", default: Any = MI
             raise Unfit(f"{count}, but a list of {size} numbers is needed")
         return tuple(element(number) for number in value)
 
-    return _field(parse, default, key)
+    return _field(parse, default)
 
 
 def stranger(path: str, key: str, known: Sequence[str]) -> ConfigProblem:

@@ -105,15 +105,12 @@ def torque_warning(
     *,
     supply_v: float,
     pwm_limit: float,
-    mass_kg: float | None = None,
 ) -> str | None:
     """What the torque table says before anything is hot: None where every knee holds its stance.
 
     Of the stances of a gait, two legs at 45° (paper): what a walking robot bears all the time.
     """
-    loads = knee_loads(
-        knees, mass_kg or kit.total_mass_kg, (2,), (PAPER_ANGLE_RAD,), supply_v=supply_v, pwm_limit=pwm_limit
-    )
+    loads = knee_loads(knees, kit.total_mass_kg, (2,), (PAPER_ANGLE_RAD,), supply_v=supply_v, pwm_limit=pwm_limit)
     worst = max(loads, key=lambda load: load.torque_nm / load.nominal_nm)
     if worst.verdict == "holds":
         return None

@@ -333,9 +333,9 @@ def _models(run: Inputs) -> tuple[str, ...]:
     return tuple(model.name if model else "" for model in run.models)
 
 
-def held_out(run: Inputs, *, share: float = TRAINED, after: Known | None = None, draws: int = 200) -> HeldOut:
+def held_out(run: Inputs, *, after: Known | None = None, draws: int = 200) -> HeldOut:
     """Fit the first part of a run and meet the rest, whose loads are known and whose temperatures are not."""
-    split = share * run.duration_s
+    split = TRAINED * run.duration_s
     trained = fit([run.until(split)], after=after)
     case = trained.replayed(run, draws)
     rows = run.edges[1:] > trained.inputs.duration_s + 1e-6

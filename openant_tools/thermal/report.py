@@ -26,12 +26,11 @@ __all__ = ["compare_report", "fit_report", "forecast_picture", "forecast_report"
 SHOWN_MIN = 120.0
 
 
-def temperature_picture(found: Fit, run: Inputs, *, split_s: float | None = None) -> MatplotlibFigure:
+def temperature_picture(found: Fit, run: Inputs) -> MatplotlibFigure:
     """One panel a joint: what was read, the model with its 95 % band, the servo's limit.
 
     Args:
         run: what to show, which may go on after what was fitted.
-        split_s: where the fitted part ends, drawn as a line.
     """
     rows = (len(run.joints) + 1) // 2
     case = found.replayed(run, 200) - 0.5
@@ -51,8 +50,6 @@ def temperature_picture(found: Fit, run: Inputs, *, split_s: float | None = None
             )
             if top > run.limit_c[k] - 20:
                 panel.axhline(run.limit_c[k], color=plots.VERMILLION, linewidth=0.9, label="limit")
-            if split_s is not None:
-                panel.axvline(split_s / 60, color=plots.INK, linewidth=0.8, linestyle=":")
             panel.set_title(joint)
         for panel in axes[-1]:
             panel.set_xlabel(plots.axis_label("time", "min"))

@@ -119,8 +119,8 @@ class PtyPort:
 class TcpPort:
     """A TCP server for one client at a time; a stream without a baud rate, so that every rate counts as right."""
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 0) -> None:
-        self._address = (host, port)
+    def __init__(self) -> None:
+        self._address = ("127.0.0.1", 0)
         self._server: socket.socket | None = None
         self._client: socket.socket | None = None
         self.plug()

@@ -140,7 +140,6 @@ class Server:
         stepped: time moves only by the control socket.
         imu: the flight controller, if any. camera: the camera, if any.
         tcp: the bus on a TCP port instead of a pseudo-terminal.
-        folder: where the links and the socket stand; by default a temporary one, removed at the end.
     """
 
     def __init__(
@@ -151,7 +150,6 @@ class Server:
         imu: Device | None = None,
         camera: CameraProcess | None = None,
         tcp: bool = False,
-        folder: Path | None = None,
     ) -> None:
         self.world, self.stepped = world, stepped
         self._idle_s = DOZING_S if world.doze else IDLE_S
@@ -166,8 +164,8 @@ class Server:
         #: the truth is not told
         self.sealed = False
         self._unplugged: set[str] = set()
-        self._own_folder = folder is None
-        self.folder = Path(tempfile.mkdtemp(prefix="openant-")) if folder is None else folder
+        #: of the links and the socket, removed at the end
+        self.folder = Path(tempfile.mkdtemp(prefix="openant-"))
         self.ports: dict[str, ClientPort] = {"bus": TcpPort() if tcp else PtyPort(self.folder / "bus")}
         if imu is not None:
             self.ports["imu"] = PtyPort(self.folder / "imu")
@@ -220,10 +218,7 @@ class Server:
         self._listener.close()
         self._selector.close()
         self._lateness.close()
-        if self._own_folder:
-            shutil.rmtree(self.folder, ignore_errors=True)
-        else:
-            (self.folder / "control").unlink(missing_ok=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def __enter__(self) -> Server:
         return self

@@ -231,13 +231,13 @@ class PoweredServo(ServoRegisters):
     def snapshot(self) -> ServoSnapshot:
         return ServoSnapshot(bytes(self.memory[:EEPROM_END]), self._backup)
 
-    def load(self, snapshot: ServoSnapshot, now: float = 0.0) -> None:
+    def load(self, snapshot: ServoSnapshot) -> None:
         """Take the EEPROM of a servo that ran before, and start from power-on without the mute time."""
         self.memory[:EEPROM_END] = snapshot.eeprom
         self.memory[0:2] = self.model.number.to_bytes(2, "little")
         self.memory[6] = self.firmware
         self._backup = snapshot.backup
-        self.boot(now, mute=False)
+        self.boot(0.0, mute=False)
 
     def _restore_ram(self, backup: bytes) -> None:
         for register in self.registers.values():

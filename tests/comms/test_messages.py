@@ -88,7 +88,7 @@ def test_what_cannot_be_is_refused_by_name_and_nothing_moves(standing: Standing)
         for make, name in (
             (lambda s: messages.Goal(HOME, s), "Goal.seconds"),
             (messages.Hold, "Hold.seconds"),
-            (messages.LetPass, "Look.seconds"),
+            (messages.LetPass, "LetPass.seconds"),
         ):
             refusals.append((make(seconds), (name,)))
     rows = np.repeat(HOME[None, :], 5, axis=0)
@@ -135,7 +135,7 @@ def test_what_cannot_be_is_refused_by_name_and_nothing_moves(standing: Standing)
 def test_bytes_that_are_no_message_are_told_and_the_engine_lives(standing: Standing) -> None:
     for data in (b"", b"\x80", b"no pickle", b"\x80\x04K\x07.", b"\x80\x04cos\nnothing_there\n."):
         standing.engine._connection.send_bytes(data)
-    with pytest.raises(BadInput, match="Look cannot be sent to the engine"):
+    with pytest.raises(BadInput, match="LetPass cannot be sent to the engine"):
         standing.engine.ask(messages.LetPass(lambda: 1.0))  # type: ignore[arg-type]
     assert standing.engine.ask(messages.Statistics())["cycles"] > 0
     told = [event.text for event in standing.engine.events() if isinstance(event, messages.Notice)]

@@ -109,7 +109,7 @@ def test_a_size_that_no_template_has_is_found_and_explains_the_rest(
 
 
 def test_a_tolerance_takes_what_lies_within_it_and_no_more(
-    pendulum: Protocol, simulated: tuple[list[Case], NDArray[np.float32], NDArray[np.float32]]
+    pendulum: RunSet, simulated: tuple[list[Case], NDArray[np.float32], NDArray[np.float32]]
 ) -> None:
     """Gains three tolerances off were once taken for those of an unlikely robot of the same build."""
     bank, templates, healthy = simulated
