@@ -31,8 +31,9 @@ OUTSIDE = "outside"
 LEAST = 1e-6
 #: nats by which held-out data speak strongly against a cause
 STRONGLY = 3.0
-#: what it costs to give a wrong name, to give none where there is one, to leave open what is known, and to name it as one of two
-WRONG, MISSED, OPEN, EITHER = 1.0, 0.7, 0.7, 0.2
+#: what it costs to give a wrong name, to say that nothing is wrong where something is, to leave open what is known (an open question is
+#: better than a wrong all-clear), and to name it as one of two
+WRONG, MISSED, OPEN, EITHER = 1.0, 0.8, 0.7, 0.2
 #: probability from which a further cause goes into the improved model
 PRESENT = 0.5
 
