@@ -69,7 +69,7 @@ def run_page(page: str, shared: Path, work: Path) -> None:
     for report in sorted(work.glob("report*")):
         pictures = re.findall(r"\]\((figures/.*?\.png)\)", (report / "report.md").read_text())
         name = report.name.replace("report", page).lower().replace("_", "-")
-        for picture, what in ((pictures[0], "error"), (pictures[-1], "worst")):
+        for picture, what in ((pictures[0], "worst"), (pictures[-1], "error")):  # first what a report begins with
             shown = f"pictures/{name}-{what}.png"
             if shown in text:
                 save(report / picture, DOCS / shown)
