@@ -29,9 +29,9 @@ from openant_tools.recording.tables import read_run, run_of_columns
 from openant_tools.robot.config import EffectEntry
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.pair import strangers
-from openant_tools.sysid.beyond import brakes_alike, with_effects
 from openant_tools.sysid.dataset import Dataset
 from openant_tools.sysid.declared import Declaration
+from openant_tools.sysid.effect_fit import brakes_alike, with_effects
 from openant_tools.sysid.identify import Identification, Progress, Value, dataset_of, identify, joints_in_common
 from openant_tools.sysid.kinds import ELECTRICAL_DAMPING
 from openant_tools.sysid.quality import without_errors

@@ -24,7 +24,7 @@ from openant_tools.model.mjcf import write_model
 from openant_tools.robot.config import EffectEntry, Provenance
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.pair import PLAIN, mark_of
-from openant_tools.sysid.beyond import TRIED, better, chosen_in_turn
+from openant_tools.sysid.effect_fit import TRIED, better, chosen_in_turn
 from openant_tools.sysid.fit_report import fit_report
 from openant_tools.sysid.identify import Identification, calibrated, restated
 from openant_tools.sysid.kinds import KINDS
