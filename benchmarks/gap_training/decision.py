@@ -25,9 +25,10 @@ from openant_tools.gap.decide import FILE, OUTSIDE, WEIGHTS, Row, chances
 from openant_tools.gap.diagnosis import NONE
 
 #: where weights begin: evidence as it is, held-out data as a few independent errors a fold; and how far from there costs as much as one
-#: robot's surprise
+#: robot's surprise, of those that cannot be negative in logarithms: what should show and does not never speaks for a cause
 START = {"evidence": 1.0, "support": 1.0, "shortfall": 0.3, "none": 0.0, "outside": 0.0, "outside: support": 0.0}
 FAR = 1.0
+POSITIVE = ("evidence", "support", "shortfall")
 #: the weights of what held-out data say
 HELD_OUT = ("support", "shortfall", "outside: support")
 
@@ -69,18 +70,18 @@ def robot(found: Mapping[str, object], truth: Mapping[str, object]) -> Judged:
 
 def learned(sets: Sequence[Sequence[Judged]], *, held_out: bool = True) -> dict[str, float]:
     """The weights under which what is right surprises least; without `held_out` what was not fitted is nothing to them."""
-    start = np.array([START[name] for name in WEIGHTS])
+    mine = [name for name in WEIGHTS if held_out or name not in HELD_OUT]
+    start = np.array([np.log(START[name]) if name in POSITIVE else START[name] for name in mine])
 
-    def surprise(w: NDArray[np.float64]) -> float:
-        named = dict(zip(WEIGHTS, w, strict=True))
-        each = [float(np.mean([_surprise(one, named) for one in some])) for some in sets]
-        return float(np.square((w - start) / FAR).sum()) + max(map(len, sets)) * sum(each)
+    def named(x: NDArray[np.float64]) -> dict[str, float]:
+        found = {name: float(np.exp(v) if name in POSITIVE else v) for name, v in zip(mine, x, strict=True)}
+        return {name: found.get(name, 0.0) for name in WEIGHTS}
 
-    bounds = [(0.0, None) if name in ("evidence", "support", "shortfall") else (None, None) for name in WEIGHTS]
-    if not held_out:
-        start = np.where([name in HELD_OUT for name in WEIGHTS], 0.0, start)
-        bounds = [(0.0, 0.0) if name in HELD_OUT else bound for name, bound in zip(WEIGHTS, bounds, strict=True)]
-    return dict(zip(WEIGHTS, minimize(surprise, start, bounds=bounds).x.tolist(), strict=True))
+    def surprise(x: NDArray[np.float64]) -> float:
+        each = [float(np.mean([_surprise(one, named(x)) for one in some])) for some in sets]
+        return float(np.square((x - start) / FAR).sum()) + max(map(len, sets)) * sum(each)
+
+    return named(minimize(surprise, start).x)
 
 
 def _surprise(one: Judged, weights: Mapping[str, float]) -> float:
