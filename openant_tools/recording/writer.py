@@ -23,6 +23,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from mcap.records import Message
 from mcap.writer import CompressionType, Writer
 
 from openant_tools.errors import BadInput, OpenAntError, StorageFault
@@ -282,6 +283,7 @@ class RecordingWriter:
             self.cycles += topic == "/cycle"
         self._writer.flush()
         self._stream.sync()
+        self._kept_t, self._kept = continued.last_s, self.cycles
 
     def _run(self) -> None:
         """The thread: everything that takes longer than a microsecond, until closed or until the disk refuses."""
@@ -329,6 +331,8 @@ class RecordingWriter:
     def _stop(self, error: OSError) -> RecordingStopped:
         what = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror or str(error)
         kept = ""
+        if self._kept_t is None:
+            self._look_what_is_kept()
         if self._kept_t is not None:
             kept = f"what was recorded until t = {self._kept_t:.3f} s is kept, {self._kept} rows"
         return RecordingStopped(
@@ -336,6 +340,18 @@ class RecordingWriter:
             where=self.path,
             remedy="free space or record to another disk",
         )
+
+    def _look_what_is_kept(self) -> None:
+        """Count the whole rows of a file that was never synced: it is a second old at most, and soon read."""
+        from openant_tools.recording.reader import RecordScan  # which reads what is written here
+
+        try:
+            found = [record for record in RecordScan(self.path) if isinstance(record, Message)]
+        except (BadInput, OSError):
+            return
+        stamps = [record.log_time for record in found if record.channel_id == self._channel_ids[_CYCLE]]
+        if stamps:
+            self._kept_t, self._kept = (max(stamps) - self._stamp_offset) * 1e-9, len(stamps)
 
 
 _CYCLE, _IMU, _POSE, _EVENT, _ROW, _SYNC, _CLOSE = range(7)
