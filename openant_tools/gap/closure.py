@@ -186,7 +186,7 @@ class _Block:
     @classmethod
     def of(cls, errors: Floats, slopes: Floats, count: Array) -> _Block:
         """Of weighted errors (rows, joints) and how each coordinate moves them (coordinates, rows, joints)."""
-        along = slopes.transpose(2, 0, 1)  # of float32, as large as they are
+        along = slopes.transpose(2, 0, 1)  # in float32: nothing of a fit is larger
         left = errors.T[:, :, None]
         return cls(
             np.square(errors, dtype=np.float64).sum(axis=0),
