@@ -96,20 +96,15 @@ def weights() -> Mapping[str, float]:
 
 
 def chances(rows: Sequence[Row], outside: float, weights: Mapping[str, float]) -> dict[str, float]:
-    """NONE, OUTSIDE and the first cause of each hypothesis → probability; they come to one."""
+    """NONE, OUTSIDE and the cause of each hypothesis → probability; they come to one."""
     most = max((row.support for row in rows if row.support is not None), default=0.0)
-    of: dict[str, list[float]] = {
-        OUTSIDE: [
-            weights["outside"] + weights["outside: support"] * max(most, 0.0) + weights["evidence"] * _log(outside)
-        ]
+    logits = {
+        OUTSIDE: weights["outside"] + weights["outside: support"] * max(most, 0.0) + weights["evidence"] * _log(outside)
     }
     for row in rows:
-        own = weights["evidence"] * _log(row.probability)
-        # A cause by itself and the same with another beside it are one name.
         name, more = (row.causes[0], row.held_out(weights)) if row.causes else (NONE, weights["none"])
-        of.setdefault(name, []).append(own + more)
+        logits[name] = weights["evidence"] * _log(row.probability) + more
     # Sorted: sums of the same numbers are the same, in whatever order rows come.
-    logits = {name: float(np.logaddexp.reduce(sorted(some))) for name, some in of.items()}
     whole = float(np.logaddexp.reduce(sorted(logits.values())))
     return {name: math.exp(one - whole) for name, one in logits.items()}
 
@@ -135,10 +130,7 @@ def decide(rows: Sequence[Row], outside: float) -> Decision:
     if verdict == UNEXPLAINED:
         return Decision(UNEXPLAINED, unknown)
 
-    def likely(row: Row) -> float:
-        return learned["evidence"] * _log(row.probability) + row.held_out(learned)
-
-    best = max((row for row in rows if row.causes[:1] == (named[0],)), key=likely)
+    best = next(row for row in rows if row.causes == (named[0],))
     if verdict == AMBIGUOUS:
         return Decision(AMBIGUOUS, p[named[0]] + p[named[1]], (best,), (tuple(named[:2]),))
     return Decision(verdict, p[verdict], (best,))

@@ -18,7 +18,7 @@ from openant_tools.effects.catalogue import catalogue
 from openant_tools.errors import BadInput
 from openant_tools.gap.assess import Assessment, assess
 from openant_tools.gap.decide import Row, adds, decide
-from openant_tools.gap.diagnosis import AMBIGUOUS, UNEXPLAINED, Diagnosis
+from openant_tools.gap.diagnosis import AMBIGUOUS, Diagnosis
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.finding import Given, finding
 from openant_tools.gap.trials import Trials
@@ -68,14 +68,6 @@ def diagnose(
     trials, rows = hypotheses(experiment, prior, lambda share, words: tell(0.02 + 0.73 * share, words))
     assessment = trials.assessment
     decision = decide(rows, assessment.outside)
-    if decision.verdict == UNEXPLAINED:
-        # What no cause explains by itself two may.
-        tell(0.75, "what two causes close together")
-        (first,) = max((causes for causes in trials.closures if causes), key=lambda one: trials.closures[one].closed)
-        trials.fit(pairs := _beside(assessment, (first,)))
-        likely = [assessment.present[first] * assessment.present[causes[-1]] for causes in pairs]
-        both = [trials.whole(causes, chance) for causes, chance in zip(pairs, likely, strict=True)]
-        decision = decide([*rows, *both], assessment.outside)
     chosen = tuple(name for row in decision.selected for name in row.causes)
     while decision.verdict != AMBIGUOUS and chosen in trials.closures and 0 < len(chosen) < CAUSES:
         tell(0.8 + 0.05 * len(chosen), f"what acts beside {' and '.join(chosen)}")

@@ -52,13 +52,6 @@ class Trials:
             return Row(causes, places, probability)
         return Row(causes, places, probability, *_beyond(one, other))
 
-    def whole(self, causes: Causes, probability: float) -> Row:
-        """What is known of causes together, that which does more of it first."""
-        first = max(causes, key=lambda name: self.closures[name,].closed if (name,) in self.closures else -np.inf)
-        ordered = (first, *(name for name in causes if name != first))
-        beyond = _beyond(self.closures[causes], self.closures[()])
-        return Row(ordered, tuple(map(self.assessment.place, ordered)), probability, *beyond)
-
     def removal(self, causes: Causes) -> dict[str, float]:
         """Of causes together, what closes less without each, the most first; of those that were tried without it."""
         whole, out = self.closures[causes], {}

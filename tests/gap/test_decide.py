@@ -50,14 +50,6 @@ def test_two_that_share_what_is_likely_are_ambiguous() -> None:
     assert [row.causes[0] for row in found.selected] == [found.alike[0][0]], "the improved model has one of them"
 
 
-def test_a_cause_is_not_open_against_itself_with_another_beside_it() -> None:
-    alone = replace(LAG, probability=0.45)
-    both = replace(alone, causes=("actuator_lag", "backlash"), joints=((0,), (0,)), support=3.0)
-    found = decide([NOTHING, alone, both], outside=0.05)
-    assert found.verdict == "actuator_lag"
-    assert found.selected == (both,), "the likelier of the two"
-
-
 def test_a_healthy_robot_has_nothing() -> None:
     rows = [
         replace(NOTHING, probability=0.9),
