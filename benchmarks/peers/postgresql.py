@@ -29,6 +29,8 @@ try:
             "openant_tools",
             "tune",
             "sarsa",
+            "--kit",
+            "standard",
             "--storage",
             url,
             "--trials",
