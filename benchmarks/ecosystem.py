@@ -103,7 +103,7 @@ ROWS = {
         ("optuna", "psycopg2-binary"), "pg_lsclusters",
     ),
     "mujoco-3.17": Row(
-        "the oldest MuJoCo with `mujoco.batch`", ((".[parquet]", *PYTEST), ("-", "mujoco-core", "mujoco"), ("--no-deps", "mujoco==3.17.0")),
+        "the oldest MuJoCo with `mujoco.batch`", ((".[camera,parquet]", *PYTEST), ("-", "mujoco-core", "mujoco"), ("--no-deps", "mujoco==3.17.0")),
         tests("tests/model/test_rollout.py", "tests/model/test_plant.py", "tests/model/test_write_model.py", "tests/model/test_plain_mujoco.py"),
         ("mujoco", "mujoco-core"),
     ),
