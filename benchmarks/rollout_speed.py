@@ -24,7 +24,6 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from openant_tools.model.gap import HORIZON_S
 from openant_tools.model.plant import Plant, Setup, load_plant
@@ -32,8 +31,6 @@ from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run
 from openant_tools.robot.mjcf import nominal_model_path
 from openant_tools.sysid.protocols import CommandSpace, protocol
-
-Array = NDArray[np.float64]
 
 #: what `Rollouts` should reach of the bare loop, times the number of cores
 TARGET = 0.9

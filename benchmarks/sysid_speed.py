@@ -25,7 +25,6 @@ from typing import Any
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
-from numpy.typing import NDArray
 
 from openant_tools.model.plant import load_plant
 from openant_tools.model.rollout import Rollouts
@@ -34,8 +33,6 @@ from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
 from openant_tools.sysid.identify import identify
 from openant_tools.sysid.protocols import CommandSpace, protocol
-
-Array = NDArray[np.float64]
 
 #: s; the whole fit on two cores
 TARGET_S = 60.0

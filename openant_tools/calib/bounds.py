@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openant_tools.calib.motions import LIBRARY, motion
 from openant_tools.calib.sweep import JointSweep, analyse, play_watched, sweep
@@ -30,7 +29,6 @@ from openant_tools.robot.kit import ANGLE_LIMIT_RAD
 __all__ = ["Range", "Unwrapped", "bounds", "measured_bounds"]
 
 COMMAND = "openant calib bounds"
-Array = NDArray[np.float64]
 
 #: A stop that hands reach comes within this of the kit's; a joint that turns less is blocked.
 SHORT_RAD = 0.15

@@ -18,7 +18,6 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openant_tools.comms import messages
 from openant_tools.comms.body_sensors import BodySensors
@@ -47,7 +46,6 @@ from openant_tools.recording.writer import RecordingStopped
 
 __all__ = ["Engine", "main", "run"]
 
-Array = NDArray[np.float64]
 
 #: s for which the parent may take its time to hear the last words
 LAST_WORDS_S = 0.5

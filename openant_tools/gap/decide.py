@@ -43,7 +43,7 @@ class Row:
     """One hypothesis.
 
     Attributes:
-        causes: names, the one that is asked about last, or all together; empty for none. joints: of each cause, indices.
+        causes: names, the one that is asked about last; empty for none. joints: of each cause, indices.
         probability: by the evidence: that it leads, or of a further cause that it is there; of none, that nothing leads.
         support: logarithm of how much less it leaves of the gap on held-out folds, mean of them and summed over joints, than what it is asked
             about beside does (no further cause, or the others); None where it was not fitted, or where positions do not tell.

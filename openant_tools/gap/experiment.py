@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.gap.folds import FOLDS
@@ -20,7 +19,6 @@ from openant_tools.recording.run import Run
 
 __all__ = ["Experiment"]
 
-Array = NDArray[np.float64]
 Window = tuple[float, float]
 
 #: s of rows before a window that are kept (what a lag or a buffer remembers, and from where a base is led), and after it

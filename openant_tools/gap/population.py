@@ -16,7 +16,6 @@ from openant_tools.gap.tolerance import random_form, scatter
 
 __all__ = ["Case", "applicable", "draw", "robot_of"]
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 #: how many robots have none, one, two … causes

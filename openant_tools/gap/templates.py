@@ -17,7 +17,6 @@ from openant_tools.gap.features import Floats
 
 __all__ = ["Template", "Templates"]
 
-Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 #: its cause, where that sits, and its coordinates

@@ -1,6 +1,7 @@
 """The measure of how far a robot is from the model: what healthy robots of one build differ by counts little.
 
-Tolerances, chatter, numerical form and sensors are in one covariance, by which differences are whitened.
+Each tolerance first takes of a difference what it may, within its bounds; chatter, numerical form and sensors are in one covariance, by
+which the rest is whitened.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from openant_tools.gap.population import WIDTH, Case
 __all__ = ["CLIP", "Whitening", "whiten"]
 
 Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 #: share by which what healthy robots show beyond their tolerances is taken for independent noise
 SHRUNK = 0.5
