@@ -4,14 +4,13 @@
     python benchmarks/ecosystem.py sb3 minari      these, anew
 
 Each row installs this project and a peer the way a user would, runs one command against the peer's own code, and keeps what it said in
-build/ecosystem/rows.json: a run that was stopped goes on where it was. What cannot be installed here says so. With `uv`
+the page itself: a run that was stopped goes on where it was. What cannot be installed here says so. With `uv`
 on the path it installs, in a third of pip's time; ECOSYSTEM_INSTALL holds further arguments for either.
 """
 
 from __future__ import annotations
 
 import datetime
-import json
 import os
 import platform
 import shlex
@@ -179,7 +178,11 @@ def _versions(python: str, names: tuple[str, ...]) -> str:
     return ", ".join(done.stdout.split("\n")).strip(", ")
 
 
-def page(rows: dict[str, dict[str, Any]]) -> str:
+SIGNS = {True: "✓", False: "✗", None: "–"}
+
+
+def page(told: dict[str, str]) -> str:
+    """The page: of each row what was told of it, or that it was not run."""
     lines = [
         "# Beside other software",
         "",
@@ -189,29 +192,35 @@ def page(rows: dict[str, dict[str, Any]]) -> str:
         "| what | version | command | result | date |",
         "|---|---|---|---|---|",
     ]
-    signs = {True: "✓", False: "✗", None: "–"}
     for name, row in ROWS.items():
-        told = rows.get(name)
-        if told is None:
-            lines.append(f"| {row.what} | | `python {' '.join(row.command)}` | – not run yet | |")
-        else:
-            result = f"{signs[told['ok']]} {told['result']}"
-            lines.append(f"| {row.what} | {told['versions']} | `{told['command']}` | {result} | {told['date']} |")
+        unknown = f"| {row.what} | | `python {' '.join(row.command)}` | – not run yet | |"
+        lines.append(told.get(name, unknown))
     return "\n".join([*lines, ""])
+
+
+def kept() -> dict[str, str]:
+    """Row → its line on the page, where the page has one with a result."""
+    lines = PAGE.read_text(encoding="utf-8").splitlines() if PAGE.is_file() else []
+    return {
+        name: line
+        for name, row in ROWS.items()
+        for line in lines
+        if line.startswith(f"| {row.what} |") and "not run yet" not in line
+    }
 
 
 def main() -> None:
     BUILD.mkdir(parents=True, exist_ok=True)
-    kept = BUILD / "rows.json"
-    rows = json.loads(kept.read_text()) if kept.is_file() else {}
+    told = kept()
     today = datetime.date.today().isoformat()
-    wanted = sys.argv[1:] or [name for name in ROWS if rows.get(name, {}).get("date") != today]
-    for name in wanted:
-        rows[name] = run(name)
-        print(name, rows[name], flush=True)
-        kept.write_text(json.dumps(rows, indent=2))
-        PAGE.write_text(page(rows), encoding="utf-8")
-    PAGE.write_text(page(rows), encoding="utf-8")
+    for name in sys.argv[1:] or [name for name in ROWS if not told.get(name, "").endswith(f"| {today} |")]:
+        found = run(name)
+        print(name, found, flush=True)
+        told[name] = (
+            f"| {ROWS[name].what} | {found['versions']} | `{found['command']}` | "
+            f"{SIGNS[found['ok']]} {found['result']} | {found['date']} |"
+        )
+        PAGE.write_text(page(told), encoding="utf-8")
 
 
 if __name__ == "__main__":
