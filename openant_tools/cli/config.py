@@ -56,12 +56,12 @@ def check(robot: Path | None, json_file: Path | None) -> int:
     from openant_tools.optional import opencv
     from openant_tools.robot.folder import RobotFolder
 
+    click.echo(f"note: {opencv().words}", err=True)  # which is asked for before there is a robot, too
     folder = RobotFolder.at(robot_folder(robot))
     _, located = folder.check()
     errors = [entry for entry in located if entry.problem.severity == "error"]
     for entry in located:
         click.echo(str(entry) if entry.problem.severity == "error" else f"note: {entry}")
-    click.echo(f"note: {opencv().words}", err=True)
     if json_file:
         problems = [{"line": entry.line, **dataclasses.asdict(entry.problem)} for entry in located]
         write_text(json_file, json_text({"consistent": not errors, "problems": problems}, indent=2))
