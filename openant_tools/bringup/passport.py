@@ -93,7 +93,8 @@ def passport(folder: RobotFolder) -> Report:
         _figures(folder),
     )
     report = Report(
-        f"Passport of {config.name}", f"{config.kit} kit, in {folder.path.resolve()}", answer, made_by=COMMAND,
+        f"Passport of {config.name}", f"{config.kit} kit, in {folder.path.resolve()}", answer,
+        made_by=f"{COMMAND} --robot {folder.path}",
         recordings=_recordings(folder),
     )  # fmt: skip
     report.section("Step by step").table(

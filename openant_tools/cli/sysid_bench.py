@@ -254,7 +254,7 @@ def scale(
             joint, own, p_gain=p_gain or float(factory or 0), supply_v=supply, pwm_limit=limit, scale=line, duty=None,
             measured_error=False, weighings=typed, **common,
         )  # fmt: skip
-        _show_stiffness(finding, report)
+        _show_stiffness(finding, report, readings)
         return _conclude(finding, kept, json_file)
 
     from openant_tools.sysid.bench.press import Pressing, press
@@ -304,11 +304,11 @@ def scale(
     return _conclude(finding, kept, json_file)
 
 
-def _show_stiffness(finding: Finding, report: Path | None) -> None:
+def _show_stiffness(finding: Finding, report: Path | None, read: Path | None = None) -> None:
     if report:
         from openant_tools.sysid.bench.report import stiffness_report
 
-        write_report(stiffness_report(finding), report)
+        write_report(stiffness_report(finding), report, [read] if read else ())
     for reading in finding.data["servo_readings"]:
         click.echo(
             f"{reading['deflection_rad']:.3f} rad pressed: error {reading['error_rad']:.4f} rad, "

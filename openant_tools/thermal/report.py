@@ -89,7 +89,7 @@ def forecast_picture(
             panel.set_ylabel(plots.axis_label("case", "°C"))
             panel.set_title(next(one.words for one in told.joints if one.joint == joint))
         axes[-1, 0].set_xlabel(plots.axis_label("time", "min"))
-        plots.legend(axes[0, 0], loc="lower right", bbox_to_anchor=(1.0, 0.0))
+        plots.legend(axes[0, 0])
     return figure
 
 
@@ -198,8 +198,12 @@ def forecast_report(found: Fit, told: HeatForecast, rest: str, run: Inputs | Non
             forecast_picture(found, told, run=run),
             "Dots: what was read; dotted line: now. The fan holds the uncertainty of parameters and room, and how the load varies.",
         ),
-        f"A servo that shuts down lets its leg fall until it is rebooted. Within 8 hours of this load {likely.joint} does with a "
-        f"probability of {percent(likely.probability)}.",
+        "A servo that shuts down lets its leg fall until it is rebooted. Within 8 hours of this load "
+        + (
+            f"{likely.joint} does with a probability of {percent(likely.probability)}."
+            if likely.probability
+            else "none does."
+        ),
         f"{rest[:1].upper()}{rest[1:]}.",
         _shutdown_tone(told),
         [_first_figure(told)],
