@@ -46,6 +46,10 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.enable()
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--long", action="store_true", help="run the blocks of docs/ that are marked long, too")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with what takes minutes, so that at the end no worker waits for another."""
     items.sort(key=lambda item: item.get_closest_marker("minutes") is None)

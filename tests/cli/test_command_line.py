@@ -7,7 +7,6 @@ import os
 import re
 import resource
 import select
-import shlex
 import signal
 import stat
 import subprocess
@@ -20,7 +19,6 @@ import click
 import mujoco
 import numpy as np
 import pytest
-from places import ROOT
 from plants import drive, pendulum, run_of, sweep
 
 from openant_tools.cli import main
@@ -139,36 +137,6 @@ def test_the_version_is_printed() -> None:
     result = openant("--version")
     assert result.returncode == 0
     assert re.match(r"openant, version \d", result.stdout)
-
-
-# ---- what the pages for builders tell to type ----
-
-
-def commands_in(page: Path) -> list[str]:
-    """The commands in a page's blocks of code, continued lines joined, without their comments."""
-    found = []
-    for block in re.findall(r"^```(?:sh)?\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
-        for line in block.replace("\\\n", " ").splitlines():
-            if line.startswith("openant "):
-                found.append(line)
-    return found
-
-
-@pytest.mark.parametrize("page", ["README.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))])
-def test_every_command_in_the_docs_is_one(page: str) -> None:
-    for line in commands_in(ROOT / page):
-        command: click.Command = manual
-        words = shlex.split(line, comments=True)[1:]
-        while isinstance(command, click.Group) and words and not words[0].startswith("-"):
-            found = command.get_command(click.Context(command), words[0])
-            assert found is not None, line
-            command, words = found, words[1:]
-        if isinstance(command, click.Group):
-            continue  # `openant` alone, with or without options, is the terminal program
-        try:
-            command.make_context(command.name, words)
-        except click.UsageError as error:
-            pytest.fail(f"{page}: {line}\n{error.format_message()}")
 
 
 # ---- bad input ----
