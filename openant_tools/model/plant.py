@@ -29,6 +29,7 @@ from openant_tools.robot.model_file import check_model_file
 __all__ = [
     "Plant",
     "Setup",
+    "beside_servos",
     "is_filtered",
     "is_motor",
     "load_plant",
@@ -255,21 +256,38 @@ def position_servos(model: mujoco.MjModel) -> dict[str, int]:
     """
     servos: dict[str, int] = {}
     for i in range(model.nactuator):
-        if model.actuator_trntype[i] != mujoco.mjtTrn.mjTRN_JOINT:
+        if not _pulls_to_setpoint(model, i):
             continue
-        joint = int(model.actuator_trnid[i, 0])
-        if int(model.jnt_type[joint]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
-            continue
-        affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and model.actuator_biasprm[i, 1] < 0
-        inputs = int(model.actuator_ctrlspec[i])  # 0 where it is not said, as in `general`
-        if inputs and not inputs & POSITION_INPUT:
-            continue
-        if model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_INTEGRATOR:
-            continue  # `intvelocity`: its control is a velocity
-        name = model.joint(joint).name
-        if (affine or is_motor(model, i)) and (name not in servos or model.actuator(i).name == name):
+        name = model.joint(int(model.actuator_trnid[i, 0])).name
+        if name not in servos or model.actuator(i).name == name:
             servos[name] = i
     return servos
+
+
+def beside_servos(model: mujoco.MjModel, joint: int, servo: int) -> list[int]:
+    """Ids of the other position servos of the joint (an id) that the actuator `servo` drives."""
+    return [
+        i
+        for i in range(model.nactuator)
+        if i != servo and _pulls_to_setpoint(model, i) and int(model.actuator_trnid[i, 0]) == joint
+    ]
+
+
+def _pulls_to_setpoint(model: mujoco.MjModel, i: int) -> bool:
+    """Whether an actuator controls the position of a hinge or slide."""
+    # Of such joints, `jointinparent` is the same as `joint`.
+    if int(model.actuator_trntype[i]) not in (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)):
+        return False
+    joint = int(model.actuator_trnid[i, 0])
+    if int(model.jnt_type[joint]) not in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+        return False
+    inputs = int(model.actuator_ctrlspec[i])  # 0 where it is not said, as in `general`
+    if inputs and not inputs & POSITION_INPUT:
+        return False
+    if model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_INTEGRATOR:
+        return False  # `intvelocity`: its control is a velocity
+    affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and model.actuator_biasprm[i, 1] < 0
+    return bool(affine or is_motor(model, i))
 
 
 #: What `motor_form` leaves in a DC motor of the joint's damping: as little as can be told from none, since its motor

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.model.floor import resolution
-from openant_tools.model.plant import Plant
+from openant_tools.model.plant import Plant, beside_servos, position_servos
 from openant_tools.model.rollout import Rollouts
 from openant_tools.model.servo import read_stiffness, torque_limit
 from openant_tools.model.stability import NUDGE, growth
@@ -37,10 +37,12 @@ SHORTEST_S = 1.0
 MOVES_QUANTA = 5
 #: share of the samples at the torque limit beyond which a run shows the limit and nothing else
 SATURATED = 0.9
-#: a position follows a command if they correlate above this, and does not below LOOSE
-FOLLOWS, LOOSE = 0.9, 0.5
+#: a position follows a command if they correlate above this
+FOLLOWS = 0.9
 #: it follows another's better if it leaves so much less unexplained than its own does; commands this much alike tell nothing
 BETTER, ALIKE = 0.25, 0.98
+#: and a command is the one that follows if that leaves so much less: no servo moves before it is commanded
+LEADS = 0.5
 #: rows by which a position may come later than its command, and as many of a run as are looked at
 LATEST_ROWS, LOOKED_AT = 15, 20_000
 #: a position that swings this much more or less than the command that it follows is in another unit
@@ -51,6 +53,8 @@ MOST_RAD = 4 * math.pi
 DEGREE_STEPS = (360 / 4096, 360 / 1024, 300 / 1024, 1.0)
 #: s between rows, rad/s and rad: rows so far apart in which a joint moved so far are of no motion as slow as this
 SPARSE_S, CREEPS_RAD_S, WENT_RAD = 0.2, 0.02, 0.1
+#: s between rows that no bus of servos comes near, rad/s that no joint reaches, and into how many parts a run is cut to see it
+DENSE_S, FLIES_RAD_S, PARTS = 1e-3, 100.0, 50
 #: rad, a jump from row to row that is a turn less a moment's motion; s, rows further apart can miss a true one
 WRAP_RAD, WRAP_ROW_S = 5.0, 0.2
 #: rad that a joint may be off a whole turn from its command
@@ -259,6 +263,26 @@ def _time_unit(case: Case) -> Found:
         )
 
 
+def _time_too_short(case: Case) -> Found:
+    """Joints that go further than noise in less time than any servo takes, in rows that lie closer than any bus is read."""
+    if not case.row_s < DENSE_S:
+        return
+    n = max(1, len(case.run.t) // PARTS)
+    for j, joint in enumerate(case.joints):
+        known = np.flatnonzero(np.isfinite(case.pos[:, j]))[::n]
+        if len(known) < 5:
+            continue
+        went, took = np.abs(np.diff(case.pos[known, j])), np.diff(case.run.t[known])
+        far = went > WENT_RAD
+        if far.any() and (speed := float(np.median(went[far] / took[far]))) > FLIES_RAD_S:
+            yield (
+                f"{joint} goes over {span(case.pos[:, j]):.2g} rad in {case.run.duration_s:.2g} s, at {speed:.0f} rad/s: t is "
+                "too small to be in s",
+                "t is in s, and was divided once too often (by 1000?)",
+            )
+            return
+
+
 def _command_time(case: Case) -> Found:
     """Stamps of commands that do not keep pace with those of the rows."""
     stamps = case.run.column("cmd_t")
@@ -433,6 +457,30 @@ def _comes_back(j: int, whose: dict[int, int]) -> bool:
     return False
 
 
+def _before_command(case: Case) -> Found:
+    """Positions that their commands follow: what is called one is the other."""
+    backwards = replace(case, run=_exchanged_columns(case))
+    for j, joint in enumerate(case.joints):
+        if case.moves[j] and case.commanded(j) > MOVES_QUANTA * case.steps[j]:
+            before = _by_delay(backwards, j, j)
+            # What rises once and stays goes along with anything that does, the better the more rows are left out.
+            known = 0 < int(np.argmax(before)) < len(before) - 1
+            if known and max(before) > FOLLOWS and 1 - max(before) < LEADS * (1 - _followed(case, j, j)):
+                yield (
+                    f"cmd.{joint} follows pos.{joint}, and not the other way round",
+                    f"exchange the two columns; where the joint was led by hand, say so by torque.{joint} = 0",
+                )
+
+
+def _exchanged_columns(case: Case) -> Run:
+    """The run with commands and positions each in the place of the other, while torque was on."""
+    columns = dict(case.run.columns)
+    for j, joint in enumerate(case.joints):
+        columns[f"cmd.{joint}"] = case.pos[:, j]
+        columns[f"pos.{joint}"] = np.where(case.on[:, j], case.cmd[:, j], np.nan)
+    return replace(case.run, columns=columns)
+
+
 def _against_command(case: Case) -> Found:
     for j, joint in enumerate(case.joints):
         if case.moves[j] and _correlation(case.cmd[:, j], case.pos[:, j]) < -FOLLOWS:
@@ -501,6 +549,32 @@ def _geared(case: Case) -> Found:
             f"write the servo at the joint, with gear 1: {same}" if affine and gear > 0 else
             "give it gear 1 and its numbers at the joint; where a servo turns backwards, turn the joint's axis",
         )  # fmt: skip
+
+
+def _second_servo(case: Case) -> Found:
+    """Joints that another position servo pulls to its own setpoint, which no log commands."""
+    assert case.plant is not None
+    model = case.plant.model
+    for j, joint in enumerate(case.joints):
+        for i in beside_servos(model, int(model.dof_jntid[case.plant.dof[j]]), int(case.plant.actuator[j])):
+            yield (
+                f"{joint} has two position servos in the model: beside the one that is commanded {model.actuator(i).name or i!r} "
+                "pulls it to 0",
+                "leave one of them, with the stiffness of both",
+            )
+
+
+def _without_servo(case: Case) -> Found:
+    """Joints of the model that the log commands, and that hang limp in it."""
+    assert case.plant is not None
+    model, servos = case.plant.model, position_servos(case.plant.model)
+    for k in range(model.njnt):
+        joint = str(model.joint(k).name)
+        if joint and joint not in servos and case.run.has("cmd", [joint]) and span(case.run.column(f"cmd.{joint}")) > 0:
+            yield (
+                f"cmd.{joint} is logged, and no position servo of the model drives {joint}: it hangs limp there",
+                f'give it one: <position joint="{joint}" kp="…" forcerange="…"/>',
+            )
 
 
 def _coupled(case: Case) -> Found:
@@ -706,11 +780,16 @@ def _correlation(a: Array, b: Array) -> float:
 
 def _followed(case: Case, k: int, j: int) -> float:
     """How well position j follows command k, with the delay that suits it best."""
+    return max(_by_delay(case, k, j))
+
+
+def _by_delay(case: Case, k: int, j: int) -> list[float]:
+    """How well position j follows command k, for each delay in rows."""
     rows = slice(0, LOOKED_AT)
     cmd = case.cmd[rows, k]
     pos = np.where(case.on[rows, j], case.pos[rows, j], np.nan)
     latest = min(LATEST_ROWS, len(pos) // 4)
-    return max(_correlation(cmd[: len(cmd) - late], pos[late:]) for late in range(latest + 1))
+    return [_correlation(cmd[: len(cmd) - late], pos[late:]) for late in range(latest + 1)]
 
 
 def _wraps(t: Array, values: Array) -> NDArray[np.int64]:
@@ -771,10 +850,13 @@ def _turns(pos: Array, cmd: Array, on: NDArray[np.bool_]) -> int:
 RULES: tuple[Rule, ...] = (
     Rule("one row", Verdict.NOTE, _few_rows),
     Rule("unit of time", Verdict.REFUSE, _time_unit),
+    Rule("too short a time", Verdict.REFUSE, _time_too_short),
     Rule("unit of command stamps", Verdict.REFUSE, _command_time),
     Rule("too short", Verdict.REFUSE_FIT, _too_short),
     Rule("nothing moves", Verdict.REFUSE_FIT, _nothing_moves),
     Rule("gear", Verdict.REFUSE, _geared, needs_model=True),
+    Rule("second servo", Verdict.REFUSE, _second_servo, needs_model=True),
+    Rule("no servo", Verdict.NOTE, _without_servo, needs_model=True),
     Rule("limits in registers", Verdict.REFUSE_FIT, _by_registers),
     Rule("joint that does not move", Verdict.REFUSE_FIT, _does_not_move),
     Rule("wrapped angle", Verdict.NOTE, _wrapped, of_turns=True),
@@ -782,6 +864,7 @@ RULES: tuple[Rule, ...] = (
     Rule("different units", Verdict.REFUSE_FIT, _other_units),
     Rule("degrees", Verdict.NOTE, _degrees),
     Rule("exchanged columns", Verdict.REFUSE, _exchanged),
+    Rule("before its command", Verdict.REFUSE, _before_command),
     Rule("against its command", Verdict.REFUSE_FIT, _against_command),
     Rule("beyond range", Verdict.NOTE, _beyond_range, needs_model=True),
     Rule("beyond ctrlrange", Verdict.NOTE, _beyond_ctrlrange, needs_model=True),

@@ -106,6 +106,49 @@ def test_a_log_with_few_rows_and_quick_servos_is_in_seconds(tmp_path: Path) -> N
     assert not [line for line in said_of(run, chain(tmp_path)) if "looks like" in line]
 
 
+@pytest.mark.parametrize("hz", [100, 1000])
+def test_time_that_was_divided_once_too_often_is_refused(hz: float, tmp_path: Path) -> None:
+    run = played(tmp_path, np.arange(0.0, 4.0, 1 / hz))
+    assert "t is too small to be in s" in refused(replace(run, t=run.t * 1e-3), chain(tmp_path))
+
+
+@pytest.mark.parametrize("joints", [("knee",), ("hip", "knee")])
+def test_commands_and_positions_in_each_others_place_are_refused(joints: tuple[str, ...], tmp_path: Path) -> None:
+    run = played(tmp_path)
+    other = {"cmd": "pos", "pos": "cmd"}
+    columns = {f"{name}.{joint}": run.columns[f"{other[name]}.{joint}"] for name in other for joint in joints}
+    assert f"cmd.{joints[0]} follows pos.{joints[0]}" in refused(
+        replace(run, columns={**run.columns, **columns}), chain(tmp_path)
+    )
+
+
+def test_a_joint_that_is_led_by_hand_is_no_exchange(tmp_path: Path) -> None:
+    """Its goal follows it, torque off."""
+    run = played(tmp_path)
+    led = {"cmd.knee": run.columns["pos.knee"], "pos.knee": run.columns["cmd.knee"], "torque.knee": 0 * T}
+    said_of(replace(run, columns={**run.columns, **led}), chain(tmp_path))
+
+
+def test_a_ramp_that_gravity_bends_is_no_exchange(tmp_path: Path) -> None:
+    run = played(tmp_path)
+    rises = np.clip(T / 2, 0, 1)
+    columns = {**run.columns, "cmd.knee": rises, "pos.knee": np.round(0.8 * rises**1.5 / QUANTUM) * QUANTUM}
+    said_of(replace(run, columns=columns), chain(tmp_path))
+
+
+def test_a_joint_of_two_servos_is_refused_and_one_with_a_damper_is_not(tmp_path: Path) -> None:
+    model = chain(tmp_path)
+
+    def beside(actuator: str) -> Path:
+        return plants.write(tmp_path / "two.xml", model.read_text().replace("</actuator>", f"{actuator}</actuator>"))
+
+    second = beside('<position name="spare" joint="knee" kp="5"/>')
+    assert "knee has two position servos in the model: beside the one that is commanded 'spare'" in refused(
+        played(tmp_path), second
+    )
+    said_of(played(tmp_path), beside('<velocity joint="knee" kv="0.1"/>'))
+
+
 def test_stamps_of_commands_in_milliseconds_are_refused(tmp_path: Path) -> None:
     run = played(tmp_path, cmd_t=1000 * T + 0.5)
     assert "cmd_t goes on to 3.99e+03 s after the first row, t to 3.99 s" in refused(run, chain(tmp_path))
@@ -257,6 +300,20 @@ def test_a_fit_goes_through_the_rules_once_and_says_each_note_once(
     assert notes[0] in heard
     for note in notes:
         assert (said + heard).count(note) == 1, note
+
+
+def test_a_joint_without_a_servo_is_said_to_hang_limp(tmp_path: Path) -> None:
+    model = chain(tmp_path)
+    text = model.read_text().replace('<position name="hip" joint="hip" kp="5" forcerange="-4 4"/>', "")
+    plant = load_plant(plants.write(tmp_path / "limp.xml", text))
+    (said,) = check_runs([played(tmp_path)], [plant])
+    assert "cmd.hip is logged, and no position servo of the model drives hip" in said
+
+
+def test_a_servo_may_act_in_the_parents_frame(tmp_path: Path) -> None:
+    """Of a hinge that is the same."""
+    text = chain(tmp_path).read_text().replace('name="hip" joint="hip"', 'name="hip" jointinparent="hip"')
+    assert load_plant(plants.write(tmp_path / "parent.xml", text)).joints == ("hip", "knee")
 
 
 def test_what_lies_within_is_not_spoken_of(tmp_path: Path) -> None:
