@@ -52,7 +52,7 @@ docs-check: $(VENV)/.dev
 ecosystem:
 	@$(PYTHON) benchmarks/ecosystem.py
 
-# docs/tour.md and its pictures: the terminal program itself, walked with a virtual robot.
+# docs/tour.md, its pictures and its film: the terminal program itself, walked with a virtual robot. Half an hour.
 tour: $(VENV)/.all
 	$(BIN)/python -m openant_tools.tui.tour docs
 

@@ -2,7 +2,8 @@
 
     python -m openant_tools.tui.tour docs        (or: make tour)
 
-Each picture is the program itself on a virtual robot, so that the page says what the program does.
+Each picture is the program itself on a virtual robot, so that the page says what the program does; and so is the film of
+the whole walk, from `openant` in an empty folder to an agent that walks, with nothing but keys.
 """
 
 from __future__ import annotations
@@ -14,23 +15,31 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 from textual.pilot import Pilot
+from textual.widgets import Input
 
+from openant_tools.bringup.walk import WALK
 from openant_tools.errors import HardwareFault
 from openant_tools.files import write_text
 from openant_tools.robot.folder import create_robot
 from openant_tools.tui.app import OpenAnt
 from openant_tools.tui.choices import Choices
+from openant_tools.tui.dialogs import Question
 from openant_tools.tui.feeds import ReplayFeed
+from openant_tools.tui.film import Film
 from openant_tools.tui.leg_map import REST_S
-from openant_tools.tui.screens.step import StepScreen
+from openant_tools.tui.screens.step import STOP, StepScreen
 
 __all__ = ["PAGES", "make"]
 
 PATIENCE_S = 120.0
+#: s for the longest step, and for the training, on a busy machine
+LONG_S = 3600.0
+#: s in which a viewer sees what a key answers
+READ_S = 0.7
 
 #: picture → heading and words of the page
 PAGES: dict[str, tuple[str, str]] = {
@@ -79,8 +88,19 @@ OPENANT_ASCII=1 NO_COLOR=1 openant   # for terminals with neither Unicode nor co
 ```
 """
 
+FILM = """\
+## The whole of it
+
+`openant` in an empty folder, at 80 by 24, with a virtual robot in loose parts: every key that is pressed is shown below the screen.
+Waiting is cut, what takes long plays as the root of its time.
+
+![The walk, from loose motors, in the program's own frames](pictures/tour-film.svg)
+"""
+
 TAIL = """\
-## Keys
+## Reference
+
+### Keys
 
 | key | |
 |---|---|
@@ -119,9 +139,13 @@ def make(docs: Path) -> None:
         try:
             asyncio.run(_walk(take))
             asyncio.run(_replay(take, recording))
+            place = Path(folder) / "film"
+            place.mkdir()
+            film = asyncio.run(film_walk(place))
         finally:
             os.chdir(here)
-    parts = [HEAD]
+    write_text(pictures / "tour-film.svg", film.svg("The walk, from loose motors, in the program's own frames"))
+    parts = [HEAD, FILM]
     for name, (title, words) in PAGES.items():
         parts.append(f"## {title}\n\n{words}\n\n![{title}](pictures/tour-{name}.svg)\n")
     write_text(docs / "tour.md", "\n".join([*parts, TAIL]))
@@ -185,6 +209,67 @@ async def _walk(take: Callable[[OpenAnt, str], None]) -> None:
         app.session.close()
 
 
+async def film_walk(folder: Path) -> Film:
+    """The walk as a new user goes it: `openant` in an empty folder, a virtual robot in loose parts, every step, an agent.
+
+    Raises:
+        HardwareFault: it does not go on, or the agent does not learn.
+    """
+    os.chdir(folder)
+    app = OpenAnt(Path(), clock="stepped")
+    film = Film(app)
+    try:
+        async with app.run_test(size=(80, 24)) as pilot:
+
+            async def press(*keys: str) -> None:
+                for key in keys:
+                    await pilot.pause(READ_S)
+                    film.press(key)
+                    await pilot.press(key)
+                await pilot.pause()
+
+            film.roll()
+            await press("v", "enter", "enter")  # a virtual robot; its folder; loose motors in their box
+            await _until(pilot, lambda: app.session.virtual is not None and not app.session.doing)
+            await press("1", "enter")
+            await _go_through(pilot, app, press)
+            await press("escape", "t", "tab", "tab")  # the screen on which agents learn
+            await press("enter")
+            await _until(pilot, lambda: app.session.learning, LONG_S)
+            await _until(pilot, lambda: not app.session.learning, LONG_S)
+            await pilot.pause(2.0)
+            film.look()
+    finally:
+        app.session.close()
+    return film
+
+
+async def _go_through(pilot: Pilot[int], app: OpenAnt, press: Callable[..., Awaitable[None]]) -> None:
+    """Every step to the last: what is offered first is chosen; the virtual robot's hands do what hands do."""
+    names = list(WALK)
+    while True:
+        await _until(pilot, lambda: isinstance(app.screen, Question) or bool(_offered(pilot)) or _asked(pilot), LONG_S)
+        screen = app.screen
+        if not isinstance(screen, StepScreen):
+            await press("enter")
+        elif STOP in _offered(pilot):
+            await press("space")
+        elif screen.step.name == names[-1] and not screen.running and screen.found is not None:
+            return
+        else:
+            wanted = ("Let the virtual", "Next: ", "Yes, and all further")
+            at = next((k for words in wanted for k, line in enumerate(_offered(pilot)) if line.startswith(words)), None)
+            chooser = screen.query_one("#choices", Choices)
+            while at is not None and chooser.highlighted is not None and chooser.highlighted != at:
+                await press("down" if chooser.highlighted < at else "up")
+            await press("enter")
+
+
+def _asked(pilot: Pilot[int]) -> bool:
+    """Whether a number is asked for."""
+    return isinstance(pilot.app.focused, Input) and isinstance(pilot.app.screen, StepScreen)
+
+
 async def _replay(take: Callable[[OpenAnt, str], None], recording: Path) -> None:
     from openant_tools.recording.tables import read_run
 
@@ -224,8 +309,8 @@ async def _choose(pilot: Pilot[int], words: str) -> None:
     await pilot.pause()
 
 
-async def _until(pilot: Pilot[int], what: Callable[[], bool]) -> None:
-    give_up = time.monotonic() + PATIENCE_S
+async def _until(pilot: Pilot[int], what: Callable[[], bool], patience_s: float = PATIENCE_S) -> None:
+    give_up = time.monotonic() + patience_s
     while not what():
         if time.monotonic() > give_up:
             raise HardwareFault(f"the tour stands still where it offers {_offered(pilot)}", remedy="walk it by hand")

@@ -107,6 +107,11 @@ and can be begun again: what it found or wrote before stays, and every write to 
         self.introduce()
 
     @property
+    def found(self) -> Finding | None:
+        """What it found, now or the last time."""
+        return self._found
+
+    @property
     def running(self) -> bool:
         """Whether its procedure has not come to its end yet."""
         return self._run is not None

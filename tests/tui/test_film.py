@@ -1,0 +1,74 @@
+"""The film of the terminal program: its own frames, waiting cut, a still where nothing may move."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from xml.etree import ElementTree
+
+from textual.app import App, ComposeResult
+from textual.widgets import Static
+
+from openant_tools.tui.film import END_S, LONGEST_S, STILL_S, Film
+
+
+class Counter(App[int]):
+    """Shows how often `a` was pressed, on two lines that never change."""
+
+    BINDINGS = [("a", "more", "More")]  # noqa: RUF012
+    pressed = 0
+
+    def compose(self) -> ComposeResult:
+        yield Static("[bold]always[/] the same & <this>")
+        yield Static("0", id="count")
+
+    def action_more(self) -> None:
+        self.pressed += 1
+        self.query_one("#count", Static).update(f"[reverse]{self.pressed}[/] times")
+
+
+class Clock:
+    """Stands still until it is set."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def filmed(pauses: list[float]) -> Film:
+    async def run() -> Film:
+        app, clock = Counter(), Clock()
+        film = Film(app, clock)
+        async with app.run_test(size=(40, 4)) as pilot:
+            film.look()
+            for pause in pauses:
+                clock.now += pause
+                film.press("a")
+                await pilot.press("a")
+                await pilot.pause()
+                clock.now += 0.5
+                film.look()
+        return film
+
+    return asyncio.run(run())
+
+
+def test_a_film_shows_each_frame_and_moves_only_the_rows_that_change() -> None:
+    svg = filmed([1.0, 1.0, 1.0]).svg("Counting")
+    root = ElementTree.fromstring(svg)
+    assert root.get("aria-label") == "Counting"
+    said = "".join(root.itertext())
+    for words in ("always", "1", "3", "times", "& <this>"):
+        assert words in said
+    # The row of the count and the row of the key; nothing else has anything to show at another time.
+    assert len(re.findall(r"@keyframes", svg)) == 2
+    assert "prefers-reduced-motion:no-preference" in svg
+    assert "<script" not in svg
+
+
+def test_waiting_is_cut_and_the_whole_is_never_long() -> None:
+    frames = filmed([600.0, 1.0]).cut()
+    assert frames[-1][0] < 8 * STILL_S
+    assert [moment for moment, _ in frames] == sorted(moment for moment, _ in frames)
+    assert filmed([30.0] * 400).cut()[-1][0] <= LONGEST_S - END_S
