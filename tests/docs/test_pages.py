@@ -32,7 +32,11 @@ from openant_tools.recording.tables import write_table
 
 PAGES = ["README.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md")))]
 #: what a fence may say of a block of commands beside its language
-MARKS = {"": "runs in CI", "long": "runs in `make docs-check`", "elsewhere": "needs hands, a cable, or files of others"}
+MARKS = {
+    "": "runs in CI",
+    "long": "runs in `make docs-check`",
+    "elsewhere": "needs hands, a real robot, or what others or other days have made",
+}
 #: option → the most of it that is run here, in its own unit
 AMOUNTS = {
     "--steps": 100, "--minutes": 1, "--trials": 2, "--seeds": 2, "--seconds": 12, "--robots": 2, "--soaks": 2, "--starts": 2,
@@ -229,6 +233,8 @@ def prepared(tmp_path_factory: pytest.TempPathFactory, thorough: bool) -> Path:
     run("config export --robot my-ant --out ant12.json", folder)
     if thorough:
         run("sysid record --protocol stand --seconds 8 --robot my-ant --out one.mcap", folder)
+        for name in ("sac-1", "sac-2"):
+            run(f"train sac --robot my-ant --steps 30 --out my-ant/runs/{name}", folder)
     else:
         t = np.arange(0.0, 4.0, 0.01)
         write_table(
@@ -257,6 +263,8 @@ def test_the_commands_of_a_page_work_in_their_order(
     lines = [line for block in blocks(page) if runs(block, thorough) for line in block.commands]
     if any("config new" in line for line in lines):  # it begins without a robot
         shutil.rmtree(folder / "my-ant")
+    for name in (name for line in lines for name in re.findall(r"--out (\S+)", line)):  # which the page makes
+        shutil.rmtree(folder / name) if (folder / name).is_dir() else (folder / name).unlink(missing_ok=True)
     for block in blocks(page):
         if block.language == "sh" and block.text.startswith("cat > "):
             subprocess.run(["bash", "-c", block.text], cwd=folder, check=True)
@@ -304,6 +312,11 @@ def fit_for_here(words: list[str]) -> list[str]:
     for option in ("--virtual", "--yes", "--until-eof"):
         if option in options and option not in words and not (option == "--virtual" and simulated):
             words = [*words, option]
+    if "--virtual" in words and "--port" in words:  # which the virtual robot has of its own
+        at = words.index("--port")
+        words = [*words[:at], *words[at + 2 :]]
+    if words[:2] == ["comms", "watch"]:  # until Ctrl-C
+        words = [*words, "--seconds", "2"]
     for option, most in AMOUNTS.items():
         if option in words:
             at = words.index(option) + 1
