@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 
-__all__ = ["UNKNOWN", "decimals_of", "exact", "is_error", "number", "percent", "readable", "span"]
+__all__ = ["UNKNOWN", "column", "decimals_of", "exact", "is_error", "number", "percent", "readable", "span"]
 
 UNKNOWN = "unknown"
 #: digits that count, of a number without an interval
@@ -34,13 +35,15 @@ def readable(value: float, unit: str, name: str = "") -> tuple[float, str]:
     """The factor by which numbers of a unit are multiplied to be read, and the unit then; `value` is a typical one.
 
     Args:
-        unit: as files have it; `1` and nothing mean that there is none.
+        unit: as files have it; `1` and nothing mean that there is none, `share` a share of 1.
         name: of the quantity, see `is_error`.
     """
     if unit == "rad":
         return (1e3, "mrad") if is_error(name) else (math.degrees(1), "°")
     if unit == "rad/s":
         return math.degrees(1), "°/s"
+    if unit == "share":
+        return 100.0, "%"
     if unit in SMALL and 0.0 < abs(value) < SMALL_BELOW[unit]:
         return SMALL[unit]
     return 1.0, "" if unit == "1" else unit
@@ -94,6 +97,18 @@ def number(
     words = _plain(shown, places)
     plus = "+" if sign and not words.startswith("−") else ""
     return f"{plus}{words}{_joined(unit)}{interval}"
+
+
+def column(values: Sequence[float | None], unit: str = "", *, name: str = "") -> list[str]:
+    """Numbers that stand below each other: as many places after the point as the largest deserves, and one unit."""
+    known = [value for value in values if value is not None and math.isfinite(value)]
+    most = max(map(abs, known), default=0.0)
+    factor, read = readable(most, unit, name)
+    whole = all((factor * value).is_integer() for value in map(float, known))
+    places = 0 if whole else decimals_of(factor * most, None, read)
+    if unit in SMALL and read != unit:  # each alone might choose the larger unit
+        return [number(None if v is None else factor * v, read, decimals=places) for v in values]
+    return [number(value, unit, name=name, decimals=places) for value in values]
 
 
 def exact(value: float, unit: str = "") -> str:

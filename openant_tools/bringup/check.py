@@ -27,6 +27,7 @@ from openant_tools.comms.servos import Servos
 from openant_tools.comms.state import BY_FACTORY, differences_of_robot, passport_registers, read_state, stopping
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.gap.measure import measure
+from openant_tools.numbers import number, percent
 from openant_tools.procedure.finding import Evidence, Finding, latest
 from openant_tools.procedure.step import Ask, Bench, Intent, Procedure, Progress, Say, Subroutine
 from openant_tools.recording.run import Facts, Run
@@ -142,7 +143,8 @@ def check(bench: Bench) -> Procedure:
         for name, share in outside.items():
             low, high = config.observation[name]
             yield Say(
-                f"{name} was outside its bounds {low:.3g} … {high:.3g} for {100 * share:.0f} % of the twitch", "warn"
+                f"{name} was outside its bounds {number(low)} … {number(high)} for {percent(share, decimals=0)} of the twitch",
+                "warn",
             )
     for line in BEFORE_A_SESSION:
         yield Say(line)
@@ -174,11 +176,11 @@ def unjudged(before: Mapping[str, JointSweep], now: Mapping[str, JointSweep]) ->
                 )
             elif new.followed < FOLLOWED:
                 words.append(
-                    f"{joint}: cannot judge its {what}, because it went only {100 * new.followed:.0f} % of the way that it was told "
+                    f"{joint}: cannot judge its {what}, because it went only {percent(new.followed, decimals=0)} of the way that it was told "
                     "→ is it blocked? Turn it by hand, torque off, and check again"
                 )
             elif _measured(value) is None:
-                found = "was not measured" if value is None else f"of {value:.3f} N·m cannot be"
+                found = "was not measured" if value is None else f"of {number(value, 'N·m', decimals=3)} cannot be"
                 words.append(f"{joint}: cannot judge its {what}, because a {what} {found} → check again")
         if new.temperature_c is None or new.volts is None:
             words.append(f"{joint}: cannot judge its supply and temperature, because it did not tell them → its cable")
@@ -196,17 +198,19 @@ def changed(before: Mapping[str, JointSweep], now: Mapping[str, JointSweep]) -> 
         if was is not None and is_now is not None:
             if is_now > FRICTION_FACTOR * was and is_now - was > FRICTION_NM:
                 words.append(
-                    f"{joint}: friction {is_now:.3f} N·m, it was {was:.3f} → gear (thread-locker, a worn "
+                    f"{joint}: friction {number(is_now, 'N·m', decimals=3)}, it was {number(was, decimals=3)} → gear (thread-locker, a worn "
                     "tooth), or the screws of its horn and idler too tight"
                 )
             elif is_now < was / FRICTION_FACTOR - FRICTION_NM:
-                words.append(f"{joint}: friction {is_now:.3f} N·m, it was {was:.3f} → is its horn screw loose?")
+                words.append(
+                    f"{joint}: friction {number(is_now, 'N·m', decimals=3)}, it was {number(was, decimals=3)} → is its horn screw loose?"
+                )
         was, is_now = _measured(old.weight_nm), _measured(new.weight_nm)
         if JOINTS[joint].kind == "knee" and was is not None and is_now is not None:
             share = is_now / was - 1
             if abs(is_now - was) > WEIGHT_NM and abs(share) > WEIGHT_SHARE:
                 words.append(
-                    f"{joint}: its leg weighs {100 * abs(share):.0f} % {'less' if share < 0 else 'more'} than it did → "
+                    f"{joint}: its leg weighs {percent(abs(share), decimals=0)} {'less' if share < 0 else 'more'} than it did → "
                     + (
                         "a foot was lost, or a part of the lower leg"
                         if share < 0
@@ -232,14 +236,14 @@ def _stops(joint: str, old: JointSweep, new: JointSweep) -> list[str]:
         ]
     if any(abs(shift) > 2 * ZERO_RAD for shift in shifts):
         return [
-            f"{joint}: one of its stops has moved by {math.degrees(max(shifts, key=abs)):+.1f}° → something is in its way"
+            f"{joint}: one of its stops has moved by {number(max(shifts, key=abs), 'rad', sign=True, decimals=1)} → something is in its way"
         ]
     return []
 
 
 def _zero_words(joint: str, shift: float) -> str:
     return (
-        f"{joint}: its zero has changed by {math.degrees(shift):+.1f}° (both stops moved) → horn screw or spline; then "
+        f"{joint}: its zero has changed by {number(shift, 'rad', sign=True, decimals=1)} (both stops moved) → horn screw or spline; then "
         "`openant calib zeros`"
     )
 
@@ -264,7 +268,7 @@ def loose(lost: Mapping[str, float], chain: Sequence[Sequence[str]], known: Sequ
             first = cable.index(there[0])
             between = f"between {cable[first - 1]} and {there[0]}" if first else f"from the board to {there[0]}"
             out.append(
-                f"{there[0]}: {100 * lost[there[0]]:.1f} % of its answers were lost while it moved → a loose connector {between}"
+                f"{there[0]}: {percent(lost[there[0]], decimals=1)} of its answers were lost while it moved → a loose connector {between}"
             )
     return out
 
@@ -329,11 +333,13 @@ def _at_rest(
         lowest, highest = config.motors[joint].servo.supply_range_v
         if not lowest <= value <= highest + 0.5:
             problems.append(
-                f"{joint}: is supplied with {value:.1f} V, it needs {lowest:.1f} to {highest:.1f} → supply and power plug"
+                f"{joint}: is supplied with {number(value, 'V', decimals=1)}, it needs {number(lowest, decimals=1)} to {number(highest, decimals=1)} → supply and power plug"
             )
     for joint, value in warm.items():
         if value > config.motors[joint].servo.temperature_limit_c - COOL_K:
-            problems.append(f"{joint}: is at {value:.0f} °C already → let it cool before the session")
+            problems.append(
+                f"{joint}: is at {number(value, '°C', decimals=0)} already → let it cool before the session"
+            )
     return problems
 
 
@@ -342,9 +348,13 @@ def _warm_or_weak(now: Mapping[str, JointSweep], config: RobotConfig) -> list[st
     for joint, one in now.items():
         model = config.motors[joint].servo
         if one.temperature_c is not None and one.temperature_c > model.temperature_limit_c - COOL_K:
-            words.append(f"{joint}: {one.temperature_c:.0f} °C after a slow sweep → let it cool; is it blocked?")
+            words.append(
+                f"{joint}: {number(one.temperature_c, '°C', decimals=0)} after a slow sweep → let it cool; is it blocked?"
+            )
         if one.volts is not None and one.volts < model.supply_range_v[0]:
-            words.append(f"{joint}: its supply fell to {one.volts:.1f} V while it moved → power plug, or a weak supply")
+            words.append(
+                f"{joint}: its supply fell to {number(one.volts, 'V', decimals=1)} while it moved → power plug, or a weak supply"
+            )
     return words
 
 
@@ -376,10 +386,12 @@ def _imu(bench: Bench, config: RobotConfig, evidence: list[Evidence]) -> list[st
     ]
     words = []
     if abs(norm / STANDARD_GRAVITY - 1) > GRAVITY_SHARE:
-        words.append(f"IMU: reads {norm:.2f} m/s² at rest → its scale has changed (new firmware?): `openant calib imu`")
+        words.append(
+            f"IMU: reads {number(norm, 'm/s²', decimals=2)} at rest → its scale has changed (new firmware?): `openant calib imu`"
+        )
     if lean > LEAN_RAD:
         words.append(
-            f"IMU: the torso leans by {math.degrees(lean):.0f}° → put it level, or the board has come loose: `openant calib imu`"
+            f"IMU: the torso leans by {number(lean, 'rad', decimals=0)} → put it level, or the board has come loose: `openant calib imu`"
         )
     if float(np.linalg.norm(gyro)) > STILL_RAD_S:
         words.append("IMU: the gyro turns at rest → was it moved while it was powered on? Power it off and on, still")
@@ -442,7 +454,7 @@ def _against_model(
         if joint not in before
     ]
     return [
-        f"{joint}: moves differently from its model ({1e3 * off:.1f} mrad, it was {1e3 * was:.1f}) → screws, gear, or a "
+        f"{joint}: moves differently from its model ({number(off, 'rad', name='error', decimals=1)}, it was {number(1e3 * was, decimals=1)}) → screws, gear, or a "
         "part that was exchanged; `openant gap diagnose` says more"
         for joint, off in now.items()
         if (was := before.get(joint)) is not None

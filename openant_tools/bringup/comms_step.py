@@ -10,6 +10,7 @@ from openant_tools.calib.wires import engine_config
 from openant_tools.comms.dropouts.diagnose import diagnose_dropouts
 from openant_tools.comms.dropouts.outcome import dropouts_finding
 from openant_tools.comms.soak import soak
+from openant_tools.numbers import exact, number
 from openant_tools.procedure.finding import together
 from openant_tools.procedure.step import Ask, Bench, Intent, Procedure
 from openant_tools.recording.tables import read_run
@@ -35,11 +36,13 @@ def comms_step(bench: Bench) -> Procedure:
     minutes = float(minutes) if isinstance(minutes, int | float) else DEFAULT_MIN
     if minutes == 0.0:
         return still
-    yield Intent(f"swing all legs gently on the stand for {minutes:g} min, and keep what the bus loses", moves=True)
+    yield Intent(
+        f"swing all legs gently on the stand for {exact(minutes)} min, and keep what the bus loses", moves=True
+    )
     path = bench.folder.recordings / "comms-soak.mcap"
     path.unlink(missing_ok=True)
     config, text = engine_config(bench), bench.folder.config_file.read_text(encoding="utf-8")
-    yield from relayed(
+    soaked = yield from relayed(
         lambda progress, notice: soak(
             config, path, 60 * minutes, robot_toml=text, notice=notice,
             progress=lambda share, statistics: progress("the legs swing", share),
@@ -47,6 +50,9 @@ def comms_step(bench: Bench) -> Procedure:
     )  # fmt: skip
     told = yield from relayed(lambda progress, notice: diagnose_dropouts([read_run(path, need=())]))
     moving = dropouts_finding(told, [bench.folder.relative(path)], COMMAND)
+    if not soaked.whole:
+        why = f"the legs swung for {number(soaked.seconds, 's')} of {number(60 * minutes, 's')}: {soaked.ended or 'motion stopped'}"
+        moving = replace(moving, ok=together(moving.ok, None), unsure=(*moving.unsure, f"{why} → run it again"))
     return replace(
         still,
         ok=together(still.ok, moving.ok),

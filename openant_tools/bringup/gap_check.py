@@ -9,6 +9,7 @@ import numpy as np
 from openant_tools.bringup.relay import relayed
 from openant_tools.errors import BadInput
 from openant_tools.gap.measure import Measurement, difference, measure
+from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding, latest
 from openant_tools.procedure.step import Bench, Procedure
 from openant_tools.recording.tables import read_run
@@ -58,13 +59,14 @@ def gap_check(bench: Bench) -> Procedure:
     return Finding(
         "gap",
         False if worse else None if unsure else True,
-        f"simulated joints are {1e3 * after.gaps['pos']:.2f} mrad off (nominal {1e3 * before.gaps['pos']:.2f}, "
-        f"floor {1e3 * after.floors['pos']:.2f})" + (f", most at {worst.joint} in {worst.regime}" if worst else ""),
+        f"simulated joints are {number(after.gaps['pos'], 'rad', name='error', decimals=2)} off (nominal {number(1e3 * before.gaps['pos'], decimals=2)}, "
+        f"floor {number(1e3 * after.floors['pos'], decimals=2)})"
+        + (f", most at {worst.joint} in {worst.regime}" if worst else ""),
         (
             Evidence("position gap, nominal", before.gaps["pos"], "rad", "0.5 s horizon, held-out recording"),
-            Evidence("position gap, calibrated", after.gaps["pos"], "rad", "the same"),
+            Evidence("position gap, calibrated", after.gaps["pos"], "rad", "the same", most=before.gaps["pos"]),
             Evidence("floor", after.floors["pos"], "rad", "repeats of the recording"),
-            Evidence("gap closed", closed, "1", "1 − excess after / before"),
+            Evidence("gap closed", closed, "share", "1 − excess after / before"),
         ),
         "the calibrated model is worse: record again, or `openant gap diagnose`" if worse else "",
         COMMAND,

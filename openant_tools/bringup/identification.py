@@ -7,6 +7,7 @@ import datetime
 from openant_tools import sysid
 from openant_tools.bringup.relay import relayed
 from openant_tools.calib.wires import engine_config
+from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Bench, Intent, Procedure
 from openant_tools.recording.tables import read_run
@@ -30,7 +31,7 @@ def identification(bench: Bench) -> Procedure:
     wanted = takes(out, played, 0)
     judge = takes(out.with_name(f"identify-{stamp}-held-out.mcap"), played, 1, repeats=2)
     yield Intent(
-        f"play `{PROTOCOL}` three times for {RECORD_S:.0f} s on the stand, legs free, and fit the model to what is seen",
+        f"play `{PROTOCOL}` three times for {number(RECORD_S, 's', decimals=0)} on the stand, legs free, and fit the model to what is seen",
         moves=True,
     )
     config = engine_config(bench, imu=None)
@@ -53,11 +54,17 @@ def identification(bench: Bench) -> Procedure:
     return Finding(
         "identify",
         False if not closer else None if result.doubt else True,
-        f"error on a motion it has not seen: {1e3 * best.before.full:.1f} → {1e3 * best.after.full:.2f} mrad{beside} "
-        f"(floor {1e3 * best.floor:.2f})",
+        f"error on a motion it has not seen: {number(1e3 * best.before.full, decimals=2)} → {number(best.after.full, 'rad', name='error', decimals=2)}{beside} "
+        f"(floor {number(1e3 * best.floor, decimals=2)})",
         (
             Evidence("error before", best.before.full, "rad", "nominal model, held-out recording, full run"),
-            Evidence("error after", best.after.full, "rad", f"calibrated model{beside}, the same recording"),
+            Evidence(
+                "error after",
+                best.after.full,
+                "rad",
+                f"calibrated model{beside}, the same recording",
+                most=best.before.full,
+            ),
             Evidence("floor", result.floor, "rad", "two repeats of that recording"),
         ),
         "" if closer else "look at fit/report.html; the nominal model stays in use",

@@ -30,6 +30,7 @@ from openant_tools.comms.setup import camera_of_robot
 from openant_tools.comms.tags import TagDetector, tag_pose
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.files import write_bytes
+from openant_tools.numbers import number
 from openant_tools.optional import cv2
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Ask, Bench, Drawing, Hands, Intent, Procedure, Progress, Say, Subroutine
@@ -172,13 +173,13 @@ def arena(bench: Bench) -> Procedure:
     if sizes.wrong:
         declared = setup.body_tag_size_m if sizes.wrong == "body" else setup.origin_tag_size_m
         wrong.append(
-            f"tag size: the {sizes.wrong}'s tag is declared {1e3 * declared:.0f} mm, but everything fits only if its edge is about "
-            f"{1e3 * (sizes.size_m or 0.0):.0f} mm → measure it, correct camera.{sizes.wrong}_tag_size_m in robot.toml, run it again"
+            f"tag size: the {sizes.wrong}'s tag is declared {number(1e3 * declared, 'mm', decimals=0)}, but everything fits only if its edge is about "
+            f"{number(1e3 * (sizes.size_m or 0.0), 'mm', decimals=0)} → measure it, correct camera.{sizes.wrong}_tag_size_m in robot.toml, run it again"
         )
     yaw = _mean_angle(lying["yaw"])
     if abs(yaw) > BY_EYE_RAD:
         problems.append(
-            f"the robot's tag is glued {math.degrees(yaw):+.0f}° askew (or the robot was) → camera.body_tag_yaw_rad takes it into account"
+            f"the robot's tag is glued {number(yaw, 'rad', sign=True, decimals=0)} askew (or the robot was) → camera.body_tag_yaw_rad takes it into account"
         )
     if lens.source == BOARD:
         values |= {
@@ -196,16 +197,25 @@ def arena(bench: Bench) -> Procedure:
     evidence = [
         *evidence_of_lens,
         Evidence("camera's height", camera_m, "m", "pose of the origin's tag"),
-        Evidence("distance by size over distance by height", sizes.ratio, "1", "lying robot"),
+        Evidence(
+            "distance by size over distance by height",
+            sizes.ratio,
+            "1",
+            "lying robot",
+            least=1 - SIZE_SHARE,
+            most=1 + SIZE_SHARE,
+        ),
         Evidence("rise seen over rise by legs", sizes.step_ratio, "1", "standing up"),
-        Evidence("tag yaw", yaw, "rad", "robot placed along the origin's tag"),
+        Evidence("tag yaw", yaw, "rad", "robot placed along the origin's tag", least=-BY_EYE_RAD, most=BY_EYE_RAD),
     ]
     share = _turned(record, turning)
-    evidence.append(Evidence("body's turn over the hips', opposite", share, "1", "camera, feet in place"))
+    evidence.append(
+        Evidence("body's turn over the hips', opposite", share, "1", "camera, feet in place", least=TURNED_SHARE)
+    )
     if not math.isfinite(share):
         unsure.append("which way the hips turn the body: joints or tag were not seen while it turned → run it again")
     elif share < TURNED_SHARE:
-        turned = f"with its feet in place the body turned by {share:+.2f} of what its hips turned the other way → "
+        turned = f"with its feet in place the body turned by {number(share, sign=True, decimals=2)} of what its hips turned the other way → "
         if share < -TURNED_SHARE:
             wrong.append(f"{turned}hips turn the wrong way: `openant calib zeros`")
         else:
@@ -225,7 +235,7 @@ def arena(bench: Bench) -> Procedure:
         ]  # fmt: skip
         if not 1 / GYRO_FACTOR < late.scale < GYRO_FACTOR:
             wrong.append(
-                f"the gyro turned by {1 / late.scale:+.2f} of what the camera saw → its board is mounted otherwise than robot.toml "
+                f"the gyro turned by {number(1 / late.scale, sign=True, decimals=2)} of what the camera saw → its board is mounted otherwise than robot.toml "
                 "says: `openant calib imu`; or the picture is mirrored"
             )
         elif abs(late.scale - 1) > max(SAME_SHARE, 3 * late.scale_error):
@@ -236,7 +246,7 @@ def arena(bench: Bench) -> Procedure:
             bias = [round(now / gyro.counts_per_dps * one, 6) for one in config.imu.gyro_bias_rad_s]
             values["imu.gyro_bias_rad_s"] = bias
             problems.append(
-                f"the gyro has {gyro.words}, not {now:.2f}: the tag turned by {100 * (late.scale - 1):+.1f} % more than it said "
+                f"the gyro has {gyro.words}, not {number(now, decimals=2)}: the tag turned by {number((late.scale - 1), 'share', sign=True, decimals=1)} more than it said "
                 f"→ imu.gyro_counts_per_dps takes it into account from now on; {old_rates(now, gyro)}"
             )
         if abs(late.latency_s) > LATE_S and latency_s > 0:
@@ -251,8 +261,8 @@ def arena(bench: Bench) -> Procedure:
     return Finding(
         "arena",
         ok,
-        f"camera at {camera_m:.2f} m, tags {origin_id} and {body_id}"
-        + ("" if latency_s is None else f", picture stamps {1e3 * abs(late.latency_s):.0f} ms off"),
+        f"camera at {number(camera_m, 'm', decimals=2)}, tags {origin_id} and {body_id}"
+        + ("" if latency_s is None else f", picture stamps {number(1e3 * abs(late.latency_s), 'ms', decimals=0)} off"),
         tuple(evidence),
         "" if ok else "mend what is listed and run it again" if wrong else "see to what is listed and run it again",
         COMMAND,
@@ -328,7 +338,7 @@ def _lens(
     sheet = bench.folder.path / "charuco-board.png"
     write_bytes(sheet, cv2.imencode(".png", board.image())[1].tobytes())
     yield Drawing(
-        f"The board to print and glue to something flat: its squares must measure {1e3 * board.square_m:.0f} mm.",
+        f"The board to print and glue to something flat: its squares must measure {number(1e3 * board.square_m, 'mm', decimals=0)}.",
         picture=sheet,
     )
     yield Hands("Have the printed board at hand.", "free")

@@ -4,22 +4,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from openant_tools.calib.motions import LIBRARY, motion
 from openant_tools.calib.sweep import JointSweep, analyse, play_watched, sweep
-from openant_tools.calib.wires import SETTLE_S, engine_config, opened_bus, rest, robot_servos, servo_angles, wait
+from openant_tools.calib.wires import (
+    SETTLE_S,
+    engine_config,
+    in_joints,
+    opened_bus,
+    rest,
+    robot_servos,
+    servo_angles,
+    wait,
+)
 from openant_tools.comms import messages
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.lateness import REMEDY, losses
 from openant_tools.comms.servos import Servos
 from openant_tools.errors import HardwareFault
+from openant_tools.numbers import number, percent
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Ask, Bench, Drawing, Hands, Intent, Live, Procedure, Progress, Say, Subroutine
+from openant_tools.procedure.unfinished import Parts
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.config import Provenance
@@ -91,7 +102,7 @@ def bounds(bench: Bench) -> Procedure:
         servos = Servos(bus, robot_servos(config))
         servos.identify()
         servos.set_torque(False)
-        ranges = yield from _by_hand(bus, servos, bench.joints or JOINT_NAMES)
+        ranges = yield from _by_hand(bench, bus, servos, bench.joints or JOINT_NAMES)
     limits = dict[str, tuple[float, float]]()
     for joint, motor in config.motors.items():
         kit_limit = ANGLE_LIMIT_RAD[JOINTS[joint].kind]
@@ -100,8 +111,22 @@ def bounds(bench: Bench) -> Procedure:
             limits[joint] = (motor.min_rad, motor.max_rad)
             continue
         evidence += [
-            Evidence(f"{joint} low end", seen.low, "rad", "by hand, torque off"),
-            Evidence(f"{joint} high end", seen.high, "rad", "by hand, torque off"),
+            Evidence(
+                f"{joint} low end",
+                seen.low,
+                "rad",
+                "by hand, torque off",
+                least=-kit_limit - FAR_RAD,
+                most=SHORT_RAD - kit_limit,
+            ),
+            Evidence(
+                f"{joint} high end",
+                seen.high,
+                "rad",
+                "by hand, torque off",
+                least=kit_limit - SHORT_RAD,
+                most=kit_limit + FAR_RAD,
+            ),
         ]
         problems += _range_words(joint, seen, kit_limit)
         limits[joint] = (-_limit(-seen.low, kit_limit), _limit(seen.high, kit_limit))
@@ -122,9 +147,11 @@ def bounds(bench: Bench) -> Procedure:
     bench.folder.update(values, provenance=Provenance("measured", COMMAND))
     swept = yield from sweep(engine_config(bench, imu=None), bench.folder.recordings / "sweep.mcap", "slow sweep")
     sweeps = analyse(swept, limits)
+    most = {kind: _most_friction(sweeps, kind) for kind in ("hip", "knee")}
     for one in sweeps.values():
+        source = "slow sweep, from duty and back-EMF"
         evidence.append(
-            Evidence(f"friction of {one.joint}", one.friction_nm, "N·m", "slow sweep, from duty and back-EMF")
+            Evidence(f"friction of {one.joint}", one.friction_nm, "N·m", source, most=most[JOINTS[one.joint].kind])
         )
     problems += _sweep_words(sweeps)
     missed = losses(swept)
@@ -177,11 +204,21 @@ def _limit(reached_rad: float, kit_rad: float) -> float:
     return kit_rad if reached_rad > kit_rad - KEEP_OFF_RAD else round(max(0.0, reached_rad - KEEP_OFF_RAD), 5)
 
 
-def _by_hand(bus: Bus, servos: Servos, joints: Sequence[str]) -> Subroutine[dict[str, Range]]:
+def _by_hand(bench: Bench, bus: Bus, servos: Servos, joints: Sequence[str]) -> Subroutine[dict[str, Range]]:
     """joint → its range by hand. Each is led to both stops, twice; the capture ends by itself when nothing new comes."""
     found: dict[str, Range] = {}
     names = list(servos.joints)
+    parts = Parts(bench.folder, "bounds", joints, bench.joints)
+    if parts.before:
+        yield Say(parts.words)
     for k, joint in enumerate(joints):
+        # A range is told from the joint's zero: where that is another now, it is no longer known.
+        zero = [servos[joint].zero_rad, servos[joint].direction]
+        if joint in parts.before:
+            if parts.before[joint].get("zero") == zero:
+                found[joint] = Range(**parts.before[joint]["range"])
+                continue
+            yield Say(f"{joint} has another zero than when it was moved; it is done again", "warn")
         yield Progress(k / len(joints), f"{joint}: range by hand")
         servo, at = servos[joint], names.index(joint)
         far = ANGLE_LIMIT_RAD[JOINTS[joint].kind] + 0.1
@@ -195,7 +232,8 @@ def _by_hand(bus: Bus, servos: Servos, joints: Sequence[str]) -> Subroutine[dict
         extreme = 0.0
         while bus.clock.now() - start < LONGEST_S:
             wait(bus.clock, SAMPLE_S)
-            angle = servo.to_joint(track.add(float(servo_angles(servos)[0][at])))
+            row = servo_angles(servos)[0]
+            angle = servo.to_joint(track.add(float(row[at])))
             angle = angle if abs(angle) < math.pi else (angle + math.pi) % (2 * math.pi) - math.pi
             if seen.add(angle):
                 newest = bus.clock.now()
@@ -209,16 +247,21 @@ def _by_hand(bus: Bus, servos: Servos, joints: Sequence[str]) -> Subroutine[dict
             both = seen.high > 0.1 and seen.low < -0.1
             mark = ("both ends seen" if both else "the other end, too") + (", seam crossed" if track.seam else "")
             limit = ANGLE_LIMIT_RAD[JOINTS[joint].kind]
-            enough = yield Live({joint: angle}, "rad", "range by hand", {joint: -limit}, {joint: limit}, {joint: mark})
+            enough = yield Live(
+                {joint: angle}, "rad", "range by hand; Enter where it goes no further", {joint: -limit}, {joint: limit},
+                {joint: mark}, in_joints(servos, row),
+            )  # fmt: skip
             if enough is True or (both and bus.clock.now() - newest > QUIET_S and bus.clock.now() - start > 4.0):
                 break
         seen.seam = track.seam
         yield Hands("Let go.", "free")
         if seen.high - seen.low < 0.05:
             raise HardwareFault(
-                f"{joint} was not moved within {LONGEST_S:.0f} s", remedy="move the joint that is named"
+                f"{joint} was not moved within {number(LONGEST_S, 's', decimals=0)}",
+                remedy="move the joint that is named",
             )
         found[joint] = seen
+        parts.done(joint, zero=zero, range=asdict(seen))
     wait(bus.clock, SETTLE_S / 2)
     return found
 
@@ -238,26 +281,39 @@ def _range_words(joint: str, seen: Range, limit: float) -> list[str]:
         short = abs(kit_end) - abs(end)
         if short > SHORT_RAD:
             words.append(
-                f"{joint}: stops {math.degrees(short):.0f}° early going {name} → a cable in the way, a screw, or a wrong spline"
+                f"{joint}: stops {number(short, 'rad', decimals=0)} early going {name} → a cable in the way, a screw, or a wrong spline"
             )
         elif -short > FAR_RAD:
-            words.append(f"{joint}: turns {math.degrees(-short):.0f}° beyond its stop going {name} → the horn is loose")
+            words.append(
+                f"{joint}: turns {number(-short, 'rad', decimals=0)} beyond its stop going {name} → the horn is loose"
+            )
     return words
+
+
+def _of_kind(sweeps: Mapping[str, JointSweep], kind: str) -> dict[str, float]:
+    """joint → its friction, N·m, of all that are hips, or knees."""
+    return {j: s.friction_nm for j, s in sweeps.items() if JOINTS[j].kind == kind and s.friction_nm is not None}
+
+
+def _most_friction(sweeps: Mapping[str, JointSweep], kind: str) -> float | None:
+    """N·m: a joint with more is odd among those of its kind."""
+    mine = _of_kind(sweeps, kind)
+    return 2 * float(np.median(list(mine.values()))) + 0.03 if mine else None
 
 
 def _sweep_words(sweeps: Mapping[str, JointSweep]) -> list[str]:
     """What is odd already on a new robot: a joint far from the others of its kind, lost answers."""
     words = []
     for kind in ("hip", "knee"):
-        mine = {j: s.friction_nm for j, s in sweeps.items() if JOINTS[j].kind == kind and s.friction_nm is not None}
+        mine, most = _of_kind(sweeps, kind), _most_friction(sweeps, kind)
         middle = float(np.median(list(mine.values()))) if mine else 0.0
         words += [
-            f"{joint}: friction {friction:.2f} N·m, the other {kind}s have {middle:.2f} → screws too tight, or thread-locker in the gear"
+            f"{joint}: friction {number(friction, 'N·m', decimals=2)}, the other {kind}s have {number(middle, decimals=2)} → screws too tight, or thread-locker in the gear"
             for joint, friction in mine.items()
-            if friction > 2 * middle + 0.03
+            if most is not None and friction > most
         ]
     words += [
-        f"{joint}: {100 * one.lost:.1f} % of its answers were lost while it moved → look at its cable"
+        f"{joint}: {percent(one.lost, decimals=1)} of its answers were lost while it moved → look at its cable"
         for joint, one in sweeps.items()
         if one.lost > 0.01
     ]

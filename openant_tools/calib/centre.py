@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from openant_tools.calib.sweep import play_watched
@@ -13,6 +11,7 @@ from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.motion import ramp
 from openant_tools.comms.servos import Servo, Servos
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import (
     Ask,
@@ -82,11 +81,7 @@ def centre(bench: Bench) -> Procedure:
             differs = _differs(bench, motor)
             if not differs:
                 centred.append(joint)
-                evidence.append(
-                    Evidence(
-                        f"{joint} off its mounting angle", parts.before[joint].get("off_rad"), "rad", "encoder, holding"
-                    )
-                )
+                evidence.append(_off_evidence(joint, parts.before[joint].get("off_rad")))
                 continue
             yield Say(f"{joint} is not as it was left: {differs}; it is done again", "warn")
         yield Progress(k / len(motors), f"{joint} ({k + 1} of {len(motors)})")
@@ -99,10 +94,11 @@ def centre(bench: Bench) -> Procedure:
             servos = journalled(bus, robot_servos(config, [joint]), bench, COMMAND)
             servos.set_torque(False)
             mode, at = servos.read_counts("operating_mode", joint), servos.read_counts("present_position", joint)
-        changes = [RegisterChange(joint, "operating_mode", mode, POSITION_MODE)] if mode != POSITION_MODE else []
+        to_position = RegisterChange(joint, "operating_mode", mode, POSITION_MODE, "position control")
+        changes = [to_position] if mode != POSITION_MODE else []
         yield Drawing(f"{joint}: how its horn goes on", DRAWINGS[JOINTS[joint].kind])
         yield Intent(
-            f"turn {joint} slowly from {math.degrees(at * RAD_PER_PULSE):.0f}° to {math.degrees(NOMINAL_ZERO_RAD):.0f}° "
+            f"turn {joint} slowly from {number(at * RAD_PER_PULSE, 'rad', decimals=0)} to {number(NOMINAL_ZERO_RAD, 'rad', decimals=0)} "
             "and hold it there; keep the shaft free",
             tuple(changes),
             moves=True,
@@ -112,7 +108,7 @@ def centre(bench: Bench) -> Procedure:
             servos.write_counts("operating_mode", joint, POSITION_MODE)
         off, trouble = yield from _one(bench, motor)
         if abs(off) <= CLOSE_RAD:
-            evidence.append(Evidence(f"{joint} off its mounting angle", off, "rad", "encoder, holding"))
+            evidence.append(_off_evidence(joint, off))
         if trouble:
             problems.append(trouble)
         else:
@@ -123,12 +119,18 @@ def centre(bench: Bench) -> Procedure:
     return Finding(
         "centre",
         not problems,
-        f"{len(centred)} of {len(motors)} horns are on at the mounting angle of {math.degrees(NOMINAL_ZERO_RAD):.0f}°",
+        f"{len(centred)} of {len(motors)} horns are on at the mounting angle of {number(NOMINAL_ZERO_RAD, 'rad', decimals=0)}",
         tuple(evidence),
         "mend what is listed and run it again" if problems else "",
         COMMAND,
         data={"centred": centred},
         problems=tuple(problems),
+    )
+
+
+def _off_evidence(joint: str, off_rad: float | None) -> Evidence:
+    return Evidence(
+        f"{joint} off its mounting angle", off_rad, "rad", "encoder, holding", least=-CLOSE_RAD, most=CLOSE_RAD
     )
 
 
@@ -158,13 +160,18 @@ def _one(bench: Bench, motor: MotorSection) -> Subroutine[tuple[float, str]]:
         engine.ask(messages.Hold(SETTLE_S))
         off = _off(engine, joint)
         if abs(off) > CLOSE_RAD:
-            return off, f"{joint}: stopped {math.degrees(off):+.0f}° from its mounting angle → is the shaft blocked?"
+            return (
+                off,
+                f"{joint}: stopped {number(off, 'rad', sign=True, decimals=0)} from its mounting angle → is the shaft blocked?",
+            )
         question = f"{joint} holds. Put the horn on as drawn and drive its screw in. Done?"
         if (yield Ask(question, ("yes", "no"), default="yes")) != "yes":
             return off, f"{joint}: no horn yet → run the step again with --joint {joint}"
         turned = _off(engine, joint) - off
         if abs(turned) > CLOSE_RAD:
-            yield Say(f"{joint} was turned by {math.degrees(turned):+.1f}° while the horn went on", "warn")
+            yield Say(
+                f"{joint} was turned by {number(turned, 'rad', sign=True, decimals=1)} while the horn went on", "warn"
+            )
     return off, ""
 
 

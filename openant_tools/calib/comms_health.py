@@ -9,6 +9,7 @@ from openant_tools.comms.bench import measure_gap, measure_rate
 from openant_tools.comms.faults import Cause
 from openant_tools.comms.lateness import ENOUGH, LATE_S, REMEDY
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servos
+from openant_tools.numbers import exact, number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Bench, Procedure, Progress, Say
 from openant_tools.robot.config import Provenance
@@ -35,7 +36,7 @@ def comms_health(bench: Bench) -> Procedure:
         servos = Servos(bus, robot_servos(config))
         servos.identify()
         servos.set_torque(False)
-        yield Progress(0.1, f"{CYCLES} reads at {RATE_HZ:g} Hz")
+        yield Progress(0.1, f"{CYCLES} reads at {exact(RATE_HZ)} Hz")
         delays = servos.read_all("return_delay_time")
         bus.timing = replace(bus.timing, return_delay_s=max(delays.values()) * 2e-6)
         lost, missed, punctual = dict.fromkeys(servos.joints, 0), 0, 0
@@ -70,7 +71,7 @@ def comms_health(bench: Bench) -> Procedure:
         problems.append(f"cannot judge the rate, because {host} → {REMEDY}")
     elif rate.hz < RATE_SHARE * rate.limit_hz:
         problems.append(
-            f"the bus manages {rate.hz:.0f} cycles/s of {rate.limit_hz:.0f} → the adapter's latency timer (`openant calib connect`) or "
+            f"the bus manages {number(rate.hz, 'cycles/s', decimals=0)} of {number(rate.limit_hz, decimals=0)} → the adapter's latency timer (`openant calib connect`) or "
             "the servos' return delay (`openant calib inventory`)"
         )
     if gap is None and busy:
@@ -83,13 +84,25 @@ def comms_health(bench: Bench) -> Procedure:
     return Finding(
         "comms",
         not problems,
-        f"{sum(lost.values())} of {CYCLES * len(lost)} answers lost at {RATE_HZ:g} Hz; {rate.words}",
+        f"{sum(lost.values())} of {CYCLES * len(lost)} answers lost at {exact(RATE_HZ)} Hz; {rate.words}",
         (
             Evidence(
-                "answers lost", sum(lost.values()) / (CYCLES * len(lost)), "1", f"{CYCLES} reads at {RATE_HZ:g} Hz"
+                "answers lost",
+                sum(lost.values()) / (CYCLES * len(lost)),
+                "share",
+                f"{CYCLES} reads at {exact(RATE_HZ)} Hz",
+                most=LOST_SHARE,
             ),
             *(
-                [Evidence("cycles a second", rate.hz, "Hz", f"write and read; the wire allows {rate.limit_hz:.0f}")]
+                [
+                    Evidence(
+                        "cycles a second",
+                        rate.hz,
+                        "Hz",
+                        f"write and read; the wire allows {number(rate.limit_hz, decimals=0)}",
+                        least=RATE_SHARE * rate.limit_hz,
+                    )
+                ]
                 if rate.believable
                 else []
             ),

@@ -6,6 +6,7 @@ from openant_tools.calib.wires import opened_bus, opened_imu
 from openant_tools.comms.ports import WANTED_LATENCY_MS, Host, Port, udev_rule
 from openant_tools.comms.setup import find_bus
 from openant_tools.errors import HardwareFault, OpenAntError
+from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Bench, Intent, Procedure, Progress, Say
 from openant_tools.robot.config import Provenance
@@ -57,7 +58,7 @@ def connect(bench: Bench, host: Host | None = None) -> Procedure:
         else:
             assert found is not None
             evidence.append(Evidence("IMU rate", found[1], "Hz", f"{found[0]} at {imu}"))
-            yield Say(f"the flight controller is {found[0]}, {found[1]:.0f} samples/s", "ok")
+            yield Say(f"the flight controller is {found[0]}, {number(found[1], 'samples/s', decimals=0)}", "ok")
     camera = bench.camera if bench.camera is not None else config.ports.camera
     if camera == "":
         yield Say("no camera is named yet; the Arena step asks for it", "info")

@@ -50,7 +50,7 @@ def estop(bench: Bench) -> Procedure:
     names = ", ".join(f"id {one.id} ({one.model})" for one in seen)
     yield Intent(
         f"switch torque on where {names} stands, then stop it, twice; nothing turns",
-        tuple(RegisterChange(f"id {one.id}", "torque_enable", 0, 1) for one in seen),
+        tuple(RegisterChange(f"id {one.id}", "torque_enable", 0, 1, "off → on") for one in seen),
         moves=True,
     )
     servos = [Servo(f"id {one.id}", one.id, servo_model(one.model_number)) for one in seen]
@@ -61,7 +61,7 @@ def estop(bench: Bench) -> Procedure:
         if not all(on.values()):
             raise HardwareFault(f"torque does not come on at {', '.join(j for j, value in on.items() if not value)}")
         yield Say("torque is on: the horn resists your fingers", "info")
-        yield Ask("Press Enter (in the terminal program: the stop key) to stop", ("stop",), default="stop")
+        yield Ask("Now stop it: space in the terminal program, Enter on the command line", ("stop",), default="stop")
         engine.stop()
         off = engine.ask(messages.ReadRegister("torque_enable"))
     stopped = not any(off.values())

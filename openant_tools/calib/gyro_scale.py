@@ -11,6 +11,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from openant_tools.numbers import number, percent
+
 __all__ = ["KNOWN", "GyroScale", "by_camera", "by_hand", "old_rates"]
 
 #: step of the sensor → raw counts for 1 °/s
@@ -42,7 +44,7 @@ class GyroScale:
     @property
     def words(self) -> str:
         of = f"a sensor of {self.step} a step" if self.step else "no known sensor's step"
-        return f"{self.counts_per_dps:.2f} counts for 1 °/s ({of})"
+        return f"{number(self.counts_per_dps, decimals=2)} counts for 1 °/s ({of})"
 
 
 def by_hand(turns_rad: Sequence[float], now: float, *, measured: bool = False) -> GyroScale | None:
@@ -95,4 +97,4 @@ def by_camera(scale: float, error: float, now: float) -> GyroScale:
 def old_rates(before: float, now: GyroScale) -> str:
     """What a new scale means for what was recorded with the one before it (counts for 1 °/s), in words."""
     off = now.counts_per_dps / before - 1
-    return f"rates that were recorded before stay as they are, {100 * abs(off):.1f} % {'low' if off < 0 else 'high'}"
+    return f"rates that were recorded before stay as they are, {percent(abs(off), decimals=1)} {'low' if off < 0 else 'high'}"

@@ -126,10 +126,16 @@ def _one(
         servos = journalled(bus, [servo], bench, COMMAND)
         servos.set_torque(False)
         old = {name: servos.read_counts(name, motor.joint) for name in wanted}
+    means = {
+        "baud_rate": f"{seen.baud} → {config.bus.baud} baud",
+        "return_delay_time": f"{2 * old['return_delay_time']} → 0 µs",
+    }
     yield Intent(
         f"make this {seen.model} (id {seen.id}, {seen.baud} baud, firmware {seen.firmware}) the {words}: id {motor.id}, "
         f"{config.bus.baud} baud, no return delay; then blink its LED and nudge its horn",
-        tuple(RegisterChange(motor.joint, n, old[n], wanted[n]) for n in wanted if old[n] != wanted[n]),
+        tuple(
+            RegisterChange(motor.joint, n, old[n], wanted[n], means.get(n, "")) for n in wanted if old[n] != wanted[n]
+        ),
         moves=True,
     )
     with opened_bus(bench, seen.baud) as bus:

@@ -22,6 +22,7 @@ from openant_tools.comms import msp
 from openant_tools.comms.clock import Clock
 from openant_tools.comms.imu import STANDARD_GRAVITY, Imu
 from openant_tools.errors import HardwareFault
+from openant_tools.numbers import exact, number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Ask, Bench, Drawing, Hands, Intent, Live, Procedure, Progress, Say, Subroutine
 from openant_tools.robot.config import Provenance
@@ -146,7 +147,7 @@ def imu(bench: Bench) -> Procedure:
         for note in info.notes:
             yield Say(note, "warn")
             if "gravity decides" in note.lower() or "Gravity says" in note:
-                problems.append(f"IMU scale: {note} → {info.acc_lsb_per_g:.0f} LSB/g is used")
+                problems.append(f"IMU scale: {note} → {number(info.acc_lsb_per_g, 'LSB/g', decimals=0)} is used")
         yield Drawing("Three poses, each held still for a second.", DRAWING)
         for attempt in range(TRIES):
             rests = list[_Rest]()
@@ -156,7 +157,7 @@ def imu(bench: Bench) -> Procedure:
             found = mounting(np.array([rest.acc for rest in rests]), np.array([pose.up for pose in POSES]))
             if found.confidence == "high" or attempt == TRIES - 1:
                 break
-            words = f"low confidence: the poses disagree by {math.degrees(found.disagreement_rad):.0f}°"
+            words = f"low confidence: the poses disagree by {number(found.disagreement_rad, 'rad', decimals=0)}"
             if (yield Ask(f"{words}. Once more?", ("yes", "no"), default="yes")) != "yes":
                 break
         level = rests[0]
@@ -174,7 +175,8 @@ def imu(bench: Bench) -> Procedure:
     gyro_bias = found.rotation @ level.gyro
     evidence = (
         Evidence(
-            "norm of acc over gravity", 1 + scale_error, "1", f"{len(POSES)} poses at rest, {nominal} LSB/g"
+            "norm of acc over gravity", 1 + scale_error, "1", f"{len(POSES)} poses at rest, {nominal} LSB/g",
+            least=1 - GRAVITY_SHARE, most=1 + GRAVITY_SHARE,
         ),
         Evidence("gyro bias", float(np.linalg.norm(gyro_bias)), "rad/s", "at rest, level"),
         Evidence("gyro noise", float(level.gyro_noise.max()), "rad/s", "standard deviation at rest"),
@@ -183,7 +185,7 @@ def imu(bench: Bench) -> Procedure:
         Evidence("poses disagree by", found.disagreement_rad, "rad", "angles between measured directions"),
         Evidence(
             "quarter turn", turned, "rad",
-            f"integral of the gyro about the body's vertical, {info.gyro_lsb_per_dps:.5g} counts for 1 °/s",
+            f"integral of the gyro about the body's vertical, {number(info.gyro_lsb_per_dps)} counts for 1 °/s",
         ),
         *([] if gyro is None else [
             Evidence("gyro counts for 1 °/s", gyro.counts_per_dps, "1", f"{len(turns)} turns by hand", gyro.low, gyro.high)
@@ -192,40 +194,40 @@ def imu(bench: Bench) -> Procedure:
     unsure = list[str]()
     if abs(scale_error) > GRAVITY_SHARE:
         problems.append(
-            f"IMU scale: |acc| at rest is {norms.mean():.2f} m/s² instead of {STANDARD_GRAVITY:.2f} → calibrate the accelerometer "
+            f"IMU scale: |acc| at rest is {number(norms.mean(), 'm/s²', decimals=2)} instead of {number(STANDARD_GRAVITY, decimals=2)} → calibrate the accelerometer "
             "in Betaflight (level, still), then run this step again"
         )
-    read = ", ".join(f"{math.degrees(turn):.0f}°" for turn in turns)
+    read = ", ".join(f"{number(turn, 'rad', decimals=0)}" for turn in turns)
     if turned < 0:
         problems.append(
-            f"gyro: a quarter turn to the left reads {math.degrees(turned):.0f}° → its sign is wrong: the mounting was taken in "
+            f"gyro: a quarter turn to the left reads {number(turned, 'rad', decimals=0)} → its sign is wrong: the mounting was taken in "
             "wrong poses, or it was turned to the right"
         )
     elif gyro is None:
         steps = " or ".join(KNOWN)
         unsure.append(
             f"gyro scale: turns of 90° and 180° read {read}, which no sensor of {steps} a step makes of a turn that ended "
-            f"within {math.degrees(HAND_RAD):.1f}° → turn it against a table's edge, from side to side, or let `openant calib "
+            f"within {number(HAND_RAD, 'rad', decimals=1)} → turn it against a table's edge, from side to side, or let `openant calib "
             "arena` measure it against the tag"
         )
     elif abs(gyro.counts_per_dps / info.gyro_lsb_per_dps - 1) > 1e-3:
-        words = f"the gyro has {gyro.words}, not {info.gyro_lsb_per_dps:.2f}: a quarter turn read {math.degrees(turned):.0f}°"
+        words = f"the gyro has {gyro.words}, not {number(info.gyro_lsb_per_dps, decimals=2)}: a quarter turn read {number(turned, 'rad', decimals=0)}"
         yield Say(words, "warn")
         problems.append(
             f"{words} → imu.gyro_counts_per_dps takes it into account from now on; {old_rates(info.gyro_lsb_per_dps, gyro)}"
         )
     if found.confidence != "high":
         problems.append(
-            f"low confidence in the mounting: the poses disagree by {math.degrees(found.disagreement_rad):.0f}° → retry, hold them still "
+            f"low confidence in the mounting: the poses disagree by {number(found.disagreement_rad, 'rad', decimals=0)} → retry, hold them still "
             "against a wall or a table's edge"
         )
     if angle > math.radians(8):
         yield Say(
-            f"the board is mounted rotated by {math.degrees(angle):.0f}° about {axis}; that is taken into account",
+            f"the board is mounted rotated by {number(angle, 'rad', decimals=0)} about {axis}; that is taken into account",
             "warn",
         )
         problems.append(
-            f"the board is mounted rotated by {math.degrees(angle):.0f}° about {axis} → robot.toml takes it into account"
+            f"the board is mounted rotated by {number(angle, 'rad', decimals=0)} about {axis} → robot.toml takes it into account"
         )
     sound = found.confidence == "high" and abs(scale_error) <= GRAVITY_SHARE and turned > 0
     counts = imu_now.gyro_counts_per_dps if gyro is None else gyro.counts_per_dps
@@ -248,11 +250,11 @@ def imu(bench: Bench) -> Procedure:
     return Finding(
         "imu",
         False if not sound else None if unsure else True,
-        f"{info.variant} {info.firmware}, {acc_counts:.0f} LSB/g, {counts:.2f} counts for 1 °/s"
+        f"{info.variant} {info.firmware}, {number(acc_counts, 'LSB/g', decimals=0)}, {number(counts, decimals=2)} counts for 1 °/s"
         + ("" if gyro is None else f" ({gyro.step} a step)" if gyro.step else " (as measured)")
         + ", mounted "
-        + (f"at {math.degrees(angle):.0f}° about {axis}, " if angle > math.radians(1) else "straight, ")
-        + f"{info.rate_hz:.0f} samples/s",
+        + (f"at {number(angle, 'rad', decimals=0)} about {axis}, " if angle > math.radians(1) else "straight, ")
+        + f"{number(info.rate_hz, 'samples/s', decimals=0)}",
         evidence,
         "run it again; nothing was written" if not sound else "turn it again: run this step again" if unsure else "",
         COMMAND,
@@ -300,7 +302,7 @@ def _samples(driver: Imu, clock: Clock, seconds: float) -> Array:
             continue  # it lay unread since the last pose
         rows.append((sample.t, *sample.acc, *sample.gyro))
     if len(rows) < 10:
-        raise HardwareFault(f"only {len(rows)} IMU samples came in {seconds:g} s", where=driver.where)
+        raise HardwareFault(f"only {len(rows)} IMU samples came in {exact(seconds)} s", where=driver.where)
     return np.array(rows)
 
 
@@ -319,14 +321,16 @@ def _turns(
             return turns, gyro
         # A sensor of another step, or a hand that stopped early: of twice the turn it is told.
         yield Say(
-            f"the quarter turn reads {math.degrees(turns[0]):.0f}°: " + ("a turn that was not 90°?" if gyro is None
+            f"the quarter turn reads {number(turns[0], 'rad', decimals=0)}: " + ("a turn that was not 90°?" if gyro is None
             else f"a sensor of {gyro.step} a step, or a turn that was not 90°?"), "warn",
         )  # fmt: skip
         turns.append((yield from _turn(driver, clock, rotation, level, HALF_RAD)))
         gyro = by_hand(turns, now, measured=measured)
         if gyro is not None or attempt == TRIES - 1:
             break
-        yield Say(f"the half turn reads {math.degrees(turns[1]):.0f}°: that does not fit together; once more", "warn")
+        yield Say(
+            f"the half turn reads {number(turns[1], 'rad', decimals=0)}: that does not fit together; once more", "warn"
+        )
     return turns, gyro
 
 
@@ -334,7 +338,7 @@ def _turn(driver: Imu, clock: Clock, rotation: Array, level: _Rest, turn_rad: fl
     """Integral of the body's yaw rate, less its bias, over a turn to the left, rad."""
     much, seconds = ("half a turn", 2 * QUARTER_S) if turn_rad > 2 else ("a quarter turn", QUARTER_S)
     yield Hands(
-        f"Within {seconds:.0f} seconds turn the robot {much} to the left (counter-clockwise seen from above), level, from one "
+        f"Within {number(seconds, 'seconds', decimals=0)} turn the robot {much} to the left (counter-clockwise seen from above), level, from one "
         "straight edge to the next.",
         "tilt",
         path_rad=(0.0, 0.0, turn_rad),

@@ -72,7 +72,7 @@ def inventory(bench: Bench) -> Procedure:
         for k, servo in enumerate(present):
             yield Progress(k / max(1, len(present)), f"reading {servo.joint}")
             table[servo.joint] = _read_eeprom(servos, servo, found[servo.joint].firmware)
-        yield Say(f"{len(present)} of {len(config.motors)} servos read, {sum(map(len, table.values()))} items")
+        yield Say(f"{len(present)} of {len(config.motors)} servos read, {sum(map(len, table.values()))} settings")
         for joint, seen in found.items():
             lacks = [what for firmware, what in FIRMWARE_BRINGS.items() if seen.firmware < firmware]
             evidence.append(Evidence(f"firmware of {joint}", float(seen.firmware), "", "register 6"))
@@ -87,7 +87,7 @@ def inventory(bench: Bench) -> Procedure:
         odd = _of_settings(differences_of_robot(present, state, config, passport))
         left: list[Difference] = []
         if odd:
-            yield Say(f"{len(odd)} items differ from what they should be", "warn")
+            yield Say(f"{len(odd)} settings differ from what they should be", "warn")
             left = yield from _mend(servos, odd)
             problems += [
                 f"{one.joint}: {one.register} is {one.found}, expected {one.expected} → accepted" for one in left
@@ -118,7 +118,7 @@ def inventory(bench: Bench) -> Procedure:
         "inventory",
         ok,
         f"{len(present)} of {len(config.motors)} servos as expected"
-        + (f", {len(odd) - len(left)} items mended" if odd else ""),
+        + (f", {len(odd) - len(left)} settings mended" if odd else ""),
         tuple(evidence),
         "" if ok else "mend what is listed and run it again",
         COMMAND,
@@ -307,8 +307,8 @@ def _values(stretch: Sequence[Register], data: bytes) -> dict[str, int]:
 
 def _mend(servos: Servos, odd: Sequence[Difference]) -> Subroutine[list[Difference]]:
     """Ask what to do with them, do it; what was accepted as it is."""
-    for one in odd:
-        yield Say(one.what, "warn")
+    for line in _alike(odd):
+        yield Say(line, "warn")
     answer = yield Ask("What to do with them?", (FIX_ALL, FIX_ONE, ACCEPT), default=FIX_ALL)
     chosen = list(odd) if answer == FIX_ALL else []
     if answer == FIX_ONE:
@@ -316,11 +316,19 @@ def _mend(servos: Servos, odd: Sequence[Difference]) -> Subroutine[list[Differen
             if (yield Ask(f"Set {_change(one)}?", ("yes", "no"), default="yes")) == "yes":
                 chosen.append(one)
     if chosen:
-        yield Intent(f"write {len(chosen)} items, each read back", tuple(_change(one) for one in chosen))
+        yield Intent(f"write {len(chosen)} settings, each read back", tuple(_change(one) for one in chosen))
         servos.set_torque(False)
         for one in chosen:
             servos.write_counts(one.register, one.joint, one.expected)
     return [one for one in odd if one not in chosen]
+
+
+def _alike(odd: Sequence[Difference]) -> list[str]:
+    """What differs, one line for all servos in which it differs alike."""
+    told: dict[str, list[Difference]] = {}
+    for one in odd:
+        told.setdefault(one.reads, []).append(one)
+    return [found[0].what if len(found) == 1 else f"{len(found)} servos: {reads}" for reads, found in told.items()]
 
 
 def _change(one: Difference) -> RegisterChange:

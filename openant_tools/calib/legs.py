@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from openant_tools.calib.bounds import Unwrapped
 from openant_tools.calib.ids import nudge
-from openant_tools.calib.wires import BOOT_S, opened_bus, robot_servos, servo_angles, wait
+from openant_tools.calib.wires import BOOT_S, in_joints, opened_bus, robot_servos, servo_angles, wait
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.faults import Cause
 from openant_tools.comms.lateness import LATE_S, REMEDY
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servo, Servos
 from openant_tools.errors import HardwareFault
+from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Ask, Bench, Hands, Intent, Live, Procedure, Progress, Say, Subroutine
 from openant_tools.procedure.unfinished import Parts
@@ -90,14 +89,15 @@ def _one(bench: Bench, leg: Leg, config: RobotConfig) -> Subroutine[list[Evidenc
         yield Hands(f"Connect {joint}.", "plug", joint)
     with opened_bus(bench) as bus:
         evidence = yield from _by_hand(bus, joints, config)
-    yield Intent(f"nudge {' and '.join(joints)} by {math.degrees(NUDGE_RAD):.0f}°, gently", moves=True)
+    yield Intent(f"nudge {' and '.join(joints)} by {number(NUDGE_RAD, 'rad', decimals=0)}, gently", moves=True)
     for joint in joints:
         motor = config.motors[joint]
         went = yield from nudge(bench, Servo(joint, motor.id, motor.servo), config.bus.baud, NUDGE_RAD)
-        evidence.append(Evidence(f"nudge of {joint}", went, "rad", "encoder"))
+        evidence.append(Evidence(f"nudge of {joint}", went, "rad", "encoder", least=NUDGED_RAD))
         if went < NUDGED_RAD:
             raise HardwareFault(
-                f"{joint} does not follow its motor ({math.degrees(went):.1f}°)", remedy="is its horn screwed on?"
+                f"{joint} does not follow its motor ({number(went, 'rad', decimals=1)})",
+                remedy="is its horn screwed on?",
             )
     return evidence
 
@@ -125,17 +125,12 @@ def _by_hand(bus: Bus, joints: list[str], config: RobotConfig) -> Subroutine[lis
             asked += len(answers)
             if asked % 20 == 0:
                 try:
-                    now = servos.joint_rad(
-                        [
-                            round(a / servos.servos[0].model.registers["present_position"].scale)
-                            for a in servo_angles(servos)[0]
-                        ]
-                    )
+                    now = in_joints(servos, servo_angles(servos)[0])
                 except HardwareFault:
                     continue  # a loss like the others; it is counted above
-                for name, angle in zip(joints, now, strict=True):
+                for name, angle in now.items():
                     tracks[name][1].append(tracks[name][0].add(angle))
-                if (yield Live(dict(zip(joints, now, strict=True)), "rad", f"moving {joint}")) is True:
+                if (yield Live(now, "rad", f"moving {joint}; Enter when it is done", angles_rad=now)) is True:
                     break
             wait(bus.clock, 0.005)
         yield Hands("Let go.", "free")
@@ -149,11 +144,14 @@ def _by_hand(bus: Bus, joints: list[str], config: RobotConfig) -> Subroutine[lis
             )
         seen = float(np.ptp(tracks[joint][1])) if tracks[joint][1] else 0.0
         whole = 2 * ANGLE_LIMIT_RAD[JOINTS[joint].kind]
-        evidence.append(Evidence(f"range of {joint}", seen, "rad", "by hand"))
-        evidence.append(Evidence(f"answers lost at {joint}", float(lost), f"of {asked}", "while it moved by hand"))
+        evidence.append(Evidence(f"range of {joint}", seen, "rad", "by hand", least=RANGE_SHARE * whole))
+        share = lost / asked if asked else None
+        evidence.append(
+            Evidence(f"answers lost at {joint}", share, "share", f"{asked} reads while it moved", most=LOST_SHARE)
+        )
         if seen < RANGE_SHARE * whole:
             raise HardwareFault(
-                f"{joint} turned by {math.degrees(seen):.0f}° of {math.degrees(whole):.0f}°",
+                f"{joint} turned by {number(seen, 'rad', decimals=0)} of {number(whole, 'rad', decimals=0)}",
                 remedy="is a screw or a cable in its way?",
             )
     return evidence

@@ -28,7 +28,7 @@ from openant_tools.robot.config import MotorSection, RobotConfig
 from openant_tools.robot.registers import RAD_PER_PULSE
 
 __all__ = [
-    "BOOT_S", "SETTLE_S", "bare_config", "engine_config", "journalled", "opened_bus", "opened_imu", "rest", "robot_servos", "servo_angles", "wait",
+    "BOOT_S", "SETTLE_S", "bare_config", "engine_config", "in_joints", "journalled", "opened_bus", "opened_imu", "rest", "robot_servos", "servo_angles", "wait",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -166,3 +166,11 @@ def servo_angles(servos: Servos, readings: int = 1, pause_s: float = 0.01) -> Ar
         counts = servos.read_all("present_position")
         rows.append([counts[s.joint] * s.model.registers["present_position"].scale for s in servos.servos])
     return np.array(rows)
+
+
+def in_joints(servos: Servos, row: Array) -> dict[str, float]:
+    """joint → its angle, rad within half a turn, of one row (n,) in the servos' own frames."""
+    angles = (servo.to_joint(float(angle)) for servo, angle in zip(servos.servos, row, strict=True))
+    return {
+        s.joint: (angle + math.pi) % (2 * math.pi) - math.pi for s, angle in zip(servos.servos, angles, strict=True)
+    }

@@ -15,14 +15,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.calib.wires import SETTLE_S, engine_config, opened_bus, robot_servos, servo_angles, wait
+from openant_tools.calib.wires import SETTLE_S, engine_config, in_joints, opened_bus, robot_servos, servo_angles, wait
 from openant_tools.comms import messages
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.servos import Servos
 from openant_tools.errors import HardwareFault
+from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Ask, Bench, Drawing, Hands, Intent, Live, Procedure, Progress, Say, Subroutine
+from openant_tools.procedure.unfinished import Parts
 from openant_tools.robot.config import Provenance, RobotConfig
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
 from openant_tools.robot.kit import ANGLE_LIMIT_RAD, NOMINAL_ZERO_RAD
@@ -147,10 +149,17 @@ def zeros(bench: Bench) -> Procedure:
             return _failed(f"{moved} moved while it was read", "hold the legs still and run it again")
         level = rows.mean(axis=0)
         yield Hands("Let go.", "free")
-        movements = yield from _by_hand(bus, servos, joints)
+        movements = yield from _by_hand(bench, bus, servos, joints)
     grid = {servo.joint: straight(float(level[k])) for k, servo in enumerate(servos.servos)}
     evidence = [
-        Evidence(f"residual of {joint}", seen.residual_rad, "rad", "encoder with straight legs, from the 45° grid")
+        Evidence(
+            f"residual of {joint}",
+            seen.residual_rad,
+            "rad",
+            "encoder with straight legs, from the 45° grid",
+            least=-STRAIGHT_RAD,
+            most=STRAIGHT_RAD,
+        )
         for joint, seen in grid.items()
     ]
     unseen = [joint for joint in joints if joint not in movements]
@@ -185,11 +194,11 @@ def zeros(bench: Bench) -> Procedure:
     for joint in far:
         degrees = math.degrees(grid[ids[joint]].residual_rad)
         problems.append(
-            f"{joint}: {degrees:+.1f}° beside the grid of horn positions → was the leg straight? else its horn or gear slips"
+            f"{joint}: {number(degrees, sign=True, decimals=1)}° beside the grid of horn positions → was the leg straight? else its horn or gear slips"
         )
     yield Intent(
         "write zero offsets and directions into robot.toml, then nudge every joint by "
-        f"{math.degrees(NUDGE_RAD):.0f}° with the motors, on the stand",
+        f"{number(NUDGE_RAD, 'rad', decimals=0)} with the motors, on the stand",
         moves=True,
     )
     bench.folder.update(values, provenance=Provenance("measured", COMMAND))
@@ -201,7 +210,7 @@ def zeros(bench: Bench) -> Procedure:
     return Finding(
         "zeros",
         ok,
-        f"zeros of {len(joints)} joints, at most {math.degrees(widest):.1f}° beside the 45° grid; every joint moves as commanded"
+        f"zeros of {len(joints)} joints, at most {number(widest, 'rad', decimals=1)} beside the 45° grid; every joint moves as commanded"
         if ok
         else "not every zero and direction is sure",
         tuple(evidence),
@@ -217,10 +226,16 @@ def zeros(bench: Bench) -> Procedure:
     )
 
 
-def _by_hand(bus: Bus, servos: Servos, joints: tuple[str, ...]) -> Subroutine[dict[str, Moved]]:
+def _by_hand(bench: Bench, bus: Bus, servos: Servos, joints: tuple[str, ...]) -> Subroutine[dict[str, Moved]]:
     """joint → what turned when the builder moved it; a joint at which nothing turned is missing."""
     found: dict[str, Moved] = {}
+    parts = Parts(bench.folder, "zeros", joints, bench.joints)
+    if parts.before:
+        yield Say(parts.words)
     for k, joint in enumerate(joints):
+        if joint in parts.before:
+            found[joint] = Moved(joint, parts.before[joint]["seen"], parts.before[joint]["by_rad"])
+            continue
         kind = JOINTS[joint].kind
         yield Progress(0.2 + 0.6 * k / len(joints), f"{joint} by hand")
         # Half a turn up or round is beyond no stop; from straight it is safe either way.
@@ -229,19 +244,24 @@ def _by_hand(bus: Bus, servos: Servos, joints: tuple[str, ...]) -> Subroutine[di
             f"Move the {JOINTS[joint].words} about 30° {WAYS[kind]}, and hold it.", "turn", joint, (BY_HAND_RAD,)
         )
         wait(bus.clock, SETTLE_S)
-        change = servo_angles(servos)[0] - before
+        row = servo_angles(servos)[0]
+        change = row - before
         change = (change + math.pi) % (2 * math.pi) - math.pi
-        yield Live({s.joint: float(change[n]) for n, s in enumerate(servos.servos)}, "rad", f"moved: {joint}")
+        yield Live(
+            {s.joint: float(change[n]) for n, s in enumerate(servos.servos)}, "rad", f"moved: {joint}",
+            angles_rad=in_joints(servos, row),
+        )  # fmt: skip
         most = int(np.abs(change).argmax())
         yield Hands("Put it back.", "turn", joint, (0.0,))
         wait(bus.clock, SETTLE_S)
         yield Hands("Let go.", "free")
         if abs(change[most]) > SEEN_RAD:
             found[joint] = Moved(joint, servos.servos[most].joint, float(change[most]))
-            words = f"{joint}: its servo turned {math.degrees(change[most]):+.0f}°"
+            words = f"{joint}: its servo turned {number(change[most], 'rad', sign=True, decimals=0)}"
             if found[joint].seen != joint:
                 words = f"{joint} was moved, but the servo with the id of {found[joint].seen} turned"
             yield Say(words, "ok" if found[joint].seen == joint else "warn")
+            parts.done(joint, seen=found[joint].seen, by_rad=found[joint].by_rad)
     return found
 
 
@@ -328,7 +348,7 @@ def _nudge_all(bench: Bench, joints: tuple[str, ...]) -> Subroutine[_Nudged]:
             if sign * went[at] < NUDGED_RAD:
                 why = "turned the wrong way" if sign * went[at] < -NUDGED_RAD else "did not follow"
                 problems.append(
-                    f"{joint}: {why} ({math.degrees(went[at]):+.1f}°) → is it blocked, or its horn screw loose?"
+                    f"{joint}: {why} ({number(went[at], 'rad', sign=True, decimals=1)}) → is it blocked, or its horn screw loose?"
                 )
             if others:
                 problems.append(f"{joint}: {', '.join(others)} moved with it → look for two servos with one id")

@@ -13,8 +13,20 @@ from rich.prompt import Confirm, FloatPrompt, Prompt
 from openant_tools.cli.hardware import need_moving, need_terminal
 from openant_tools.cli.log import is_quiet
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number, percent, span
 from openant_tools.procedure.finding import Finding
-from openant_tools.procedure.step import Answer, Ask, Drawing, Event, Hands, Intent, Live, Progress, Say
+from openant_tools.procedure.step import (
+    Answer,
+    Ask,
+    Drawing,
+    Event,
+    Hands,
+    Intent,
+    Live,
+    Progress,
+    Say,
+    change_lines,
+)
 
 __all__ = ["CommandFace", "echo_finding"]
 
@@ -76,7 +88,7 @@ class CommandFace:
         before, at = self._said
         if words != before or (share or 0.0) - at > 0.25:
             self._said = (words, share or 0.0)
-            self._line(f"[dim]{'' if share is None else f'{100 * share:3.0f} % '}{escape(words)} …[/dim]")
+            self._line(f"[dim]{'' if share is None else f'{percent(share)} '}{escape(words)} …[/dim]")
 
     def _line(self, markup: str) -> None:
         encoding = (self.console.encoding or "ascii").lower()
@@ -89,8 +101,8 @@ class CommandFace:
         self._line(
             f"[bold]will {escape(intent.words)}[/bold]" + (" [yellow](it moves)[/yellow]" if intent.moves else "")
         )
-        for change in intent.registers:
-            self._line(f"    {escape(str(change))}")
+        for line in change_lines(intent.registers):
+            self._line(f"    {escape(line)}")
         if intent.moves:
             need_moving()
         if self._yes:
@@ -127,14 +139,14 @@ class CommandFace:
         if ask.unit == "text":
             return Prompt.ask(question, console=self.console, default=str(ask.default or ""))
         while True:
-            number = FloatPrompt.ask(f"{question} [{ask.unit}]", console=self.console, default=ask.default)
+            given = FloatPrompt.ask(f"{question} [{ask.unit}]", console=self.console, default=ask.default)
             if (
-                isinstance(number, int | float)
-                and (ask.low is None or number >= ask.low)
-                and (ask.high is None or number <= ask.high)
+                isinstance(given, int | float)
+                and (ask.low is None or given >= ask.low)
+                and (ask.high is None or given <= ask.high)
             ):
-                return float(number)
-            self._line(f"[red]✗[/red] from {ask.low} to {ask.high} {ask.unit}")
+                return float(given)
+            self._line(f"[red]✗[/red] from {span(ask.low, ask.high, ask.unit)}")
 
     def _show(self, live: Live) -> bool:
         """Bars that stay in place on a terminal; nothing where the output goes to a file."""
@@ -145,7 +157,9 @@ class CommandFace:
                 low, high = live.low.get(joint, value - 1), live.high.get(joint, value + 1)
                 at = round(min(max((value - low) / max(high - low, 1e-9), 0.0), 1.0) * (BAR_WIDTH - 1))
                 bar = "".join("#" if k == at else "-" for k in range(BAR_WIDTH))
-                sys.stderr.write(f"\x1b[2K  {joint:8} {bar} {value:+.2f} {live.unit} {live.marks.get(joint, '')}\n")
+                sys.stderr.write(
+                    f"\x1b[2K  {joint:8} {bar} {number(value, live.unit, sign=True, decimals=1)} {live.marks.get(joint, '')}\n"
+                )
             self._live = len(live.values)
         return False
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from openant_tools.errors import BadInput
 from openant_tools.files import json_text, known, read_json, write_text
-from openant_tools.numbers import number
+from openant_tools.numbers import number, span
 from openant_tools.procedure.unfinished import forget
 
 if TYPE_CHECKING:  # a manual that lists the steps opens without NumPy
@@ -37,6 +37,7 @@ class Evidence:
         value: in `unit`; None where the data do not give it, which NaN and infinity become.
         low, high: its 95 % interval where there is one.
         source: the instrument, register, file or formula that it came from.
+        least, most: between which it is as it should be, in `unit`; None for an end that is free.
     """
 
     name: str
@@ -45,6 +46,8 @@ class Evidence:
     source: str
     low: float | None = None
     high: float | None = None
+    least: float | None = None
+    most: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("value", "low", "high"):
@@ -56,6 +59,16 @@ class Evidence:
     def words(self) -> str:
         """The number as it is read, with unit and interval."""
         return number(self.value, self.unit, self.low, self.high, name=self.name)
+
+    @property
+    def wanted(self) -> str:
+        """Between what it is as it should be, in words; "" where nothing is asked of it."""
+        ends = [
+            f"at {word} {number(end, self.unit, name=self.name)}"
+            for word, end in (("least", self.least), ("most", self.most))
+            if end is not None
+        ]
+        return span(self.least, self.most, self.unit, name=self.name) if len(ends) == 2 else "".join(ends)
 
 
 @dataclass(frozen=True)
@@ -129,7 +142,7 @@ class Finding:
             "unsure": list(self.unsure),
             "problems": list(self.problems),
             "next_action": self.next_action,
-            "evidence": [vars(evidence) for evidence in self.evidence],
+            "evidence": [_entry(evidence) for evidence in self.evidence],
             "parameters": {
                 p.name: {
                     "value": p.value,
@@ -187,7 +200,13 @@ def together(*verdicts: bool | None) -> bool | None:
 
 
 def _row(evidence: Evidence) -> str:
-    return f"| {evidence.name} | {evidence.words} | {evidence.source} |"
+    wanted = f"; as it should be: {evidence.wanted}" if evidence.wanted else ""
+    return f"| {evidence.name} | {evidence.words} | {evidence.source}{wanted} |"
+
+
+def _entry(evidence: Evidence) -> dict[str, Any]:
+    """As JSON; without ends of a range that nothing is asked of."""
+    return {name: value for name, value in vars(evidence).items() if value is not None or name not in ("least", "most")}
 
 
 def latest(folder: RobotFolder, step: str) -> Finding | None:

@@ -12,7 +12,7 @@ stop key, a closed terminal) leaves the robot with torque off, and the step can 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol, TypeVar
@@ -39,6 +39,7 @@ __all__ = [
     "RegisterChange",
     "Say",
     "Step",
+    "change_lines",
     "drive",
 ]  # fmt: skip
 
@@ -66,16 +67,40 @@ class Say:
 
 @dataclass(frozen=True)
 class RegisterChange:
-    """One register that will be written; counts, `old` None where it has not been read."""
+    """One register that will be written; counts, `old` None where it has not been read.
+
+    Attributes:
+        means: what `old` and `new` are in words or units; "" where the counts say it.
+    """
 
     joint: str
     register: str
     old: int | None
     new: int
+    means: str = ""
 
     def __str__(self) -> str:
+        return f"{self.joint}: {self.words}"
+
+    @property
+    def words(self) -> str:
+        """What is written, without the joint."""
         was = "" if self.old is None else f" {self.old} →"
-        return f"{self.joint}: {self.register}{was} {self.new}"
+        return f"{self.register}{was} {self.new}" + (f" ({self.means})" if self.means else "")
+
+
+def change_lines(changes: Sequence[RegisterChange]) -> list[str]:
+    """What will be written, one line for all joints that are written alike, and for all that is written to one joint."""
+    alike: dict[str, list[str]] = {}
+    for change in changes:
+        alike.setdefault(change.words, []).append(change.joint)
+    together: dict[tuple[str, ...], list[str]] = {}
+    for words, joints in alike.items():
+        together.setdefault(tuple(joints), []).append(words)
+    return [
+        f"{joints[0] if len(joints) == 1 else f'{len(joints)} servos'}: {', '.join(words)}"
+        for joints, words in together.items()
+    ]
 
 
 @dataclass(frozen=True)
@@ -133,6 +158,7 @@ class Live:
 
     Attributes:
         low, high: joint → the ends of its bar. marks: joint → a few words beside it.
+        angles_rad: joint → where it is now, of all that were read, for the picture of the robot.
     """
 
     values: Mapping[str, float]
@@ -141,6 +167,7 @@ class Live:
     low: Mapping[str, float] = field(default_factory=dict)
     high: Mapping[str, float] = field(default_factory=dict)
     marks: Mapping[str, str] = field(default_factory=dict)
+    angles_rad: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ def test_both_stops_moved_is_a_changed_zero():
 
 def test_one_stop_moved_is_something_in_the_way():
     (words,) = now("knee_fl", high_stop_rad=1.0)
-    assert "one of its stops has moved by -12.8°" in words
+    assert "one of its stops has moved by −12.8°" in words
 
 
 def test_a_horn_on_another_spline_moves_both_stops_out_of_reach():

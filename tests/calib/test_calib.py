@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from openant_tools.calib import arena as arena_step
 from openant_tools.calib.arena import LYING_M, STANDING_M, arena, judge_sizes
-from openant_tools.calib.bounds import Unwrapped
+from openant_tools.calib.bounds import Unwrapped, bounds
 from openant_tools.calib.centre import centre
 from openant_tools.calib.comms_health import comms_health
 from openant_tools.calib.connect import connect
@@ -41,7 +41,7 @@ from openant_tools.procedure.step import Ask, Bench, Declined, Event, Hands, Int
 from openant_tools.procedure.unfinished import unfinished
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
-from openant_tools.robot.config import CameraSection
+from openant_tools.robot.config import CameraSection, Provenance
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
 
@@ -260,6 +260,25 @@ def test_centring_that_was_left_goes_on_where_it_was_and_reads_again_what_was_do
         assert "knee_rr is not as it was left: its operating mode is 4, not 3; it is done again" in builder.said
         asked = [event.question.split()[0] for event in builder.events if isinstance(event, Ask)]
         assert asked == ["knee_rr", "hip_fr", "knee_fr"]
+
+
+def test_zeros_and_ranges_that_were_left_go_on_with_the_next_joint(tmp_path):
+    with robot(tmp_path / "ant") as ant:
+        for step, name in ((zeros, "zeros"), (bounds, "bounds")):
+            with pytest.raises(KeyboardInterrupt):
+                ant.do(step(ant.bench), ant.builder(before=leave_at(Hands, "Move the front right hip")))
+            assert unfinished(ant.folder, name).words == "2 of 8"
+        ant.folder.update({"motors.knee_rr.zero_offset_rad": 3.0}, provenance=Provenance("measured", "a test"))
+        moved = {}
+        for step in (zeros, bounds):
+            builder = ant.builder(before=leave_at(Hands, "Move the front right knee"))
+            with pytest.raises(KeyboardInterrupt):
+                ant.do(step(ant.bench), builder)
+            assert "it goes on at 3 of 8: hip_rr, knee_rr were done before" in builder.said
+            asked = [event.joint for event in builder.events if isinstance(event, Hands) and event.task == "turn"]
+            moved[step.__name__] = list(dict.fromkeys(asked))
+        assert moved == {"zeros": ["hip_fr", "knee_fr"], "bounds": ["knee_rr", "hip_fr", "knee_fr"]}
+        assert "knee_rr has another zero than when it was moved; it is done again" in builder.said
 
 
 def test_legs_are_proven_one_by_one_and_a_bad_cable_is_named(tmp_path):

@@ -44,7 +44,7 @@ def dropouts_finding(
     evidence = [
         Evidence("time watched", round(log.seconds, 3), "s", source),
         Evidence("answers asked for", float(asked), "", source),
-        Evidence("share lost", lost / asked if asked else None, "", source, low, high),
+        Evidence("share lost", lost / asked if asked else None, "share", source, low, high),
     ]
     last = np.nanmax(np.where(np.isfinite(log.rtt), log.rtt, -np.inf), axis=1)
     last = last[np.isfinite(last)]
@@ -56,7 +56,7 @@ def dropouts_finding(
         evidence.append(Evidence("loop late, 99 of 100", float(np.quantile(wake, 0.99)), "s", source))
     best = found.suspects[0]
     if not found.healthy_bus:
-        evidence.append(Evidence(f"probability of {best.cause}", best.probability, "", "openant comms diagnose"))
+        evidence.append(Evidence(f"probability of {best.cause}", best.probability, "share", "openant comms diagnose"))
     remedy = "" if found.verdict in ("none", "unknown") else best.remedy
     steps = [words for words in (remedy, found.next_test) if words]
     marks = tuple(why.words for why in best.evidence if why.nats > 0)[:_SHOWN]
