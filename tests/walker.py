@@ -61,8 +61,12 @@ class Walker:
 
     @property
     def log(self) -> str:
-        """What stands in the step's log."""
-        return "\n".join(str(line.render()) for line in self.screen.query("#log Static").results(Static))
+        """What stands in the step's log, and in its places for what to do and what was found."""
+        lines = [
+            *self.screen.query("#log Static").results(Static),
+            *self.screen.query("#now, #found, #numbers").results(Static),
+        ]
+        return "\n".join(str(line.render()) for line in lines)
 
     def press(self, *keys: str) -> None:
         """Press keys; a pilot's own way waits until this process is idle, which it is not while a step works."""

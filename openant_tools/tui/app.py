@@ -134,7 +134,7 @@ class OpenAnt(App[int]):
         Binding("ctrl+c", "interrupt", show=False, priority=True),
         Binding("ctrl+z", "suspend_process", show=False),
         # tmux makes alt+f1 of an Esc and an F1 that come soon after each other.
-        Binding("f1,alt+f1", "help", "Help", key_display="F1"),
+        Binding("f1,alt+f1", "help", "Help", key_display="F1", priority=True),
         Binding("ctrl+o", "jump", "Jump", show=False),
         # Of a number that was typed; any other Enter goes to what has the focus.
         Binding("enter", "open_typed", show=False, priority=True),
@@ -208,7 +208,7 @@ class OpenAnt(App[int]):
             self.focused.insert_text_at_cursor(" ")
             if not told:
                 return
-        words = "STOP: torque is switched off" if told else "STOP: nothing is connected, no torque is on"
+        words = "STOP: torque is switched off" if told else "STOP: no torque was on"
         self.notify(words, severity="error" if told else "information", timeout=4)
 
     def action_interrupt(self) -> None:
@@ -225,7 +225,7 @@ class OpenAnt(App[int]):
         def stop(number: int, frame: FrameType | None) -> None:
             self.session.release()
             if self._running_step is not None:
-                self._running_step.end()
+                self._running_step.end("suspended")
             suspend(number, frame)
 
         signal.signal(signal.SIGTSTP, stop)
@@ -343,11 +343,13 @@ class OpenAnt(App[int]):
             self.push_screen(Jump(self.screen))
 
     def action_help(self) -> None:
-        """Help on the focused widget, else on the screen, and the keys that hold everywhere."""
+        """Help on the step at hand, the focused widget or the screen, and the keys that hold everywhere."""
         if isinstance(self.screen, Help):
+            self.pop_screen()
             return
         own = next((words for widget in self._focus_path() if (words := help_of(widget))), "")
-        about = self.screen.about if isinstance(self.screen, Page) else ""
+        # A question is about the page below it.
+        about = next((screen.about for screen in reversed(self.screen_stack) if isinstance(screen, Page)), "")
         self.push_screen(Help(f"{about}\n{own}\n{GENERAL_HELP}"))
 
     def _focus_path(self) -> Iterable[Widget]:
@@ -390,7 +392,7 @@ class OpenAnt(App[int]):
             self._in_background("ending the virtual robot", self.session.end_virtual, self.refresh_walk)
 
     def _ask_virtual(self) -> None:
-        self.push_screen(Question("A virtual robot:", *(words for words, _ in VIRTUAL_ROBOTS)), self._chose_virtual)
+        self.push_screen(Question("Which virtual robot?", *(words for words, _ in VIRTUAL_ROBOTS)), self._chose_virtual)
 
     def _chose_virtual(self, choice: int | None) -> None:
         if choice is not None:

@@ -1,4 +1,4 @@
-"""Live values as bars, one line a joint."""
+"""Values as bars: live ones, one line a joint; and what was found, against what is allowed."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ import math
 from rich.text import Text
 
 from openant_tools.numbers import number, readable
+from openant_tools.procedure.finding import Evidence
 from openant_tools.procedure.step import Live
-from openant_tools.tui.marks import BLUE, plain, spelled
+from openant_tools.tui.marks import BLUE, GREEN, ORANGE, plain, spelled
 
-__all__ = ["bars"]
+__all__ = ["allowed_bar", "bars"]
+
+#: of the width of an allowed range: what a bar shows beyond each of its ends
+BEYOND = 0.4
 
 
 def bars(live: Live, width: int) -> Text:
@@ -39,3 +43,33 @@ def _end(value: float, unit: str) -> str:
     """An end of a bar, without its unit."""
     factor, read = readable(value, unit)
     return number(factor * value, sign=True, decimals=0 if read in ("°", "°/s") else 2)
+
+
+def allowed_bar(evidence: Evidence, width: int) -> Text:
+    """Where a number lies: what is allowed is a thick line, what is beyond it a dotted one; blank where it is not known."""
+    value, least, most = evidence.value, evidence.least, evidence.most
+    if value is None or (least is None and most is None):
+        return Text(" " * width)
+    if least is None:
+        least = min(0.0, float(most or 0.0))
+        free = (least, most + BEYOND * (most - least or 1.0)) if most is not None else (least, least + 1.0)
+    elif most is None:
+        free = (least - BEYOND * (abs(least) or 1.0), max(value, least + 2 * (abs(least) or 1.0)))
+    else:
+        beyond = BEYOND * (most - least or 1.0)
+        free = (least - beyond, most + beyond)
+
+    def cell(number: float) -> int:
+        return min(max(round((number - free[0]) / (free[1] - free[0]) * (width - 1)), 0), width - 1)
+
+    within, outside, here = ("=", ".", "|") if plain() else ("━", "┄", "●")
+    ends = cell(least), cell(most) if most is not None else width - 1
+    drawn = [within if ends[0] <= k <= ends[1] else outside for k in range(width)]
+    right = value >= least and (most is None or value <= most)
+    # A number just outside is drawn outside.
+    at = cell(value)
+    if not right:
+        at = min(at, max(ends[0] - 1, 0)) if value < least else max(at, min(ends[1] + 1, width - 1))
+    text = Text("".join(drawn), GREEN if right else ORANGE)
+    text = Text.assemble(text[:at], (here, f"bold {GREEN if right else ORANGE}"), text[at + 1 :])
+    return text

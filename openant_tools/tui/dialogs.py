@@ -19,7 +19,7 @@ __all__ = ["Help", "Question"]
 class Help(ModalScreen[None]):
     """A page of Markdown; any of the usual keys closes it."""
 
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,q,f1,enter", "dismiss", "Close", key_display="esc")]
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,q,enter", "dismiss", "Close", key_display="esc")]
 
     def __init__(self, words: str) -> None:
         super().__init__()
@@ -33,6 +33,12 @@ class Help(ModalScreen[None]):
 
 class Question(ModalScreen[int | None]):
     """Dismissed with the number of the choice, from 0; None for Escape."""
+
+    HELP = """\
+# A question
+
+Arrow keys and `Enter` answer it; `Esc` leaves everything as it is.
+"""
 
     BINDINGS: ClassVar[list[BindingType]] = [Binding("escape", "dismiss(None)", "No")]
 
@@ -49,4 +55,5 @@ class Question(ModalScreen[int | None]):
         self.query_one(Choices).highlighted = 0
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
-        self.dismiss(event.option_index)
+        if self.app.screen is self:  # a key that was pressed twice answers once
+            self.dismiss(event.option_index)

@@ -38,6 +38,8 @@ def condition(history: History, joint: str) -> Condition:
 def _condition(history: History, joint: str) -> Condition:
     if not len(history.rows):
         return Condition("todo", "no data")
+    if history.over:
+        return Condition("off", "last read")
     answered = history.column(f"ok.{joint}") > 0
     code = history.newest(f"err.{joint}")
     word = ERR_CODES[int(code)] if np.isfinite(code) and 0 <= code < len(ERR_CODES) else ""
@@ -96,7 +98,7 @@ class FaultList:
         """Take in what the newest rows say of each joint; where most are silent it is the bus."""
         found = {joint: condition(history, joint) for joint in history.joints}
         silent = [joint for joint, one in found.items() if one.word == "silent"]
-        if len(silent) > len(found) / 2:
+        if len(silent) > max(1.0, len(found) / 2):
             self.note(
                 BUS, f"{len(silent)} of {len(found)} servos do not answer: power, first cable, or a busy computer"
             )

@@ -126,10 +126,12 @@ class History:
     Attributes:
         t: (n,) s. rows: (n, columns).
         bounds: name of a column → measured (low, high) of it, for what is observed (`[observation]` of robot.toml).
+        over: whether nobody reads any more: what stands here was read last.
     """
 
     def __init__(self, joints: Sequence[str], bounds: Mapping[str, tuple[float, float]] | None = None) -> None:
         self.joints = tuple(joints)
+        self.over = False
         self.bounds = dict(bounds or {})
         self._index = {name: k for k, name in enumerate(columns(joints))}
         self.rows: Array = np.empty((0, len(self._index)))
@@ -145,6 +147,23 @@ class History:
             self.worked_out.clear()
             self.rows = np.concatenate([self.rows, rows])
             self.rows = self.rows[np.searchsorted(self.t, self.t[-1] - WINDOW_S) :]
+
+    def read(self, angles_rad: Mapping[str, float], t: float) -> None:
+        """Take in what a procedure has read of all its joints by itself, torque off."""
+        row = dict.fromkeys(self._index, np.nan) | {"t": t, "torque": 0.0}
+        for joint, angle in angles_rad.items():
+            row |= {f"pos.{joint}": angle, f"ok.{joint}": 1.0, f"err.{joint}": 0.0}
+        self.add(np.array([list(row.values())]))
+
+    def left(self) -> History:
+        """What was read last, torque off, once who read it has ended."""
+        out = History(self.joints)
+        out.over = True
+        if len(self.rows):
+            row = np.array([[self.last_known(name) for name in self._index]])
+            row[0, self._index["torque"]] = 0.0
+            out.rows = row
+        return out
 
     def clear(self) -> None:
         self.rows = self.rows[:0]

@@ -49,7 +49,11 @@ class JointChosen(Message):
 
 
 class LegMap(Widget, can_focus=True):
-    """A drawing of the robot as it stands now; arrows choose a joint."""
+    """A drawing of the robot as it stands now; arrows choose a joint.
+
+    Args:
+        captioned: whether a line below tells of the chosen joint.
+    """
 
     HELP = """\
 # The robot from above
@@ -68,9 +72,10 @@ Arrow keys choose a joint, here and among the strips.
 
     chosen = reactive(JOINT_NAMES[0])
 
-    def __init__(self, history: History, *, id: str | None = None) -> None:
+    def __init__(self, history: History, *, id: str | None = None, captioned: bool = True) -> None:
         super().__init__(id=id)
         self._history = history
+        self._captioned = captioned
         self._looks: tuple[tuple[int, Condition], ...] = ()
         self._shown: tuple[tuple[int, Condition], ...] = ()
         self._resting: Timer | None = None
@@ -96,7 +101,7 @@ Arrow keys choose a joint, here and among the strips.
         self.post_message(JointChosen(names[(names.index(self.chosen) + by) % len(names)]))
 
     def render(self) -> Text:
-        width, height = self.size.width, self.size.height - 1
+        width, height = self.size.width, self.size.height - int(self._captioned)
         if width < 12 or height < 5:
             return Text("")
         ascii_only = plain()
@@ -168,6 +173,9 @@ Arrow keys choose a joint, here and among the strips.
         text = Text("\n".join("".join(cells) for cells in lines) + "\n", no_wrap=True)
         for (row, column), style in styles.items():
             text.stylize(style, row * (width + 1) + column, row * (width + 1) + column + 1)
+        if not self._captioned:
+            text.right_crop(1)
+            return text
         found = self._condition(self.chosen)
         text.append(f"{self.chosen} ", "bold")
         text.append(f"{mark(found.mark)} {found.word}", MARKS[found.mark].colour)

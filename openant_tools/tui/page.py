@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Callable
+from pathlib import Path
+from typing import ClassVar, Protocol, cast
 
 from rich.text import Text
 from textual import events
@@ -10,22 +12,52 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.screen import Screen
 from textual.widget import Widget
-from textual.widgets import Footer, Input, Static
+from textual.widgets import Footer, Input, OptionList, Static
 
 from openant_tools.numbers import number
+from openant_tools.tui.feeds import ReplayFeed
+from openant_tools.tui.joint_table import JointTable
 from openant_tools.tui.leg_map import JointChosen, LegMap
 from openant_tools.tui.marks import MARKS, mark, marked, plain, spelled
 from openant_tools.tui.session import Session
 from openant_tools.tui.strips import JointStrips
 
-if TYPE_CHECKING:
-    from openant_tools.tui.app import OpenAnt
-
-__all__ = ["Page", "help_of"]
+__all__ = ["Page", "Program", "help_of"]
 
 #: columns and lines that every screen needs
 LEAST = (80, 24)
 STOP_STYLE = "bold #000000 on #FFE14D"
+
+
+class Program(Protocol):
+    """What a screen asks of the program that it is a screen of.
+
+    Attributes:
+        session: what all screens work on.
+    """
+
+    session: Session
+
+    def action_go(self, name: str) -> None:
+        """Open a screen by its name."""
+
+    def open_step(self, name: str, *, instead: bool = False) -> None:
+        """Open a step, on top or instead of the screen that is open."""
+
+    def action_virtual(self) -> None:
+        """Start a virtual robot, or end the one that runs."""
+
+    def free_bus(self, then: Callable[[], None]) -> None:
+        """Stop watching, so that something else can have the bus, then go on."""
+
+    def play(self, feed: ReplayFeed) -> None:
+        """Show a recording on all screens."""
+
+    def diagnose(self, recording: Path) -> None:
+        """Have a recording diagnosed, on the screen of the gap."""
+
+    def typed(self, digit: str) -> None:
+        """A digit of a step's number, which Enter opens."""
 
 
 class Page(Screen[None]):
@@ -48,11 +80,8 @@ class Page(Screen[None]):
         self._drawn_top: Text | None = None
 
     @property
-    def ant(self) -> OpenAnt:
-        from openant_tools.tui.app import OpenAnt
-
-        assert isinstance(self.app, OpenAnt)
-        return self.app
+    def ant(self) -> Program:
+        return cast(Program, self.app)
 
     @property
     def session(self) -> Session:
@@ -130,9 +159,9 @@ class Page(Screen[None]):
         for map_ in self.query(LegMap):
             map_.chosen = session.selected
             map_.draw(session.history)
-        for strips in self.query(JointStrips):
-            strips.chosen = session.selected
-            strips.draw(session.history)
+        for view in (*self.query(JointStrips), *self.query(JointTable)):
+            view.chosen = session.selected
+            view.draw(session.history)
 
     def _top(self) -> Text:
         session = self.session
@@ -161,6 +190,14 @@ class Page(Screen[None]):
         if event.character is not None and event.character in "0123456789" and not isinstance(self.focused, Input):
             event.stop()
             self.ant.typed(event.character)
+
+    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+        # Of a key that was pressed twice the second may find its line gone, or another screen on top.
+        if self.app.screen is self and event.option in event.option_list.options:
+            self.chosen(event)
+
+    def chosen(self, event: OptionList.OptionSelected) -> None:
+        """A line of one of the screen's lists was chosen."""
 
     def on_joint_chosen(self, message: JointChosen) -> None:
         self.session.selected = message.joint

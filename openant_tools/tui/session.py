@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -88,12 +89,13 @@ class Session:
         """Work on another robot's folder."""
         self.disconnect()
         self.path = path
+        self.history = History(JOINT_NAMES)
         self._say_who_holds()
 
     def _say_who_holds(self) -> None:
         who = None if self.folder is None else self.folder.holder
         if who is not None:
-            self.notices.append(f"this robot is held by {who}: you can look at it here, not move nor change it")
+            self.notices.append(f"this robot is held by {who}: here you can look at it, but neither move nor change it")
 
     def create(self, path: Path, kit: str) -> None:
         """Make a robot's folder with the nominal values of its kit; raises BadInput."""
@@ -234,7 +236,17 @@ class Session:
         if running:
             self._show(LiveFeed(running[-1], "live"))
         elif self.feed is not None:
+            before = self.history
             self._show(None)
+            self.history = before.left()
+
+    def read(self, angles_rad: Mapping[str, float]) -> None:
+        """Show what a procedure has read by itself, joint → its angle, torque off."""
+        if self.feed is not None or not angles_rad:
+            return
+        if self.history.over or set(self.history.joints) != set(angles_rad):
+            self.history = History(tuple(angles_rad))
+        self.history.read(angles_rad, time.monotonic())
 
     def _show(self, feed: Feed | None) -> None:
         if self.feed is not None:

@@ -81,6 +81,7 @@ class StepRun:
             seen = self._enough.is_set()
             self._enough.clear()
             return seen
+        self._enough.clear()  # a key that was pressed before counts for nothing that comes later
         if isinstance(event, Hands) and event.while_watching and self._bench.control is not None:
             self._do_virtually(event)
         elif isinstance(event, Intent | Ask) or (isinstance(event, Hands) and not event.while_watching):
@@ -105,6 +106,8 @@ class StepRun:
         try:
             with self._bench.folder.hold():
                 finding = drive(self.step.start(self._bench), self)
+                if self._ended is not None:  # what was stopped has seen less than it says
+                    raise self._ended
                 keep(finding, self._bench.folder)
         except (OpenAntError, OSError) as error:
             self._done(None, str(error))

@@ -49,13 +49,13 @@ SIGNALS: tuple[Signal, ...] = (
     Signal("angle", ("pos",), "°", -30.0, 30.0, 1),
     Signal("velocity", ("vel",), "°/s", -60.0, 60.0, 0),
     Signal("effort (A, or share of full load)", ("cur", "load"), "", -0.2, 0.2, 2),
-    Signal("duty", ("pwm",), "of 1", -0.2, 0.2, 2),
+    Signal("duty", ("pwm",), "%", -20.0, 20.0, 0),
     Signal("supply", ("volt",), "V", 9.0, 13.0, 1),
     Signal("temperature", ("temp",), "°C", 20.0, 60.0, 0),
     Signal("round trip", ("rtt",), "ms", 0.0, 5.0, 2),
 )
 #: columns → factor from the row's unit to the one shown
-_FACTOR: Mapping[str, float] = {"rtt": 1e3, "pos": math.degrees(1), "vel": math.degrees(1)}
+_FACTOR: Mapping[str, float] = {"rtt": 1e3, "pwm": 100.0, "pos": math.degrees(1), "vel": math.degrees(1)}
 #: columns of text before and after the trace
 _BEFORE, _AFTER = 25, 17
 #: of one joint: each line costs time ten times a second
@@ -140,7 +140,7 @@ All strips of a signal share one scale, which stands in the top line; it grows w
         grey = Style(color="#A8A8A8")
         unit = spelled(chosen.unit)
         title = f"{chosen.title} {unit}"
-        scale = f"{spelled(span(low, high))} {unit}, {number(WINDOW_S)} s"
+        scale = f"{spelled(span(low, high, chosen.unit))}, {number(WINDOW_S)} s"
         head = f"{'joint':9}{'servo':9}{title}"
         room = width - len(head) - after - 1
         head += scale.rjust(room) if room > len(scale) else ""

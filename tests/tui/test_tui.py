@@ -8,6 +8,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -18,10 +19,10 @@ import mujoco
 import numpy as np
 import pytest
 from rich.text import Text
-from syrupy.assertion import SnapshotAssertion
 from textual.pilot import Pilot
 from textual.widgets import Input
 
+from openant_tools.bringup.walk import WALK
 from openant_tools.calib.wires import engine_config
 from openant_tools.comms import messages
 from openant_tools.comms.clock import VirtualControl
@@ -31,13 +32,14 @@ from openant_tools.errors import HardwareFault
 from openant_tools.files import write_text
 from openant_tools.gap.diagnosis import Diagnosis, Found, Span
 from openant_tools.procedure.finding import Evidence, Finding, keep
-from openant_tools.procedure.step import Bench, Event, Hands, Intent, Live, Procedure, RegisterChange, Say, Step
+from openant_tools.procedure.step import Ask, Bench, Intent, Procedure, Say, Step
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run, write_table
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.app import SCENARIOS, SCREENS, OpenAnt
 from openant_tools.tui.choices import Choices
+from openant_tools.tui.dialogs import Question
 from openant_tools.tui.faults import FaultList, condition
 from openant_tools.tui.feeds import History, ReplayFeed
 from openant_tools.tui.leg_map import REST_S
@@ -171,27 +173,6 @@ async def _go(pilot: Pilot[int], name: str) -> None:
     await pilot.pause()
 
 
-#: what procedures say and ask
-EVENTS: dict[str, tuple[Event, ...]] = {
-    "intent": (
-        Say("one servo answers, at 57600 baud", "ok"),
-        Say("its firmware is old: no fast reads", "warn"),
-        Intent(
-            "make this XC430-W240-T (id 1, 57600 baud, firmware 46) the rear right hip",
-            (RegisterChange("hip_rr", "id", 1, 10), RegisterChange("hip_rr", "baud_rate", 1, 3)),
-            moves=True,
-        ),
-    ),
-    "bars": (
-        Hands("Move each joint by hand to both of its stops.", "turn", while_watching=True),
-        Live(
-            {joint: 0.1 * k - 0.4 for k, joint in enumerate(JOINT_NAMES)}, "rad", "reached so far",
-            dict.fromkeys(JOINT_NAMES, -1.3), dict.fromkeys(JOINT_NAMES, 1.2), {"knee_fl": "upper stop missing"},
-        ),
-    ),
-}  # fmt: skip
-
-
 def a_worked_folder(robot: RobotFolder, monkeypatch: pytest.MonkeyPatch) -> Run:
     """A robot with a recording, a learning curve and a diagnosis, of always the same date."""
     monkeypatch.setenv("TEXTUAL_ANIMATIONS", "none")
@@ -236,71 +217,6 @@ def test_every_screen_looks_as_it_did(
         await pilot.pause()
 
     assert snap_compare(app, terminal_size=size, run_before=before)
-
-
-def test_every_state_reads_as_it_did(
-    robot: RobotFolder, monkeypatch: pytest.MonkeyPatch, snapshot: SnapshotAssertion
-) -> None:
-    """What a step asks and shows, the helpers over a screen, a fault, and a window that is too small."""
-    a_worked_folder(robot, monkeypatch)
-    seen = dict[str, str]()
-
-    async def look() -> None:
-        app = OpenAnt(Path("my-ant"), ticking=False)
-        async with app.run_test(size=(80, 24)) as pilot:
-            for name, key in {"help": "f1", "jump": "ctrl+o"}.items():
-                await pilot.press(key)
-                await pilot.pause()
-                seen[name] = screen_text(app)
-                await pilot.press("escape")
-            app.session.faults.note("knee_fl", "does not answer")
-            app.screen.draw()  # type: ignore[attr-defined]
-            await pilot.pause()
-            seen["fault"] = screen_text(app)
-            await pilot.press("f8")
-            await _step(pilot)
-            for name, events in EVENTS.items():
-                for event in events:
-                    app.screen.shown(event)  # type: ignore[attr-defined]
-                app.screen.draw()  # type: ignore[attr-defined]
-                await pilot.wait_for_scheduled_animations()
-                await pilot.pause(0.1)  # what scrolls into view has a frame to do so
-                seen[name] = screen_text(app)
-            await pilot.resize_terminal(60, 14)
-            await pilot.pause()
-            seen["small"] = screen_text(app)
-
-    asyncio.run(look())
-    assert "SPACE: STOP" in seen["small"]
-    assert "Make the window larger: 80 columns and 24 lines at least." in seen["small"]
-    assert "\n".join(f"==== {name}\n{text}" for name, text in seen.items()) == snapshot
-
-
-def test_without_unicode_every_screen_is_ascii(robot: RobotFolder) -> None:
-    plain(True)
-    run = a_run(robot.path.parent)
-    a_diagnosis(robot)
-
-    async def look() -> None:
-        app = OpenAnt(robot.path, ticking=False)
-        async with app.run_test(size=(80, 24)) as pilot:
-            await pilot.pause()
-            seen = {"walk": screen_text(app)}
-            frozen(app, run, 10.0)
-            for name in SCREENS:
-                app.action_go(name)
-                await pilot.pause()
-                seen[name] = screen_text(app)
-            app.open_step("estop")
-            await pilot.pause()
-            seen["step"] = screen_text(app)
-        for name, text in seen.items():
-            strange = {character for character in text if ord(character) > 126}
-            assert not strange, (name, strange)
-        assert "ok" in seen["walk"]
-        assert "no" in seen["walk"]
-
-    asyncio.run(look())
 
 
 def test_every_widget_that_takes_keys_explains_itself(robot: RobotFolder) -> None:
@@ -757,6 +673,86 @@ def test_the_stop_key_reaches_a_robot_that_moves(tmp_path: Path) -> None:
         app.session.close()
 
     asyncio.run(stop())
+
+
+def asks(bench: Bench) -> Procedure:
+    """A procedure with one question."""
+    yield Ask("Is it so?", ("yes", "no"), default="yes")
+    return Finding("asks", True, "it is so", (), "", "none")
+
+
+def test_a_key_that_is_pressed_twice_answers_once(robot: RobotFolder) -> None:
+    async def press() -> None:
+        app = OpenAnt(robot.path)
+        async with app.run_test(size=(80, 24)) as pilot:
+            app.push_screen(StepScreen(Step("asks", "Asks", "Asks.", f"{__name__}:asks")))
+            for words in ("Begin", "yes"):
+                await until(pilot, lambda words=words: offered(app)[:1] == [words])  # type: ignore[misc]
+                app.simulate_key("enter")
+                app.simulate_key("enter")
+            await until(pilot, lambda: "Begin again" in offered(app))
+            app.push_screen(Question("Quit?", "Stay", "Quit"))
+            await pilot.pause()
+            app.simulate_key("enter")
+            app.simulate_key("enter")
+            await until(pilot, lambda: isinstance(app.screen, StepScreen))
+            await pilot.press("escape")
+            await until(pilot, lambda: isinstance(app.screen, WalkScreen))
+            app.simulate_key("enter")
+            app.simulate_key("enter")
+            await until(pilot, lambda: isinstance(app.screen, StepScreen))
+            await pilot.pause(0.2)
+            assert sum(isinstance(screen, StepScreen) for screen in app.screen_stack) == 1
+        app.session.close()
+
+    asyncio.run(press())
+
+
+def test_help_on_a_question_is_about_the_step_below_it(robot: RobotFolder) -> None:
+    async def ask() -> None:
+        app = OpenAnt(robot.path)
+        async with app.run_test(size=(80, 24)) as pilot:
+            app.push_screen(StepScreen(WALK["centre"]))
+            await until(pilot, lambda: "Begin" in offered(app))
+            app.push_screen(Question("Leave this step?", "Leave", "Stay"))
+            await pilot.pause()
+            await pilot.press("f1")
+            await until(pilot, lambda: "Horn: the disc on the servo's shaft" in screen_text(app))
+            assert "SPACE: STOP" in screen_text(app), "whatever lies over it"
+            await pilot.press("f1")
+            await until(pilot, lambda: isinstance(app.screen, Question))
+        app.session.close()
+
+    asyncio.run(ask())
+
+
+HEEDED = threading.Event()
+
+
+def heedless(bench: Bench) -> Procedure:
+    """A procedure that goes on to its finding whatever happens meanwhile."""
+    yield Say("it has begun")
+    HEEDED.wait(PATIENCE_S)
+    return Finding("heedless", True, "all is well", (), "", "none")
+
+
+@pytest.mark.parametrize("key", ["space", "ctrl+c"])
+def test_what_was_stopped_finds_nothing(robot: RobotFolder, key: str) -> None:
+    HEEDED.clear()
+
+    async def stop() -> None:
+        app = OpenAnt(robot.path)
+        async with app.run_test(size=(80, 24)) as pilot:
+            app.push_screen(StepScreen(Step("heedless", "Heedless", "Goes on.", f"{__name__}:heedless")))
+            await choose(pilot, "Begin")
+            await until(pilot, lambda: "it has begun" in screen_text(app))
+            await pilot.press(key)
+            HEEDED.set()
+            await until(pilot, lambda: "Begin again" in offered(app) or app.return_code is not None)
+        app.session.close()
+
+    asyncio.run(stop())
+    assert not list(robot.findings.glob("heedless-*"))
 
 
 def test_ctrl_c_leaves_with_130_and_nothing_running(robot: RobotFolder, loose: Mapping[str, str | None]) -> None:

@@ -115,7 +115,7 @@ improved model, which `w` writes beside the robot's own. The full report with pi
             self._shown = self._files[event.option_index]
             self._show(self._shown)
 
-    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+    def chosen(self, event: OptionList.OptionSelected) -> None:
         if event.option_list.id == "runs":
             self._choose(self._chosen ^ {self._runs[event.option_index]})
 

@@ -159,7 +159,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
     def on_input_submitted(self, event: Input.Submitted) -> None:
         self.query_one("#choices").focus()
 
-    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+    def chosen(self, event: OptionList.OptionSelected) -> None:
         if event.option_id == "stop":
             if self.session.training is not None:
                 self.session.training.stop()

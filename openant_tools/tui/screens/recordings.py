@@ -77,7 +77,7 @@ that has the columns of docs/recordings.md.
     def note(self, words: str) -> None:
         self.query_one("#note", Static).update(words)
 
-    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+    def chosen(self, event: OptionList.OptionSelected) -> None:
         self.play(self._files[event.option_index])
 
     def on_input_submitted(self, event: Input.Submitted) -> None:

@@ -62,7 +62,7 @@ there, or a new place, and press `Enter`; then choose below whether to open it o
     def on_input_submitted(self, event: Input.Submitted) -> None:
         self.query_one("#choices").focus()
 
-    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+    def chosen(self, event: OptionList.OptionSelected) -> None:
         path = Path(self.query_one("#path", Input).value.strip() or ".").expanduser()
         chosen = event.option_id
         note = self.query_one("#note", Static)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -9,21 +10,34 @@ from typing import ClassVar
 from rich.text import Text
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Horizontal, Vertical, VerticalScroll
+from textual.containers import Container, Vertical, VerticalScroll
 from textual.widgets import Input, OptionList, Static
 from textual.widgets.option_list import Option
 
 from openant_tools.bringup.walk import WALK, standing
 from openant_tools.errors import OpenAntError
-from openant_tools.numbers import number, percent, span
+from openant_tools.numbers import exact, number, percent, span
 from openant_tools.procedure.finding import Finding
 from openant_tools.procedure.journal import Journal
-from openant_tools.procedure.step import Answer, Ask, Drawing, Event, Hands, Intent, Live, Progress, Say, Step
+from openant_tools.procedure.step import (
+    Answer,
+    Ask,
+    Drawing,
+    Event,
+    Hands,
+    Intent,
+    Live,
+    Progress,
+    Say,
+    Step,
+    change_lines,
+)
 from openant_tools.procedure.unfinished import forget, unfinished
 from openant_tools.tui.bars import bars
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.dialogs import Question
-from openant_tools.tui.found import finding_lines, verdict
+from openant_tools.tui.found import numbers_lines, verdict
+from openant_tools.tui.joint_table import JointTable
 from openant_tools.tui.leg_map import LegMap
 from openant_tools.tui.marks import MARKS, Name, mark, marked, plain, spelled
 from openant_tools.tui.page import Page
@@ -33,6 +47,12 @@ from openant_tools.tui.step_run import BY_VIRTUAL_HANDS, StepRun
 
 __all__ = ["StepScreen"]
 
+#: of live bars: more than these take the place of the robot in a small window
+FEW_BARS = 2
+#: lines of the places for what to do now, and for what was found
+NOW_LINES, FOUND_LINES = 6, 4
+#: columns of the robot beside the rest, where there is room
+ROBOT = 56
 #: the answer that the stop key gives where a procedure asks for the stop key
 STOP = "stop"
 _LEVELS: Mapping[str, Name] = {"info": "info", "ok": "ok", "warn": "warn", "fail": "fail"}
@@ -46,9 +66,31 @@ class StepChoice:
     do: Callable[[], None]
 
 
+class Log(VerticalScroll):
+    """Lines below each other. What was said last is what is seen, however the rest of the screen grows, until one scrolls."""
+
+    follows = True
+
+    def say(self, words: Text) -> None:
+        self.mount(Static(words if not plain() else Text(spelled(words.plain), words.style)))
+        self._follow()
+
+    def on_resize(self) -> None:
+        self._follow()
+
+    def turn(self, by: int) -> None:
+        """Scroll by so many pages."""
+        self.scroll_relative(y=by * max(1, self.size.height - 1), animate=False)
+        self.follows = self.scroll_target_y >= self.max_scroll_y
+
+    def _follow(self) -> None:
+        if self.follows:
+            self.call_after_refresh(self.scroll_end, animate=False)
+
+
 class StepScreen(Page):
     """Three fixed places: above what to do now and what was found, below what is asked and what comes next. Between them the
-    log; beside it the robot, where there is room."""
+    robot as it is now, and the log; once there is a finding, its numbers instead of the log."""
 
     HELP = """\
 # A step of the walk
@@ -57,11 +99,16 @@ The step says what it will do and which registers it will change, and does nothi
 `Enter` answer. `Space` is the stop key at any time: torque off, the step ends. `Esc` leaves the step; it ends in order,
 and can be begun again: what it found or wrote before stays, and every write to a servo's memory stands in
 `journal.jsonl` with the value before, so that it can be undone.
+
+The table shows each joint while something reads it: whether its servo answers, angle, torque, load, heat, supply; the drawing
+beside it where the legs are. When the step has ended its numbers stand there: a bar's thick part is what is allowed, the dot
+where the number lies. `l` shows the log of what was said and done instead.
 """
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape", "leave", "Leave"),
-        Binding("pageup", "scroll(-1)", "Log", key_display="pgup/dn"),
-        Binding("pagedown", "scroll(1)", "Log", show=False),
+        Binding("l", "log", "Log"),
+        Binding("pageup", "scroll(-1)", "Scroll", key_display="pgup/dn"),
+        Binding("pagedown", "scroll(1)", "Scroll", show=False),
     ]
 
     def __init__(self, step: Step) -> None:
@@ -78,6 +125,8 @@ and can be begun again: what it found or wrote before stays, and every write to 
         self._now = ""
         self._found: Finding | None = None
         self._found_before = ""
+        #: whether the log is wanted where there are numbers to show
+        self._log_wanted = False
 
     @property
     def about(self) -> str:
@@ -86,16 +135,19 @@ and can be begun again: what it found or wrote before stays, and every write to 
     @property
     def verdict(self) -> Text:
         if self._found is not None and not self.running:
-            return verdict(self._found, self._found_before)
+            return self._pinned()
         return Text.assemble(self._head(), "\n", spelled(self._now))
 
     def body(self) -> ComposeResult:
         yield Static(id="head")
         yield Static(id="now")
         yield Static(id="found")
-        with Horizontal(id="work"):
-            yield VerticalScroll(id="log", can_focus=True)
-            yield LegMap(self.session.history)
+        with Container(id="work"):
+            with Container(id="robot"):
+                yield JointTable(self.session.history)
+                yield LegMap(self.session.history, captioned=False)
+            yield Log(id="log", can_focus=True)
+            yield VerticalScroll(Static(id="numbers"), id="result", can_focus=True)
         with Vertical(id="ask"):
             yield Static(id="bars")
             yield Static(id="question")
@@ -118,21 +170,46 @@ and can be begun again: what it found or wrote before stays, and every write to 
 
     def draw(self) -> None:
         super().draw()
+        if not self.query("#numbers"):
+            return  # not filled yet
         self.query_one("#head", Static).update(self._head())
         now, found = self.query_one("#now", Static), self.query_one("#found", Static)
         now.display, found.display = bool(self._now) and not self.small, self._found is not None and not self.small
         now.update(Text(spelled(self._now), style="bold"))
         if self._found is not None:
-            found.update(verdict(self._found, self._found_before))
+            found.update(self._pinned())
         if self._live is not self._drawn_live:
             self._drawn_live = self._live
             line = self.query_one("#bars", Static)
-            if line.display != (self._live is not None):
-                line.display = self._live is not None
-                # What is below the log now takes another share of the screen.
-                self.call_after_refresh(self.query_one("#log", VerticalScroll).scroll_end, animate=False)
+            line.display = self._live is not None and not self._in_table
             if self._live is not None:
                 line.update(bars(self._live, line.size.width or self.size.width - 4))
+                self.session.read(self._live.angles_rad)
+        result = self._found is not None and not self._log_wanted
+        self.query_one("#log").display = not result
+        self.query_one("#result").display = result
+        self.query_one("#robot").display = self._robot_shown
+
+    @property
+    def _roomy(self) -> bool:
+        """Whether the robot has its place beside the rest."""
+        return self.has_class("-wide") and self.has_class("-tall")
+
+    @property
+    def _in_table(self) -> bool:
+        """Whether the robot's table tells what live bars would, in a small window."""
+        live = self._live
+        joints = live is not None and live.unit == "rad" and len(live.values) > FEW_BARS
+        return joints and self.session.feed is not None and not self._roomy
+
+    @property
+    def _robot_shown(self) -> bool:
+        """Where there is room always; in a small window while it is read, unless bars of all its joints stand there."""
+        if self._roomy:
+            return True
+        if self._live is not None and len(self._live.values) > FEW_BARS and not self._in_table:
+            return False
+        return self.running and len(self.session.history.rows) > 0
 
     def _head(self) -> Text:
         text = Text(no_wrap=True, overflow="ellipsis")
@@ -155,10 +232,8 @@ and can be begun again: what it found or wrote before stays, and every write to 
         """What the step is about, and the offer to begin."""
         step, folder = self.step, self.session.folder
         self._now = step.does
-        if step.table:
-            self.say(Text(f"You need {step.table}."))
-        moves = "The robot moves; you are asked before it does." if step.moves else "Nothing moves."
-        self.say(Text(f"It changes {step.changes or 'nothing'}. {moves} About {number(step.minutes)} min."))
+        for words in self._needs():
+            self.say(Text(words))
         if folder is None:
             self.say(
                 marked("warn", f"there is no robot's folder at {self.session.path.resolve()}: make one in Settings (s)")
@@ -168,11 +243,18 @@ and can be begun again: what it found or wrote before stays, and every write to 
         one = standing(folder).get(step.name)
         if one is not None and one.waits_for:
             names = ", ".join(WALK[name].title for name in one.waits_for)
-            self.say(marked("warn", f"before this one should come: {names}"))
+            self.say(marked("warn", f"do first: {names}"))
         if one is not None and one.finding is not None:
             self.show_finding(one.finding, "the last time: ")
         self.offer("", [*self._beginnings("Begin"), self._back()])
         self.draw()
+
+    def _needs(self) -> list[str]:
+        """What must be at hand, and what it does to the robot."""
+        step = self.step
+        moves = "The robot moves; you are asked before it does." if step.moves else "Nothing moves."
+        needs = [f"You need {step.table}."] if step.table else []
+        return [*needs, f"It changes {step.changes or 'nothing'}. {moves} About {number(step.minutes)} min."]
 
     def _beginnings(self, words: str) -> list[StepChoice]:
         """To begin; where it was left in the middle, first of all to go on there."""
@@ -236,6 +318,8 @@ and can be begun again: what it found or wrote before stays, and every write to 
                     f"Next: {WALK[following].title}", lambda: self.ant.open_step(following, instead=True)
                 )
                 choices = [forward, *choices] if finding.ok else [*ahead, again, forward, self._back()]
+            elif self.step.name in WALK and finding.ok:
+                choices = [StepChoice("Next: train an agent", lambda: self.ant.action_go("learn")), *choices]
             if self._wrote():
                 choices.append(
                     StepChoice("Undo what was written last", lambda: self.ant.open_step("undo", instead=True))
@@ -253,10 +337,41 @@ and can be begun again: what it found or wrote before stays, and every write to 
 
     def show_finding(self, finding: Finding, before: str = "") -> None:
         self._found, self._found_before = finding, before
-        for line in finding_lines(
-            finding, not before, max(40, (self.query_one("#log").size.width or self.size.width) - 4)
-        ):
-            self.say(line)
+        self.refresh_bindings()
+        self._log_wanted = False
+        self._draw_numbers()
+        self.query_one("#result", VerticalScroll).scroll_home(animate=False)
+
+    def _pinned(self) -> Text:
+        """The verdict, with what is wrong as far as there is room; else where it stands."""
+        assert self._found is not None
+        whole = verdict(self._found, self._found_before)
+        if self._fits(whole):
+            return whole
+        first = whole.split("\n")[0]
+        return first.append(
+            f"\n  {mark('warn')} {len(self._found.lines)} things are to be seen to:", MARKS["warn"].colour
+        )
+
+    def _fits(self, whole: Text) -> bool:
+        return sum(self._rows(line) for line in whole.plain.split("\n")) <= FOUND_LINES
+
+    def _draw_numbers(self) -> None:
+        if self._found is None:
+            return
+        beside = ROBOT if self._roomy else 0
+        lines = numbers_lines(self._found, self.size.width - beside - 3)
+        whole = verdict(self._found)
+        if not self._fits(whole):
+            lines = [*whole.split("\n")[1:], Text(), *lines]
+        if self._found_before:  # before it begins one reads what it needs and changes
+            lines = [*(Text(spelled(words)) for words in self._needs()), Text(), *lines]
+        self.query_one("#numbers", Static).update(Text("\n").join(lines))
+
+    def on_resize(self) -> None:
+        super().on_resize()
+        if self.query("#numbers"):
+            self._draw_numbers()
 
     # ---- from the procedure --------------------------------------------------------------------------------------
 
@@ -293,11 +408,16 @@ and can be begun again: what it found or wrote before stays, and every write to 
             self._hands(event)
 
     def _intend(self, event: Intent) -> None:
-        self._now = f"It will {event.words}."
-        self.say(Text(f"{mark('info')} It will {event.words}.", style="bold"))
-        for change in event.registers:
-            self.say(Text(f"    {change}"))
+        words, lines = f"It will {event.words}.", change_lines(event.registers)
+        # What is to be granted stands where it is seen, as far as there is room.
+        room = NOW_LINES - self._rows(words)
+        if len(lines) > room:
+            left = lines[max(room - 1, 0) :]
+            self.say(Text("\n".join(["It will write, too:", *(f"  {line}" for line in left)])))
+            lines = [*lines[: max(room - 1, 0)], f"and {len(left)} more, below"]
+        self._now = "\n".join([words, *(f"  {line}" for line in lines)])
         if self._granted_all and not event.moves:
+            self._log_intent(event)
             self.say(marked("ok", "granted with the rest"))
             self._reply_later(True)
             return
@@ -313,6 +433,15 @@ and can be begun again: what it found or wrote before stays, and every write to 
             choices.insert(1, StepChoice("Yes, and all further writes of this step", self._grant_all))
         self.ask(event, f"May it?{count}{motion}", choices)
 
+    def _log_intent(self, event: Intent) -> None:
+        self.say(Text(f"{mark('info')} It will {event.words}.", style="bold"))
+        for line in change_lines(event.registers):
+            self.say(Text(f"    {line}"))
+
+    def _rows(self, words: str) -> int:
+        """Lines that words take at the top."""
+        return len(textwrap.wrap(spelled(words), max(self.size.width - 2, 20)))
+
     def _grant_all(self) -> None:
         self._granted_all = True
         self.reply(True, "granted, with all further writes of this step")
@@ -322,40 +451,39 @@ and can be begun again: what it found or wrote before stays, and every write to 
         if event.choices:
             choices = [StepChoice(word, lambda word=word: self.reply(word, word)) for word in event.choices]  # type: ignore[misc]
             default = event.choices.index(str(event.default)) if event.default in event.choices else 0
-            self.ask(event, event.question, choices, default)
+            self.ask(event, "", choices, default)
             return
-        allowed = (
-            f" ({number(event.low)} to {number(event.high)})"
-            if event.low is not None and event.high is not None
-            else ""
-        )
-        unit = "" if event.unit == "text" else event.unit
-        self.ask(event, f"{event.question} {unit}{allowed}", [])
+        of = [event.unit] if event.unit not in ("", "text") else []
+        of += [span(event.low, event.high)] if event.low is not None and event.high is not None else []
+        self.ask(event, f"Your answer ({', '.join(of)}), then Enter:" if of else "Your answer, then Enter:", [])
         field = self.query_one("#value", Input)
         field.display = True
-        field.value = "" if event.default is None else str(event.default)
+        given = event.default
+        field.value = exact(given).replace("−", "-") if isinstance(given, int | float) else given or ""
         field.focus()
 
     def on_input_submitted(self, message: Input.Submitted) -> None:
         event = self._pending
         if not isinstance(event, Ask):
             return
-        value: str | float = message.value.strip()
-        if event.unit != "text":
-            try:
-                value = float(value)
-            except ValueError:
-                self.say(marked("warn", f"{value!r} is no number"))
-                return
-            if not (event.low is None or value >= event.low) or not (event.high is None or value <= event.high):
-                self.say(marked("warn", f"{number(value)} is outside {span(event.low, event.high)}"))
-                return
-        self.reply(value, str(value))
+        words = message.value.strip()
+        if event.unit == "text":
+            self.reply(words, words)
+            return
+        try:
+            value = float(words.replace("−", "-").replace(",", "."))
+        except ValueError:
+            self.say(marked("warn", f"{words!r} is no number"))
+            return
+        if not (event.low is None or value >= event.low) or not (event.high is None or value <= event.high):
+            self.say(marked("warn", f"{number(value)} is outside {span(event.low, event.high)}"))
+            return
+        self.reply(value, exact(value, event.unit))
 
     def _hands(self, event: Hands) -> None:
         self._now = event.words
-        self.say(Text(f"{mark('info')} {event.words}", style="bold"))
         if event.while_watching:
+            self.say(Text(f"{mark('info')} {event.words}", style="bold"))
             return
         choices = [StepChoice("Done", lambda: self.reply(True, "done"))]
         if self.session.virtual is not None:
@@ -363,7 +491,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
                 "Let the virtual robot's hands do it", lambda: self.reply(BY_VIRTUAL_HANDS, "done by virtual hands")
             )
             choices = [by_hand, StepChoice("It is done already", choices[0].do)]
-        self.ask(event, "Your hands are needed.", choices)
+        self.ask(event, "", choices)
 
     # ---- to the procedure ----------------------------------------------------------------------------------------
 
@@ -377,6 +505,11 @@ and can be begun again: what it found or wrote before stays, and every write to 
         if self._run is None or self._pending is None:
             return
         asked = f"{self._pending.question} " if isinstance(self._pending, Ask) else ""
+        # What was asked stood above until now; in the log it stands with its answer.
+        if isinstance(self._pending, Intent):
+            self._log_intent(self._pending)
+        elif isinstance(self._pending, Hands):
+            self.say(Text(f"{mark('info')} {self._pending.words}", style="bold"))
         self._pending = None
         self.say(Text(f"  {mark('ok')} {asked}{words}", style=MARKS["todo"].colour))
         self.offer("", [])
@@ -403,7 +536,7 @@ and can be begun again: what it found or wrote before stays, and every write to 
         else:
             self.query_one("#log").focus()
 
-    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+    def chosen(self, event: OptionList.OptionSelected) -> None:
         self.choices[event.option_index].do()
 
     def on_key(self, event: object) -> None:
@@ -436,11 +569,11 @@ and can be begun again: what it found or wrote before stays, and every write to 
         )
         self.app.push_screen(Question(words, "Leave", "Stay"), answered)
 
-    def end(self) -> None:
+    def end(self, why: str = "left by hand") -> None:
         """End what runs, in order."""
         if self._run is not None:
             self.session.release()
-            self._run.end("left by hand")
+            self._run.end(why)
 
     def on_unmount(self) -> None:
         self.end()
@@ -452,10 +585,19 @@ and can be begun again: what it found or wrote before stays, and every write to 
 
     def say(self, words: Text) -> None:
         """One more entry of the log."""
-        log = self.query_one("#log", VerticalScroll)
-        log.mount(Static(words if not plain() else Text(spelled(words.plain), words.style)))
-        log.scroll_end(animate=False)
+        self.query_one(Log).say(words)
+
+    def action_log(self) -> None:
+        """The log instead of the numbers, and back."""
+        self._log_wanted = not self._log_wanted
+        self.draw()
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        return self._found is not None if action == "log" else True
 
     def action_scroll(self, by: int) -> None:
-        log = self.query_one("#log", VerticalScroll)
-        log.scroll_relative(y=by * max(1, log.size.height - 1), animate=False)
+        log, result = self.query_one(Log), self.query_one("#result", VerticalScroll)
+        if log.display:
+            log.turn(by)
+        else:
+            result.scroll_relative(y=by * max(1, result.size.height - 1), animate=False)

@@ -149,7 +149,7 @@ class WalkScreen(Page):
         else:
             about.update(_about(WALK[event.option_id], self._standing.get(event.option_id)))
 
-    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+    def chosen(self, event: OptionList.OptionSelected) -> None:
         if event.option_id == VIRTUAL:
             self.ant.action_virtual()
         elif event.option_id is not None:
@@ -175,7 +175,7 @@ def _about(step: Step, one: Standing | None) -> Text:
     if one is not None and one.finding is not None:
         text.append(f"{mark(sign(one.finding))} {one.finding.what}\n", "bold")
     if one is not None and one.waits_for:
-        text.append(f"{mark('warn')} wants first: {', '.join(WALK[name].title for name in one.waits_for)}\n")
+        text.append(f"{mark('warn')} do first: {', '.join(WALK[name].title for name in one.waits_for)}\n")
     if step.table:
         text.append(f"You need {step.table}.\n")
     moves = "the robot moves, after you say so" if step.moves else "nothing moves"
