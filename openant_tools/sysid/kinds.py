@@ -15,16 +15,26 @@ from openant_tools.effects.catalogue import acting, catalogue
 from openant_tools.effects.kind import Kind
 from openant_tools.model.plant import Plant
 
-__all__ = ["ACTION_DELAY", "ACTUATOR_LAG", "ELECTRICAL_DAMPING", "KINDS", "LOAD_FRICTION", "SPEED_LIMIT", "Kind"]
+__all__ = [
+    "ACTION_DELAY",
+    "ACTUATOR_LAG",
+    "ELECTRICAL_DAMPING",
+    "KINDS",
+    "LOAD_FRICTION",
+    "SPEED_LIMIT",
+    "ZERO_OFFSET",
+    "Kind",
+]
 
 ACTION_DELAY = "action_delay"
 ACTUATOR_LAG = "actuator_lag"
 ELECTRICAL_DAMPING = "electrical_damping"
 LOAD_FRICTION = "load_friction"
 SPEED_LIMIT = "speed_limit"
+ZERO_OFFSET = "zero_offset"
 #: what is fitted, in the order in which it is set: what is a share of another, or a ratio to it, comes after that
 NAMES = (
-    "stiffness", "velocity_gain", "damping", "armature", "coulomb_friction", ELECTRICAL_DAMPING, "zero_offset", ACTION_DELAY,
+    "stiffness", "velocity_gain", "damping", "armature", "coulomb_friction", ELECTRICAL_DAMPING, ZERO_OFFSET, ACTION_DELAY,
     "torque_limit", SPEED_LIMIT, ACTUATOR_LAG, "link_mass", "torso_mass", "floor_friction", "contact_softness",
     "contact_impedance",
 )  # fmt: skip

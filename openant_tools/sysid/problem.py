@@ -14,16 +14,19 @@ Jacobian foresees, so that one step goes as far as it would in many.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.sysid.dataset import Dataset
 from openant_tools.sysid.estimate import CONFLICT, Estimate, Posterior, estimate, posterior
 from openant_tools.sysid.forward import ForwardModel
+from openant_tools.sysid.kinds import ZERO_OFFSET
 from openant_tools.sysid.parameter import ACTION_DELAY, Parameter
 from openant_tools.sysid.solve import (
     ARRIVED,
@@ -59,6 +62,8 @@ LOOSE = 0.1
 DECISIVE = 1.0
 #: delays (s) from which a fit starts where they explain the data far better than none
 DELAYS_S = (0.02, 0.04, 0.06)
+#: rad by which a zero may be off that no prior expects: horns that sit some teeth off, or the wrong way round
+ZEROS_RAD = tuple(math.radians(angle) for angle in (-135, -90, -45, -25, 25, 45, 90, 135, 180))
 #: share of what is left to tell of a fit's progress that each step takes: how many there are nobody knows beforehand
 TOLD = 0.06
 
@@ -74,7 +79,7 @@ class Problem:
         tempered: all runs of a joint count alike, by their length: for laws all of which are wrong, by the error that they leave.
             Trusting each stretch as far as the model can follow it, as is done otherwise, lets a wrong model choose what it is
             judged by.
-        freed: (parameters,) whose priors the data contradict, so that they count for next to nothing; found by `solve`.
+        trust: (parameters,) what their priors weigh: 1, or next to nothing where the data contradict them; found by `solve`.
         left_out: (rows,) of all datasets that nothing is fitted to: they are simulated, and count for nothing; None: no row.
     """
 
@@ -82,7 +87,7 @@ class Problem:
     parameters: Sequence[Parameter]
     floor: Array
     tempered: bool = False
-    freed: Bools = field(default_factory=lambda: np.zeros(0, bool))
+    trust: Array = field(default_factory=lambda: np.ones(0))
     left_out: Bools | None = None
 
     def __post_init__(self) -> None:
@@ -90,14 +95,13 @@ class Problem:
         self._weighing = Weighing(stretches(self.datasets, self.left_out), self.floor, self.tempered)
         self._valley = np.array([parameter.definition.valley for parameter in self.parameters], bool)
         self.centre: Array = np.array([parameter.centre for parameter in self.parameters])
-        if not len(self.freed):
-            self.freed = np.zeros(len(self.parameters), bool)
+        if not len(self.trust):
+            self.trust = np.ones(len(self.parameters))
 
     @property
     def prior(self) -> Prior:
         """Of unit deviation, but where the data contradict it."""
-        precision = np.where(self.freed, LOOSE, 1.0) ** 2
-        return Prior(self.centre, precision, self._model.low, self._model.high)
+        return Prior(self.centre, self.trust**2, self._model.low, self._model.high)
 
     def solve(self, start: Array | None = None, progress: Progress | None = None) -> Estimate:
         """Fit, re-weight, and fit again until the weights settle; from both ends where the cost is known to have valleys.
@@ -136,7 +140,7 @@ class Problem:
             held: for each fit, (parameters,) what stays where it begins; default nothing.
             progress: as `solve` calls it.
         """
-        others = [replace(self, left_out=rows, freed=self.freed.copy()) for rows in left_out]
+        others = [replace(self, left_out=rows, trust=self.trust.copy()) for rows in left_out]
         begun = [
             other._from(found, starts[k] if starts else None, held[k] if held else None)
             for k, other in enumerate(others)
@@ -174,15 +178,18 @@ class Problem:
         lasting = weights.correlation_s >= WHITE * self._weighing.period
         if not (lasting & (weights.noise > CLEAN * self.floor)).any():
             return found
-        led = yield from self._by_data_alone(found)
-        if led is None:
-            return found
-        before, score = self.freed, self._score(found.point)
-        self.freed = before | (np.abs(led - self.centre) > CONFLICT)
-        again = yield from self._descend(led)
-        if self._explains(again, weights) or self._score(again.point) < score - DECISIVE:
-            return again
-        self.freed = before
+        for lead in (self._by_other_zeros(), self._by_data_alone(found)):
+            led = yield from lead
+            if led is None:
+                continue
+            before, score = self.trust, self._score(found.point)
+            away = np.abs(led - self.centre)
+            # However far the data lead: what is left of the prior must not pull them back.
+            self.trust = np.where(away > CONFLICT, np.minimum(LOOSE, 1 / np.maximum(away, CONFLICT)), before)
+            again = yield from self._descend(led)
+            if self._explains(again, weights) or self._score(again.point) < score - DECISIVE:
+                return again
+            self.trust = before
         return found
 
     def _starts(self, start: Array | None) -> list[Array]:
@@ -218,6 +225,36 @@ class Problem:
             if squares[best] < 0.5 * squares[0]:
                 out[p] = tried[best][p]
         return out
+
+    def _by_other_zeros(self) -> Generator[Look | Derive, Any, Array | None]:
+        """The prior with the zeros among ZEROS_RAD that leave less than half of what its own leaves, joint by joint; None where
+        none does.
+
+        Commands and positions go along with the zero, so that only gravity tells it: its pull has the other sign elsewhere.
+        """
+        plant = self.datasets[0].plant
+        turns = plant.model.jnt_type[plant.model.dof_jntid[plant.dof]] == mujoco.mjtJoint.mjJNT_HINGE
+        zeros = [
+            p for p, one in enumerate(self.parameters) if one.kind == ZERO_OFFSET and turns[list(one.joints)].all()
+        ]
+        prior = self.prior
+        first = np.clip(self.centre, prior.low, prior.high)
+        tried = [first]
+        for zero in ZEROS_RAD if zeros else ():
+            moved = first.copy()
+            moved[zeros] = [zero / self.parameters[p].std for p in zeros]
+            tried.append(moved)
+        left = []
+        for u in tried if zeros else ():
+            point = yield Look(u)
+            left.append(np.nansum(point.residual**2, axis=0))
+        out = first.copy()
+        for p in zeros:
+            squares = [float(one[list(self.parameters[p].joints)].sum()) for one in left]
+            best = int(np.argmin(squares))
+            if squares[best] < 0.5 * squares[0]:
+                out[p] = tried[best][p]
+        return None if np.array_equal(out, first) else out
 
     def _descend(self, u: Array) -> Steps:
         """To the estimate that is reached from one start."""
@@ -299,5 +336,5 @@ class Problem:
     def _score(self, point: Point) -> float:
         """−log posterior with unknown noise: compares starts."""
         away = (point.u - self.centre) ** 2
-        prior = 0.5 * float(np.sum(np.where(self.freed, np.minimum(away, CONFLICT**2), away)))
+        prior = 0.5 * float(np.sum(np.where(self.trust < 1, np.minimum(away, CONFLICT**2), away)))
         return prior + self._weighing.score(point.residual)

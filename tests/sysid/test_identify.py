@@ -189,6 +189,16 @@ def test_data_that_contradict_the_given_model_win_and_it_is_said(
     assert result.after.full < 4 * FLOOR < result.before.full
 
 
+def test_a_zero_that_is_off_by_a_sixth_of_a_turn_is_found(model: Path) -> None:
+    robot = Robot(zero_offset=1.0)
+    result = identify([robot.record("a")], model, [robot.record("b", seed=1)])
+    holds(result, robot.values)
+    zero = value(result, "zero_offset.joint")
+    assert zero.verdict == "conflict"
+    assert zero.value == pytest.approx(1.0, abs=0.02), "gravity tells it half as well there as where a leg hangs"
+    assert result.after.full < 4 * FLOOR < result.before.full
+
+
 def test_runs_of_two_gains_are_one_servo(tmp_path: Path) -> None:
     """Its registers set the stiffness, each file's own; friction, inertia and zero are the servo's, and told by both."""
     files = {kp: plants.write(tmp_path / f"p{kp:g}.xml", MODEL.replace('kp="8"', f'kp="{kp:g}"')) for kp in (8.0, 4.0)}
