@@ -26,11 +26,19 @@ from openant_tools.gap.diagnosis import NONE
 
 #: where weights begin: evidence as it is, held-out data as a few independent errors a fold; and how far from there costs as much as one
 #: robot's surprise, of those that cannot be negative in logarithms: what should show and does not never speaks for a cause
-START = {"evidence": 1.0, "support": 1.0, "shortfall": 0.3, "none": 0.0, "outside": 0.0, "outside: support": 0.0}
+START = {
+    "evidence": 1.0,
+    "support": 1.0,
+    "shortfall": 0.3,
+    "likelier": 0.05,
+    "none": 0.0,
+    "outside": 0.0,
+    "outside: support": 0.0,
+}
 FAR = 1.0
-POSITIVE = ("evidence", "support", "shortfall")
+POSITIVE = ("evidence", "support", "shortfall", "likelier")
 #: the weights of what held-out data say
-HELD_OUT = ("support", "shortfall", "outside: support")
+HELD_OUT = ("support", "shortfall", "likelier", "outside: support")
 
 
 @dataclass(frozen=True)
@@ -57,7 +65,7 @@ def robot(found: Mapping[str, object], truth: Mapping[str, object]) -> Judged:
         if row["causes"] == [OUTSIDE]:
             outside = row["probability"]
             continue
-        rows.append(Row(tuple(row["causes"]), (), row["probability"], row["support"], row["foretold"]))
+        rows.append(Row(tuple(row["causes"]), (), row["probability"], row["support"], row["foretold"], row["likelier"]))
     effects = truth.get("effect", [])
     right = {one["effect"] for one in effects}
     # What is hardly beyond tolerance need not be found.

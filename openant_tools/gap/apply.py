@@ -22,8 +22,8 @@ from openant_tools.effects.robot import Reference, Robot, Seen
 from openant_tools.effects.zero_offset import read_zero, write_zero
 from openant_tools.errors import BadInput
 from openant_tools.files import json_text, write_text
-from openant_tools.gap.closure import BODY, adjust
 from openant_tools.gap.diagnosis import Diagnosis, Found
+from openant_tools.gap.nuisance import BODY, adjust
 from openant_tools.model.body import floor_contacts
 from openant_tools.model.engines import carries, elsewhere, state
 from openant_tools.model.mjcf import document_text, write_model

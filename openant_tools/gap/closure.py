@@ -1,11 +1,12 @@
 """How far the gap closes on runs that were not used: the model re-fitted within tolerance, with causes and without.
 
-Everything is judged as the gap is defined (formats, section 3): re-initialised from measurement, positions, held-out runs.
+The gap is measured as it is defined (formats, section 3): re-initialised from measurement twice a second, positions, held-out runs. Causes are
+fitted, and judged, by whole windows, and by what sensors of the body say as well: a load or a slipping foot moves the body, and joints
+hardly; and a body that has sunk into a soft floor would be put back where it is not by each new beginning.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,68 +16,39 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from openant_tools.effects.catalogue import enter
-from openant_tools.effects.effect import Quantity
-from openant_tools.effects.robot import Robot
-from openant_tools.gap.features import Floats, around_switching
-from openant_tools.gap.hypothesis import Hypothesis, Part, bounds_of
+from openant_tools.effects.robot import USUAL_NOISE, Robot
+from openant_tools.gap.descent import END, LEAST_GAIN, Descent
+from openant_tools.gap.features import COLUMNS, Floats, around_switching
+from openant_tools.gap.hypothesis import Part, Refit, bounds_within, extent, quantities, refit_at, sizes
+from openant_tools.gap.nuisance import BODY, HEAT_LOSS, LESS, ONE_SIDED, TILTS, adjust, nuisances
 from openant_tools.gap.protocol import Played, RunSet
 from openant_tools.gap.simulation import simulate
-from openant_tools.gap.tolerance import FACTORS, FLOOR, tolerance_of, torso_kg
 from openant_tools.model.floor import floors
 from openant_tools.model.gap import HORIZON_S, share_closed
 from openant_tools.model.plant import Setup
 from openant_tools.model.rollout import Rollouts
 
-__all__ = [
-    "BODY", "Closure", "Refit", "Windows", "adjust", "calibration_of", "closures", "heat_loss_of", "nothing", "unmoved",
-]  # fmt: skip
+__all__ = ["SENSED", "Closure", "Windows", "calibration_of", "closures", "heat_loss_of", "nothing", "unmoved"]
 
 Array = NDArray[np.float64]
 
-#: standard deviation of a prior, as a share of the tolerance; and where it ends: a re-fit within tolerance is no effect
-SPREAD, END = 0.6, 1.0
 #: rows (of some tens of milliseconds each) of one window say about as much as one: errors within it go together
 INDEPENDENT_S = 0.1
-#: standard deviation that sizes of causes keep from where they were found, as a share
-POLISH = 0.3
-#: times what it was found to be that a size may become
-FARTHEST = 2.5
-#: how often slopes are followed, and the step, in prior deviations, below which a fit has settled
-ITERATIONS, SETTLED = 8, 0.02
+#: how often slopes are followed at most
+ITERATIONS = 30
+#: how often slopes of tolerances are measured, each time where those before lead no farther
+MEASURED = 3
 #: how often errors of each joint in each run are taken to be as large as a step leaves them: no model of a real servo is true, and one
 #: that trusts its sensors follows what no parameter explains, to the ends of all of them
 INFLATIONS = 4
-#: times what slopes foretold that may be left: beyond, they are looked at anew
-FORETOLD = 1.3
-#: of so many windows fits follow one, on the stand and on the floor, where each takes long and all joints move each
-FOLLOWED = {Setup.STAND: 1, Setup.FLOOR: 2}
-#: of a tolerance by which it is varied to learn its slope
-NEARBY = 0.3
 #: by which bounds are wider than what lies on them
 TINY = 1e-12
 #: rad: no joint is farther off than in a simulation that fell apart
 LOST_RAD = 10.0
-#: what tilts a floor along its x and y, rad
-TILTS = ("tilt_x", "tilt_y")
-#: what a warm motor loses, and °C between runs from which it is asked how much; what of a servo is less by it
-HEAT_LOSS, WARMED_C, LESS = "heat_loss", 2.0, ("stiffness", "torque_limit")
-#: whose calibration it is that belongs to no joint
-BODY = "body"
 #: rad, the least that a position is known to
 LEAST_SIGMA_RAD = 2e-4
-
-
-@dataclass(frozen=True)
-class Refit:
-    """A model re-fitted within tolerance, with causes.
-
-    Attributes:
-        x: of each part of the hypothesis, its coordinates. nuisance: what else moved, in tolerances, see `Windows.names`.
-    """
-
-    hypothesis: Hypothesis
-    x: tuple[Mapping[str, float], ...]
-    nuisance: Array
+#: sensors of the body, and how many columns each has
+SENSED = {name: len(columns) for name, columns in COLUMNS.items()}
 
 
 @dataclass(frozen=True)
@@ -84,239 +56,86 @@ class Closure:
     """What a hypothesis leaves of the gap on folds that its fit had not seen.
 
     Attributes:
-        after, floor: rad. closed: share of the excess that is gone; low, high: over the folds, 95 %.
-        squares: (2, folds, joints) rad², summed over rows, of the given model and of this one; counts: (folds,) of how many errors.
-        fitted: (joints,) rad², mean square of what it leaves of all that it was fitted to.
+        before, after, floor: rad, of joints. closed: share of the excess that is gone; low, high: over the folds, 95 %.
+        squares: (folds, channels) summed over rows; counts: (folds, channels) of how many errors.
+        fitted: (channels,) mean square of what it leaves of all that it was fitted to; likelihood: the logarithm of how likely that is,
+            where errors of each channel in each run have a size of their own, and that of sizes and tolerances.
+            known: (channels,) mean square of sensors.
         refit: on all training runs together.
         std: of the coordinates of its causes, in order: by curvature with errors as large as the fit leaves them, or by how much folds
             differ (jackknife), whichever is more.
     """
 
+    before: float
     after: float
     floor: float
     closed: float
     low: float
     high: float
     fitted: Array
+    likelihood: float
     squares: Array
     counts: Array
+    known: Array
     refit: Refit
     std: tuple[Mapping[str, float], ...]
 
-    @property
-    def before(self) -> float:
-        """rad, the gap of the given model."""
-        return float(np.sqrt(self.squares[0].sum() / self.counts.sum()))
-
     def support(self, other: Closure) -> float:
-        """Logarithm of how much less it leaves than another on the same folds, rms, mean of them, summed over joints.
+        """Logarithm of how much less it leaves than another on the same folds, rms, mean of them, summed over joints and body sensors.
 
-        Up to a factor that of their likelihoods, where errors of each joint on each fold have a size of their own that nobody knows,
+        Up to a factor that of their likelihoods, where errors of each channel on each fold have a size of their own that nobody knows,
         but not less than sensors'.
         """
-        rows = np.maximum(self.counts[:, None] / self.squares.shape[2], 1.0)  # of a fold without any nothing is left
-        return self._less(other.squares[1] / rows, self.squares[1] / rows) / len(self.counts)
+        rows = np.maximum(self.counts, 1.0)  # of a fold without any nothing is left
+        return self._less(other.squares / rows, self.squares / rows) / len(self.counts)
+
+    def likelier(self, other: Closure) -> float:
+        """nats by which what it was fitted to is likelier."""
+        return self.likelihood - other.likelihood
 
     def foretold(self, other: Closure) -> float:
         """The same of what it was fitted to."""
         return self._less(other.fitted, self.fitted)
 
     def _less(self, other: Array, own: Array) -> float:
-        known = max(self.floor, LEAST_SIGMA_RAD) ** 2
-        return float(0.5 * np.log((other + known) / (own + known)).sum())
-
-
-@dataclass(frozen=True)
-class _Nuisance:
-    """What may move within tolerance; of the body and the floor where it has no joints."""
-
-    name: str
-    joints: tuple[int, ...]
-    tolerance: float
-
-    def value(self, u: float) -> float:
-        """The factor, or what is added (N·m, rad, s, kg), at so many tolerances; 1/°C of what is lost to heat."""
-        if self.name == HEAT_LOSS:
-            return self.tolerance * (1 + u)
-        return float(np.exp(u * self.tolerance)) if self.name in {*FACTORS, *FLOOR} else float(u * self.tolerance)
-
-
-def adjust(robot: Robot, kind: str, joints: Sequence[int], value: float) -> None:
-    """Move a robot within tolerance, by a value of `calibration_of`.
-
-    Args:
-        joints: none for what belongs to the body or the floor.
-
-    Raises:
-        KeyError: no such kind.
-    """
-    at = list(joints)
-    if kind in FACTORS:
-        robot.factor(kind)[at] *= value
-    elif kind == "coulomb_friction":
-        robot.more(kind)[at] += value
-    elif kind == "zero_offset":
-        robot.zero[at] += value
-    elif kind == "delay":
-        robot.delay[at] += value
-    elif kind in FLOOR:
-        setattr(robot, kind, getattr(robot, kind) * value)
-    elif kind == "torso_kg":
-        robot.torso_kg += value
-    elif kind in TILTS:
-        robot.tilt = robot.tilt + value * np.eye(2)[TILTS.index(kind)]
-    else:
-        raise KeyError(kind)
-
-
-@dataclass(frozen=True)
-class _Block:
-    """What a run says where a descent is, joint by joint; errors count in deviations of their sensors.
-
-    Attributes:
-        cost: (joints,) squares. more: (joints, coordinates, coordinates), slope: (joints, coordinates), so that so far from there squares
-            are cost + 2 slope·moved + moved·more·moved. count: (joints,) of how many independent errors.
-    """
-
-    cost: Array
-    more: Array
-    slope: Array
-    count: Array
-
-    @classmethod
-    def of(cls, errors: Floats, slopes: Floats, count: Array) -> _Block:
-        """Of weighted errors (rows, joints) and how each coordinate moves them (coordinates, rows, joints)."""
-        along = slopes.transpose(2, 0, 1)  # in float32: nothing of a fit is larger
-        left = errors.T[:, :, None]
-        return cls(
-            np.square(errors, dtype=np.float64).sum(axis=0),
-            (along @ along.transpose(0, 2, 1)).astype(np.float64),
-            (along @ left)[:, :, 0].astype(np.float64),
-            np.maximum(count, 1.0),
-        )
-
-    def left(self, moved: Array) -> Array:
-        """(joints,) squares that are foretold so far from there."""
-        out: Array = np.maximum(self.cost + 2 * self.slope @ moved + self.more @ moved @ moved, 0.0)
-        return out
-
-    def inflation(self, left: Array) -> Array:
-        """(joints,) how many times its sensors' variance."""
-        out: Array = np.maximum(left / self.count, 1.0)
-        return out
-
-    @property
-    def surprise(self) -> float:
-        """Minus twice the logarithm of how likely it is, with errors as large as they are, if not smaller than sensors'."""
-        inflation = self.inflation(self.cost)
-        return float((self.cost / inflation + self.count * np.log(inflation)).sum())
-
-    def weighted(self, weight: Array) -> tuple[Array, Array]:
-        """Normal matrix and gradient of all joints together."""
-        return np.tensordot(weight, self.more, 1), weight @ self.slope
-
-
-@dataclass
-class _Descent:
-    """One hypothesis on its way to where it leaves least.
-
-    Attributes:
-        u: where it is, sizes of causes, then tolerances. prior, scale: around what, and how far it may go.
-        at, least, blocks: where it was best, what it cost there, and what each run says there. seen: the same where it is now.
-        slopes: of each run, weighted, (coordinates, rows, joints). bends: which of them are other ones wherever it comes to.
-        share: of the way to where its blocks lead that it has gone since.
-    """
-
-    start: Refit
-    causes: int
-    u: Array
-    prior: Array
-    scale: Array
-    steps: Array
-    slopes: dict[int, Floats]
-    at: Array
-    bends: NDArray[np.bool_]
-    least: float = np.inf
-    share: float = 1.0
-    blocks: dict[int, _Block] = dataclasses.field(default_factory=dict)
-    seen: dict[int, _Block] = dataclasses.field(default_factory=dict)
-
-    @classmethod
-    def of(cls, start: Refit, tolerances: int, learnt: Mapping[int, Floats]) -> _Descent:
-        """From a start, with what slopes are known of the tolerances alone."""
-        centre = _vector(start)
-        shares = np.array([q.share for q in _quantities(start)], bool)
-        sizes = np.where(shares, POLISH, np.maximum(POLISH * np.abs(centre), 1e-3))
-        steps = np.where(shares, 0.1, np.maximum(0.05 * np.abs(centre), 1e-3))
-        u: Array = np.concatenate([centre, start.nuisance])
-        slopes = {
-            k: np.concatenate([np.zeros((len(centre), *known.shape[1:]), np.float32), known])
-            for k, known in learnt.items()
-        }
-        return cls(
-            start,
-            len(centre),
-            u,
-            np.concatenate([centre, np.zeros(tolerances)]),
-            np.concatenate([sizes, np.full(tolerances, SPREAD)]),
-            np.concatenate([steps, np.full(tolerances, NEARBY)]),
-            slopes,
-            u,
-            np.array([True] * len(centre) + [False] * tolerances),
-        )
-
-    def moved(self, members: Iterable[tuple[int, NDArray[np.bool_]]]) -> Array:
-        """Where it is with some coordinates a step farther."""
-        out = self.u.copy()
-        for p, _ in members:
-            out[p] += self.steps[p]
-        return out
-
-    @property
-    def cost(self) -> float:
-        """Minus twice the logarithm of how likely it is where it is now, and what that says of sizes and tolerances."""
-        own = float(np.sum(np.square((self.u - self.prior) / self.scale)))
-        return own + sum(block.surprise for block in self.seen.values())
-
-    def failed(self, k: int) -> bool:
-        """Whether a run leaves clearly more than its slopes foretold where it was best, though all together have gained."""
-        if k not in self.blocks or self.cost > self.least:
-            return False
-        before, now = self.blocks[k], self.seen[k]
-        foretold = before.left(self.u - self.at)
-        weight = 1 / before.inflation(before.cost)
-        return bool(weight @ now.cost > FORETOLD * (weight @ foretold))
+        return float(0.5 * np.log((other + self.known) / (own + self.known)).sum())
 
 
 class Windows:
     """Runs cut into windows, and what of the model is re-fitted on them.
 
+    Channels are the joints' positions, rad, and then what sensors of the body say, each column by itself.
+
     Args:
-        protocol: the robot and its runs, at the model's own step.
+        protocol: the robot and its runs, at the model's own step. without: signals that have no part in it.
 
     Attributes:
-        measured: of each run, (rows, joints) rad; NaN where nobody knows what a servo had in mind (`around_switching`).
+        sensed: signals of the body that any run has, of the others.
+        measured: of each run, (rows, channels); NaN where nobody knows what a servo had in mind (`around_switching`).
         found: where a re-fit of `nothing` came to, in tolerances as `names`; 0 before.
     """
 
-    def __init__(self, protocol: RunSet) -> None:
+    def __init__(self, protocol: RunSet, without: Collection[str] = ()) -> None:
         self.protocol = protocol
-        self.names = _nuisances(protocol)
+        self.joints = len(protocol.joints)
+        there = {name for one in protocol.runs for name in one.seen} - set(without)
+        self.sensed = tuple(name for name in SENSED if name in there)
+        self.names = nuisances(protocol, self.sensed)
         self._before: dict[int, Array] = {}
-        self._rollouts = [_restarted(one) for one in protocol.runs]
-        coarse = protocol.coarse().runs
-        self._quick = [_restarted(one).thinned(FOLLOWED[one.plant.setup]) for one in coarse]
-        unsure = [around_switching(one.run, protocol.joints) for one in protocol.runs]
-        self.measured = [
-            np.where(there, np.nan, one.run.signal("pos", protocol.joints))
-            for one, there in zip(protocol.runs, unsure, strict=True)
-        ]
+        self._rollouts = [_restarted([one]) for one in protocol.runs]
+        self._whole = [_windows([one]) for one in protocol.runs]
+        self._there = [_rows(one) for one in self._whole]
+        self._coarse = protocol.coarse().runs
+        self._together: dict[tuple[int, ...], list[tuple[tuple[int, ...], Rollouts]]] = {}
+        self.measured = [self._measured(one) for one in protocol.runs]
         self.floor = floors([one.run for one in protocol.runs], protocol.joints)[0]
-        self._sigma = np.maximum(self.floor, LEAST_SIGMA_RAD)
-        self._followed = [
-            np.isin(np.arange(len(one.run.t)), [row for piece in quick.segments for row in piece.row])
-            for one, quick in zip(protocol.runs, self._quick, strict=True)
-        ]
+        #: (channels,) of sensors
+        self.sigma = np.concatenate(
+            [
+                np.maximum(self.floor, LEAST_SIGMA_RAD),
+                *(np.full(SENSED[name], USUAL_NOISE[name]) for name in self.sensed),
+            ]
+        )
         self._learnt: dict[int, Floats] = {}
         self.found = np.zeros(len(self.names))
 
@@ -336,15 +155,17 @@ class Windows:
                 left = 1 / (1 + one.value(float(u)) * (self.protocol.runs[k].warm_c if warm_c is None else warm_c))
                 for kind in LESS:
                     robot.factor(kind)[:] *= left
-            elif u:
+            elif u or one.name in ONE_SIDED:
                 adjust(robot, one.name, one.joints, one.value(float(u)))
         return robot
 
-    def errors(self, k: int, refits: Sequence[Refit | None], *, quick: bool = False) -> Array:
-        """(refits, rows, joints) rad, measured minus simulated on run k; `quick`: in larger steps, where fits follow it."""
-        return self._errors(
-            k, [self.robot(refit, k) for refit in refits], (self._quick if quick else self._rollouts)[k]
-        )
+    def errors(self, k: int, refits: Sequence[Refit | None]) -> Array:
+        """(refits, rows, joints) rad, measured minus simulated on run k, begun anew as the gap is defined."""
+        return self._errors([k], [self.robot(refit, k) for refit in refits], self._rollouts[k], ())[0]
+
+    def over_windows(self, k: int, refits: Sequence[Refit]) -> Array:
+        """(refits, rows, channels), measured minus simulated on run k, over whole windows."""
+        return self._errors([k], [self.robot(refit, k) for refit in refits], self._whole[k], self.sensed)[0]
 
     def simulated(self, k: int, refit: Refit, signals: Sequence[str]) -> dict[str, Array]:
         """Signal → (rows, joints), what a re-fitted model does on run k."""
@@ -354,15 +175,17 @@ class Windows:
         return {name: values[0].astype(np.float64) for name, values in found.items()}
 
     def before(self, k: int) -> Array:
-        """(rows, joints) rad, the same of the model as it was given."""
+        """(rows, joints) rad, errors of the model as it was given."""
         if k not in self._before:
-            self._before[k] = self._errors(k, [self.robot(None, k)], self._rollouts[k])[0]
+            self._before[k] = self.errors(k, [None])[0]
         return self._before[k]
 
     def written(self, refit: Refit, judged: Sequence[int]) -> float:
         """The gap, rad, on these runs of the one model that can be written: its servos are always as warm as on average there."""
         warm = self.warmth(judged)
-        errors = np.concatenate([self._errors(k, [self.robot(refit, k, warm)], self._rollouts[k])[0] for k in judged])
+        errors = np.concatenate(
+            [self._errors([k], [self.robot(refit, k, warm)], self._rollouts[k], ())[0][0] for k in judged]
+        )
         return float(np.sqrt(np.mean(np.square(errors[np.isfinite(errors)]))))
 
     def warmth(self, judged: Sequence[int]) -> Array:
@@ -370,23 +193,59 @@ class Windows:
         mean: Array = np.mean([self.protocol.runs[k].warm_c for k in judged], axis=0)
         return mean
 
-    def _errors(self, k: int, robots: Sequence[Robot], rollouts: Rollouts) -> Array:
-        found = simulate(rollouts, robots, signals=("pos",), warm_c=[self.protocol.runs[k].warm_c]).signals["pos"]
-        out: Array = self.measured[k][None] - found.astype(np.float64)
-        there = np.zeros(found.shape[1], bool)
-        for segment in rollouts.segments:
-            there[segment.row] = True
+    def _errors(
+        self, runs: Sequence[int], robots: Sequence[Robot], rollouts: Rollouts, sensed: Sequence[str]
+    ) -> list[Array]:
+        """Of each run of a rollout (robots, rows, channels), measured minus simulated: of joints, and some sensors of the body."""
+        warm_c = [self.protocol.runs[k].warm_c for k in runs]
+        signals = simulate(rollouts, robots, signals=("pos", *sensed), warm_c=warm_c).signals
+        pos = signals["pos"]
+        absent = {name: np.full((*pos.shape[:2], width), np.nan) for name, width in SENSED.items()}
+        found = np.concatenate([pos, *(signals.get(name, absent[name]) for name in sensed)], axis=2)
+        measured = np.concatenate([self.measured[k][:, : found.shape[2]] for k in runs])
+        out: Array = measured[None] - found.astype(np.float64)
+        if "yaw" in sensed:
+            out[..., self._of("yaw")] = np.remainder(out[..., self._of("yaw")] + np.pi, 2 * np.pi) - np.pi
         # A robot that no step holds together is as wrong as can be: neither right nor unknown.
-        lost = there[:, None] & np.isfinite(self.measured[k]) & ~(np.abs(found) < LOST_RAD)
-        out[lost] = LOST_RAD
-        return out
+        lost = _rows(rollouts)[:, None] & np.isfinite(measured[:, : self.joints]) & ~(np.abs(pos) < LOST_RAD)
+        out[..., : self.joints][lost] = LOST_RAD
+        return [out[:, rows] for rows in rollouts.rows]
+
+    def _side_by_side(self, fitted: Sequence[int]) -> list[tuple[tuple[int, ...], Rollouts]]:
+        """Runs that one simulation plays, in large steps, where fits follow them: those on one plant, if servos are alike in all."""
+        key = tuple(fitted)
+        if key not in self._together:
+            unlike = any(one.name == HEAT_LOSS for one in self.names)
+            groups: dict[tuple[int, int], list[int]] = {}
+            for k in fitted:
+                one = self._coarse[k]
+                groups.setdefault((id(one.plant), k if unlike or one.windows is None else -1), []).append(k)
+            self._together[key] = [(tuple(mine), _windows([self._coarse[k] for k in mine])) for mine in groups.values()]
+        return self._together[key]
+
+    def _measured(self, one: Played) -> Array:
+        """(rows, channels) of a run."""
+        pos = np.where(
+            around_switching(one.run, self.protocol.joints), np.nan, one.run.signal("pos", self.protocol.joints)
+        )
+        absent = {name: np.full((len(pos), width), np.nan) for name, width in SENSED.items()}
+        body = [one.seen[name][0] if name in one.seen else absent[name] for name in self.sensed]
+        return np.concatenate([pos, *body], axis=1)
+
+    def _of(self, signal: str) -> slice:
+        """Which channels a sensor of the body has."""
+        first = self.joints + sum(SENSED[name] for name in self.sensed[: self.sensed.index(signal)])
+        return slice(first, first + SENSED[signal])
 
     def refit(
         self, starts: Sequence[Refit], training: Sequence[int], leave_out: Sequence[Collection[int]]
-    ) -> list[tuple[Refit, list[Refit], tuple[Mapping[str, float], ...]]]:
+    ) -> list[tuple[Refit, list[Refit], tuple[Mapping[str, float], ...], float]]:
         """Fit within tolerance, and polish sizes: each on all the runs to train on, and without each group of some of them.
 
         All share one linearisation each, at what is found on all of the training runs; and are simulated side by side.
+
+        Returns:
+            of each the fit, those without a group, standard deviations of its sizes, and the logarithm of how likely it is.
         """
         descents = self._descend(starts, list(training))
         for one in descents:
@@ -395,13 +254,14 @@ class Windows:
         out = []
         for one in descents:
             folds = [[k for k in one.blocks if k not in left] for left in leave_out]
-            # As far as all of them together went.
-            each = [one.at + one.share * (self._solve(one, fold) - one.at) for fold in folds]
-            whole, parts = _from(one.start, one.u), [_from(one.start, u) for u in each]
-            out.append((whole, parts, _from(one.start, self._deviations(one, parts)).x))
+            # Where a fold leads otherwise than all of them together, from where these came to.
+            low, high = self._bounds(one)
+            each = [np.clip(one.at + self._solve(one, fold) - one.u, low, high) for fold in folds]
+            whole, parts = refit_at(one.start, one.at), [refit_at(one.start, u) for u in each]
+            out.append((whole, parts, refit_at(one.start, self._deviations(one, parts)).x, -0.5 * one.least))
         return out
 
-    def _deviations(self, descent: _Descent, folds: Sequence[Refit]) -> Array:
+    def _deviations(self, descent: Descent, folds: Sequence[Refit]) -> Array:
         """Standard deviations of a fit's coordinates."""
         normal = np.diag(1 / descent.scale**2)
         for block in descent.blocks.values():
@@ -409,64 +269,59 @@ class Windows:
         curvature: Array = np.sqrt(np.diag(np.linalg.inv(normal)))
         if len(folds) < 2:
             return curvature
-        each = np.array([np.concatenate([_vector(fold), fold.nuisance]) for fold in folds])
+        each = np.array([np.concatenate([sizes(fold), fold.nuisance]) for fold in folds])
         spread = np.sqrt((len(each) - 1) / len(each) * np.square(each - each.mean(axis=0)).sum(axis=0))
         out: Array = np.maximum(curvature, spread)
         return out
 
-    def _descend(self, starts: Sequence[Refit], fitted: Sequence[int]) -> list[_Descent]:
+    def _descend(self, starts: Sequence[Refit], fitted: Sequence[int]) -> list[Descent]:
         """Follow each start to where it leaves least on these runs."""
-        # Slopes cost the most: what was learnt without causes does until it fails.
+        # Slopes cost the most: causes begin with what was learnt of tolerances without them.
         learnt = {k: known for k, known in self._learnt.items() if k in fitted}
-        descents = [_Descent.of(start, len(self.names), learnt) for start in starts]
-        moving = descents
-        for _ in range(ITERATIONS):
-            self._linearize(moving, fitted)
-            for k in fitted:
-                if poor := [one for one in moving if one.failed(k)]:
-                    for one in poor:
-                        del one.slopes[k]
-                    self._linearize(poor, [k])
-            for one in moving:
-                if one.cost > one.least:
-                    # Farther than the slopes hold.
-                    one.share /= 2
-                    one.u = (one.at + one.u) / 2
-                    continue
-                one.at, one.least, one.blocks, one.share = one.u, one.cost, dict(one.seen), 1.0
-                one.u = self._solve(one, list(one.blocks))
-            moving = [one for one in moving if (np.abs(one.u - one.at) > SETTLED * one.scale).any()]
-            if not moving:
+        descents = [Descent.of(start, len(self.names), learnt) for start in starts]
+        begun = descents
+        for _ in range(1 if learnt else MEASURED):
+            before = [one.least for one in begun]
+            for one in begun if not learnt else ():
+                one.begin()
+            moving = begun
+            for _ in range(ITERATIONS):
+                self._look(moving, fitted)
+                for one in moving:
+                    one.u = self._solve(one, list(one.blocks))
+                moving = [one for one in moving if one.goes_on]
+                if not moving:
+                    break
+            begun = [one for one, cost in zip(begun, before, strict=True) if cost - one.least > 2 * LEAST_GAIN]
+            if not begun:
                 break
         return descents
 
-    def _keep(self, found: _Descent) -> None:
+    def _keep(self, found: Descent) -> None:
         """Remember what was learnt of tolerances."""
         self._learnt = {k: slopes[found.causes :] for k, slopes in found.slopes.items()}
-        self.found = found.u[found.causes :]
+        self.found = found.at[found.causes :]
 
     def _weight(self, k: int) -> Array:
-        """(joints,) that errors of a run are multiplied by: its rows go together, and windows stand for those not followed."""
-        played = self.protocol.runs[k]
-        period = float(np.median(np.diff(played.run.t)))
-        out: Array = np.sqrt(FOLLOWED[played.plant.setup] / max(1.0, INDEPENDENT_S / period)) / self._sigma
+        """(channels,) that errors of a run are multiplied by: its rows go together."""
+        period = float(np.median(np.diff(self.protocol.runs[k].run.t)))
+        out: Array = np.sqrt(1 / max(1.0, INDEPENDENT_S / period)) / self.sigma
         return out
 
     def _count(self, k: int) -> Array:
-        """(joints,) how many independent errors the rows of a run are, as weighted."""
-        weight = np.square(self._weight(k) * self._sigma)
-        count: Array = (np.isfinite(self.measured[k]) & self._followed[k][:, None]).sum(axis=0) * weight
+        """(channels,) how many independent errors the rows of a run are, as weighted."""
+        weight = np.square(self._weight(k) * self.sigma)
+        count: Array = (np.isfinite(self.measured[k]) & self._there[k][:, None]).sum(axis=0) * weight
         return count
 
-    def _solve(self, descent: _Descent, runs: Sequence[int]) -> Array:
+    def _solve(self, descent: Descent, runs: Sequence[int]) -> Array:
         """Where the blocks of some runs lead, made where the descent was best."""
-        u, prior, scale = descent.at, descent.prior, descent.scale
-        ends = [_limits(q, float(at)) for q, at in zip(_quantities(descent.start), prior, strict=False)]
-        low, high = np.array([*ends, *[(-END, END)] * len(self.names)]).T
+        u, prior, scale, held = descent.at, descent.prior, descent.scale, 1 + descent.damping
+        low, high = self._bounds(descent)
         within = np.minimum(low - u, 0) - TINY, np.maximum(high - u, 0) + TINY
         blocks, found = [descent.blocks[k] for k in runs], u
         for _ in range(INFLATIONS):
-            more, slope = np.diag(1 / scale**2), (u - prior) / scale**2
+            more, slope = np.diag(held / scale**2), (u - prior) / scale**2
             for block in blocks:
                 own, along = block.weighted(1 / block.inflation(block.left(found - u)))
                 more, slope = more + own, slope + along
@@ -475,32 +330,42 @@ class Windows:
             found = np.clip(u + lsq_linear(root.T, -np.linalg.solve(root, slope), bounds=within).x, low, high)
         return found
 
-    def _linearize(self, descents: Sequence[_Descent], fitted: Sequence[int]) -> None:
-        """Look at runs from where descents have come to: what they cost there, and their blocks."""
-        for k in fitted:
-            weight = self._weight(k)
-            columns = [self._columns(k, one) for one in descents]
-            refits = [
-                refit
-                for one, mine in zip(descents, columns, strict=True)
-                for refit in [_from(one.start, one.u), *(_from(one.start, one.moved(members)) for members in mine)]
-            ]
-            errors = self.errors(k, refits, quick=True)
-            at = 0
-            for one, mine in zip(descents, columns, strict=True):
-                base = np.nan_to_num(errors[at]) * weight
-                slopes = np.zeros((len(one.u), *base.shape), np.float32)
-                if k in one.slopes:
-                    slopes[:] = one.slopes[k]
-                for row, members in enumerate(mine, at + 1):
-                    change = np.nan_to_num(errors[row] - errors[at]) * weight
-                    for p, mask in members:
-                        slopes[p] = np.where(mask, change, 0.0) / one.steps[p]
-                at += 1 + len(mine)
-                one.slopes[k] = slopes
-                one.seen[k] = _Block.of(base.astype(np.float32), slopes, self._count(k))
+    def _bounds(self, descent: Descent) -> tuple[Array, Array]:
+        """Between which each coordinate may be."""
+        each = zip(quantities(descent.start), descent.prior, extent(descent.start), strict=False)
+        ends = [bounds_within(q, float(at), float(far)) for q, at, far in each]
+        low, high = np.array([*ends, *[(-END, END)] * len(self.names)]).T
+        return low, high
 
-    def _columns(self, k: int, descent: _Descent) -> list[list[tuple[int, NDArray[np.bool_]]]]:
+    def _look(self, descents: Sequence[Descent], fitted: Sequence[int]) -> None:
+        """Simulate runs where descents look next, and what varies there."""
+        found: list[dict[int, Floats]] = [{} for _ in descents]
+        for mine, rollouts in self._side_by_side(fitted):
+            first = mine[0]
+            columns = [self._columns(first, one) for one in descents]
+            steps = [one.steps_on(self.protocol.runs[first].plant.setup) for one in descents]
+            robots = [
+                self.robot(refit_at(one.start, u), first)
+                for one, some, by in zip(descents, columns, steps, strict=True)
+                for u in (one.u, *(one.moved(members, by) for members in some))
+            ]
+            for k, errors in zip(mine, self._errors(mine, robots, rollouts, self.sensed), strict=True):
+                weight, at = self._weight(k), 0
+                for one, some, by, seen in zip(descents, columns, steps, found, strict=True):
+                    seen[k] = (np.nan_to_num(errors[at]) * weight).astype(np.float32)
+                    slopes = np.zeros((len(one.u), *seen[k].shape), np.float32)
+                    if k in one.slopes:
+                        slopes[:] = one.slopes[k]
+                    for row, members in enumerate(some, at + 1):
+                        change = np.nan_to_num(errors[row] - errors[at]) * weight
+                        for p, mask in members:
+                            slopes[p] = np.where(mask, change, 0.0) / by[p]
+                    at += 1 + len(some)
+                    one.slopes[k] = slopes
+        for one, seen in zip(descents, found, strict=True):
+            one.told(seen, {k: self._count(k) for k in fitted})
+
+    def _columns(self, k: int, descent: Descent) -> list[list[tuple[int, NDArray[np.bool_]]]]:
         """What is varied on a run. A joint within tolerance moves little: slopes once known are not looked at again."""
         columns = self._colours(self.protocol.runs[k], descent.start)
         if k not in descent.slopes:
@@ -509,7 +374,8 @@ class Windows:
 
     def _colours(self, one: Played, start: Refit) -> list[list[tuple[int, NDArray[np.bool_]]]]:
         """Coordinates that one simulation can vary, because on the stand legs do not move each other."""
-        everywhere = np.ones(len(self.protocol.joints), bool)
+        everywhere = np.ones(len(self.sigma), bool)
+        on_stand = one.plant.setup is Setup.STAND
         out: list[list[tuple[int, NDArray[np.bool_]]]] = []
         n = 0
         for part in start.hypothesis:
@@ -519,12 +385,12 @@ class Windows:
         tree = one.plant.tree
         used: list[tuple[set[int], list[tuple[int, NDArray[np.bool_]]]]] = []
         for k, nuisance in enumerate(self.names):
-            mine = {int(tree[j]) for j in nuisance.joints} if one.plant.setup is Setup.STAND else set(tree.tolist())
+            mine = {int(tree[j]) for j in nuisance.joints} if on_stand else set(tree.tolist())
             if not mine:  # of the floor, which does nothing to who hangs on a stand, unless it turns both
                 if nuisance.name not in TILTS:
                     continue
                 mine = set(tree.tolist())
-            mask = np.isin(tree, list(mine))
+            mask = np.concatenate([np.isin(tree, list(mine)), ~on_stand & everywhere[self.joints :]])
             for trees, members in used:
                 if not trees & mine:
                     trees |= mine
@@ -535,15 +401,39 @@ class Windows:
         return out + [members for _, members in used]
 
 
-def _restarted(one: Played) -> Rollouts:
-    """A run, begun anew from measurement as the gap is defined: all of it, or what of it is simulated."""
-    if one.windows is None:
-        return Rollouts(one.plant, [one.run], HORIZON_S)
+def _restarted(runs: Sequence[Played]) -> Rollouts:
+    """Runs on one plant, begun anew from measurement as the gap is defined: all of it, or what of it is simulated."""
     parts = []
-    for start, stop in one.windows:
-        edges = np.linspace(start, stop, max(1, round((stop - start) / HORIZON_S)) + 1).tolist()
-        parts += list(itertools.pairwise(edges))
-    return Rollouts(one.plant, [one.run], windows=[parts])
+    for one in runs:
+        mine: list[tuple[float, float]] = []
+        for start, stop in one.windows or ():
+            edges = np.linspace(start, stop, max(1, round((stop - start) / HORIZON_S)) + 1).tolist()
+            mine += itertools.pairwise(edges)
+        parts.append(mine)
+    return _rollouts(runs, parts)
+
+
+def _windows(runs: Sequence[Played]) -> Rollouts:
+    """Runs on one plant in whole windows."""
+    return _rollouts(runs, [one.windows or () for one in runs])
+
+
+def _rollouts(runs: Sequence[Played], windows: Sequence[Sequence[tuple[float, float]]]) -> Rollouts:
+    whole = runs[0].windows is None
+    return Rollouts(
+        runs[0].plant,
+        [one.run for one in runs],
+        HORIZON_S if whole else None,
+        windows=None if whole else windows,
+    )
+
+
+def _rows(rollouts: Rollouts) -> NDArray[np.bool_]:
+    """(rows,) which of its runs' are simulated."""
+    out = np.zeros(rollouts.rows[-1].stop, bool)
+    for segment in rollouts.segments:
+        out[segment.row] = True
+    return out
 
 
 def closures(
@@ -556,30 +446,44 @@ def closures(
     """
     fits = windows.refit(starts, training, folds)
     judged = {k for fold in folds for k in fold}
-    joints = windows.measured[0].shape[1]
-    each, counts = np.zeros((len(starts) + 1, len(folds), joints)), np.zeros(len(folds))
-    seen, rows = np.zeros((len(starts), joints)), 0.0
+    channels = len(windows.sigma)
+    each, counts = np.zeros((len(starts), len(folds), channels)), np.zeros((len(folds), channels))
+    seen, rows = np.zeros((len(starts), channels)), np.zeros(channels)
+    gaps, known = np.zeros((len(starts) + 1, len(folds))), np.zeros(len(folds))
     for k in sorted(judged | set(training)):
         mine = [f for f, fold in enumerate(folds) if k in fold]
-        refits = [one for whole, parts, _ in fits for one in (whole, *(parts[f] for f in mine))]
-        errors = np.concatenate([windows.before(k)[None], windows.errors(k, refits)])
-        good = np.isfinite(errors).all(axis=0)
-        squares = np.square(np.where(good, errors, 0.0)).sum(axis=1)
-        of = squares[1:].reshape(len(starts), 1 + len(mine), joints)
+        refits = [one for whole, parts, *_ in fits for one in (whole, *(parts[f] for f in mine))]
+        squares, good = _squares(windows.over_windows(k, refits))
+        of = squares.reshape(len(starts), 1 + len(mine), channels)
         if k in training:
-            seen, rows = seen + of[:, 0], rows + good.sum() / joints
-        each[0, mine] += squares[0]
-        each[1:, mine] += of[:, 1:]
-        counts[mine] += good.sum()
+            seen, rows = seen + of[:, 0], rows + good
+        each[:, mine] += of[:, 1:]
+        counts[mine] += good
+        if mine:
+            held_out = [parts[f] for _, parts, *_ in fits for f in mine]
+            squares, good = _squares(np.concatenate([windows.before(k)[None], windows.errors(k, held_out)]))
+            gaps[0, mine] += squares[0].sum()
+            gaps[1:, mine] += squares[1:].sum(axis=1).reshape(len(starts), len(mine))
+            known[mine] += good.sum()
     floor = float(np.sqrt(np.mean(windows.floor**2)))
     out = []
-    for n, (whole, _, std) in enumerate(fits):
-        both = each[[0, n + 1]]
-        before, after = np.sqrt(both.sum(axis=(1, 2)) / counts.sum())
-        low, high = _interval(both[0].sum(axis=1), both[1].sum(axis=1), counts, floor)
-        closed = _closed(float(before), float(after), floor)
-        out.append(Closure(float(after), floor, closed, low, high, seen[n] / rows, both, counts, whole, std))
+    for n, (whole, _, std, likelihood) in enumerate(fits):
+        both = gaps[[0, n + 1]]
+        before, after = (float(one) for one in np.sqrt(both.sum(axis=1) / known.sum()))
+        low, high = _interval(both[0], both[1], known, floor)
+        closed, fitted = _closed(before, after, floor), seen[n] / np.maximum(rows, 1.0)
+        out.append(
+            Closure(
+                before, after, floor, closed, low, high, fitted, likelihood, each[n], counts, windows.sigma**2, whole, std
+            )
+        )  # fmt: skip
     return out
+
+
+def _squares(errors: Array) -> tuple[Array, Array]:
+    """(robots, channels) summed over rows that all robots have, and (channels,) of how many."""
+    good = np.isfinite(errors).all(axis=0)
+    return np.square(np.where(good, errors, 0.0)).sum(axis=1), good.sum(axis=0).astype(np.float64)
 
 
 def _closed(before: float, after: float, floor: float) -> float:
@@ -601,32 +505,6 @@ def _interval(before: Array, after: Array, counts: Array, floor: float) -> tuple
     return float(low), float(high)
 
 
-def _nuisances(protocol: RunSet) -> list[_Nuisance]:
-    """What may move within tolerance: of each joint, of floor and body."""
-    out = []
-    joints = range(len(protocol.joints))
-    for kind in ("stiffness", "damping", "torque_limit", "armature", "link_mass"):
-        if kind != "torque_limit" or np.isfinite(protocol.reference.limit).all():
-            out += [_Nuisance(kind, (j,), FACTORS[kind]) for j in joints]
-    out += [
-        _Nuisance(
-            "coulomb_friction",
-            (j,),
-            tolerance_of("coulomb_friction") * min(1.0, float(protocol.reference.torque[j]) / 0.2),
-        )
-        for j in joints
-    ]
-    out += [_Nuisance("zero_offset", (j,), tolerance_of("zero_offset")) for j in joints]
-    out.append(_Nuisance("delay", tuple(joints), tolerance_of("action_delay")))
-    if protocol.warmed_c > WARMED_C:
-        out.append(_Nuisance(HEAT_LOSS, tuple(joints), tolerance_of("thermal_derating")))
-    if protocol.reference.floor:
-        out += [_Nuisance(kind, (), tolerance) for kind, tolerance in FLOOR.items()]
-        out.append(_Nuisance("torso_kg", (), torso_kg(protocol.reference)))
-        out += [_Nuisance(kind, (), tolerance_of("floor_tilt") / np.sqrt(2)) for kind in TILTS]
-    return out
-
-
 def calibration_of(windows: Windows, refit: Refit, judged: Sequence[int]) -> dict[str, dict[str, float]]:
     """What moved within tolerance: kind → joint or `BODY` → factor, or what is added (N·m, rad, s, kg), see `adjust`.
 
@@ -637,6 +515,8 @@ def calibration_of(windows: Windows, refit: Refit, judged: Sequence[int]) -> dic
     joints = windows.protocol.joints
     for one, u in zip(windows.names, refit.nuisance, strict=True):
         value = one.value(float(u))
+        if one.of_imu:
+            continue
         if one.name == HEAT_LOSS:
             for kind in LESS:
                 for joint, left in zip(joints, 1 / (1 + value * windows.warmth(judged)), strict=True):
@@ -664,29 +544,3 @@ def unmoved(windows: Windows, parts: Iterable[Part], x: Iterable[Mapping[str, fl
 def nothing(windows: Windows) -> Refit:
     """No cause at all, only what tolerances let move, from where it was last found to be."""
     return Refit((), (), windows.found)
-
-
-def _limits(quantity: Quantity, at: float) -> tuple[float, float]:
-    """Between which a size may be polished that was found somewhere: it keeps its sign, and a shape its reason."""
-    if quantity.shape:
-        return bounds_of(quantity)
-    return (0.0, FARTHEST * at) if at >= 0 else (FARTHEST * at, 0.0)
-
-
-def _quantities(refit: Refit) -> list[Quantity]:
-    return [q for part in refit.hypothesis for q in part.definition.quantities]
-
-
-def _vector(refit: Refit) -> Array:
-    return np.array(
-        [x[q.name] for part, x in zip(refit.hypothesis, refit.x, strict=True) for q in part.definition.quantities]
-    )
-
-
-def _from(start: Refit, u: Array) -> Refit:
-    at, x = 0, []
-    for part in start.hypothesis:
-        names = [q.name for q in part.definition.quantities]
-        x.append(dict(zip(names, map(float, u[at : at + len(names)]), strict=True)))
-        at += len(names)
-    return dataclasses.replace(start, x=tuple(x), nuisance=u[at:])

@@ -1,8 +1,8 @@
 """The decision: a pure function of frozen rows, one for each hypothesis, of learned weights and of explicit costs.
 
-A row says how likely its cause is to lead by the evidence, and what held-out data say of it: how much less of the gap its fit leaves there
-than a re-fit within tolerance does, and how much less it left where it was fitted. So held-out data speak for a cause and against it: one
-that leaves more there, or that should leave less and does not, is no longer likely, whatever the evidence said.
+A row says how likely its cause is to lead by the evidence, and what its fit says of it: how much less of the gap it leaves on held-out data
+than a re-fit within tolerance does, how much less it left where it was fitted, and how much likelier it made that. So data speak for a cause
+and against it: one that leaves more, or that should leave less and does not, is no longer likely, whatever the evidence said.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED
 
 __all__ = ["OUTSIDE", "WEIGHTS", "Decision", "Row", "adds", "chances", "decide", "weights"]
 
-#: the weights by their names: of logarithms of probabilities by the evidence, of what held-out data say of a cause, and of how much more
-#: its fit had promised; of nothing and of something unknown by themselves, and of this by the best that any cause does
-WEIGHTS = ("evidence", "support", "shortfall", "none", "outside", "outside: support")
+#: the weights by their names: of logarithms of probabilities by the evidence, of what held-out data say of a cause, of how much more
+#: its fit had promised, and of how much likelier it made what it was fitted to; of nothing and of something unknown by themselves, and of this by the best that any cause does
+WEIGHTS = ("evidence", "support", "shortfall", "likelier", "none", "outside", "outside: support")
 #: where they lie in this package
 FILE = "decision.json"
 #: of what no catalogue has, beside the names of causes
@@ -31,6 +31,8 @@ OUTSIDE = "outside"
 LEAST = 1e-6
 #: nats by which held-out data speak strongly against a cause
 STRONGLY = 3.0
+#: nats beyond which what was fitted says little more: no model of a real robot is true, and a wrong one can be surer than any right one
+SURE = 30.0
 #: what it costs to give a wrong name, to say that nothing is wrong where something is, to leave open what is known (an open question is
 #: better than a wrong all-clear), and to name it as one of two
 WRONG, MISSED, OPEN, EITHER = 1.0, 0.8, 0.7, 0.2
@@ -46,8 +48,9 @@ class Row:
         causes: names, the one that is asked about last; empty for none. joints: of each cause, indices.
         probability: by the evidence: that it leads, or of a further cause that it is there; of none, that nothing leads.
         support: logarithm of how much less it leaves of the gap on held-out folds, mean of them and summed over joints, than what it is asked
-            about beside does (no further cause, or the others); None where it was not fitted, or where positions do not tell.
-        foretold: the same of what it was fitted to.
+            about beside does (no further cause, or the others); None where it was not fitted, or where nothing that was recorded
+            tells.
+        foretold: the same of what it was fitted to; likelier: nats by which that is likelier, its sizes and tolerances with it.
         gain: share of the excess gap that it closes on held-out folds beyond what is closed without it, for the report.
     """
 
@@ -56,15 +59,16 @@ class Row:
     probability: float = 0.0
     support: float | None = None
     foretold: float = 0.0
+    likelier: float = 0.0
     gain: float | None = None
 
     def held_out(self, weights: Mapping[str, float]) -> float:
-        """What held-out data say of it, in nats."""
+        """What fits say of it, in nats."""
         if self.support is None:
             return 0.0
-        return weights["support"] * self.support - weights["shortfall"] * max(
-            self.foretold - max(self.support, 0.0), 0.0
-        )
+        short = max(self.foretold - max(self.support, 0.0), 0.0)
+        sure = SURE * math.asinh(self.likelier / SURE)
+        return weights["support"] * self.support - weights["shortfall"] * short + weights["likelier"] * sure
 
     @property
     def refuted(self) -> bool:

@@ -88,8 +88,13 @@ def hypotheses(experiment: Experiment, prior: Sequence[str], progress: Progress)
     suspects = ranked[:SUSPECTS] + [name for name in prior if name in ranked[SUSPECTS:]]
     progress(0.8, "what the likeliest causes close on held-out parts")
     trials = Trials.of(experiment, assessment)
-    trials.fit([(), *((name,) for name in suspects)])
-    return trials, [Row((), probability=assessment.none), *(trials.row((name,), leads[name]) for name in ranked)]
+    # By itself first: causes begin where tolerances have come to, with what was learnt of them.
+    trials.fit([()])
+    trials.fit([(name,) for name in suspects])
+    return trials, [
+        Row((), probability=assessment.none),
+        *(trials.row((name,), leads[name]) for name in ranked),
+    ]
 
 
 def prepare(

@@ -97,13 +97,10 @@ def finding(
 
 
 def _rows(trials: Trials, rows: Sequence[Row]) -> tuple[dict[str, Any], ...]:
-    """What was decided on, so that it can be decided anew and weights be learned from it."""
-    outside = {"causes": [OUTSIDE], "probability": trials.assessment.outside, "support": None, "foretold": 0.0}
-    every = [
-        {"causes": list(row.causes), "probability": row.probability, "support": row.support, "foretold": row.foretold}
-        for row in rows
-    ]
-    return outside, *every
+    """What the decision was made of."""
+    outside = Row((OUTSIDE,), probability=trials.assessment.outside)
+    kept = ("causes", "probability", "support", "foretold", "likelier")
+    return tuple({name: getattr(row, name) for name in kept} for row in (*rows, outside))
 
 
 def _rank(one: Found, rows: Sequence[Row], chosen: Sequence[str]) -> float:

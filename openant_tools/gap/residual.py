@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.closure import Refit, Windows
+from openant_tools.gap.closure import Windows
+from openant_tools.gap.hypothesis import Refit
 from openant_tools.gap.measure import Measurement
 from openant_tools.recording.run import Run
 
@@ -112,7 +113,7 @@ def residual_after(
     joints = windows.protocol.joints
     runs = [windows.protocol.runs[k].run for k in judged]
     simulated = [windows.simulated(k, refit, ("pos", "vel", "torque")) for k in judged]
-    errors = [windows.measured[k] - one["pos"] for k, one in zip(judged, simulated, strict=True)]
+    errors = [windows.measured[k][:, : windows.joints] - one["pos"] for k, one in zip(judged, simulated, strict=True)]
     return residual_of(runs, joints, errors, simulated), places_left(measured, simulated)
 
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap.assess import Assessment
-from openant_tools.gap.closure import Closure, Refit, Windows, closures, nothing, unmoved
+from openant_tools.gap.closure import Closure, Windows, closures, nothing, unmoved
 from openant_tools.gap.decide import Row
 from openant_tools.gap.experiment import Experiment
-from openant_tools.gap.hypothesis import Part, bounds_of
+from openant_tools.gap.hypothesis import Part, Refit, bounds_of
 
 __all__ = ["Trials"]
 
@@ -34,7 +34,7 @@ class Trials:
 
     @classmethod
     def of(cls, experiment: Experiment, assessment: Assessment) -> Trials:
-        return cls(experiment, assessment, Windows(experiment.parts))
+        return cls(experiment, assessment, Windows(experiment.parts, assessment.set_aside))
 
     def fit(self, sets: Sequence[Causes]) -> None:
         """Fit sets of causes, each at its best place, on all parts but those of each fold."""
@@ -47,8 +47,8 @@ class Trials:
         places = tuple(self.assessment.place(name) for name in causes)
         one, other = self.closures.get(causes), self.closures.get(causes[:-1])
         effect = catalogue()[causes[-1]]
-        # What joints' positions hardly show, or no simulation repeats, held-out positions do not tell.
-        if one is None or other is None or effect.random or effect.unseen_in_joints:
+        # What joints' positions hardly show, without a sensor of the body, or no simulation repeats, held-out data do not tell.
+        if one is None or other is None or effect.random or (effect.unseen_in_joints and not self.windows.sensed):
             return Row(causes, places, probability)
         return Row(causes, places, probability, *_beyond(one, other))
 
@@ -84,6 +84,6 @@ class Trials:
         return Refit(tuple(parts), (*before.refit.x, self.size(causes[-1])), before.refit.nuisance)
 
 
-def _beyond(one: Closure, other: Closure) -> tuple[float, float, float]:
+def _beyond(one: Closure, other: Closure) -> tuple[float, float, float, float]:
     """What a row says of held-out data, and of the data that were fitted."""
-    return one.support(other), one.foretold(other), one.closed - other.closed
+    return one.support(other), one.foretold(other), one.likelier(other), one.closed - other.closed

@@ -15,10 +15,11 @@ import pytest
 from plants import BENCH, ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, write
 
 import openant_tools.gap.closure as closure
+import openant_tools.gap.descent as descent
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.robot import Robot
-from openant_tools.gap.closure import Closure, Refit, Windows, calibration_of, closures, heat_loss_of, nothing
-from openant_tools.gap.hypothesis import Part
+from openant_tools.gap.closure import Closure, Windows, calibration_of, closures, heat_loss_of, nothing
+from openant_tools.gap.hypothesis import Part, Refit
 from openant_tools.gap.protocol import Played, RunSet
 from openant_tools.gap.simulation import Log, simulate
 from openant_tools.model.plant import load_plant
@@ -49,14 +50,14 @@ def protocol(folder: Path, *, kp: float, dry: float) -> RunSet:
 def test_a_refit_stays_within_tolerance_and_is_the_best_there(tmp_path: Path) -> None:
     """Stiffness is half as large again, far beyond its 15 %: some end at their bounds, the others where they then serve best."""
     windows = Windows(protocol(tmp_path, kp=12.0, dry=0.05))
-    ((found, _, _),) = windows.refit([nothing(windows)], [0, 1], ())
+    ((found, *_),) = windows.refit([nothing(windows)], [0, 1], ())
     assert np.abs(found.nuisance).max() == pytest.approx(1.0)
 
     def cost(u: np.ndarray[Any, np.dtype[np.float64]]) -> float:
         """Minus twice the logarithm of how likely it is, of 2 · 30 independent errors as large as it leaves them."""
         refits = [dataclasses.replace(found, nuisance=u)]
         left = sum(float(np.nansum(windows.errors(k, refits) ** 2)) for k in (0, 1))
-        return 60 * math.log(left) + float(np.sum((u / closure.SPREAD) ** 2))
+        return 60 * math.log(left) + float(np.sum((u / descent.SPREAD) ** 2))
 
     least = cost(found.nuisance)
     assert least < cost(np.zeros(len(windows.names))) - 60
@@ -109,11 +110,84 @@ def test_a_cause_that_is_not_there_ends_at_nothing_and_not_beyond(name: str, tmp
 def test_what_leaves_nothing_at_all_and_a_fold_without_rows_say_nothing() -> None:
     """Of a log without noise: no sensor has a floor there."""
     none = Closure(
-        0, 0, 1, 1, 1, np.zeros(1), np.zeros((2, 2, 1)), np.array([0.0, 50.0]), Refit((), (), np.zeros(0)), ()
+        0,
+        0,
+        0,
+        1,
+        1,
+        1,
+        np.zeros(1),
+        0.0,
+        np.zeros((2, 1)),
+        np.array([[0.0], [50.0]]),
+        np.full(1, 4e-8),
+        Refit((), (), np.zeros(0)),
+        (),
     )
-    some = dataclasses.replace(none, squares=np.array([[[0.0], [0.5]], [[0.0], [0.5]]]))
+    some = dataclasses.replace(none, squares=np.array([[0.0], [0.5]]))
     assert none.support(none) == none.foretold(none) == 0.0
     assert 0 < none.support(some) == -some.support(none) < 10
+
+
+#: a box on a floor, and a weight on an arm on it that shakes it
+BOX = f"""\
+<mujoco model="box">
+  <compiler angle="radian"/>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 0.1"/>
+    <body name="torso" pos="0 0 0.05">
+      <freejoint name="base"/>
+      <geom name="box" type="box" size="0.08 0.08 0.05" mass="0.8"/>
+      <site name="imu" euler="IMU"/>
+      <body name="arm" pos="0 0 0.06">
+        <joint name="joint" axis="0 1 0" damping="0.12" armature="0.006" frictionloss="0.03"/>
+        <geom name="rod" type="capsule" fromto="0 0 0 0 0 0.1" size="0.01" mass="0.02"/>
+        <geom name="bob" type="sphere" pos="0 0 0.1" size="0.02" mass="0.1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><position {SERVO} kp="8" forcerange="-4 4"/></actuator>
+  <sensor><gyro name="gyro" site="imu"/><accelerometer name="acc" site="imu"/></sensor>
+</mujoco>
+"""
+
+
+def test_a_board_that_sits_askew_is_told_by_what_it_reads(tmp_path: Path) -> None:
+    """It moves no joint: what an IMU says names it, how far it is turned is found, and the gap of joints stays what it was."""
+    robot, turned = mujoco.MjModel.from_xml_string(BOX.replace("IMU", "0 0.12 0")), []
+    data, chance, t = mujoco.MjData(robot), np.random.default_rng(4), np.arange(125) / 50
+    for seed in (1, 2):
+        command, rows = 0.4 * sweep(t, 1, high_hz=1.5 + 0.3 * seed), []
+        mujoco.mj_resetData(robot, data)
+        for k in range(len(t)):
+            data.ctrl[0] = command[k, 0]
+            mujoco.mj_forward(robot, data)
+            rows.append([data.joint("joint").qpos[0], *data.sensordata])
+            mujoco.mj_step(robot, data, 10)
+        seen = np.array(rows) + np.array([3e-4, *[0.01] * 3, *[0.05] * 3]) * chance.standard_normal((len(t), 7))
+        names = ("pos.joint", *(f"{name}.{axis}" for name in ("gyro", "acc") for axis in "xyz"))
+        columns = {"cmd.joint": command[:, 0], **dict(zip(names, seen.T, strict=True))}
+        turned.append(run_of(columns, t, ["joint"], f"sweep-{seed}", setup="floor"))
+    windows = Windows(
+        RunSet.of(turned, write(tmp_path / "box.xml", BOX.replace("IMU", "0 0 0")), ["joint"], [None] * 2)
+    )
+    assert windows.sensed == ("gyro", "acc")
+    parts = [Part("imu_misalignment", (0,)), Part("payload", (0,))]
+    starts = [{"x_rad": 0.0, "y_rad": 0.07, "z_rad": 0.0}, catalogue()["payload"].starts(0.3)[0]]
+    plain, askew, loaded = closures(
+        windows,
+        [nothing(windows), *(Refit((part,), (x,), windows.found) for part, x in zip(parts, starts, strict=True))],
+        [(0,), (1,)],
+        [0, 1],
+    )
+    assert askew.refit.x[0]["y_rad"] == pytest.approx(0.12, abs=0.025)
+    assert askew.support(plain) > max(0.2, loaded.support(plain) + 0.2)
+    assert askew.likelier(plain) > max(10, loaded.likelier(plain) + 10)
+    assert askew.after == pytest.approx(plain.after, rel=0.05)
+    without = Windows(windows.protocol, without=("gyro", "acc"))
+    assert without.sensed == ()
+    assert without.measured[0].shape == (len(t), 1)
 
 
 def test_a_simulation_that_falls_apart_is_wrong_and_not_unknown(
