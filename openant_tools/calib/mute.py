@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from openant_tools.comms import protocol1
 from openant_tools.comms import protocol2 as p2
-from openant_tools.comms.bus import Bus
+from openant_tools.comms.bus import Bus, called
 from openant_tools.comms.scan import Scan, scan
 from openant_tools.comms.silence import (
     LEVELS,
@@ -56,7 +56,7 @@ class Mute:
 
     @property
     def who(self) -> str:
-        return self.joint if self.joint == f"id {self.id}" else f"{self.joint} (id {self.id})"
+        return called(self.joint, self.id)
 
 
 def silenced(bus: Bus, motors: Iterable[MotorSection]) -> list[Mute]:

@@ -33,7 +33,7 @@ from openant_tools.comms.statistics import BusStatistics
 from openant_tools.comms.ticks import TickClock
 from openant_tools.errors import BadInput
 
-__all__ = ["Answer", "Bus", "BusTiming", "FoundServo"]
+__all__ = ["Answer", "Bus", "BusTiming", "FoundServo", "called"]
 
 #: What lets a servo move: Startup Configuration, Torque Enable, and the goals of PWM, current, velocity; and position.
 STARTUP, TORQUE, GOALS = 60, 64, (range(100, 108), range(116, 120))
@@ -77,6 +77,11 @@ class BusTiming:
 NOTHING_PENDING = ReplyPlan()
 #: What becomes of those whose part of a joined reply is missing: they are asked again.
 _BROKEN_OFF = (Cause.TIMEOUT, Cause.SHORT, Cause.CRC)
+
+
+def called(name: str, id: int) -> str:
+    """What a servo is called in messages: its joint and its id; its id alone, where nobody knows yet which joint it is."""
+    return name if name == f"id {id}" else f"{name} (id {id})"
 
 
 @dataclass(frozen=True)
@@ -369,7 +374,7 @@ class Bus:
     # ---- how it is done ------------------------------------------------------------------------------------------
 
     def _name(self, id: int) -> str:
-        return f"{self.names[id]} (id {id})" if id in self.names else f"servo {id}"
+        return called(self.names[id], id) if id in self.names else f"servo {id}"
 
     def _place(self, id: int) -> str:
         return f"{self.line.path}, {self._name(id)}"

@@ -61,7 +61,7 @@ def examined(trip: Trip, hardware: Hardware) -> Trip:
         return trip
     servo = hardware.servos[trip.joint]
     names = ", ".join(error.name for error in errors)
-    what = f"{servo.joint} (id {servo.id}) reports {names}"
+    what = f"{servo.called} reports {names}"
     return Trip(what, errors[0].advice, trip.joint, cause=StopCause.HARDWARE_ERROR)
 
 
@@ -82,11 +82,11 @@ def _who_is_silent(trip: Trip, hardware: Hardware) -> Trip:
         if not late.busy or broken:
             return trip
         return Trip(f"{trip.what}; {late.words}", REMEDY, trip.joint, cause=trip.cause)
-    first, names = silent[0], ", ".join(f"{servo.joint} (id {servo.id})" for servo in silent)
+    first, names = silent[0], ", ".join(servo.called for servo in silent)
     if broken:
         [other] = broken
         return Trip(
-            f"{names} is silent and what comes from {other.joint} (id {other.id}) is broken",
+            f"{names} is silent and what comes from {other.called} is broken",
             f"probably both have id {other.id}: unplug {other.joint}, and `openant comms scan` shows it",
             first.joint,
             cause=trip.cause,

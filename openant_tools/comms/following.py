@@ -48,7 +48,7 @@ class Behind:
         """Why the motion ends, as far as the joint's angle alone tells."""
         away = abs(self.command_rad - self.angle_rad)
         return Trip(
-            f"{self.servo.joint} (id {self.servo.id}) stands {away:.2f} rad from its command: it was sent to "
+            f"{self.servo.called} stands {away:.2f} rad from its command: it was sent to "
             f"{self.command_rad:.2f} rad, is at {self.angle_rad:.2f} and pushes with {100 * abs(self.duty):.0f} % of full duty",
             "blocked, overloaded or weak: free the joint, take load off it, and look at its horn and its supply",
             self.servo.joint,

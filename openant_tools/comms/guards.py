@@ -120,7 +120,7 @@ class Watch:
         causes = _words(missed)
         broken = _broken(missed) > missed.total() / 4
         return Trip(
-            f"{servo.joint} (id {servo.id}) has not answered for {silent:.2f} s ({causes})",
+            f"{servo.called} has not answered for {silent:.2f} s ({causes})",
             "its answers come broken: two servos with one id, a loose connector, or noise"
             if broken
             else "`openant comms scan` asks why",
@@ -130,7 +130,7 @@ class Watch:
         )
 
     def _measured(self, t: float, servo: Servo, answer: Answer, block: Block) -> Trip | None:
-        guards, model, place = self.guards, servo.model, f"{servo.joint} (id {servo.id})"
+        guards, model, place = self.guards, servo.model, servo.called
         if answer.alert:
             remedy = "read its hardware error status"
             return Trip(f"{place} raises its alert bit", remedy, servo.joint, "alert", StopCause.HARDWARE_ERROR)

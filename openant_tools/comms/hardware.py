@@ -81,7 +81,7 @@ def report_leftovers(servos: Servos, notice: Callable[[str], None]) -> None:
     for joint, status in servos.read_all("hardware_error_status").items():
         if status:
             for error in servos.hardware_errors(joint):
-                notice(f"{joint} (id {servos[joint].id}) reports {error.name}: {error.advice}")
+                notice(f"{servos[joint].called} reports {error.name}: {error.advice}")
 
 
 @dataclass

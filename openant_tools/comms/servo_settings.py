@@ -81,7 +81,7 @@ class ServoSettings:
                 if outside:
                     end = servo.to_joint(table[name] * scale)
                     raise HardwareFault(
-                        f"{servo.joint} (id {servo.id}) would be sent to {outside[0]:.3f} rad, but refuses goals beyond "
+                        f"{servo.called} would be sent to {outside[0]:.3f} rad, but refuses goals beyond "
                         f"{end:.3f} rad: its {name} is {table[name]}",
                         where=self._config.port,
                         remedy="widen it by `openant calib inventory`, or narrow this joint's limits in robot.toml",

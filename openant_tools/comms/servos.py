@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from openant_tools.comms.bus import FAST_READ_FIRMWARE, Answer, Bus, FoundServo
+from openant_tools.comms.bus import FAST_READ_FIRMWARE, Answer, Bus, FoundServo, called
 from openant_tools.comms.faults import BrokenAnswer, Cause, Refused
 from openant_tools.comms.protocol2 import BROADCAST, SyncWriteTemplate, write
 from openant_tools.errors import BadInput, HardwareFault
@@ -65,6 +65,11 @@ class Servo:
     direction: int = 1
     zero_rad: float = 0.0
     firmware: int | None = None
+
+    @property
+    def called(self) -> str:
+        """Joint and id, for messages."""
+        return called(self.joint, self.id)
 
     def to_joint(self, servo_rad: float) -> float:
         return self.direction * (servo_rad - self.zero_rad)
@@ -126,7 +131,7 @@ class Servos:
             seen = found[servo.joint]
             if seen.model_number != servo.model.number:
                 raise HardwareFault(
-                    f"{servo.joint} (id {servo.id}) is a {_model_name(seen.model_number)}, not a {servo.model.name}",
+                    f"{servo.called} is a {_model_name(seen.model_number)}, not a {servo.model.name}",
                     where=self.bus.line.path,
                     remedy="correct its model in robot.toml, or the id of the servo: two may be swapped",
                 )
@@ -167,7 +172,7 @@ class Servos:
             if seen[-1] == seen[-2]:
                 return seen[-1]
         raise BrokenAnswer(
-            f"{register} of {joint} (id {servo.id}) reads {', '.join(map(str, dict.fromkeys(seen)))} by turns",
+            f"{register} of {servo.called} reads {', '.join(map(str, dict.fromkeys(seen)))} by turns",
             where=self.bus.line.path,
             remedy="the line is not to be trusted: look at `openant comms watch` before anything is written",
         )
@@ -222,7 +227,7 @@ class Servos:
             now = item.decode(self.bus.read(change.id_after, item.address, item.size))
             if now != counts:
                 raise HardwareFault(
-                    f"{register} of {joint} (id {servo.id}) reads back {now} after writing {counts}",
+                    f"{register} of {servo.called} reads back {now} after writing {counts}",
                     where=self.bus.line.path,
                     remedy="write it again; a servo that forgets its memory must be replaced",
                 )
@@ -245,7 +250,7 @@ class Servos:
         if self.bus.ping(servo.id, insist=True) is None or self.read_counts("baud_rate", joint) != change.new:
             self.bus.line.set_baud(before)
             raise HardwareFault(
-                f"{joint} (id {servo.id}) does not answer at {baud} baud after it was set from {before}",
+                f"{servo.called} does not answer at {baud} baud after it was set from {before}",
                 where=self.bus.line.path,
                 remedy="`openant calib ids` looks at every baud rate",
             )

@@ -14,7 +14,7 @@ from typing import Any
 
 from openant_tools.comms import protocol1
 from openant_tools.comms import protocol2 as p2
-from openant_tools.comms.bus import Bus
+from openant_tools.comms.bus import Bus, called
 from openant_tools.comms.faults import BrokenAnswer, NoAnswer
 from openant_tools.comms.ports import Host, PortHolder
 from openant_tools.comms.troubles import SILENCE
@@ -370,7 +370,7 @@ def _name(bus: Bus, id: int) -> str:
 
 
 def _who(bus: Bus, ids: Sequence[int]) -> str:
-    return ", ".join(f"{bus.names[id]} (id {id})" if id in bus.names else f"servo {id}" for id in ids)
+    return ", ".join(called(bus.names[id], id) if id in bus.names else f"servo {id}" for id in ids)
 
 
 def _together(found: Sequence[Silence], questions: _Questions) -> Silence:

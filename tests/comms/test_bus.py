@@ -408,6 +408,17 @@ def p2_step() -> float:
     return 2 * 3.14159265 / 4096 / 2 + 1e-9
 
 
+def test_a_servo_whose_joint_nobody_knows_is_called_by_its_id_once() -> None:
+    bus, line = ant()
+    line.wire.settings.lost[IDS.index(31)] = 1.0
+    Servos(bus, [Servo("id 31", 31, kit("standard").servo("knee")), Servo("hip_fl", 30, kit("standard").servo("hip"))])
+    with pytest.raises(NoAnswer, match=r"\bid 31 does not answer"):
+        bus.read(31, 132, 4)
+    line.wire.settings.lost[IDS.index(30)] = 1.0
+    with pytest.raises(NoAnswer, match=r"hip_fl \(id 30\) does not answer"):
+        bus.read(30, 132, 4)
+
+
 def test_emergency_packet_releases_everyone() -> None:
     servos, line = robot()
     servos.set_torque(True)

@@ -182,7 +182,7 @@ def _reading(engine: EngineProcess, servo: Servo, deflection: float, goal: float
     good = (column("ok") == 1) & np.isfinite(column("pwm"))
     if not len(good) or good.mean() < LEAST_ANSWERS:
         raise HardwareFault(
-            f"{servo.joint} (id {servo.id}) answered {int(good.sum())} of {len(good)} times",
+            f"{servo.called} answered {int(good.sum())} of {len(good)} times",
             where=engine.config.port,
             remedy="look at its cable; `openant comms watch` shows what is lost",
         )
