@@ -45,7 +45,7 @@ class JointTable(Widget):
         return self._shown
 
     def _table(self) -> Text:
-        head = f"{'joint':9}{'servo':11}{'angle':>8}{'torque':>7}{'load':>7}{'C' if plain() else '°C':>5}{'V':>5}"
+        head = f"{'joint':9}{'servo':11}{'angle':>8}{'torque':>7}{'load':>8}{'C' if plain() else '°C':>4}{'V':>5}"
         text = Text(no_wrap=True).append(head, MARKS["todo"].colour)
         for joint in JOINT_NAMES:
             text.append("\n").append_text(self._joint(joint))
@@ -64,8 +64,10 @@ class JointTable(Widget):
         line.append(f"{_shown(angle, 'rad', sign=True, decimals=1):>8}", "bold")
         state: Name = "on" if on else "off"
         line.append(f"{mark(state)} {MARKS[state].word}".rjust(7), MARKS[state].colour)
-        line.append(f"{percent(share) if math.isfinite(share) else _shown(amperes, 'A', decimals=2):>7}")
-        line.append(f"{_shown(known(f'temp.{joint}'), decimals=0):>5}{_shown(known(f'volt.{joint}'), decimals=1):>5}")
+        # Amperes always: what stands below each other is read in one unit.
+        current = f"{_shown(amperes, decimals=2)} A" if math.isfinite(amperes) else "-"
+        line.append(f"{percent(share) if math.isfinite(share) else current:>8}")
+        line.append(f"{_shown(known(f'temp.{joint}'), decimals=0):>4}{_shown(known(f'volt.{joint}'), decimals=1):>5}")
         return line
 
 

@@ -134,7 +134,8 @@ def held() -> History:
     values: dict[str, Any] = {"t": t, "torque": 1.0}
     for k, joint in enumerate(JOINT_NAMES):
         values |= {f"pos.{joint}": 0.5 * np.sin(k), f"ok.{joint}": 1.0, f"err.{joint}": 0.0, f"volt.{joint}": 11.8}
-        values |= {f"temp.{joint}": 31.0 + k, f"{'cur' if 'knee' in joint else 'load'}.{joint}": 0.12 + 0.01 * k}
+        values |= {f"temp.{joint}": 31.0 + k}
+        values |= {f"cur.{joint}": 0.125 - 0.041 * k} if "knee" in joint else {f"load.{joint}": 0.12 + 0.01 * k}
     history = History(JOINT_NAMES)
     history.rows = np.column_stack(
         [np.broadcast_to(values.get(name, np.nan), t.shape) for name in columns(JOINT_NAMES)]
