@@ -103,7 +103,9 @@ class Session:
         self.open(path)
 
     def bench(self) -> Bench:
-        """Where procedures work. Raises BadInput while there is no robot's folder."""
+        """Where procedures work. Raises BadInput while there is no robot's folder, or none is there yet that is being started."""
+        if self.doing:  # else what a virtual robot is to be asked would go to whatever is plugged in
+            raise BadInput(f"not yet: {self.doing}", where=self.path, remedy="begin once that is done")
         folder = self.folder
         if folder is None:
             raise BadInput(
