@@ -254,7 +254,8 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         text.append(spelled(walks_at(float(reward[-1]))), "bold")
         text.append(f"; step {number(step[-1])}{share}, {minutes} min of robot time\n")
         stop = max(float(step[-1]), float(steps or 0.0))
-        room = self.query_one("#progress").size.height - text.plain.count("\n") - 4
+        # Of what is under way the command takes a second line.
+        room = self.query_one("#progress").size.height - text.plain.count("\n") - (4 if steps is None else 5)
         for line in curve_lines(step, 100 * reward, stop, level, self.size.width - 4, min(max(room, 3), MOST_ROWS)):
             text.append_text(line).append("\n")
         text.append(
