@@ -28,7 +28,7 @@ from openant_tools.model.gap import HORIZON_S, share_closed
 from openant_tools.model.plant import Setup
 from openant_tools.model.rollout import Rollouts
 
-__all__ = ["SENSED", "Closure", "Windows", "calibration_of", "closures", "heat_loss_of", "nothing", "unmoved"]
+__all__ = ["Closure", "Windows", "calibration_of", "closures", "heat_loss_of", "nothing", "unmoved"]
 
 Array = NDArray[np.float64]
 

@@ -91,10 +91,7 @@ def hypotheses(experiment: Experiment, prior: Sequence[str], progress: Progress)
     # By itself first: causes begin where tolerances have come to, with what was learnt of them.
     trials.fit([()])
     trials.fit([(name,) for name in suspects])
-    return trials, [
-        Row((), probability=assessment.none),
-        *(trials.row((name,), leads[name]) for name in ranked),
-    ]
+    return trials, [Row((), probability=assessment.none), *(trials.row((name,), leads[name]) for name in ranked)]
 
 
 def prepare(

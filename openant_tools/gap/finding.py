@@ -97,7 +97,7 @@ def finding(
 
 
 def _rows(trials: Trials, rows: Sequence[Row]) -> tuple[dict[str, Any], ...]:
-    """What the decision was made of."""
+    """What was decided on, so that it can be decided anew and weights be learned from it."""
     outside = Row((OUTSIDE,), probability=trials.assessment.outside)
     kept = ("causes", "probability", "support", "foretold", "likelier")
     return tuple({name: getattr(row, name) for name in kept} for row in (*rows, outside))

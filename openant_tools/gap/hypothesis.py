@@ -64,11 +64,11 @@ class Refit:
     nuisance: Array
 
 
-def bounds_within(quantity: Quantity, at: float, extent: float) -> tuple[float, float]:
+def bounds_within(quantity: Quantity, at: float, from_none: float) -> tuple[float, float]:
     """Between which a size may be polished that was found somewhere: it keeps its sign, and a shape its reason."""
     if quantity.shape:
         return bounds_of(quantity)
-    far = FARTHEST * extent
+    far = FARTHEST * from_none
     return -far if at < 0 or (quantity.signed and not at) else 0.0, far if at > 0 or not at else 0.0
 
 
@@ -76,8 +76,8 @@ def extent(refit: Refit) -> Array:
     """(coordinates,) how far each is from none; of a vector what it would be if it had its part in how long that is."""
     out = []
     for part, x in zip(refit.hypothesis, refit.x, strict=True):
-        sizes = [q for q in part.definition.quantities if not q.shape]
-        long = max((abs(x[q.name]) / q.small for q in sizes), default=0.0) if part.definition.vector else 0.0
+        amounts = [q for q in part.definition.quantities if not q.shape]
+        long = max((abs(x[q.name]) / q.small for q in amounts), default=0.0) if part.definition.vector else 0.0
         out += [max(abs(x[q.name]), 0.0 if q.shape else q.small * long) for q in part.definition.quantities]
     return np.array(out)
 
