@@ -21,6 +21,7 @@ from openant_tools.comms.silence import (
     find_elsewhere,
     patient_ping,
     read_register,
+    return_level,
 )
 from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import HardwareFault
@@ -67,9 +68,9 @@ def silenced(bus: Bus, motors: Iterable[MotorSection]) -> list[Mute]:
         if status is None:
             silent.append(motor)
             continue
-        level = read_register(bus, motor.id, RETURN_LEVEL, 1)
-        if level is None or level[0] < 2:
-            found.append(Mute(motor.joint, motor.id, bus.line.baud, "status_return_level", level[0] if level else 0))
+        level = return_level(bus, motor.id)
+        if level is not None and level < 2:
+            found.append(Mute(motor.joint, motor.id, bus.line.baud, "status_return_level", level))
     elsewhere = find_elsewhere(bus, [motor.id for motor in silent]) if silent else {}
     for motor in silent:
         baud, protocol = elsewhere.get(motor.id, (0, 2))

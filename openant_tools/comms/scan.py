@@ -21,6 +21,7 @@ from openant_tools.comms.silence import (
     patient_ping,
     protocol_1_ping,
     reader_words,
+    return_level,
 )
 from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import BadInput
@@ -183,7 +184,7 @@ def _examined(bus: Bus, seen: FoundServo, *, stolen: bool) -> Scanned:
     broken = sum(answer.cause in (Cause.CRC, Cause.SHORT) for answer in reads)
     level = bus.sync_read(RETURN_LEVEL, 1, [seen.id])[0]
     silent = sum(answer.data is None for answer in (*reads, level)) - broken
-    mute = not stolen and silent == PROOFS + 1 and bus.ping(seen.id, insist=True) is not None
+    mute = not stolen and silent == PROOFS + 1 and return_level(bus, seen.id) == 0
     return Scanned(
         seen.id, bus.line.baud, seen.model_number, seen.firmware,
         clash=broken > PROOFS // 2,

@@ -21,7 +21,7 @@ from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.robot.servo import BAUD_CODES, hardware_errors, servo_model
 
-__all__ = ["Heard", "Silence", "ask", "diagnose", "explained", "explaining", "reader_words"]
+__all__ = ["Heard", "Silence", "ask", "diagnose", "explained", "explaining", "reader_words", "return_level"]
 
 #: s that a single question waits, again and again: a patient one tells a late answer from none.
 PATIENCE_S = (0.06, 0.12, 0.25)
@@ -29,6 +29,10 @@ PATIENCE_S = (0.06, 0.12, 0.25)
 QUIET_S, RESTLESS_S = 0.02, 0.3
 #: pings of one servo that show whether its answers are taken away
 PROOFS = 24
+#: s that reads wait for an answer before a servo is called silent to reads, and how many of them must have been fair
+LEVEL_WAITS_S, FAIR = (*PATIENCE_S[1:], 0.06, 0.06, 0.06), 3
+#: share of a wait by which this computer may be late in it for the silence to count
+LATE_SHARE = 0.5
 RETURN_LEVEL, ERROR_STATUS, VOLTAGE = 68, 70, 144
 #: so many silent servos are each sought at every baud rate; the others, where one of these is found
 FEW = 3
@@ -163,6 +167,23 @@ def _register(heard: Heard, id: int, count: int) -> bytes | None:
     return next((one.params for one in heard.statuses if one.id == id and len(one.params) == count), None)
 
 
+def return_level(bus: Bus, id: int) -> int | None:
+    """Status Return Level of a servo that answers pings; None where it cannot be told.
+
+    Level 0, at which a servo answers pings alone, is told by silence, so only of one that answered a ping after each read
+    that it let pass, while this computer was punctual.
+    """
+    fair = 0
+    for wait_s in LEVEL_WAITS_S:
+        heard = ask(bus, p2.read(id, RETURN_LEVEL, 1).encode(), wait_s, lambda h: _register(h, id, 1) is not None)
+        data = _register(heard, id, 1)
+        if data is not None:
+            return data[0]
+        status, ping = patient_ping(bus, id, PATIENCE_S[:1])
+        fair += status is not None and max(heard.late_s / wait_s, ping.late_s) < LATE_SHARE
+    return 0 if fair >= FAIR else None
+
+
 def protocol_1_ping(bus: Bus, id: int, wait_s: float = PATIENCE_S[0]) -> list[int]:
     """The ids that answer a ping in Protocol 1.0."""
     asked = protocol1.ping(id)
@@ -252,10 +273,11 @@ class _Questions:
         bus, status = self.bus, self.seen[id]
         if status.alert:
             return self._error(id)
-        level = read_register(bus, id, RETURN_LEVEL, 1)
-        number = 0 if level is None else level[0]
-        if number < 2:
-            return self._say("return_level", (id,), level=number, answers=LEVELS[number])
+        level = return_level(bus, id)
+        if level is None:
+            return self._late((id,))
+        if level < 2:
+            return self._say("return_level", (id,), level=level, answers=LEVELS[level])
         # Alone on a quiet line: what came before may have been the answer to an earlier try.
         bus.clock.sleep_until(bus.clock.now() + PATIENCE_S[1])
         heard = ask(bus, p2.ping(id).encode(), PATIENCE_S[2], lambda h: h.answer_s is not None, id)
@@ -263,7 +285,7 @@ class _Questions:
         timing = bus.timing
         usual = timing.return_delay_s + timing.latency_timer_s + timing.margin_s + bus.wire_s(24)
         if self._lateness.busy:
-            return self._say("host_late", (id,), late=self._lateness.words)
+            return self._late((id,))
         if after > usual:
             return self._say("late_answers", (id,), after_ms=after * 1e3)
         return self._say("intermittent", (id,))
@@ -299,8 +321,8 @@ class _Questions:
         if supply is not None:
             volts, low, high = supply
             return [self._say("supply", left, volts=volts, low=low, high=high)]
-        if all(self.heard[id].late_s > 0.5 for id in left):
-            return [self._say("host_late", left, late=self._lateness.words or "this computer was late")]
+        if all(self.heard[id].late_s > LATE_SHARE for id in left):
+            return [self._late(left)]
         if len(left) == len(self.asked):
             if all(self.heard[id].echo for id in left):
                 return [self._say("echo_only", left)]
@@ -335,6 +357,9 @@ class _Questions:
                 at = cable.index(silent[0])
                 before = _name(self.bus, cable[at - 1]) if at else "the adapter or board"
                 yield silent, _name(self.bus, silent[0]), before
+
+    def _late(self, ids: tuple[int, ...]) -> Silence:
+        return self._say("host_late", ids, late=self._lateness.words or "this computer was late")
 
     def _say(self, cause: str, ids: tuple[int, ...], **values: Any) -> Silence:
         trouble = SILENCE[cause]

@@ -198,6 +198,19 @@ def test_a_servo_that_answers_again_is_no_cable() -> None:
     assert diagnose(bus, [31], IDS).cause == "intermittent"
 
 
+@pytest.mark.parametrize(("late", "cause"), [(False, "return_level"), (True, "host_late")])
+def test_silence_to_reads_is_a_setting_only_while_this_computer_is_punctual(
+    late: bool, cause: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus, line = ant()
+    line.wire.servos[5].set("status_return_level", 0)
+    if late:  # starved: it misses what it waits for, and no servo has a part in it
+        monkeypatch.setattr(type(bus.clock.lateness), "cycle", lambda self, wake_s=0.0: 0.2)
+    found = diagnose(bus, [31], IDS)
+    assert found.cause == cause
+    assert ("inventory" in found.remedy) is not late
+
+
 def test_an_answer_that_an_adapter_holds_back_is_late_and_not_lost(tmp_path: Path) -> None:
     with talking(tmp_path, 10, late_s=0.045) as talker:
         result = run("scan", "--port", talker.path, *MEGABAUD, "--id", "10")
