@@ -85,6 +85,7 @@ class AntHardware(AntBase):
             say otherwise.
         bus, imu, camera: in place of what robot.toml names.
         recordings: folder for the recording of every connection; None: `recordings/` of the robot's folder.
+        record_pictures: these recordings hold the camera's pictures, too (JPEG, five a second at most).
         tag_patience_s: s without a pose, which keeps its last value meanwhile, after which the robot counts as lost.
         patience_s: s that `reset` waits for a robot that needs help before it gives up; None: for ever.
         attended: somebody is there who calls `resume` (as the space bar of our commands does): where motion has ended for
@@ -115,6 +116,7 @@ class AntHardware(AntBase):
         imu: str | None = None,
         camera: str | int | None = None,
         recordings: str | Path | None = None,
+        record_pictures: bool = False,
         tag_patience_s: float = 2.0,
         patience_s: float | None = None,
         attended: bool = False,
@@ -179,6 +181,7 @@ class AntHardware(AntBase):
             self.link = RobotLink(
                 config,
                 recordings=None if kept is None else Path(kept),
+                pictures=record_pictures,
                 facts=facts,
                 robot_toml=None if folder is None else folder.config_file.read_text(encoding="utf-8"),
                 notice=self._notice,

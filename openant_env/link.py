@@ -103,6 +103,7 @@ class RobotLink:
     Args:
         config: the hardware.
         recordings: folder for one recording a connection; None to record nothing.
+        pictures: whether they hold the camera's, too.
         facts: of these recordings.
         robot_toml: kept inside them.
         notice: called with what the user should know.
@@ -118,12 +119,14 @@ class RobotLink:
         config: EngineConfig,
         *,
         recordings: Path | None,
+        pictures: bool = False,
         facts: Facts,
         robot_toml: str | None,
         notice: Callable[[str], None],
     ) -> None:
         self.config, self._notice = config, notice
         self._recordings, self._facts, self._robot_toml = recordings, facts, robot_toml
+        self._pictures = pictures
         self._control = VirtualControl(config.control) if config.control else None
         self.stepped = bool(self._control is not None and self._control.ask("now")["stepped"])
         self._engine: EngineProcess | None = None
@@ -167,7 +170,7 @@ class RobotLink:
             try:
                 self._recordings.mkdir(parents=True, exist_ok=True)
                 path = _free_name(self._recordings)
-                engine.ask(messages.Record(str(path), facts, self._robot_toml))
+                engine.ask(messages.Record(str(path), facts, self._robot_toml, pictures=self._pictures))
             except (OSError, HardwareFault) as error:
                 if not self.recorded:  # nothing was begun yet: the place is wrong from the start
                     raise

@@ -81,6 +81,7 @@ def eval_(
     virtual_source: str | None,
     clock: str | None,
     yes: bool,
+    record_pictures: bool,
     likeliest: bool,
     strip: Path | None,
     video: Path | None,
@@ -123,13 +124,16 @@ def eval_(
                 "a robot paints no pictures of itself",
                 remedy="leave --strip and --video out; its recording can be replayed",
             )
+        options["record_pictures"] = record_pictures
         may_walk(options, yes)
+    elif record_pictures:
+        raise BadInput("--record-pictures is of a robot's camera", remedy="add --env hardware")
     elif (strip is not None or video is not None) and name != SIMULATED_ID:
         raise BadInput(f"{name} paints no pictures", remedy="leave --strip and --video out")
     elif virtual_source is not None:
         raise BadInput("--virtual is a robot behind its ports", remedy="add --env hardware")
     else:
-        for key in ("virtual", "clock"):
+        for key in ("virtual", "clock", "record_pictures"):
             options.pop(key, None)
     if name == SIMULATED_ID and robot is not None:
         options.pop("kit", None)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Moving", "adapter_option", "anyway_option", "camera_option", "engine_config", "imu_option", "may_move", "need_moving", "need_terminal",
-    "port_option", "robot_of", "yes_option",
+    "port_option", "record_pictures_option", "robot_of", "yes_option",
 ]  # fmt: skip
 
 
@@ -43,6 +43,10 @@ yes_option = click.option(
     "--yes", is_flag=True, help="The robot may move: do not ask. Needed where no terminal is attached."
 )
 
+record_pictures_option = click.option(
+    "--record-pictures", is_flag=True,
+    help="The recording holds the camera's pictures, too: JPEG, 640 px wide, 5 a second at most; some 400 MB an hour.",
+)  # fmt: skip
 anyway_option = click.option(
     "--anyway",
     is_flag=True,

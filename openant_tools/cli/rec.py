@@ -65,6 +65,8 @@ def info(run: Path, model: Path | None, json_file: Path | None) -> None:
             "started": recording.started,
             "imu_samples": len(recording.imu.t),
             "pose_samples": len(recording.pose.t),
+            "pictures": len(recording.pictures.t),
+            "picture_bytes": int(recording.pictures.columns["bytes"].sum()),
             "events": list(recording.events),
             "has_config": recording.config is not None,
         }
@@ -301,6 +303,8 @@ def _notes(run: Run, model: Path | None) -> Iterator[str]:
 
 
 def _lines(path: Path, run: Run, summary: RunSummary, more: dict[str, Any]) -> list[str]:
+    from openant_tools.recording.summary import words_of_pictures
+
     facts = run.facts
     lines = [
         str(path),
@@ -336,6 +340,7 @@ def _lines(path: Path, run: Run, summary: RunSummary, more: dict[str, Any]) -> l
     if more:
         lines.append(
             f"  started {more['started']['wall']}; {more['imu_samples']} IMU samples, {more['pose_samples']} poses, "
+            f"{words_of_pictures(more['pictures'], more['picture_bytes'], run.duration_s)}, "
             f"{len(more['events'])} events, {'with' if more['has_config'] else 'without'} the robot's config"
         )
     return lines

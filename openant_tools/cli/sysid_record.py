@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING
 
 import click
 
-from openant_tools.cli.hardware import Moving, anyway_option, engine_config, may_move, port_option, robot_of, yes_option
+from openant_tools.cli.hardware import (
+    Moving,
+    anyway_option,
+    engine_config,
+    may_move,
+    port_option,
+    record_pictures_option,
+    robot_of,
+    yes_option,
+)
 from openant_tools.cli.options import Number, rate_option, robot_option, seconds_option
 from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
 from openant_tools.workers import pass_on
@@ -71,6 +80,7 @@ setup_option = click.option(
 @setup_option
 @click.option("--imu/--no-imu", default=None, help="Record the IMU too. Default: on the floor.")
 @click.option("--camera/--no-camera", default=None, help="Record the pose too. Default: on the floor, if there is one.")
+@record_pictures_option
 @anyway_option
 @yes_option
 def record(
@@ -90,6 +100,7 @@ def record(
     setup: str | None,
     imu: bool | None,
     camera: bool | None,
+    record_pictures: bool,
     anyway: bool,
     yes: bool,
 ) -> None:
@@ -114,6 +125,8 @@ def record(
         return
     if out is None:
         raise BadInput("no name for the recording", remedy="name it with --out RUN.mcap")
+    if record_pictures and camera is False:
+        raise BadInput("pictures come from the camera", remedy="leave out --no-camera or --record-pictures")
     played = protocols_of(name, plan_file, seconds, setup)
     wanted = takes(recording_path(out), played, seed, repeats=repeats, hold_out_seed=hold_out_seed, hot_s=hot_s)
     for take in wanted:
@@ -141,10 +154,14 @@ def record(
             source = virtual_source
             if source is not None and moves_itself:
                 source = stack.enter_context(placed(source, protocol.setup, protocol.heading_rad))
-            done = _record_here(stack, console, place, source, port, folder, rate_hz, imu, camera, yes or k > 0, anyway)
+            done = _record_here(
+                stack, console, place, source, port, folder, rate_hz, imu, camera, yes or k > 0, anyway, record_pictures
+            )
         for recorded in done:
             click.echo(f"{recorded.path}  {recorded.cycles} cycles")
             _print_tracking(recorded.path)
+            if record_pictures:
+                _print_pictures(recorded.path)
 
 
 def protocols_of(
@@ -182,6 +199,15 @@ def _print_tracking(path: Path) -> None:
         click.echo(f"  {joint.joint} follows later by {seen}")
 
 
+def _print_pictures(path: Path) -> None:
+    from openant_tools.recording.reader import read_recording
+    from openant_tools.recording.summary import words_of_pictures
+
+    recording = read_recording(path)
+    size = float(recording.pictures.columns["bytes"].sum())
+    click.echo(f"  {words_of_pictures(len(recording.pictures.t), size, recording.run.duration_s)}")
+
+
 def _where(protocol: Protocol) -> str:
     from math import degrees
 
@@ -205,6 +231,7 @@ def _record_here(
     camera: bool | None,
     yes: bool,
     anyway: bool,
+    pictures: bool,
 ) -> list[Recorded]:
     """Connect to the robot where it is, and record."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -219,7 +246,7 @@ def _record_here(
             port,
             virtual_source,
             imu=floor if imu is None else imu,
-            camera=floor if camera is None else camera,
+            camera=pictures or (floor if camera is None else camera),
             rate_hz=rate_hz,
             anyway=anyway,
         )
@@ -247,6 +274,7 @@ def _record_here(
             progress=tell,
             journal=None if folder is None else folder.journal,
             notice=lambda text: bar.console.print(text, highlight=False),
+            pictures=pictures,
         )
     except (HardwareFault, KeyboardInterrupt):
         kept = [str(take.path) for take in wanted if take.path.exists()]

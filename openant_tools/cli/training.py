@@ -94,10 +94,11 @@ def training_options(hour: int, step_s: float, leaves: str) -> Callable[[Callabl
             yes: bool,
             task: str,
             effects: bool,
+            record_pictures: bool,
             **rest: Any,
         ) -> Any:
             need_agents()
-            name, chosen = _place_of(where, robot, kit, virtual_source, clock, task, effects)
+            name, chosen = _place_of(where, robot, kit, virtual_source, clock, task, effects, record_pictures)
             return command(place=TrainingPlace(name, chosen, yes), **rest)
 
         for option in reversed(options):
@@ -115,6 +116,7 @@ def _place_of(
     clock: str | None,
     task: str,
     effects: bool,
+    pictures: bool,
 ) -> tuple[str, dict[str, Any]]:
     """The environment's id and options.
 
@@ -124,10 +126,14 @@ def _place_of(
     hardware = where == "hardware"
     if virtual_source is not None and not hardware:
         raise BadInput("--virtual is a robot behind its ports", remedy="add --env hardware")
+    if pictures and not hardware:
+        raise BadInput("--record-pictures is of a robot's camera", remedy="add --env hardware")
     chosen = hardware_robot(robot, kit, virtual_source, clock) if hardware else robot_argument(robot, kit)
     options: dict[str, Any] = {**chosen, "task": task}
     if not effects and not hardware:
         options["effects"] = False
+    if pictures:
+        options["record_pictures"] = True
     return HARDWARE_ID if hardware else SIMULATED_ID, options
 
 

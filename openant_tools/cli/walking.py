@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from openant_tools.cli.hardware import may_move
+from openant_tools.cli.hardware import may_move, record_pictures_option
 from openant_tools.cli.learning import robot_argument
 from openant_tools.cli.virtual_for_command import virtual_option
 from openant_tools.errors import BadInput
@@ -26,7 +26,7 @@ SIMULATED_ID, HARDWARE_ID = "openant/Ant-v0", "openant/AntHardware-v0"
 
 
 def hardware_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """`--virtual`, `--clock`, `--yes`, of commands that may let a robot walk."""
+    """`--virtual`, `--clock`, `--yes`, `--record-pictures`, of commands that may let a robot walk."""
     for option in (
         click.option("--yes", is_flag=True, help="The robot may move: do not ask."),
         click.option(
@@ -34,6 +34,7 @@ def hardware_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Time of a virtual robot that is started here. Default: stepped, unless its scenario says otherwise.",
         ),
         virtual_option,
+        record_pictures_option,
     ):  # fmt: skip
         command = option(command)
     return command

@@ -20,11 +20,15 @@ from openant_tools.comms.clock import Clock
 from openant_tools.comms.intrinsics import Intrinsics
 from openant_tools.comms.tags import BodyLost, BodyPose, BodyTracker, TagSetup
 from openant_tools.errors import HardwareFault, OpenAntError
+from openant_tools.optional import cv2
 
 __all__ = ["BodyCamera", "CameraConfig"]
 
 #: px of a picture that is shown to somebody; a larger one would keep the bus waiting while it is handed over
 WIDEST = 640
+#: Of pictures that are kept: s between two at least, px of their width at most, JPEG's quality. At 1920 px an hour of them
+#: would be several GB.
+KEPT_EVERY_S, KEPT_WIDTH, KEPT_QUALITY = 0.2, 640, 80
 #: What is wrong is said again after so long, if it is still wrong.
 REPEAT_S = 10.0
 #: A lost tag is normal for a picture or two (a leg above it, a blurred one).
@@ -60,6 +64,7 @@ class BodyCamera:
 
     Attributes:
         info: what the camera gives.
+        keeping: whether pictures are kept for `kept`.
 
     Raises:
         HardwareFault: it cannot be opened or sends nothing.
@@ -81,6 +86,9 @@ class BodyCamera:
         self._results: deque[BodyPose | BodyLost] = deque(maxlen=QUEUE)
         self._pose: BodyPose | None = None
         self._image: NDArray[np.uint8] | None = None
+        self.keeping = False
+        self._kept: deque[tuple[float, bytes]] = deque(maxlen=QUEUE)
+        self._kept_at = -np.inf
         self._seen_at = clock.now()
         self._lost = ""
         self._said: tuple[str, float] = ("", -np.inf)
@@ -127,6 +135,10 @@ class BodyCamera:
         every = -(-image.shape[1] // WIDEST)
         few = image[::every, ::every]
         return np.ascontiguousarray(few[..., ::-1] if few.ndim == 3 else np.repeat(few[..., None], 3, axis=2))
+
+    def kept(self) -> list[tuple[float, bytes]]:
+        """The pictures kept since the last call: s when each was taken, and its JPEG."""
+        return [self._kept.popleft() for _ in range(len(self._kept))]
 
     @property
     def taken_at(self) -> float:
@@ -182,6 +194,9 @@ class BodyCamera:
         if frame is None:
             return
         self._image = frame.image
+        if self.keeping and frame.t - self._kept_at > KEPT_EVERY_S - 1e-6:
+            self._kept_at = frame.t
+            self._kept.append((frame.t, _jpeg(frame.image)))
         result = self._tracker.track(frame.image, frame.t, self._lean_at(frame.t))
         if isinstance(result, BodyPose):
             self._seen_at, self._lost = self._clock.now(), ""
@@ -192,3 +207,10 @@ class BodyCamera:
     def _lean_at(self, t: float) -> tuple[float, float] | None:
         near = min(tuple(self._leans), key=lambda lean: abs(lean[0] - t), default=None)
         return None if near is None or abs(near[0] - t) > LEAN_FRESH_S else (near[1], near[2])
+
+
+def _jpeg(image: NDArray[np.uint8]) -> bytes:
+    height, width = image.shape[:2]
+    if width > KEPT_WIDTH:
+        image = cv2.resize(image, (KEPT_WIDTH, round(height * KEPT_WIDTH / width)), interpolation=cv2.INTER_AREA)
+    return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, KEPT_QUALITY])[1])

@@ -71,7 +71,11 @@ class BodySensors:
                 if recorder.writer is not None:
                     recorder.writer.imu(*sample)
         if self.camera is not None:
+            self.camera.keeping = recorder.pictures
             self._take_poses(self.camera, recorder)
+            for picture in self.camera.kept():
+                if recorder.writer is not None:
+                    recorder.writer.picture(*picture)
 
     def _take_poses(self, camera: BodyCamera, recorder: Recorder) -> None:
         from openant_tools.comms.tags import BodyPose

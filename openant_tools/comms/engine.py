@@ -513,6 +513,10 @@ class Engine:
         recorder = self._recorder
         if recorder.writer is not None:
             raise BadInput(f"{recorder.writer.path} is being recorded", remedy="stop that recording first")
+        if command.pictures and self._sensors.camera is None:
+            raise BadInput(
+                "no camera sends pictures that could be recorded", remedy="look at its cable, or record without"
+            )
         extra: dict[str, Any] = {}
         if self._sensors.imu is not None:
             scales = self._sensors.imu.info

@@ -201,6 +201,7 @@ class Record:
         resume: go on with the recording that stands there, be it torn; its facts and config stay.
         thin_s: keep one healthy cycle in so many s, all cycles around what is not as it should be, the raw bytes of what was
             lost, and counts of the rest.
+        pictures: keep the overhead camera's, too: JPEG, five a second at most.
     """
 
     path: str
@@ -209,6 +210,7 @@ class Record:
     overwrite: bool = False
     resume: bool = False
     thin_s: float | None = None
+    pictures: bool = False
 
 
 @dataclass(frozen=True)

@@ -33,12 +33,14 @@ class Recorder:
 
     Attributes:
         writer: of the recording under way; None where there is none.
+        pictures: whether it is to hold the camera's pictures.
         stopped: why the one that was asked for is not written any more, until whoever records is told.
     """
 
     def __init__(self, config: EngineConfig, port: EnginePort) -> None:
         self._config, self._port = config, port
         self.writer: RecordingWriter | None = None
+        self.pictures = False
         self.stopped: RecordingStopped | None = None
         self._thinning: Thinning | None = None
         self._effort: Sequence[str] = ()
@@ -92,7 +94,7 @@ class Recorder:
             )
         except (TypeError, ValueError, AttributeError) as error:
             raise BadInput(f"Record.facts cannot be recorded: {error}", where=command.path) from error
-        self.writer = writer
+        self.writer, self.pictures = writer, command.pictures
         self._port.beat()
         self._thinning = None if command.thin_s is None else Thinning(command.thin_s, facts.joints)
         bus.failed = None
@@ -165,7 +167,7 @@ class Recorder:
         """
         if self.writer is None:
             return None
-        writer, self.writer = self.writer, None
+        writer, self.writer, self.pictures = self.writer, None, False
         if self._thinning is not None:
             for kept in self._thinning.flush():
                 writer.cycle(kept)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from heapq import merge
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +33,17 @@ _SERVO = {
 def write_foxglove(source: Source, path: Path) -> int:
     """Write an MCAP file with Foxglove's own schemas; returns how many messages it has.
 
-    Topics: `/joint_states` (measured), `/joint_commands`, `/servos`, `/imu`, `/tracker`, `/log`, and where the robot's model is
-    known `/tf` and `/scene`. Without a wall clock (a table) time begins in 1970, at the run's own.
+    Topics: `/joint_states` (measured), `/joint_commands`, `/servos`, `/imu`, `/tracker`, `/log`, where the robot's model is
+    known `/tf` and `/scene`, and where they were recorded the camera's `/picture`. Without a wall clock (a table) time begins in 1970, at the run's own.
     """
     context = foxglove.Context()
     offset = source.wall_ns or 0
     messages = 0
     with atomic_writer(path) as stream, foxglove.open_mcap(stream, context=context):
         channels: dict[str, Any] = {}
-        for topic, t, message in sorted(_messages(source), key=lambda one: one[1]):
+        for topic, t, message in merge(
+            sorted(_messages(source), key=itemgetter(1)), _pictures(source), key=itemgetter(1)
+        ):
             if topic not in channels:
                 channels[topic] = _channel(topic, message, context)
             stamp = max(0, round(t * 1e9) + offset)
@@ -55,7 +59,7 @@ def _channel(topic: str, message: Any, context: Any) -> Any:
         return foxglove.Channel(topic, schema=_schema(message), message_encoding="json", context=context)
     kinds = {
         "/joint_states": "JointStates", "/joint_commands": "JointStates", "/tf": "FrameTransforms", "/scene": "SceneUpdate",
-        "/tracker": "PoseInFrame", "/log": "Log",
+        "/tracker": "PoseInFrame", "/log": "Log", "/picture": "CompressedImage",
     }  # fmt: skip
     return getattr(foxglove_channels, f"{kinds[topic]}Channel")(topic, context=context)
 
@@ -103,6 +107,18 @@ def _messages(source: Source) -> Iterator[tuple[str, float, Any]]:
         )
     if source.scene is not None:
         yield from _scene(source)
+
+
+def _pictures(source: Source) -> Iterator[tuple[str, float, Any]]:
+    """One at a time: all together they need more memory than there is."""
+    for one in source.pictures():
+        yield (
+            "/picture",
+            one.t,
+            lambda stamp, jpeg=one.jpeg: _m.CompressedImage(
+                timestamp=stamp, frame_id="camera", data=jpeg, format="jpeg"
+            ),
+        )
 
 
 def _known(value: float) -> float | None:

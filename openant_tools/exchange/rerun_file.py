@@ -34,7 +34,7 @@ def rerun_stream(name: str, path: Path | None = None) -> Any:
 
 
 def log_source(stream: Any, source: Source) -> None:
-    """Log what was measured: `joints/J/SIGNAL`, `imu`, `base`, `log`, and the robot below `robot/measured`.
+    """Log what was measured: `joints/J/SIGNAL`, `imu`, `base`, `log`, `camera`, and the robot below `robot/measured`.
 
     Timelines: `t`, s since the run began, and `wall`, where the day is known.
     """
@@ -52,6 +52,9 @@ def log_source(stream: Any, source: Source) -> None:
     for one in source.sayings():
         _at(stream, source, one.t)
         stream.log("log", rr.TextLog(one.words, level="WARN" if one.bad else "INFO"))
+    for picture in source.pictures():
+        _at(stream, source, picture.t)
+        stream.log("camera", rr.EncodedImage(contents=picture.jpeg, media_type="image/jpeg"))
     stream.reset_time()
     if source.scene is not None:
         joints = run.signal("pos", source.scene.plant.joints)

@@ -15,6 +15,7 @@ from openant_tools.errors import BadInput
 from openant_tools.exchange.scene import DrawnRobot, load_scene
 from openant_tools.files import read_json
 from openant_tools.model.of_run import own_model
+from openant_tools.recording.pictures import Picture, read_pictures
 from openant_tools.recording.reader import Recording, Samples, read_recording
 from openant_tools.recording.run import Run
 from openant_tools.recording.tables import find_run, read_run
@@ -63,6 +64,11 @@ class Source:
             name: np.asarray(values, float) for name, values in self.run.columns.items() if name.startswith(starts)
         }
         return Samples(self.run.t if columns else np.zeros(0), columns)
+
+    def pictures(self) -> Iterator[Picture]:
+        """The overhead camera's, where they were recorded."""
+        if self.recording is not None and len(self.recording.pictures.t) and self.run.path is not None:
+            yield from read_pictures(self.run.path)
 
     def sayings(self) -> Iterator[Saying]:
         """Events in their order, then findings, at the end of the run that they are about."""

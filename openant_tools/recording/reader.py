@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.files import parse_json, reading
 from openant_tools.recording.facts import facts_from_json
+from openant_tools.recording.pictures import PICTURE
 from openant_tools.recording.run import Array, Facts, Run
 from openant_tools.recording.telemetry import IMU_FIELDS, POSE_FIELDS, ServoChannel, message_classes
 from openant_tools.recording.writer import METADATA, SCHEMA
@@ -58,6 +59,7 @@ class Recording:
     Attributes:
         run: the rows of the bus, in SI, with the body's samples at their nearest rows (see `merge_nearest`).
         imu, pose: the body's samples at their own times and rates.
+        pictures: when the camera's were taken, and their `bytes`; `read_pictures` has them themselves.
         events: what happened, each with `t` (s) and `kind`.
         channels: how counts became SI.
         registers: joint → register → counts, as dumped at the start.
@@ -69,6 +71,7 @@ class Recording:
     run: Run
     imu: Samples
     pose: Samples
+    pictures: Samples
     events: tuple[Mapping[str, Any], ...]
     channels: tuple[ServoChannel, ...]
     registers: Mapping[str, Mapping[str, int]]
@@ -200,6 +203,7 @@ def _read(path: Path) -> Recording:
     cycles: list[Any] = []
     body: dict[str, list[Any]] = {"openant.Imu": [], "openant.Pose": []}
     events: list[Mapping[str, Any]] = []
+    pictures: list[tuple[int, int]] = []
     for record in scan:
         if isinstance(record, Metadata) and record.name == METADATA:
             content = recording_content(record, path)
@@ -216,6 +220,8 @@ def _read(path: Path) -> Recording:
                 cycles.append(classes[kind].FromString(record.data))
             elif kind == "openant.Event":
                 events.append(parse_json(record.data, path))
+            elif kind == PICTURE:
+                pictures.append((record.log_time, len(record.data)))
             elif kind in body:
                 body[kind].append(classes[kind].FromString(record.data))
     if content is None:
@@ -253,6 +259,7 @@ def _read(path: Path) -> Recording:
         run=replace(run, columns=columns),
         imu=imu,
         pose=pose,
+        pictures=_pictures(pictures, int(content.get("stamp_offset_ns", 0))),
         events=tuple(events),
         channels=channels,
         registers=content["registers"],
@@ -383,6 +390,11 @@ def _samples(messages: list[Any], fields: Mapping[str, str]) -> Samples:
         if column is not None:
             columns[name] = column
     return Samples(t[forward], columns)
+
+
+def _pictures(found: list[tuple[int, int]], offset_ns: int) -> Samples:
+    stamps, sizes = np.array(found, np.int64).reshape(-1, 2).T
+    return Samples(np.asarray((stamps - offset_ns) * 1e-9, np.float64), {"bytes": sizes.astype(float)})
 
 
 def _forward(t: Array) -> NDArray[np.bool_]:

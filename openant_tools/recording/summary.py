@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from openant_tools.numbers import number
 from openant_tools.recording.run import BODY_COLUMNS, JOINT_SIGNALS, Run
 
-__all__ = ["JointSummary", "RowGap", "RunSummary", "summarize"]
+__all__ = ["JointSummary", "RowGap", "RunSummary", "summarize", "words_of_pictures"]
 
 #: a gap is longer than this many median rows
 GAP_ROWS = 3.0
@@ -102,3 +103,9 @@ def _counts(run: Run, column: str) -> dict[str, int]:
     words: Any = run.columns.get(column, np.array([], dtype=object))
     names, counts = np.unique(np.array([word for word in words if word], dtype=str), return_counts=True)
     return {str(name): int(count) for name, count in zip(names, counts, strict=True)}
+
+
+def words_of_pictures(count: int, size: float, seconds: float) -> str:
+    """So many pictures of `size` bytes in all, and what an hour of them would weigh."""
+    an_hour = f", {number(size / 1e6 * 3600 / seconds, decimals=0)} MB an hour" if count and seconds else ""
+    return f"{count} pictures, {number(size / 1e6)} MB{an_hour}"

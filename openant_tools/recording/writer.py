@@ -28,6 +28,7 @@ from mcap.writer import CompressionType, Writer
 
 from openant_tools.errors import BadInput, OpenAntError, StorageFault
 from openant_tools.recording.facts import facts_to_json
+from openant_tools.recording.pictures import PICTURE, PICTURE_TOPIC, picture_message, picture_schema
 from openant_tools.recording.run import Facts
 from openant_tools.recording.telemetry import AGENT_TIMES, Cycle, ServoChannel, Telemetry
 
@@ -191,6 +192,10 @@ class RecordingWriter:
         """Record where the body is by the names of formats: x, y, z, yaw, qw, qx, qy, qz; NaN is missing."""
         self._put((_POSE, t + self._shift, values))
 
+    def picture(self, t: float, jpeg: bytes) -> None:
+        """Record a picture (JPEG) taken at `t`, s."""
+        self._put((_PICTURE, t + self._shift, jpeg))
+
     def event(self, kind: str, **payload: Any) -> None:
         """Record that something happened now, such as a question answered or a write to a register; kept as JSON."""
         now = self._clock() + self._shift
@@ -268,7 +273,7 @@ class RecordingWriter:
         # Metadata records carry no checksum of their own, and a zeroed tail may begin in the middle of this one.
         metadata = {"content": content, "crc32": f"{zlib.crc32(content.encode()):08x}"}
         self._writer.add_metadata(METADATA, metadata if continued is None else dict(continued.metadata))
-        self._channel_ids = {}
+        self._channel_ids: dict[int, int] = {}
         for kind, topic, message in ((_CYCLE, "/cycle", "Cycle"), (_IMU, "/imu", "Imu"), (_POSE, "/pose", "Pose")):
             schema = self._writer.register_schema(f"openant.{message}", "protobuf", self._telemetry.descriptor_set)
             self._channel_ids[kind] = self._writer.register_channel(topic, "protobuf", schema)
@@ -276,10 +281,21 @@ class RecordingWriter:
         self._channel_ids[_EVENT] = self._writer.register_channel("/event", "json", schema)
         self._stream.sync()
 
+    def _channel(self, kind: int) -> int:
+        """Its number; that of pictures is there from the first one on."""
+        if kind not in self._channel_ids:
+            schema = self._writer.register_schema(PICTURE, "protobuf", picture_schema())
+            self._channel_ids[kind] = self._writer.register_channel(PICTURE_TOPIC, "protobuf", schema)
+        return self._channel_ids[kind]
+
+    def _stamp(self, t: float) -> int:
+        """A time on the clock of the rows, s, as the file's own, ns since 1970."""
+        return max(0, round(t * 1e9) + self._stamp_offset)
+
     def _take_over(self, continued: Continued) -> None:
-        topics = {"/cycle": _CYCLE, "/imu": _IMU, "/pose": _POSE, "/event": _EVENT}
+        topics = {"/cycle": _CYCLE, "/imu": _IMU, "/pose": _POSE, "/event": _EVENT, PICTURE_TOPIC: _PICTURE}
         for topic, stamp, data in continued.messages:
-            self._writer.add_message(self._channel_ids[topics[topic]], stamp, data, stamp)
+            self._writer.add_message(self._channel(topics[topic]), stamp, data, stamp)
             self.cycles += topic == "/cycle"
         self._writer.flush()
         self._stream.sync()
@@ -293,6 +309,7 @@ class RecordingWriter:
             _POSE: self._telemetry.pose,
             _EVENT: lambda t, data: bytes(data),
             _ROW: lambda t, data: bytes(data),
+            _PICTURE: lambda t, jpeg: picture_message(self._stamp(t), jpeg),
         }
         due, pending_t, pending, clean = time.monotonic() + SYNC_PERIOD, None, self.cycles, True
         while True:
@@ -305,8 +322,8 @@ class RecordingWriter:
                     if kind in encode:
                         if clean:
                             due, clean = time.monotonic() + SYNC_PERIOD, False
-                        stamp = max(0, round(t * 1e9) + self._stamp_offset)
-                        channel = self._channel_ids[_CYCLE if kind == _ROW else kind]
+                        stamp = self._stamp(t)
+                        channel = self._channel(_CYCLE if kind == _ROW else kind)
                         self._writer.add_message(channel, stamp, encode[kind](t, item), stamp)
                         if kind in (_CYCLE, _ROW):
                             pending_t, pending = t, pending + 1
@@ -354,7 +371,7 @@ class RecordingWriter:
             self._kept_t, self._kept = (max(stamps) - self._stamp_offset) * 1e-9, len(stamps)
 
 
-_CYCLE, _IMU, _POSE, _EVENT, _ROW, _SYNC, _CLOSE = range(7)
+_CYCLE, _IMU, _POSE, _EVENT, _ROW, _PICTURE, _SYNC, _CLOSE = range(8)
 #: what a disk says that takes no more, rather than a path that cannot be
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG)
 

@@ -113,6 +113,7 @@ def record_takes(
     progress: Callable[[str, float], None] = lambda words, share: None,
     notice: Callable[[str], None] = lambda text: None,
     journal: Path | None = None,
+    pictures: bool = False,
 ) -> list[Recorded]:
     """Record one take after another, of a robot that stays where it is.
 
@@ -122,6 +123,7 @@ def record_takes(
         progress: called with what is being done and the share of all that is done.
         notice: called with what the user should know.
         journal: file that every write to a servo's permanent memory is added to.
+        pictures: record the overhead camera's, too.
 
     Raises:
         HardwareFault: a guard or the stop key stopped it; the recording up to there is kept.
@@ -171,7 +173,7 @@ def record_takes(
                     **extra,
                 },
             )
-            engine.ask(messages.Record(str(take.path), facts, robot_toml))
+            engine.ask(messages.Record(str(take.path), facts, robot_toml, pictures=pictures))
             play(protocol, take.seed, take.path.stem)
             written, cycles = engine.ask(messages.StopRecording())
             done.append(Recorded(Path(written), cycles))

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -28,6 +29,7 @@ from openant_tools.comms.messages import EngineConfig
 from openant_tools.comms.restart import Interlock, MotionStopped, Restart, StopCause
 from openant_tools.comms.setup import camera_of_robot, config_of_unknown_robot, imu_of_robot
 from openant_tools.errors import HardwareFault
+from openant_tools.recording.pictures import read_pictures
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
 from openant_tools.recording.tables import read_run
@@ -477,7 +479,7 @@ def test_sigterm_ends_in_good_order(
 
 
 def test_body_and_joints_stand_in_one_recording(tmp_path: Path) -> None:
-    """On the floor the engine takes poses and IMU beside the bus, all on one clock."""
+    """On the floor the engine takes poses, pictures and IMU beside the bus, all on one clock."""
     scenario, out = tmp_path / "floor.toml", tmp_path / "run.mcap"
     look = "position = [-0.35, 0.2, 1.3]\nlook_at = [-0.35, 0.2, 0.0]\n"
     scenario.write_text(f'[robot]\nsetup = "floor"\n[camera]\nwidth = 640\nheight = 360\n{look}')
@@ -486,7 +488,7 @@ def test_body_and_joints_stand_in_one_recording(tmp_path: Path) -> None:
         with EngineProcess(config(robot, **seen)) as engine:  # type: ignore[arg-type]
             engine.ask(messages.Torque(True))
             engine.ask(messages.Ramp(HOME))
-            engine.ask(messages.Record(str(out), Facts(joints=(), setup="floor")))
+            engine.ask(messages.Record(str(out), Facts(joints=(), setup="floor"), pictures=True))
             engine.ask(messages.Hold(1.0))
             truth = VirtualControl(robot["control"]).ask("state")["base"]
             row = dict(zip(engine.columns, engine.telemetry()[-1].tolist(), strict=True))
@@ -498,6 +500,18 @@ def test_body_and_joints_stand_in_one_recording(tmp_path: Path) -> None:
     assert [row["base.x"], row["base.y"], row["base.z"]] == pytest.approx([x + 0.75, y - 0.30, z], abs=0.02)
     assert row["base.yaw"] == pytest.approx(2 * truth["quaternion"][3], abs=0.03)
     assert np.nanmedian(recording.run.columns["base.x"]) == pytest.approx(row["base.x"], abs=5e-3)
+    kept = list(read_pictures(out))
+    assert [one.t for one in kept] == pytest.approx(recording.pictures.t.tolist())
+    assert 5 <= len(kept) <= 6  # of some thirty
+    assert np.diff(recording.pictures.t).min() == pytest.approx(0.2, abs=1e-3)
+    assert set(recording.pictures.t.round(6)) <= set(recording.pose.t.round(6))
+    assert cv2.imdecode(np.frombuffer(kept[-1].jpeg, np.uint8), cv2.IMREAD_COLOR).shape == (360, 640, 3)
+
+
+def test_pictures_are_recorded_only_where_a_camera_sends_some(live: dict[str, str], tmp_path: Path) -> None:
+    with EngineProcess(config(live)) as engine, pytest.raises(HardwareFault, match="no camera sends pictures"):
+        engine.ask(messages.Record(str(tmp_path / "run.mcap"), Facts(joints=()), pictures=True))
+    assert not (tmp_path / "run.mcap").exists()
 
 
 def test_a_virtual_robot_that_ends_is_told_in_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

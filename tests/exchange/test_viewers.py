@@ -23,6 +23,7 @@ from openant_tools.robot.mjcf import nominal_model_path
 
 RAD = 2 * math.pi / 4096
 ROWS = 60
+JPEG = b"\xff\xd8 what no exporter looks into \xff\xd9"
 
 
 def code_of(*words: object) -> int:
@@ -46,6 +47,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
             writer.cycle(Cycle(t, (goal,) * 8, t + 1e-4, 0.0, answers, (True,) * 8))
             writer.imu(t, (0.0, 0.0, 0.1), (0.0, 0.0, 9.81))
             writer.pose(t, position=(0.01 * k, 0.0, 0.12), quaternion=(1.0, 0.0, 0.0, 0.0))
+            if k % 10 == 0:
+                writer.picture(t - 0.05, JPEG)
         writer.event("question", words="is it on the floor?")
     folder.findings.mkdir(exist_ok=True)
     (folder.findings / "walk-1.json").write_text(
@@ -82,6 +85,10 @@ def test_foxglove_gets_joints_in_radians_the_robot_where_it_was_and_what_was_sai
     assert [one.name for one in state] == list(run.joints)
     assert state[0].position == pytest.approx(run.columns[f"pos.{run.joints[0]}"][30])
     assert len(found["/joint_commands"]) == len(found["/imu"]) == len(found["/tracker"]) == ROWS
+    pictures = found["/picture"]
+    assert len(pictures) == ROWS // 10
+    assert (pictures[0][1].data, pictures[0][1].format) == (JPEG, "jpeg")
+    assert pictures[0][0] < found["/joint_states"][0][0] < pictures[1][0]  # in the file's order, 50 ms before its row
     said = [one[1].message for one in found["/log"]]
     assert any("on the floor?" in words for words in said)
     assert any("knee_fl lags" in words for words in said)
@@ -103,11 +110,15 @@ def test_rerun_shows_the_simulation_over_the_measurement_and_the_gap_as_curves(r
     rerun = pytest.importorskip("rerun")
     assert code_of("rec", "view", recording, "--out", tmp_path / "walk.rrd") == 0
     curves: dict[str, list[float]] = {}
+    pictures: list[bytes] = []
     for chunk in rerun.chunk.RrdReader(str(tmp_path / "walk.rrd")).store().stream():
         batch = chunk.to_record_batch()
         for name in batch.schema.names:
             if name.endswith("Scalars:scalars"):
                 curves.setdefault(chunk.entity_path, []).extend(value[0] for value in batch[name].to_pylist() if value)
+            elif "EncodedImage:blob" in name:
+                assert chunk.entity_path == "/camera"
+                pictures += [bytes(one[0]) for one in batch[name].to_pylist()]
             elif "Transform3D:translation" in name:
                 curves.setdefault(chunk.entity_path, []).append(batch.num_rows)
     run = read_recording(recording).run
@@ -116,6 +127,7 @@ def test_rerun_shows_the_simulation_over_the_measurement_and_the_gap_as_curves(r
     )
     np.testing.assert_allclose(measured, run.columns["pos.knee_fl"])
     assert len(gap) == len(simulated) == ROWS
+    assert pictures == [JPEG] * (ROWS // 10)
     np.testing.assert_allclose(np.array(measured) - simulated, gap, atol=1e-9)
     assert sum(curves["/robot/simulated/torso"]) == sum(curves["/robot/measured/lower_leg_fl"]) == ROWS
 

@@ -29,10 +29,12 @@ from openant_tools.cli.rec import rec
 from openant_tools.errors import BadInput
 from openant_tools.recording import writer as writer_module
 from openant_tools.recording.convert import import_run
+from openant_tools.recording.pictures import read_pictures
 from openant_tools.recording.reader import Samples, merge_nearest, read_recording
 from openant_tools.recording.repair import repair
 from openant_tools.recording.resume import continuation
 from openant_tools.recording.run import Facts, Run
+from openant_tools.recording.summary import words_of_pictures
 from openant_tools.recording.tables import read_run, read_table, write_table
 from openant_tools.recording.telemetry import Cycle, RecordedAnswer, ServoChannel, Telemetry
 from openant_tools.recording.writer import RecordingStopped, RecordingWriter
@@ -287,6 +289,28 @@ def test_a_file_from_before_wall_clocks_is_read_and_gone_on_with(whole: Path, tm
         with path.open("rb") as stream:
             stamps = [message.log_time for _, _, message in make_reader(stream).iter_messages(topics=["/cycle"])]
         assert (stamps[-1] - stamps[0]) * 1e-9 == pytest.approx(2.0)
+
+
+def test_pictures_outlive_a_cut_a_repair_and_a_recording_that_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "seen.mcap"
+    with RecordingWriter(path, facts=FACTS, channels=CHANNELS) as writer:
+        for k in range(60):
+            writer.cycle(cycle(k))
+            if k % 10 == 0:
+                writer.picture(50.0 + 0.02 * k - 0.05, bytes([k]) * 20_000)
+    with path.open("r+b") as stream:
+        stream.truncate(path.stat().st_size - 30)
+    repair(path)
+    going_on = continuation(path, CHANNELS, now=52.0, wall_counts=False)
+    with RecordingWriter(path, facts=FACTS, channels=CHANNELS, continued=going_on) as again:
+        again.cycle(cycle(100))
+        again.picture(51.95, b"last")
+    kept = list(read_pictures(path))
+    assert [one.jpeg[:1] for one in kept] == [bytes([k]) for k in range(0, 60, 10)] + [b"l"]
+    assert [one.t for one in kept] == pytest.approx([*(49.95 + 0.02 * k for k in range(0, 60, 10)), 51.95])
+    seen = read_recording(path).pictures
+    assert seen.t.tolist() == pytest.approx([one.t for one in kept])
+    assert words_of_pictures(len(seen.t), 2.5e6, 10.0) == "7 pictures, 2.50 MB, 900 MB an hour"
 
 
 def chunk_ends(path: Path) -> list[tuple[int, int]]:
