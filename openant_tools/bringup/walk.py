@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,7 +15,7 @@ from openant_tools.procedure.unfinished import Unfinished, unfinished
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
 
-__all__ = ["WALK", "Standing", "State", "do", "standing", "step", "walk"]
+__all__ = ["BENCH", "BESIDE", "WALK", "Standing", "State", "beside", "do", "standing", "step", "walk"]
 
 #: key of a finding's data: the `StopCause` of what ended its motion
 STOPPED = "stop_cause"
@@ -185,6 +185,68 @@ WALK: Mapping[str, Step] = {
     )
 }
 
+#: name → procedure of the bench, each by itself.
+BENCH: Mapping[str, Step] = {
+    step.name: step
+    for step in (
+        Step(
+            "knee-torque",
+            "Torque table",
+            "What the knees must bear on four, three and two legs, against what their servos can hold.",
+            "openant_tools.sysid.bench.steps:knee_torque",
+            table="a scale that weighs the whole robot",
+            changes="nothing",
+        ),
+        Step(
+            "stiffness",
+            "Kitchen scale",
+            "Press one foot against a scale, and say how stiff the joint is by the scale and by its servo's own duty.",
+            "openant_tools.sysid.bench.steps:stiffness",
+            needs=("zeros",),
+            table="the torso fixed on its stand, a kitchen scale or a block under one foot",
+            changes="[bench] in robot.toml",
+            moves=True,
+            minutes=5,
+        ),
+        Step(
+            "floor-friction",
+            "Tilted plate",
+            "Tilt a plate of the floor's material until the robot slides, and say how slippery it is.",
+            "openant_tools.sysid.bench.steps:floor_friction",
+            needs=("zeros", "imu"),
+            table="a plate of the floor's material, the robot on it",
+            changes="[bench] in robot.toml",
+            moves=True,
+            minutes=5,
+        ),
+    )
+}
+
+#: name → step that has no place in the order of the walk.
+BESIDE: Mapping[str, Step] = {
+    "check": Step(
+        "check",
+        "Daily check",
+        "Two minutes before a session: bus, supply, zeros, friction of each joint, IMU, heat, and what changed since the "
+        "passport.",
+        "openant_tools.bringup.check:check",
+        needs=("bounds",),
+        table="the robot on its stand, as it will be used",
+        changes="nothing",
+        moves=True,
+        minutes=2,
+    ),
+    **BENCH,
+    "undo": Step(
+        "undo",
+        "Undo",
+        "Take back the last step's writes to the servos' memory, newest first, as journal.jsonl has them.",
+        "openant_tools.calib.undo:undo",
+        table="the servos that were written to, plugged in as they were then",
+        changes="registers back to what they were",
+    ),
+}
+
 State = Literal["todo", "ok", "failed", "unsure", "stale"]
 
 
@@ -209,21 +271,31 @@ class Standing:
 def standing(folder: RobotFolder) -> dict[str, Standing]:
     """Every step of the walk, in order, as the robot's `findings/` tell; the walk resumes from it."""
     found = {name: latest(folder, name) for name in WALK}
-    out: dict[str, Standing] = {}
-    for name, step in WALK.items():
-        finding = found[name]
-        needed = [found[other] for other in step.needs]
-        state: State = "todo"
-        if finding is not None:
-            # A passport tells of every step.
-            told = found.values() if name == "passport" else needed
-            newer = any(other is not None and other.date > finding.date for other in told)
-            state = "stale" if newer else "ok"
-            if not finding.ok:
-                state = "unsure" if finding.ok is None else "failed"
-        waits = tuple(other for other, seen in zip(step.needs, needed, strict=True) if seen is None or not seen.ok)
-        out[name] = Standing(step, finding, state, waits, unfinished(folder, name))
-    return out
+    # A passport tells of every step.
+    return {
+        name: _standing(folder, step, found, tuple(found) if name == "passport" else step.needs)
+        for name, step in WALK.items()
+    }
+
+
+def beside(folder: RobotFolder, name: str) -> Standing:
+    """The same of a step that has no place in the order."""
+    step = BESIDE[name]
+    found = {one: latest(folder, one) for one in (*step.needs, name)}
+    return _standing(folder, step, found, ())  # each is a measurement by itself: no other makes it stale
+
+
+def _standing(folder: RobotFolder, step: Step, found: Mapping[str, Finding | None], told: Iterable[str]) -> Standing:
+    """Args: found: step → its newest finding. told: steps of which its finding tells, so that newer ones make it stale."""
+    finding = found[step.name]
+    state: State = "todo"
+    if finding is not None:
+        newer = any(other.date > finding.date for name in told if (other := found[name]) is not None)
+        state = "stale" if newer else "ok"
+        if not finding.ok:
+            state = "unsure" if finding.ok is None else "failed"
+    waits = tuple(name for name in step.needs if (seen := found[name]) is None or not seen.ok)
+    return Standing(step, finding, state, waits, unfinished(folder, step.name))
 
 
 def step(name: str) -> Step:

@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.calib.wires import heard
 from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.guards import Guards
 from openant_tools.comms.lateness import losses
 from openant_tools.comms.messages import EngineConfig
-from openant_tools.errors import HardwareFault
-from openant_tools.procedure.step import Live, Progress, Say, Subroutine
+from openant_tools.procedure.step import Live, Progress, Subroutine
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.joints import JOINTS
@@ -149,11 +149,7 @@ def play_watched(engine: EngineProcess, command: messages.Command, seconds: floa
     high = {name: limit[1] for name, limit in engine.config.limits_rad.items()}
     said = 0.0
     while not engine.done(number):
-        for event in engine.events():
-            if isinstance(event, messages.Notice):
-                yield Say(event.text, "info")
-            elif isinstance(event, messages.Stopped):
-                raise HardwareFault(event.what, where=engine.config.port, remedy=event.remedy)
+        yield from heard(engine)
         rows = engine.telemetry()
         if len(rows):
             first = float(rows[0, t]) if math.isnan(first) else first

@@ -10,8 +10,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.comms import messages
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.clock import Clock, RealClock, SteppedClock, VirtualControl
+from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.guards import Guards
 from openant_tools.comms.imu import Imu, open_imu
 from openant_tools.comms.line import SerialLine
@@ -23,12 +25,12 @@ from openant_tools.comms.silence import explaining
 from openant_tools.comms.state import passport_registers
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import EepromWrite, Journal
-from openant_tools.procedure.step import Bench
+from openant_tools.procedure.step import Bench, Say, Subroutine
 from openant_tools.robot.config import MotorSection, RobotConfig
 from openant_tools.robot.registers import RAD_PER_PULSE
 
 __all__ = [
-    "BOOT_S", "SETTLE_S", "bare_config", "engine_config", "in_joints", "journalled", "opened_bus", "opened_imu", "rest", "robot_servos", "servo_angles", "wait",
+    "BOOT_S", "SETTLE_S", "bare_config", "engine_config", "heard", "in_joints", "journalled", "opened_bus", "opened_imu", "rest", "robot_servos", "servo_angles", "wait",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -141,6 +143,15 @@ def bare_config(bench: Bench, servos: Sequence[Servo], baud: int) -> EngineConfi
         anyway=True,
         journal=str(bench.folder.journal),
     )
+
+
+def heard(engine: EngineProcess) -> Subroutine[None]:
+    """Say what the engine found worth knowing; raises HardwareFault where it switched torque off, with the guard's own words."""
+    for event in engine.events():
+        if isinstance(event, messages.Notice):
+            yield Say(event.text)
+        elif isinstance(event, messages.Stopped):
+            raise HardwareFault(event.what, where=engine.config.port, remedy=event.remedy)
 
 
 def rest(bench: Bench) -> None:

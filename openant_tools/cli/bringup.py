@@ -12,6 +12,7 @@ import click
 from openant_tools.cli.hardware import Moving, adapter_option, camera_option, imu_option
 from openant_tools.cli.options import json_option
 from openant_tools.cli.virtual_for_command import virtual_option
+from openant_tools.numbers import number
 
 __all__ = ["bringup"]
 
@@ -78,11 +79,11 @@ def bringup(
         bench = Bench(folder, port, imu, camera, control)
 
         def notice(step: Step, found: Finding | None) -> None:
-            number = list(WALK).index(step.name) + 1
+            place = list(WALK).index(step.name) + 1
             if found is None:
-                click.echo(f"{number}/{len(WALK)} {step.title}", err=True)
+                click.echo(f"{place}/{len(WALK)} {step.title}", err=True)
             else:
-                click.echo(f"{number}/{len(WALK)} {step.title}: ", nl=False)
+                click.echo(f"{place}/{len(WALK)} {step.title}: ", nl=False)
                 echo_finding(found)
 
         walk(bench, face, again=again, notice=notice)
@@ -101,5 +102,5 @@ def bringup(
     if red:
         click.echo(f"not green: {', '.join(WALK[name].title for name in red)}; the findings are in {folder.findings}")
         return 1
-    click.echo(f"{folder.passport}: every step says yes ({time.monotonic() - began:.0f} s)")
+    click.echo(f"{folder.passport}: every step says yes ({number(time.monotonic() - began, 's', decimals=0)})")
     return 0

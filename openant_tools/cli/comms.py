@@ -18,6 +18,7 @@ from openant_tools.cli.comms_soak import soak
 from openant_tools.cli.hardware import engine_config, port_option, robot_of
 from openant_tools.cli.options import SECONDS, driver_option, json_option, robot_option
 from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_option, virtual_robot
+from openant_tools.numbers import number, percent
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -207,14 +208,18 @@ def bench(
             bus.close()
     click.echo(f"{rate.words}: write {len(servos.ids)} goals, read {len(servos.ids)} blocks of 27 bytes")
     if rate.believable:
-        click.echo(f"  {rate.share:.0%} of the {rate.limit_hz:.0f} Hz that the wire allows; {rate.lost:.2%} lost")
+        click.echo(
+            f"  {percent(rate.share)} of the {number(rate.limit_hz, 'Hz', decimals=0)} that the wire allows; {percent(rate.lost, decimals=2)} lost"
+        )
     if late:
         click.echo(f"{late}: losses and rate are in part its own → {REMEDY}", err=True)
-    click.echo(f"  latency timer about {timer * 1e3:.0f} ms; return delay {max(delays.values()) * 2} µs at most")
+    click.echo(
+        f"  latency timer about {number(1e3 * timer, 'ms', decimals=0)}; return delay {max(delays.values()) * 2} µs at most"
+    )
     click.echo("quiet time after a write → failed reads")
     for trial in trials:
-        click.echo(f"  {trial.gap_s * 1e3:4.1f} ms   {trial.failed:2d} of {trial.tries}")
-    click.echo(f"smallest loss-free gap: {'none of these' if gap is None else f'{gap * 1e3:.1f} ms'}")
+        click.echo(f"  {number(1e3 * trial.gap_s, 'ms', decimals=1):>7}   {trial.failed:2d} of {trial.tries}")
+    click.echo(f"smallest loss-free gap: {'none of these' if gap is None else number(1e3 * gap, 'ms', decimals=1)}")
     if json_file:
         content = {
             "rate": rate.as_dict(), "gaps": [vars(trial) for trial in trials], "gap_s": gap,
@@ -285,14 +290,18 @@ def _watch_by_sdk(config: EngineConfig, seconds: float | None) -> dict[str, Any]
             found = sdk.sync_read(ids, BLOCK_ADDRESS, BLOCK_SIZE)
             cycles += 1
             table = Table(title=f"{cycles} cycles, asked by the vendor's SDK", box=None, padding=(0, 1, 0, 0))
-            for name in ("joint", "rad", "V", "°C", "lost", "in its words"):
+            for name in ("joint", "angle", "V", "°C", "lost", "in its words"):
                 table.add_column(name, justify="left" if name in ("joint", "in its words") else "right")
             for servo in config.servos:
                 data, cells = found.get(servo.id), ("", "", "")
                 if data is not None:
                     block = Block._make(BLOCK.unpack(data))
                     angle = servo.to_joint(block.position * servo.model.registers["present_position"].scale)
-                    cells = f"{angle:.3f}", f"{block.voltage / 10:.1f}", f"{block.temperature}"
+                    cells = (
+                        number(angle, "rad", decimals=1),
+                        number(block.voltage / 10, decimals=1),
+                        f"{block.temperature}",
+                    )
                 lost = sum(sdk.lost.get(servo.id, {}).values())
                 table.add_row(servo.joint, *cells, f"{lost}/{sdk.asked[servo.id]}", sdk.why(servo.id))
             live.update(table, refresh=True)
@@ -310,13 +319,13 @@ def _table(columns: Sequence[str], row: Sequence[float], statistics: Mapping[str
 
     values = dict(zip(columns, row, strict=True))
     comb = statistics["comb_period_s"]
-    title = f"{statistics['cycles']} cycles, worst wake-up {statistics['worst_wake_s'] * 1e3:.1f} ms late"
+    title = f"{statistics['cycles']} cycles, worst wake-up {number(1e3 * statistics['worst_wake_s'], 'ms', decimals=1)} late"
     if statistics["late"]:
         title += f"; {statistics['late']}: losses are in part its own"
     if comb:
-        title += f"; answers come in the beat of a {comb * 1e3:.0f} ms latency timer: see `openant comms ports`"
+        title += f"; answers come in the beat of a {number(1e3 * comb, 'ms', decimals=0)} latency timer: see `openant comms ports`"
     table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for name in ("joint", "rad", "V", "°C", "effort", "p50 ms", "p99 ms", "lost", "by cause"):
+    for name in ("joint", "angle", "V", "°C", "effort", "p50 ms", "p99 ms", "lost", "by cause"):
         table.add_column(name, justify="left" if name in ("joint", "by cause") else "right", no_wrap=True)
     for servo in statistics["servos"]:
         joint = servo["joint"]
@@ -324,12 +333,12 @@ def _table(columns: Sequence[str], row: Sequence[float], statistics: Mapping[str
         causes = ", ".join(f"{cause} {count}" for cause, count in servo["lost"].items())
         table.add_row(
             joint,
-            f"{values[f'pos.{joint}']:.3f}",
-            f"{values[f'volt.{joint}']:.1f}",
-            f"{values[f'temp.{joint}']:.0f}",
-            f"{current:.2f} A" if current == current else f"{load:.0%}",
-            *(f"{servo[key] * 1e3:.2f}" if servo[key] else "" for key in ("latency_p50_s", "latency_p99_s")),
-            f"{servo['loss']:.2%}",
+            number(values[f"pos.{joint}"], "rad", decimals=1),
+            number(values[f"volt.{joint}"], decimals=1),
+            number(values[f"temp.{joint}"], decimals=0),
+            number(current, "A", decimals=2) if current == current else percent(load),
+            *(number(1e3 * servo[key], decimals=2) if servo[key] else "" for key in ("latency_p50_s", "latency_p99_s")),
+            percent(servo["loss"], decimals=2),
             causes + (f", retries {servo['retries']}" if servo["retries"] else ""),
         )
     return table

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from openant_tools.cli.options import json_option, report_option, robot_option, write_report
+from openant_tools.numbers import percent
 
 __all__ = ["diagnose", "timing"]
 
@@ -57,7 +58,7 @@ def diagnose(
         for suspect in found.suspects[:3]:
             if suspect.probability < 0.02:
                 continue
-            click.echo(f"{suspect.cause:16} {suspect.probability:4.0%}  {', '.join(suspect.where)}")
+            click.echo(f"{suspect.cause:16} {percent(suspect.probability):>5}  {', '.join(suspect.where)}")
             for why in [one for one in suspect.evidence if one.nats > 0][:4]:
                 click.echo(f"  {why.words}")
         if found.verdict != "unknown":

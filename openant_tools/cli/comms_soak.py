@@ -12,6 +12,7 @@ from openant_tools.cli.hardware import Moving, anyway_option, engine_config, may
 from openant_tools.cli.options import MINUTES, json_option, rate_option, robot_option
 from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option
+from openant_tools.numbers import number, percent
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -126,10 +127,10 @@ def _on_the_bus(
         except KeyboardInterrupt:
             console.print(f"kept as far as it got: {path}; go on with --resume")
             raise
-    click.echo(f"{done.path}  {done.seconds:.0f} s, {done.cycles} rows kept")
+    click.echo(f"{done.path}  {number(done.seconds, 's', decimals=0)}, {done.cycles} rows kept")
     for servo in done.statistics["servos"]:
         lost = ", ".join(f"{cause} {count}" for cause, count in servo["lost"].items())
-        click.echo(f"  {servo['joint']:8} {servo['loss']:7.3%} of {servo['asked']} lost  {lost}")
+        click.echo(f"  {servo['joint']:8} {percent(servo['loss'], decimals=3):>8} of {servo['asked']} lost  {lost}")
     if done.statistics.get("late"):
         click.echo(f"{done.statistics['late']}: losses are in part its own")
     for stop in done.stops:
@@ -179,4 +180,4 @@ def _transactions(source: str, out: Path, seconds: float, rate_hz: float, still:
             scenario, seconds, rate_hz, out.stem, still=still, progress=lambda share: progress(share, {"servos": []})
         )
     write_table(run, out)
-    click.echo(f"{out}  {run.duration_s:.0f} s, {len(run.t)} rows")
+    click.echo(f"{out}  {number(run.duration_s, 's', decimals=0)}, {len(run.t)} rows")

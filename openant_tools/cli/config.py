@@ -11,6 +11,7 @@ import click
 
 from openant_tools.cli.options import json_option, robot_folder, robot_option
 from openant_tools.errors import BadInput
+from openant_tools.numbers import exact, number, span
 
 if TYPE_CHECKING:
     from openant_tools.robot.config import Provenance, RobotConfig
@@ -157,9 +158,8 @@ def _export_urdf(robot: Path | None, out: Path | None, grid: bool) -> None:
 
 
 def _degrees(value: float) -> str:
-    from math import degrees
 
-    return f"{degrees(value):+.2f}°"
+    return number(value, "rad", sign=True, decimals=2)
 
 
 def _source(entry: Provenance | None) -> str:
@@ -171,7 +171,7 @@ def _source(entry: Provenance | None) -> str:
     if entry.date:
         parts.append(f"on {entry.date:%Y-%m-%d}")
     if entry.low is not None and entry.high is not None:
-        parts.append(f"[{entry.low:.4g}, {entry.high:.4g}]")
+        parts.append(f"({span(entry.low, entry.high)})")
     return " ".join(parts)
 
 
@@ -189,7 +189,7 @@ def _print(folder: RobotFolder, configuration: RobotConfig) -> None:
         ("bus", f"{configuration.ports.bus or 'not known yet'}, {configuration.bus.baud} baud"),
         ("IMU", configuration.ports.imu or "not known yet"),
         ("camera", "not known yet" if configuration.ports.camera == "" else configuration.ports.camera),
-        ("control step", f"{configuration.timing.dt_s:g} s"),
+        ("control step", exact(configuration.timing.dt_s, "s")),
         ("actions", f"range {configuration.actions.preset!r}"),
         ("measured bounds", f"{len(configuration.observation)} of 22 signals"),
         ("backups", len(list(folder.backups.glob("robot-*.toml")))),

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from openant_tools.cli.options import json_option
+from openant_tools.numbers import number
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -56,15 +57,15 @@ def demo(robot: Path, steps: int, fresh: bool, json_file: Path | None) -> None:
     stages = whole.stages()
     say(f"A virtual Open Ant in {escape(str(robot))}: from its first recording to walking, in about three minutes.")
     try:
-        for number, stage in enumerate(stages, 1):
-            line = f"[bold]{number}/{len(stages) + 1} {stage.name:8}[/bold] {escape(stage.words):49}"
+        for place, stage in enumerate(stages, 1):
+            line = f"[bold]{place}/{len(stages) + 1} {stage.name:8}[/bold] {escape(stage.words):49}"
             if whole.stands(stage):
                 say(f"{line} stands already")
                 continue
             since = time.monotonic()
             with _bar(console, line) as tell:
                 whole.run(stage, tell)
-            say(f"{line} [green]done[/green], {time.monotonic() - since:.0f} s")
+            say(f"{line} [green]done[/green], {number(time.monotonic() - since, 's', decimals=0)}")
         if not whole.learns:
             say("learning is left out: it needs torch (pip install 'openant-tools\\[agents]')")
         elif not whole.video.exists():
@@ -73,7 +74,9 @@ def demo(robot: Path, steps: int, fresh: bool, json_file: Path | None) -> None:
         since = time.monotonic()
         with _bar(console, line):
             figures = write_report(whole)
-        say(f"{line} [green]done[/green], {time.monotonic() - since:.0f} s; {time.monotonic() - began:.0f} s in all")
+        say(
+            f"{line} [green]done[/green], {number(time.monotonic() - since, 's', decimals=0)}; {number(time.monotonic() - began, 's', decimals=0)} in all"
+        )
     except StageFailed as failure:
         say(escape(failure.said))
         raise

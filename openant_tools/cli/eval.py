@@ -24,6 +24,7 @@ from openant_tools.cli.walking import (
     may_walk,
 )
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number
 from openant_tools.workers import pass_on
 
 if TYPE_CHECKING:
@@ -152,10 +153,13 @@ def eval_(
         found = []
         with Progress(console=Console(stderr=True), transient=True) as bar:
             task = bar.add_task("walking", total=len(ways) * starts * seconds)
-            for number, way in enumerate(ways):
+            for played, way in enumerate(ways):
 
-                def tell(done: float, average: float, number: int = number, way: str = way) -> None:
-                    so_far, words = number * starts * seconds + done, f"{way} {100 * average:+.1f} cm/s"
+                def tell(done: float, average: float, played: int = played, way: str = way) -> None:
+                    so_far, words = (
+                        played * starts * seconds + done,
+                        f"{way} {number(100 * average, 'cm/s', sign=True, decimals=1)}",
+                    )
                     bar.update(task, completed=so_far, description=words)
                     pass_on(words, so_far / (len(ways) * starts * seconds))
 
@@ -191,12 +195,16 @@ def eval_(
 def _line(plays: Plays, seconds: float) -> str:
     """What it achieved in one way of acting, in a line."""
     starts = len(plays.plays)
-    spread = "" if starts == 1 else f", median of {starts} starts ({100 * plays.low:+.1f} to {100 * plays.high:+.1f})"
+    spread = (
+        ""
+        if starts == 1
+        else f", median of {starts} starts ({number(100 * plays.low, sign=True, decimals=1)} to {number(100 * plays.high, sign=True, decimals=1)})"
+    )
     still = f"; stood still for good in {plays.stood_still} of {starts}" if plays.stood_still else ""
     turns, path = (statistics.median(getattr(play, what) for play in plays.plays) for what in ("turns", "path_m"))
     return (
-        f"{LABELS[plays.way]}: {100 * plays.median:+.1f} cm/s over {seconds:.0f} s{spread}{still}; "
-        f"{path:.2f} m walked, {turns:.0f} turns"
+        f"{LABELS[plays.way]}: {number(100 * plays.median, 'cm/s', sign=True, decimals=1)} over {number(seconds, 's', decimals=0)}{spread}{still}; "
+        f"{number(path, 'm')} walked, {number(turns, decimals=0)} turns"
     )
 
 

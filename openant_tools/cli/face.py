@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import select
 import sys
+import termios
 from collections.abc import Callable
 
 import click
@@ -28,7 +30,7 @@ from openant_tools.procedure.step import (
     change_lines,
 )
 
-__all__ = ["CommandFace", "echo_finding"]
+__all__ = ["CommandFace", "echo_finding", "echo_numbers"]
 
 _GLYPHS = {"info": ("·", "dim"), "ok": ("✓", "green"), "warn": ("▲", "yellow"), "fail": ("✗", "red")}
 _PLAIN = {"·": "-", "✓": "ok", "▲": "!", "✗": "x", "→": "->", "…": "..."}
@@ -47,7 +49,7 @@ class CommandFace:
         self.console = Console(stderr=True, highlight=False)
         self._yes = yes
         self._hands = hands
-        self._live = 0
+        self._live, self._watching = 0, False
         self._said = ("", 0.0)
 
     def answer(self, event: Event) -> Answer:
@@ -137,7 +139,9 @@ class CommandFace:
             default = ask.default if isinstance(ask.default, str) else ask.choices[0]
             return Prompt.ask(question, console=self.console, choices=list(ask.choices), default=default)
         if ask.unit == "text":
-            return Prompt.ask(question, console=self.console, default=str(ask.default or ""))
+            return Prompt.ask(
+                question, console=self.console, default=str(ask.default or ""), show_default=bool(ask.default)
+            )
         while True:
             given = FloatPrompt.ask(f"{question} [{ask.unit}]", console=self.console, default=ask.default)
             if (
@@ -149,7 +153,11 @@ class CommandFace:
             self._line(f"[red]✗[/red] from {span(ask.low, ask.high, ask.unit)}")
 
     def _show(self, live: Live) -> bool:
-        """Bars that stay in place on a terminal; nothing where the output goes to a file."""
+        """Bars that stay in place on a terminal, nothing where the output goes to a file; whether Enter was pressed since."""
+        watched = not self._yes and sys.stdin.isatty()
+        if watched and not self._watching:  # a key that was pressed before counts for nothing that comes later
+            termios.tcflush(sys.stdin, termios.TCIFLUSH)
+        self._watching = watched
         if self.console.is_terminal and live.low:
             if self._live:
                 sys.stderr.write(f"\x1b[{self._live}A")
@@ -161,10 +169,13 @@ class CommandFace:
                     f"\x1b[2K  {joint:8} {bar} {number(value, live.unit, sign=True, decimals=1)} {live.marks.get(joint, '')}\n"
                 )
             self._live = len(live.values)
+        if watched and select.select([sys.stdin], [], [], 0)[0]:
+            sys.stdin.readline()
+            return True
         return False
 
     def _end_live(self) -> None:
-        self._live = 0
+        self._live, self._watching = 0, False
 
 
 def echo_finding(finding: Finding) -> None:
@@ -174,3 +185,12 @@ def echo_finding(finding: Finding) -> None:
         click.echo(f"  {words}")
     if finding.next_action:
         click.echo(f"next: {finding.next_action}")
+
+
+def echo_numbers(finding: Finding) -> None:
+    """The numbers that a finding rests on, for stdout, one below the other; what is not as it should be is marked."""
+    names = max((len(one.name) for one in finding.evidence), default=0)
+    values = max((len(one.words) for one in finding.evidence), default=0)
+    for one in finding.evidence:
+        wanted = f"   {'✗' if one.outside else '✓'} {one.wanted}" if one.wanted else ""
+        click.echo(f"{one.name:{names}}  {one.words:>{values}}{wanted}")

@@ -63,9 +63,8 @@ def measure(
     """
     from openant_tools.errors import BadInput
     from openant_tools.files import json_text, write_text
-    from openant_tools.gap.measure import UNITS
     from openant_tools.gap.measure import measure as measured
-    from openant_tools.gap.measure_report import gap_report, sentence
+    from openant_tools.gap.measure_report import gap_report, sentence, table
 
     try:
         seconds = None if horizon == "full" else float(horizon)
@@ -79,14 +78,8 @@ def measure(
     click.echo(sentence(found))
     if found.effects:
         click.echo(f"beside the model act: {', '.join(dict.fromkeys(name for name, _ in found.effects))}")
-    for signal, value in found.gaps.items():
-        click.echo(f"{signal}: {value:.5g} {UNITS[signal]}, floor {found.floors[signal]:.3g}")
-    click.echo("signal  joint          while        share    gap")
-    for place in found.places[:12]:
-        click.echo(
-            f"{place.signal:6}  {place.joint:13}  {place.regime:11}  {100 * place.share:4.1f} %  {place.gap:.4g} "
-            f"{UNITS[place.signal]}"
-        )
+    for words in table(found):
+        click.echo(words)
     if json_file:
         write_text(json_file, json_text(found.as_json()))
     if report:

@@ -14,6 +14,7 @@ from openant_tools.cli.options import joint_option, json_option, report_option, 
 from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.runs import checked, model_of, read_runs
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number, percent
 
 if TYPE_CHECKING:
     from openant_tools.gap.diagnosis import Diagnosis
@@ -182,7 +183,7 @@ def progress() -> Iterator[Callable[[float, str], None]]:
             nonlocal said
             if int(share * TOLD) > said:
                 said = int(share * TOLD)
-                click.echo(f"{100 * share:3.0f} %  {words}", err=True)
+                click.echo(f"{percent(share):>5}  {words}", err=True)
 
         yield say
         return
@@ -200,15 +201,15 @@ def _print(found: Diagnosis) -> None:
     click.echo(f"{'effect':20} {'where':{wide}}  present  closes  parameters")
     for one in shown:
         values = ", ".join(f"{name} {span}" for name, span in one.parameters.items())
-        closed = "–" if one.gap_closed is None else f"{100 * one.gap_closed:.0f} %"
+        closed = "–" if one.gap_closed is None else percent(one.gap_closed)
         mark = "*" if one.effect in found.selected else " "
         click.echo(
-            f"{mark}{one.effect:19} {where_words(one.joints):{wide}}  {100 * one.probability:5.0f} %  {closed:>6}  {values}"
+            f"{mark}{one.effect:19} {where_words(one.joints):{wide}}  {percent(one.probability):>7}  {closed:>6}  {values}"
         )
     gap = found.gap
     click.echo(
-        f"gap of position on held-out runs: {1e3 * gap['before']:.2f} → {1e3 * gap['after']:.2f} mrad, "
-        f"floor {1e3 * gap['floor']:.2f} mrad"
+        f"gap of position on held-out runs: {number(gap['before'], 'rad', name='gap')} → "
+        f"{number(gap['after'], 'rad', name='gap')}, floor {number(gap['floor'], 'rad', name='floor')}"
     )
     if found.rest and found.verdict != UNEXPLAINED:
         click.echo(rest_words(found))

@@ -109,6 +109,8 @@ def engine_config(
         if camera:
             more["camera"] = camera_of_robot(described, found.get("camera"))
         if described is not None:
+            assert folder is not None
+            more.setdefault("journal", str(folder.journal))
             yield config_of_robot(described, port, control=control, passport=passport_registers(folder), **more)
         else:
             yield config_of_unknown_robot(find_bus(port), control, **more)

@@ -14,6 +14,7 @@ import click
 from openant_tools.cli.options import robot_folder
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json
+from openant_tools.numbers import number
 from openant_tools.workers import pass_on
 
 if TYPE_CHECKING:
@@ -144,19 +145,24 @@ class LearningBar:
             self._bar.reset(self._task, completed=progress.step)
         self._last = progress.step
         speed = self._bar.tasks[self._task].speed
-        words = [f"{100 * progress.average_reward_m_s:+5.1f} cm/s", f"{progress.robot_seconds / 60:5.1f} min walked"]
+        words = [
+            number(100 * progress.average_reward_m_s, "cm/s", sign=True, decimals=1),
+            f"{number(progress.robot_seconds / 60, 'min', decimals=1)} walked",
+        ]
         if speed:
-            words.append(f"{speed:4.0f} steps/s")
+            words.append(number(speed, "steps/s", decimals=0))
         self._bar.update(
             self._task,
             completed=progress.step,
             description=name or ("learning" if progress.learning else "exploring"),
             words="  ".join(words),
         )
-        pass_on(f"{100 * progress.average_reward_m_s:+.1f} cm/s", progress.step / progress.steps)
+        pass_on(
+            number(100 * progress.average_reward_m_s, "cm/s", sign=True, decimals=1), progress.step / progress.steps
+        )
         drop = self._watch.see(progress) if self._watch is not None else None
         if drop is not None:
             self._bar.console.print(
-                f"the reward dropped from {100 * drop.best_m_s:.1f} to {100 * drop.lowest_m_s:.1f} cm/s at"
-                f" {drop.from_s / 60:.0f} min: the checkpoint is kept in drops/; `openant plot` says what preceded it"
+                f"the reward dropped from {number(100 * drop.best_m_s, decimals=1)} to {number(100 * drop.lowest_m_s, 'cm/s', decimals=1)} at"
+                f" {number(drop.from_s / 60, 'min', decimals=0)}: the checkpoint is kept in drops/; `openant plot` says what preceded it"
             )

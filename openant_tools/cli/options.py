@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from openant_tools.errors import BadInput
+from openant_tools.numbers import exact
 
 if TYPE_CHECKING:
     from openant_tools.report import Report
@@ -33,11 +34,11 @@ class Number(click.FloatRange):
     name = "number"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        number: float = click.FLOAT.convert(value, param, ctx)
-        if not abs(number) <= LARGEST:
+        given: float = click.FLOAT.convert(value, param, ctx)
+        if not abs(given) <= LARGEST:
             option = param.opts[0] if param is not None else "it"
-            raise BadInput(f"{option} is {number:g}", remedy="give it a number")
-        return float(super().convert(number, param, ctx))
+            raise BadInput(f"{option} is {exact(given)}", remedy="give it a number")
+        return float(super().convert(given, param, ctx))
 
 
 #: a length, a mass, a voltage

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from openant_tools.cli.options import json_option
+from openant_tools.numbers import number
 
 __all__ = ["plot"]
 
@@ -43,10 +44,10 @@ def plot(runs: tuple[Path, ...], out: Path, singly: bool, json_file: Path | None
     for name, members in groups.items():
         together = band(members)
         last, error = together.mean[-1], together.error[-1]
-        spread = f" ± {3 * error:.1f} (3 standard errors)" if together.runs > 1 else ""
+        spread = f" ± {number(3 * error, decimals=1)} (3 standard errors)" if together.runs > 1 else ""
         helped = sum(len(curve.interventions) for curve in members)
         click.echo(
-            f"{name}: {last:+.1f}{spread} cm/s after {together.minutes[-1]:.0f} min,"
+            f"{name}: {number(last, sign=True, decimals=1)}{spread} cm/s after {number(together.minutes[-1], 'min', decimals=0)},"
             f" {together.runs} {'seeds' if together.runs > 1 else 'seed'}"
             + (f", {helped} intervention{'s' if helped > 1 else ''}" if helped else "")
         )
@@ -61,10 +62,14 @@ def plot(runs: tuple[Path, ...], out: Path, singly: bool, json_file: Path | None
         )  # fmt: skip
     for curve in curves:
         for drop, path in zip(curve.drops, write_drops(curve.folder, curve.points), strict=True):
-            back = "not back yet" if drop.until_s is None else f"back after {(drop.until_s - drop.from_s) / 60:.0f} min"
+            back = (
+                "not back yet"
+                if drop.until_s is None
+                else f"back after {number((drop.until_s - drop.from_s) / 60, 'min', decimals=0)}"
+            )
             click.echo(
-                f"reward drop in {curve.folder} at {drop.from_s / 60:.0f} min: {100 * drop.best_m_s:.1f} →"
-                f" {100 * drop.lowest_m_s:.1f} cm/s, {back}; what preceded it: {path}"
+                f"reward drop in {curve.folder} at {number(drop.from_s / 60, 'min', decimals=0)}: {number(100 * drop.best_m_s, decimals=1)} →"
+                f" {number(100 * drop.lowest_m_s, 'cm/s', decimals=1)}, {back}; what preceded it: {path}"
             )
     click.echo(f"wrote {out}", err=True)
     if json_file is not None:

@@ -14,6 +14,7 @@ from openant_tools.cli.hardware import Moving
 from openant_tools.cli.learning import need_agents
 from openant_tools.cli.options import SECONDS, json_option, report_option, write_report
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number, percent
 
 if TYPE_CHECKING:
     from openant_agents.ranking import PlaceResult
@@ -193,14 +194,17 @@ def _print(names: list[str], real: Mapping[str, Any], simulated: Mapping[str, An
         cells = [real[policy], *(measured[policy] for measured in simulated.values())]
         click.echo(
             f"{policy:24} "
-            + " ".join(f"{100 * one.average_reward_m_s:+6.1f} ±{100 * one.standard_error_m_s:3.1f}" for one in cells)
+            + " ".join(
+                f"{number(100 * one.average_reward_m_s, sign=True, decimals=1):>6} ±{number(100 * one.standard_error_m_s, decimals=1)}"
+                for one in cells
+            )
         )
     for name, one in found.items():
         s, k, v, r = one.spearman, one.kendall, one.rank_violation_m_s, one.regret_m_s
         click.echo(
-            f"{name}: Spearman {s.value:.2f} [{s.low:.2f}, {s.high:.2f}], Kendall {k.value:.2f} [{k.low:.2f}, {k.high:.2f}],"
-            f" rank violation {100 * v.value:.1f} cm/s, regret {100 * r.value:.1f} cm/s"
-            f" ({100 * one.regret_share:.0f} %): its best is number {one.best_is} of {one.policies} on the robot"
+            f"{name}: Spearman {number(s.value, low=s.low, high=s.high)}, Kendall {number(k.value, low=k.low, high=k.high)},"
+            f" rank violation {number(100 * v.value, 'cm/s', decimals=1)}, regret {number(100 * r.value, 'cm/s', decimals=1)}"
+            f" ({percent(one.regret_share)}): its best is number {one.best_is} of {one.policies} on the robot"
         )
 
 
@@ -282,24 +286,24 @@ def _play(
         def tell(share: float) -> None:
             bar.update(task, completed=share)
 
-        for number, (name, run) in enumerate(runs.items(), start=1):
+        for at, (name, run) in enumerate(runs.items(), start=1):
             if known and name in known:
                 continue
-            bar.update(task, completed=0.0, description=f"{place}: {name} ({number} of {len(runs)})")
+            bar.update(task, completed=0.0, description=f"{place}: {name} ({at} of {len(runs)})")
             yield name, play_one(run, made, seconds=seconds, starts=starts, likeliest=likeliest, report=tell)
 
 
 def _achieved(measured: PlaceResult) -> str:
     """Both ways of a policy in a line, in cm/s."""
     plays, starts = measured.plays, len(measured.plays)
-    words = f"sampled {100 * measured.median:+6.1f} cm/s"
+    words = f"sampled {number(100 * measured.median, 'cm/s', sign=True, decimals=1):>11}"
     if starts > 1:
-        words += f" ({100 * min(plays):+.1f} to {100 * max(plays):+.1f} in {starts} starts)"
+        words += f" ({number(100 * min(plays), sign=True, decimals=1)} to {number(100 * max(plays), sign=True, decimals=1)} in {starts} starts)"
     if measured.likeliest is not None:
         likeliest = measured.likeliest
-        words += f", likeliest {100 * likeliest['median']:+6.1f}"
+        words += f", likeliest {number(100 * likeliest['median'], sign=True, decimals=1):>5}"
         if likeliest["stood_still"]:
-            words += f" (stood still for good in {likeliest['stood_still']:.0f} of {starts})"
+            words += f" (stood still for good in {number(likeliest['stood_still'])} of {starts})"
     return words
 
 

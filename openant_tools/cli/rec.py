@@ -13,6 +13,7 @@ import click
 
 from openant_tools.cli.options import json_option
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number, percent, span
 
 if TYPE_CHECKING:
     from openant_tools.recording.run import Run
@@ -275,7 +276,9 @@ def _import_lerobot(root: Path, calibration: Path | None, names: tuple[str, ...]
     for run in convert(conversion):
         path = out / f"{run.name}.parquet"
         write_table(run, path)
-        click.echo(f"{path}: {len(run.t)} rows over {run.duration_s:.1f} s of {', '.join(run.joints)}")
+        click.echo(
+            f"{path}: {len(run.t)} rows over {number(run.duration_s, 's', decimals=1)} of {', '.join(run.joints)}"
+        )
 
 
 def _notes(run: Run, model: Path | None) -> Iterator[str]:
@@ -308,23 +311,25 @@ def _lines(path: Path, run: Run, summary: RunSummary, more: dict[str, Any]) -> l
     facts = run.facts
     lines = [
         str(path),
-        f"  {summary.rows} rows over {summary.duration_s:.2f} s, {summary.rate_hz:.1f} Hz "
-        f"(a row every {1e3 * summary.period_s:.2f} ms; 98 % within {1e3 * summary.period_low_s:.2f} … "
-        f"{1e3 * summary.period_high_s:.2f} ms, longest {1e3 * summary.period_longest_s:.2f} ms)",
+        f"  {summary.rows} rows over {number(summary.duration_s, 's', decimals=2)}, {number(summary.rate_hz, 'Hz', decimals=1)} "
+        f"(a row every {number(1e3 * summary.period_s, 'ms', decimals=2)}; 98 % within {number(1e3 * summary.period_low_s, decimals=2)} to "
+        f"{number(1e3 * summary.period_high_s, 'ms', decimals=2)}, longest {number(1e3 * summary.period_longest_s, 'ms', decimals=2)})",
     ]
     if more.get("damage"):
         lines.append(f"  DAMAGED: {more['damage']} → `openant rec repair {path}`")
     for gap in summary.gaps[:5]:
-        lines.append(f"  gap of {gap.duration_s:.3f} s at t = {gap.t:.3f} s (row {gap.row + 1})")
+        lines.append(
+            f"  gap of {number(gap.duration_s, 's')} at t = {number(gap.t, 's', decimals=3)} (row {gap.row + 1})"
+        )
     if len(summary.gaps) > 5:
         lines.append(f"  … and {len(summary.gaps) - 5} more gaps")
     width = max(len(joint.joint) for joint in summary.joints)
     for joint in summary.joints:
-        span = "" if joint.pos_low is None else f"{joint.pos_low:+.3f} … {joint.pos_high:+.3f} rad"
+        reach = "" if joint.pos_low is None else span(joint.pos_low, joint.pos_high, "rad", decimals=1)
         errors = ", ".join(f"{count} {word}" for word, count in joint.errors.items())
-        lost = f"{100 * joint.lost:.2f} % lost" + (f" ({errors})" if errors else "")
+        lost = f"{percent(joint.lost, decimals=2)} lost" + (f" ({errors})" if errors else "")
         lines.append(
-            f"  {joint.joint:<{width}}  {joint.motor or '–':<14}  {span:<22}  {lost:<14}  {' '.join(joint.signals)}"
+            f"  {joint.joint:<{width}}  {joint.motor or '–':<14}  {reach:<22}  {lost:<14}  {' '.join(joint.signals)}"
         )
     if summary.body:
         lines.append(f"  body: {' '.join(summary.body)}")

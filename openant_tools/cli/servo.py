@@ -9,6 +9,7 @@ import click
 
 from openant_tools.cli.options import POSITIVE, Number, json_option
 from openant_tools.errors import BadInput
+from openant_tools.numbers import exact, number, percent
 
 if TYPE_CHECKING:
     from openant_tools.robot.servo_gains import Beside, Conversion
@@ -31,7 +32,7 @@ class Counts(click.ParamType):  # type: ignore[type-arg]  # generic from click 8
             share = Number().convert(value, param, ctx)
             remedy = "give it a whole number, as the register holds it"
             if option == "--pwm-limit" and 0 < share <= 1:
-                remedy = f"it counts to {PWM_FULL}: for {share:.0%} give {round(share * PWM_FULL)}"
+                remedy = f"it counts to {PWM_FULL}: for {percent(share)} give {round(share * PWM_FULL)}"
             raise BadInput(f"{option} {value} is no count", remedy=remedy) from None
 
 
@@ -140,7 +141,7 @@ def gains_(
     if own is not None and pwm_limit is None:
         origins["pwm_limit"] = "the robot's"
     rows = beside(result, folder) if folder else []
-    click.echo(f"{model.name} at {supply:g} V{whose}")
+    click.echo(f"{model.name} at {exact(supply, 'V')}{whose}")
     _show(result, origins)
     if folder and config:
         click.echo(f"beside what was identified of {folder.path}:")
@@ -157,21 +158,21 @@ def _show(result: Conversion, origins: dict[str, str]) -> None:
     from openant_tools.robot.registers import PWM_FULL
 
     registers, mjcf, wanted = result.registers, result.mjcf, result.wanted
-    parts = f"{result.back_emf_damping:.4g} back-EMF + {result.derivative_damping:.4g} of the D gain"
+    parts = f"{_for_mjcf(result.back_emf_damping)} back-EMF + {_for_mjcf(result.derivative_damping)} of the D gain"
     if result.back_emf == "joint":
-        parts = f"of the D gain; back-EMF {mjcf.damping:.4g} in the joint's damping"
-    reached = "" if mjcf.saturates_at_rad is None else f"; kp reaches it at {mjcf.saturates_at_rad:.3g} rad"
-    duty = f"{registers.pwm_limit / PWM_FULL:.1%} of full duty{reached}"
-    integral = f"{result.ki:.3g} N·m/(rad·s)" if registers.position_i else "-"
+        parts = f"of the D gain; back-EMF {_for_mjcf(mjcf.damping)} in the joint's damping"
+    reached = "" if mjcf.saturates_at_rad is None else f"; kp reaches it at {number(mjcf.saturates_at_rad, 'rad')}"
+    duty = f"{percent(registers.pwm_limit / PWM_FULL, decimals=1)} of full duty{reached}"
+    integral = number(result.ki, "N·m/(rad·s)") if registers.position_i else "-"
     rows = (
-        ("position_p", registers.position_p, wanted.kp, "kp", f"{mjcf.kp:.4g} N·m/rad",
-         f"by a P divisor of {result.model.p_divisor:g}"),
-        ("position_d", registers.position_d, wanted.kv, "kv", f"{mjcf.kv:.4g} N·m·s/rad", parts),
+        ("position_p", registers.position_p, wanted.kp, "kp", f"{_for_mjcf(mjcf.kp)} N·m/rad",
+         f"by a P divisor of {exact(result.model.p_divisor)}"),
+        ("position_d", registers.position_d, wanted.kv, "kv", f"{_for_mjcf(mjcf.kv)} N·m·s/rad", parts),
         ("position_i", registers.position_i, None, "", integral, "no counterpart in <position>"),
-        ("pwm_limit", registers.pwm_limit, wanted.force_nm, "forcerange", f"±{mjcf.force_nm:.4g} N·m", duty),
+        ("pwm_limit", registers.pwm_limit, wanted.force_nm, "forcerange", f"±{_for_mjcf(mjcf.force_nm)} N·m", duty),
     )  # fmt: skip
     for register, count, asked, name, value, words in rows:
-        origin = origins[register] if asked is None else f"for {asked:g}, rounded"
+        origin = origins[register] if asked is None else f"for {exact(asked)}, rounded"
         click.echo(f"  {register:10} {count:6}  {origin:20}  {name:10} {value:18}  {words}")
     for line in mjcf.lines:
         click.echo(f"  {line}")
@@ -179,7 +180,14 @@ def _show(result: Conversion, origins: dict[str, str]) -> None:
         click.echo("the P divisor is told differently:")
         for k, (divisor, p, kp) in enumerate(result.by_divisor):
             used = "used above" if k == 0 else "not used"
-            click.echo(f"  by {divisor.value:g} ({used}) position_p {p} is kp {kp:.4g} N·m/rad; {divisor.source}")
+            click.echo(
+                f"  by {exact(divisor.value)} ({used}) position_p {p} is kp {_for_mjcf(kp)} N·m/rad; {divisor.source}"
+            )
+
+
+def _for_mjcf(value: float) -> str:
+    """With the digits that are worth typing into a model."""
+    return f"{value:.4g}"  # for a file
 
 
 def _show_constants(result: Conversion) -> None:
@@ -191,10 +199,10 @@ def _show_constants(result: Conversion) -> None:
         for one in told:
             if one.used == used:
                 figure = one.figure
-                number = f"{figure.value:.4g}" if figure.value < 1e4 else f"{figure.value:.0f}"
+                words = _for_mjcf(figure.value)
                 name = "" if one.quantity == before else one.quantity
                 unit = "" if figure.unit == "1" else figure.unit
-                click.echo(f"  {name:19} {number:>7} {unit:9} {figure.source}")
+                click.echo(f"  {name:19} {words:>7} {unit:9} {figure.source}")
                 before = one.quantity
     for note in result.notes:
         click.echo(f"note: {note}")
@@ -203,9 +211,8 @@ def _show_constants(result: Conversion) -> None:
 def _show_beside(rows: list[Beside], model: str, has: set[str]) -> None:
     units = {"kp": "N·m/rad", "kv": "N·m·s/rad", "forcerange": "N·m"}
     for row in rows:
-        interval = "" if row.low is None or row.high is None else f" [{row.low:.4g}, {row.high:.4g}]"
         click.echo(
-            f"  {row.joint:8} {row.name:10} data sheet {row.sheet:<7.4g} identified {row.value:.4g}{interval} "
+            f"  {row.joint:8} {row.name:10} data sheet {_for_mjcf(row.sheet):7} identified {number(row.value, low=row.low, high=row.high)} "
             f"{units[row.name]} ({row.how})"
         )
     if model not in has:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
-import select
-import sys
-from collections.abc import Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from openant_tools.cli.hardware import Moving, engine_config, may_move, port_option, robot_of, yes_option
+from openant_tools.cli.hardware import Moving, engine_config, port_option, robot_of, yes_option
 from openant_tools.cli.options import POSITIVE, SECONDS, Number, json_option, report_option, robot_option, write_report
 from openant_tools.cli.virtual_for_command import virtual_option
 
 if TYPE_CHECKING:
+    from openant_tools.cli.face import CommandFace
+    from openant_tools.comms.messages import EngineConfig
     from openant_tools.procedure.finding import Finding
     from openant_tools.robot.folder import RobotFolder
 
@@ -91,48 +92,17 @@ def torque(
 
     Exit code 1: a knee works beyond what it can hold.
     """
-    from openant_tools.robot.kit import HOME_RAD, PLATFORM_PWM_LIMIT
     from openant_tools.robot.kit import kit as kit_by_name
     from openant_tools.robot.servo import servo_model
-    from openant_tools.sysid.bench.knee_torque import (
-        KNEE_TO_GROUND_M,
-        LEGS_IN_STANCE,
-        knee_loads,
-        torque_finding,
-    )
+    from openant_tools.sysid.bench.knee_torque import KNEE_TO_GROUND_M, torque_table
 
     folder = None if kit else robot_of(robot, needed=robot is not None)
     config = folder.config() if folder else None
-    parts = kit_by_name(kit or (config.kit if config else "standard"))
-    if servo:
-        own = servo_model(servo)
-        knees = [(own.name, own)]
-        supply = supply_v or own.nominal_voltage_v
-    else:
-        models = {m.servo.name: m.servo for m in config.motors.values() if m.joint.startswith("knee")} if config else {}
-        knees = list(models.items()) or [(parts.knee, parts.servo("knee"))]
-        supply = supply_v or parts.supply_v
-    mass = parts.total_mass_kg if mass_kg is None else mass_kg
-    length = KNEE_TO_GROUND_M if length_m is None else length_m
-    limit = pwm_limit if pwm_limit is not None else config.bus.pwm_limit if config else PLATFORM_PWM_LIMIT
-    loads = knee_loads(
-        knees,
-        mass,
-        legs or LEGS_IN_STANCE,
-        angles or (math.pi / 2 + HOME_RAD["knee"], math.pi / 4),
-        supply_v=supply,
-        pwm_limit=limit,
-        length_m=length,
-    )
-    finding = torque_finding(loads, mass, length, supply, limit, _command())
-    click.echo(f"{mass:g} kg, {length:g} m from knee to ground, {supply:g} V, PWM limit {limit:.0%}")
-    click.echo("knee           legs  from vertical   must bear   nominal   stall at limit")
-    for load in loads:
-        mark = {"holds": "", "heats": "  heats: beyond nominal", "gives way": "  gives way"}[load.verdict]
-        click.echo(
-            f"{load.servo:13}  {load.legs:4}  {load.angle_rad:.3f} rad {math.degrees(load.angle_rad):3.0f}°  "
-            f"{load.torque_nm:6.2f} N·m  {load.nominal_nm:4.2f} N·m   {load.limit_nm:10.2f} N·m{mark}"
-        )
+    finding = torque_table(
+        kit_by_name(kit or (config.kit if config else "standard")), config, servo=servo_model(servo) if servo else None,
+        mass_kg=mass_kg, legs=legs, angles_rad=angles, length_m=length_m or KNEE_TO_GROUND_M, supply_v=supply_v,
+        pwm_limit=pwm_limit, command=_command(),
+    )  # fmt: skip
     return _conclude(finding, folder if robot is not None else None, json_file)
 
 
@@ -202,31 +172,18 @@ def scale(
     Exit code 1: the estimators disagree, or neither divisor fits.
     """
     from openant_tools.errors import BadInput
+    from openant_tools.procedure.step import drive
     from openant_tools.robot.joints import JOINTS
     from openant_tools.robot.kit import HOME_RAD, PLATFORM_PWM_LIMIT
     from openant_tools.robot.servo import servo_model
+    from openant_tools.sysid.bench import scale as bench
     from openant_tools.sysid.bench.knee_torque import KNEE_TO_GROUND_M
-    from openant_tools.sysid.bench.stiffness import (
-        ARM_UNCERTAINTY,
-        lever_arm,
-        read_weighings,
-        scale_line,
-        servo_line,
-        stiffness_finding,
-    )
+    from openant_tools.sysid.bench.stiffness import Lever, read_weighings, weighed_finding
 
     kind = JOINTS[joint].kind if joint in JOINTS else "knee"
     touch = HOME_RAD[kind] if pose is None else pose
-    length = KNEE_TO_GROUND_M if length_m is None else length_m
+    lever = Lever(joint, length_m or KNEE_TO_GROUND_M, arm_m)
     typed = read_weighings(readings) if readings is not None else []
-
-    def arm_at(angle: float) -> float:
-        if arm_m is not None:
-            return arm_m
-        if kind == "hip":
-            raise BadInput("a hip's lever arm is not known", remedy="measure it from axis to hook and give it by --arm")
-        return lever_arm(length, angle)
-
     moves = virtual_source is not None or port is not None or readings is None
     folder = robot_of(robot, needed=moves and virtual_source is None)
     config = folder.config() if folder else None
@@ -236,88 +193,26 @@ def scale(
             where=folder.config_file if folder else None,
             remedy=f"use {', '.join(config.motors)}",
         )
-    kept = folder if robot is not None else None
-    common: dict[str, Any] = {"command": _command(), "arm_m": arm_at(touch) if typed or kind == "knee" else arm_m}
-    if not moves:
+    if moves:
+        pressing = bench.Pressing(joint, touch, step_rad, steps, 1 if up or kind == "hip" else -1)
+        with engine_config(folder, port, virtual_source) as engine, _face(engine, virtual_source, yes) as face:
+            procedure = bench.stiffness(
+                engine, pressing, lever, weighings=typed, weigh=not yes and not typed, held=yes and virtual_source is None,
+                command=_command(),
+            )  # fmt: skip
+            finding = drive(procedure, face)
+    else:
         own = servo_model(servo) if servo else config.motors[joint].servo if config else servo_model("XM430-W350-T")
-        supply = own.nominal_voltage_v if supply_v is None else supply_v
         limit = pwm_limit if pwm_limit is not None else config.bus.pwm_limit if config else PLATFORM_PWM_LIMIT
-        factory = own.register("position_p_gain").default
-        line = scale_line(
-            [w.deflection_rad for w in typed],
-            [w.grams for w in typed],
-            arm_at(touch),
-            torque_limit_nm=own.stall_torque_at(supply, limit),
-            arm_uncertainty_m=ARM_UNCERTAINTY * arm_at(touch),
-        )
-        finding = stiffness_finding(
-            joint, own, p_gain=p_gain or float(factory or 0), supply_v=supply, pwm_limit=limit, scale=line, duty=None,
-            measured_error=False, weighings=typed, **common,
+        finding = weighed_finding(
+            joint, own, typed, lever, pose_rad=touch, p_gain=p_gain, supply_v=supply_v, pwm_limit=limit,
+            command=_command(),
         )  # fmt: skip
-        _show_stiffness(finding, report, readings)
-        return _conclude(finding, kept, json_file)
-
-    from openant_tools.sysid.bench.press import Pressing, press
-
-    talk = sys.stdin.isatty()
-    by_step = {round(w.deflection_rad / step_rad): w.grams for w in typed}
-
-    def grams(deflection: float) -> float | None:
-        if typed:
-            return by_step.get(round(deflection / step_rad))
-        return _ask_grams(deflection) if talk else None
-
-    pressing = Pressing(joint, touch, step_rad, steps, 1 if up or kind == "hip" else -1)
-    with engine_config(folder, port, virtual_source) as engine:
-        own = pressing.check(engine).model
-        words = (
-            f"{joint} goes to {touch:.2f} rad and presses {steps} × {step_rad:g} rad beyond; the others stand at home."
-        )
-        click.echo(f"{words} Fix the torso on its stand, feet free.", err=True)
-        may_move(yes)
-        result = press(
-            engine,
-            pressing,
-            ready=_place_scale if talk else lambda: None,
-            grams=grams,
-            notice=lambda text: click.echo(text, err=True),
-            progress=lambda words, share: click.echo(f"  {words}", err=True),
-            journal=folder.journal if folder else None,
-        )
-    duty = servo_line(result.readings, result.pwm_limit)
-    weighed = {w.deflection_rad: w.grams for w in result.weighings}
-    pairs = [(r, weighed[r.deflection_rad]) for r in result.readings if r.deflection_rad in weighed]
-    line_or_none = None
-    if pairs:
-        line_or_none = scale_line(
-            [r.error_rad for r, _ in pairs],
-            [g for _, g in pairs],
-            [arm_at(r.position_rad) for r, _ in pairs],
-            torque_limit_nm=own.stall_torque_at(result.volts, result.pwm_limit),
-            arm_uncertainty_m=ARM_UNCERTAINTY * arm_at(touch),
-        )
-    finding = stiffness_finding(
-        joint, own, p_gain=result.p_gain, i_gain=result.i_gain, supply_v=result.volts, pwm_limit=result.pwm_limit,
-        scale=line_or_none, duty=duty, measured_error=True, weighings=result.weighings, readings=result.readings, **common,
-    )  # fmt: skip
-    _show_stiffness(finding, report)
-    return _conclude(finding, kept, json_file)
-
-
-def _show_stiffness(finding: Finding, report: Path | None, read: Path | None = None) -> None:
     if report:
         from openant_tools.sysid.bench.report import stiffness_report
 
-        write_report(stiffness_report(finding), report, [read] if read else ())
-    for reading in finding.data["servo_readings"]:
-        click.echo(
-            f"{reading['deflection_rad']:.3f} rad pressed: error {reading['error_rad']:.4f} rad, "
-            f"duty {reading['duty']:.3f}, {reading['volts']:.1f} V"
-        )
-    for evidence in finding.evidence:
-        interval = "" if evidence.low is None else f"  [{evidence.low:.2f}, {evidence.high:.2f}]"
-        unit = "" if evidence.unit == "1" else f" {evidence.unit}"
-        click.echo(f"{evidence.name:42}  {evidence.value:8.2f}{interval}{unit}")
+        write_report(stiffness_report(finding), report, [readings] if readings else ())
+    return _conclude(finding, folder if robot is not None else None, json_file)
 
 
 @click.command(cls=Moving)
@@ -338,7 +233,7 @@ def _show_stiffness(finding: Finding, report: Path | None, read: Path | None = N
     default=3.0,
     show_default=True,
     metavar="S",
-    help="With --imu, without a terminal: a trial.",
+    help="With --yes: a trial.",
 )
 @click.option("--held", is_flag=True, help="It did not slide at these angles: they bound the coefficient from below.")
 @click.option(
@@ -386,65 +281,38 @@ def tilt(
     if not live and not slopes:
         raise BadInput("no angles", remedy="give --static 31deg for each trial, --readings FILE, or --imu")
     folder = robot_of(robot, needed=live and virtual_source is None)
-    source = "protractor"
     if live:
-        from openant_tools.sysid.bench.tilt import tilt_trials
+        from openant_tools.procedure.step import drive
+        from openant_tools.sysid.bench.tilt import LONGEST_S, floor_friction
 
-        source = "accelerometer"
-        talk = sys.stdin.isatty()
-        with engine_config(folder, port, virtual_source, imu=True) as engine:
-            click.echo("The robot stands up at home on the plate and holds itself there.", err=True)
-            may_move(yes)
-            angles = tilt_trials(
-                engine,
-                trials,
-                level=lambda: talk and _enter("Hold the plate level and still"),
-                begin=lambda trial: _begin(trial, trials) if talk else None,
-                ended=lambda so_far: _key_pressed() if talk else so_far >= seconds,
-                notice=lambda text: click.echo(text, err=True),
-                journal=folder.journal if folder else None,
-            )
-        for angle in angles:
-            click.echo(f"{angle:.3f} rad ({math.degrees(angle):.1f}°), μ = {math.tan(angle):.3f}")
-        slopes = [Slope(checked(angle, "the accelerometer"), "static") for angle in angles]
-    finding = friction_finding(slopes, _command(), source=source, resolution_rad=resolution, slid=not held)
-    for evidence in finding.evidence:
-        interval = "" if evidence.low is None else f"  [{evidence.low:.3f}, {evidence.high:.3f}]"
-        click.echo(f"{evidence.name:20} {evidence.value:.3f}{interval}")
+        with (
+            engine_config(folder, port, virtual_source, imu=True) as engine,
+            _face(engine, virtual_source, yes) as face,
+        ):
+            procedure = floor_friction(
+                engine, trials, by_hand=not yes, seconds=seconds if yes else LONGEST_S, slid=not held,
+                resolution_rad=resolution, command=_command(),
+            )  # fmt: skip
+            finding = drive(procedure, face)
+    else:
+        finding = friction_finding(slopes, _command(), source="protractor", resolution_rad=resolution, slid=not held)
     return _conclude(finding, folder if robot is not None else None, json_file)
 
 
-def _enter(words: str) -> bool:
-    click.prompt(f"{words}, then press Enter", default="", show_default=False, err=True)
-    return True
+@contextlib.contextmanager
+def _face(engine: EngineConfig, virtual_source: str | None, yes: bool) -> Iterator[CommandFace]:
+    """Who answers: the terminal; and a virtual robot's own hands, where nobody is asked."""
+    from openant_tools.bringup.simulated_builder import SimulatedBuilder
+    from openant_tools.cli.face import CommandFace
 
-
-def _place_scale() -> None:
-    _enter("Slide the scale under the foot until it just touches, and tare it")
-
-
-def _begin(trial: int, trials: int) -> None:
-    _enter(f"Trial {trial + 1} of {trials}: turn the robot a little, plate level")
-    click.echo("Tilt slowly until it slides; then press Enter.", err=True)
-
-
-def _key_pressed() -> bool:
-    if not select.select([sys.stdin], [], [], 0)[0]:
-        return False
-    sys.stdin.readline()
-    return True
-
-
-def _ask_grams(deflection: float) -> float | None:
-    """What the scale shows; an empty answer skips this weighing."""
-    while True:
-        answer = click.prompt(f"{deflection:.3f} rad: grams", default="", show_default=False, err=True).strip()
-        if not answer:
-            return None
-        try:
-            return float(answer.removesuffix("g").replace(",", "."))
-        except ValueError:
-            click.echo(f"{answer!r} is no number of grams", err=True)
+    if virtual_source is None or engine.control is None:
+        yield CommandFace(yes=yes)
+        return
+    hands = SimulatedBuilder(engine.control)
+    try:
+        yield CommandFace(yes=yes, hands=hands.do)
+    finally:
+        hands.close()
 
 
 def _command() -> str:
@@ -453,17 +321,11 @@ def _command() -> str:
 
 def _conclude(finding: Finding, folder: RobotFolder | None, json_file: Path | None) -> int:
     """Print what was found, write it where it belongs, and say by the exit code whether it is well."""
-    from openant_tools.files import json_text, write_text
+    from openant_tools.cli.calib import show_finding
+    from openant_tools.cli.face import echo_numbers
     from openant_tools.procedure.finding import keep
 
-    click.echo(finding.what)
-    for words in finding.lines:
-        click.echo(f"  {words}")
-    if finding.next_action:
-        click.echo(f"→ {finding.next_action}")
+    echo_numbers(finding)
     if folder is not None:
         click.echo(f"wrote {keep(finding, folder)}", err=True)
-    if json_file:
-        content: Mapping[str, Any] = finding.as_json()
-        write_text(json_file, json_text(content))
-    return 0 if finding.ok else 1
+    return show_finding(finding, json_file)

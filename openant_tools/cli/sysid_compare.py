@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from openant_tools.cli.options import json_option, report_option, robot_option, write_report
+from openant_tools.numbers import number
 
 __all__ = ["compare"]
 
@@ -41,14 +42,14 @@ def compare(a: str, b: str, robot: Path | None, json_file: Path | None, report: 
     width = max(len(change.name) for change in result.changes)
     click.echo(f"{'':{width}}  {'A':>10}  {'B':>10}  {'B − A':>10}  95 % interval")
     for change in result.changes:
-        line = f"{change.name:{width}}  {change.a.value:10.4g}  {change.b.value:10.4g}  "
+        line = f"{change.name:{width}}  {number(change.a.value):>10}  {number(change.b.value):>10}  "
         if change.status == "not comparable":
             click.echo(f"{line}{'–':>10}  {change.why}")
             continue
-        p = f"p {change.p_holm:.2g}" if change.status == "changed" else ""
+        p = f"p {number(change.p_holm)}" if change.status == "changed" else ""
         said = "changed" if change.status == "changed" else ""
-        interval = f"[{change.low:+.3g}, {change.high:+.3g}] {change.unit}"
-        click.echo(f"{line}{change.difference:+10.3g}  {interval:28} {said} {p}".rstrip())
+        interval = f"({number(change.low, sign=True)} to {number(change.high, sign=True)}) {change.unit}"
+        click.echo(f"{line}{number(change.difference, sign=True):>10}  {interval:28} {said} {p}".rstrip())
     for note in result.notes:
         click.echo(note)
     click.echo(result.sentence)

@@ -20,6 +20,7 @@ from openant_tools.cli.options import (
 )
 from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.sysid_record import DEFAULT_PROTOCOL, protocols_of, setup_option
+from openant_tools.numbers import exact, number, percent, span
 
 if TYPE_CHECKING:
     from openant_tools.sysid.plan import Plan
@@ -156,7 +157,7 @@ def plan(
             if gain > 0 and not better.objections:
                 notes.append(
                     f"of {found.considered} motions ({found.refused} refused), {len(found.protocol.segments)} were chosen: "
-                    f"intervals narrower by {100 * _narrower(result, better):.0f} % in the mean than of {of}"
+                    f"intervals narrower by {percent(_narrower(result, better))} in the mean than of {of}"
                 )
                 result = better
             else:
@@ -195,31 +196,32 @@ def _narrower(before: Plan, after: Plan) -> float:
 
 
 def _print(result: Plan) -> None:
-    from math import degrees
 
     for one in result.forecasts:
         protocol = one.protocol
-        heading = f" at {degrees(protocol.heading_rad):.0f}°" if protocol.heading_rad else ""
+        heading = f" at {number(protocol.heading_rad, 'rad', decimals=0)}" if protocol.heading_rad else ""
         fast = max(one.peaks, key=lambda peak: peak.speed_rad_s / peak.no_load_rad_s)
         strong = max(one.peaks, key=lambda peak: peak.saturated)
         moves = (
-            f"; leans {degrees(one.lean_rad):.0f}°, goes {100 * one.travel_m:.0f} cm"
+            f"; leans {number(one.lean_rad, 'rad', decimals=0)}, goes {number(100 * one.travel_m, 'cm', decimals=0)}"
             if protocol.setup == "floor"
             else ""
         )
-        near = f"{1e3 * one.clearance_m:.0f} mm ({', '.join(one.nearest)})" if one.nearest else "far"
+        near = f"{number(1e3 * one.clearance_m, 'mm', decimals=0)} ({', '.join(one.nearest)})" if one.nearest else "far"
         click.echo(
-            f"{protocol.name}, {protocol.setup}{heading}: {protocol.seconds:.0f} s; fastest {fast.joint} {fast.speed_rad_s:.1f} "
-            f"of {fast.no_load_rad_s:.1f} rad/s; {strong.joint} {100 * strong.saturated:.0f} % at its torque limit, largest "
-            f"{max(peak.torque_nm for peak in one.peaks):.2f} N·m; nearest to itself {near}{moves}"
+            f"{protocol.name}, {protocol.setup}{heading}: {number(protocol.seconds, 's', decimals=0)}; fastest {fast.joint} {number(fast.speed_rad_s, 'rad/s', decimals=0)} "
+            f"of {number(fast.no_load_rad_s, 'rad/s', decimals=0)}; {strong.joint} {percent(strong.saturated)} at its torque limit, largest "
+            f"{number(max(peak.torque_nm for peak in one.peaks), 'N·m', decimals=2)}; nearest to itself {near}{moves}"
         )
     width = max(len(one.name) for one in result.expectations)
     click.echo(f"{'':{width}}  {'expected':>9}  {'95 % interval':21}  {'prior':21}")
     for value in result.expectations:
-        tied = f" {value.tied_to} ({value.correlation:+.2f})" if value.verdict == "tied" else ""
+        tied = (
+            f" {value.tied_to} ({number(value.correlation, sign=True, decimals=2)})" if value.verdict == "tied" else ""
+        )
         click.echo(
-            f"{value.name:{width}}  {value.nominal:9.4g}  {f'[{value.low:.4g}, {value.high:.4g}]':21}  "
-            f"{f'[{value.prior_low:.4g}, {value.prior_high:.4g}]':21}  {value.unit:10} {value.verdict}{' to' if tied else ''}{tied}"
+            f"{value.name:{width}}  {number(value.nominal):>9}  {span(value.low, value.high):21}  "
+            f"{span(value.prior_low, value.prior_high):21}  {value.unit:10} {value.verdict}{' to' if tied else ''}{tied}"
         )
     counts = {
         verdict: sum(one.verdict == verdict for one in result.expectations)
@@ -227,5 +229,5 @@ def _print(result: Plan) -> None:
     }
     click.echo(
         f"{counts['identified']} of {len(result.expectations)} identified, {counts['weak']} weak, {counts['tied']} tied, in "
-        f"{result.seconds:.0f} s; if a fit leaves {1e3 * result.asked.residual.rad:g} mrad"
+        f"{number(result.seconds, 's', decimals=0)}; if a fit leaves {exact(1e3 * result.asked.residual.rad, 'mrad')}"
     )

@@ -21,6 +21,7 @@ from openant_tools.cli.hardware import (
 )
 from openant_tools.cli.options import Number, rate_option, robot_option, seconds_option
 from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
+from openant_tools.numbers import exact, number, span
 from openant_tools.workers import pass_on
 
 if TYPE_CHECKING:
@@ -193,7 +194,7 @@ def _print_tracking(path: Path) -> None:
 
     for joint in tracking(read_run(path)):
         seen = ", ".join(
-            f"{1e3 * late:.1f} ms at {hz:g} Hz (gain {gain:.2f})"
+            f"{number(1e3 * late, 'ms', decimals=1)} at {exact(hz, 'Hz')} (gain {number(gain, decimals=2)})"
             for hz, late, gain in zip(joint.hz, joint.late_s, joint.gain, strict=True)
         )
         click.echo(f"  {joint.joint} follows later by {seen}")
@@ -209,12 +210,13 @@ def _print_pictures(path: Path) -> None:
 
 
 def _where(protocol: Protocol) -> str:
-    from math import degrees
 
     if protocol.setup == "stand":
         return "on its stand, legs free"
     heading = (
-        f", turned left by {degrees(protocol.heading_rad):.0f}° from where it looked" if protocol.heading_rad else ""
+        f", turned left by {number(protocol.heading_rad, 'rad', decimals=0)} from where it looked"
+        if protocol.heading_rad
+        else ""
     )
     return f"on the floor, with room around it{heading}"
 
@@ -234,7 +236,7 @@ def _record_here(
     pictures: bool,
 ) -> list[Recorded]:
     """Connect to the robot where it is, and record."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
     from openant_tools.errors import HardwareFault
     from openant_tools.sysid.record import record_takes
@@ -253,12 +255,12 @@ def _record_here(
     )
     first = wanted[0].protocol
     console.print(
-        f"{first.name}: {first.words}; {sum(take.protocol.seconds for take in wanted):.0f} s"
+        f"{first.name}: {first.words}; {number(sum(take.protocol.seconds for take in wanted), 's', decimals=0)}"
         + (f" in {len(wanted)} recordings" if len(wanted) > 1 else "")
         + f". All {len(config.servos)} joints move on {config.port}; the robot must be {_where(first)}."
     )
     may_move(yes)
-    columns = TextColumn("{task.description:18}"), BarColumn(), TextColumn("{task.percentage:3.0f} %")
+    columns = TextColumn("{task.description:18}"), BarColumn(), TaskProgressColumn()
     bar = stack.enter_context(Progress(*columns, TimeElapsedColumn(), console=console, transient=True))
     task = bar.add_task("connecting", total=1.0)
 
@@ -272,7 +274,6 @@ def _record_here(
             wanted,
             robot_toml=None if folder is None else folder.config_file.read_text(),
             progress=tell,
-            journal=None if folder is None else folder.journal,
             notice=lambda text: bar.console.print(text, highlight=False),
             pictures=pictures,
         )
@@ -300,8 +301,8 @@ def _list(robot: Path | None) -> None:
             for kind in reach:
                 columns = [k for k, joint in enumerate(space.joints) if joint.startswith(kind)]
                 reach[kind] = float(moved[:, columns].min()), float(moved[:, columns].max())
-            where = one.setup + (f" at {one.heading_rad * 57.29578:.0f}°" if one.heading_rad else "")
+            where = one.setup + (f" at {number(one.heading_rad, 'rad', decimals=0)}" if one.heading_rad else "")
             click.echo(
-                f"{'':17} {where:13} {one.seconds:4.0f} s   from home: "
-                + "   ".join(f"{kind} {low:+.2f} … {high:+.2f} rad" for kind, (low, high) in reach.items())
+                f"{'':17} {where:13} {number(one.seconds, 's', decimals=0):>6}   from home: "
+                + "   ".join(f"{kind} {span(low, high, 'rad', decimals=0)}" for kind, (low, high) in reach.items())
             )

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from openant_tools.cli.options import Number, json_option, model_option, robot_option
+from openant_tools.numbers import exact, number
 
 __all__ = ["twitch"]
 
@@ -45,16 +46,17 @@ def twitch(model: Path | None, robot: Path | None, seconds: float, json_file: Pa
     found = travel(plant, space, seconds=seconds)
     result = {"model": str(model), "speed_m_s": found.speed, "turn_rad": found.turn_rad, "stays": found.stays}
     click.echo(
-        f"{model}: twitching for {seconds:g} s moves it {1e3 * found.distance_m:.1f} mm ({1e3 * found.speed:.1f} mm/s) and "
-        f"turns it {found.turn_rad:+.2f} rad; below {1e3 * STAYS_M_S:g} mm/s it stays"
+        f"{model}: twitching for {exact(seconds, 's')} moves it {number(1e3 * found.distance_m, 'mm', decimals=1)} "
+        f"({number(1e3 * found.speed, 'mm/s', decimals=1)}) and "
+        f"turns it {number(found.turn_rad, 'rad', sign=True)}; below {exact(1e3 * STAYS_M_S, 'mm/s')} it stays"
     )
     if not found.stays:
         softer = travel(with_paper_contacts(plant), space, seconds=seconds)
         result["speed_with_paper_contacts_m_s"] = softer.speed
-        values = " ".join(f"{value:g}" for value in PAPER_SOLREF), " ".join(f"{value:g}" for value in PAPER_SOLIMP[:3])
+        values = " ".join(map(exact, PAPER_SOLREF)), " ".join(map(exact, PAPER_SOLIMP[:3]))
         click.echo(
             f'it travels: with solref="{values[0]}" solimp="{values[1]}" on floor and feet it moves '
-            f"{1e3 * softer.speed:.1f} mm/s"
+            f"{number(1e3 * softer.speed, 'mm/s', decimals=1)}"
             + (", so set these" if softer.stays else ", too: look at friction, masses and the time step")
         )
     if json_file:

@@ -10,6 +10,7 @@ import click
 
 from openant_tools.cli.log import command_line
 from openant_tools.cli.options import Number, json_option, report_option, robot_option, write_report
+from openant_tools.numbers import exact, number, percent
 
 if TYPE_CHECKING:
     from openant_tools.robot.folder import RobotFolder
@@ -61,13 +62,13 @@ def fit(
             value = number(one.value, one.unit, one.low, one.high)
             click.echo(f"{one.joint or 'all':9} {PARAMETER_WORDS[one.name]:55} {value}{mark}")
     click.echo(
-        f"crossings missed by {float(max(found.residual_k)):.2f} K rms at the worst joint; slow disturbance "
-        f"{found.disturbance_k:g} K over {found.disturbance_s / 60:.0f} min"
+        f"crossings missed by {number(float(max(found.residual_k)), 'K', decimals=2)} rms at the worst joint; slow disturbance "
+        f"{exact(found.disturbance_k, 'K')} over {number(found.disturbance_s / 60, 'min', decimals=0)}"
     )
     if held is not None:
         click.echo(
-            f"fitted until {held.from_s / 60:.0f} min, the later part is missed by {held.rms_k:.2f} K rms, {held.worst_k:.1f} K "
-            f"at most ({held.worst}); {held.within:.0%} of it inside the 95 % band"
+            f"fitted until {number(held.from_s / 60, 'min', decimals=0)}, the later part is missed by {number(held.rms_k, 'K', decimals=2)} rms, {number(held.worst_k, 'K', decimals=1)} "
+            f"at most ({held.worst}); {percent(held.within)} of it inside the 95 % band"
         )
     if json_file is not None:
         _write(json_file, {
@@ -166,7 +167,11 @@ def forecast(
     inputs = _read(run)
     known = None if after is None else Known.read(after)
     if at_min is not None and at_min * 60 > inputs.duration_s + 1:
-        raise BadInput(f"the run ends after {inputs.duration_s / 60:.1f} min", where=run, remedy="give --at less")
+        raise BadInput(
+            f"the run ends after {number(inputs.duration_s / 60, 'min', decimals=1)}",
+            where=run,
+            remedy="give --at less",
+        )
     if at_min is not None:
         found = fit_runs([inputs.until(at_min * 60)], after=known)
     else:
@@ -174,24 +179,27 @@ def forecast(
     load = torque_load(found, _torques(loads)) if loads else present_load(found, whole=whole)
     told = look_ahead(found, load, from_cold=from_cold)
     rest = rest_advice(found, load)
-    click.echo(f"{load.words}, {'from cold' if from_cold else f'from {found.inputs.duration_s / 60:.1f} min on'}:")
+    since = "from cold" if from_cold else f"from {number(found.inputs.duration_s / 60, 'min', decimals=1)} on"
+    click.echo(f"{load.words}, {since}:")
     for one in told.joints:
         torque = one.continuous_torque_nm
-        hold = "" if torque is None else f"; {torque.value:.2f} [{torque.low:.2f}, {torque.high:.2f}] N·m for ever"
+        hold = "" if torque is None else f"; {number(torque.value, 'N·m', torque.low, torque.high)} for ever"
         if one.hour_torque_nm is not None:
-            hold += f", {one.hour_torque_nm.value:.2f} for an hour"
-        click.echo(f"  {one.words} (now {one.temperature_c:.0f} °C){hold}")
+            hold += f", {number(one.hour_torque_nm.value, decimals=2)} for an hour"
+        click.echo(f"  {one.words} (now {number(one.temperature_c, '°C', decimals=0)}){hold}")
     click.echo(f"advice: {rest.words}")
     cooling = {}
     for one in told.joints:
         interval = cool_down(found, one.joint)
         if interval.value > 0:
             cooling[one.joint] = interval
-            click.echo(f"  {one.joint} has cooled {interval.value / 60:.0f} min after torque goes off")
+            click.echo(
+                f"  {one.joint} has cooled {number(interval.value / 60, 'min', decimals=0)} after torque goes off"
+            )
     rules = derating(found, load, told=told)
     for joint, rule in rules.joints.items():
         click.echo(
-            f"  derating {joint}: all of its torque up to {rule.start_c:.0f} °C, {rule.least:.0%} of it from {rule.stop_c:.0f} °C on"
+            f"  derating {joint}: all of its torque up to {number(rule.start_c, '°C', decimals=0)}, {percent(rule.least)} of it from {number(rule.stop_c, '°C', decimals=0)} on"
         )
     folder = _folder(robot)
     if warning := None if folder is None else _warning(folder):
@@ -264,8 +272,8 @@ def compare(
     differences = subtract(one, fit_runs([_read(b)]), joints=chosen)
     for d in differences:
         click.echo(
-            f"{d.joint:9} at {d.torque_nm:.2f} N·m: {d.a_c.value:.0f} → {d.b_c.value:.0f} °C, {d.difference_k.value:+.1f} "
-            f"[{d.difference_k.low:+.1f}, {d.difference_k.high:+.1f}] K{' *' if d.certain else ''}"
+            f"{d.joint:9} at {number(d.torque_nm, 'N·m', decimals=2)}: {number(d.a_c.value, decimals=0)} → {number(d.b_c.value, '°C', decimals=0)}, "
+            f"{number(d.difference_k.value, 'K', d.difference_k.low, d.difference_k.high, sign=True)}{' *' if d.certain else ''}"
         )
     click.echo("* beyond what either soak leaves open (95 %)")
     if json_file is not None:

@@ -14,6 +14,7 @@ import click
 from openant_tools.cli.hardware import Moving, anyway_option, engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import Number, json_option, robot_option
 from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
+from openant_tools.numbers import exact, number, percent
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -165,17 +166,19 @@ def soak(
             stack, plan, virtual_source, port, folder, rate_hz or (50.0 if plan.load == "play" else 5.0), anyway
         )
         console.print(
-            f"{'going on with ' if resume else ''}{_words(plan)}, {plan.seconds / 60:g} min, then {plan.cool_down_s / 60:g} "
+            f"{'going on with ' if resume else ''}{_words(plan)}, {exact(plan.seconds / 60, 'min')}, then {exact(plan.cool_down_s / 60)} "
             f"min of cooling. {'The knees press' if plan.load == 'stall' else 'All joints move'} on {config.port}."
         )
         may_move(yes)
         made = _run(console, config, plan, out, folder, resume)
     for joint, peak in made.peak_c.items():
         click.echo(
-            f"{joint:9} {peak:4.0f} °C at most"
+            f"{joint:9} {number(peak, '°C', decimals=0):>6} at most"
             + (f", {made.glitches[joint]} telemetry errors" if made.glitches[joint] else "")
         )
-    click.echo(f"{made.path}  {made.cycles} cycles, {made.loaded_s / 60:.1f} min under load: {made.words}")
+    click.echo(
+        f"{made.path}  {made.cycles} cycles, {number(made.loaded_s / 60, 'min', decimals=1)} under load: {made.words}"
+    )
     if json_file is not None:
         from openant_tools.files import json_text, write_text
 
@@ -255,7 +258,11 @@ class _Curves:
         from rich.table import Table
 
         minutes = sample.seconds / 60
-        table = Table(title=f"{sample.phase}, {minutes:.1f} min, {sample.share:.0%}", title_justify="left", box=None)
+        table = Table(
+            title=f"{sample.phase}, {number(minutes, 'min', decimals=1)}, {percent(sample.share)}",
+            title_justify="left",
+            box=None,
+        )
         for name, justify in (
             ("servo", "left"),
             ("°C", "right"),
@@ -272,17 +279,17 @@ class _Curves:
             effort = sample.current_a[k] if math.isfinite(sample.current_a[k]) else sample.load[k]
             unit = " A" if math.isfinite(sample.current_a[k]) else ""
             table.add_row(
-                joint, f"[{colour}]{now:.0f}[/{colour}]", f"{limit:.0f}",
-                "–" if math.isnan(sample.rate_k_min[k]) else f"{sample.rate_k_min[k]:+.1f}",
-                "–" if math.isnan(effort) else f"{effort:+.2f}{unit}", f"{sample.volts[k]:.1f}", self._strip(k, limit),
+                joint, f"[{colour}]{number(now, decimals=0)}[/{colour}]", number(limit, decimals=0),
+                "–" if math.isnan(sample.rate_k_min[k]) else number(sample.rate_k_min[k], sign=True, decimals=1),
+                "–" if math.isnan(effort) else f"{number(effort, sign=True, decimals=2)}{unit}", number(sample.volts[k], decimals=1), self._strip(k, limit),
             )  # fmt: skip
         return table
 
     def line(self, sample: Sample) -> str:
         warmest = max(range(len(sample.joints)), key=lambda k: sample.temperature_c[k] - sample.limit_c[k])
         return (
-            f"{sample.phase} {sample.seconds / 60:5.1f} min ({sample.share:.0%}): {sample.joints[warmest]} "
-            f"{sample.temperature_c[warmest]:.0f} °C of {sample.limit_c[warmest]:.0f}"
+            f"{sample.phase} {number(sample.seconds / 60, 'min', decimals=1)} ({percent(sample.share)}): {sample.joints[warmest]} "
+            f"{number(sample.temperature_c[warmest], '°C', decimals=0)} of {number(sample.limit_c[warmest], decimals=0)}"
         )
 
     def _strip(self, k: int, limit: float) -> str:
@@ -311,7 +318,7 @@ def _joints(names: tuple[str, ...]) -> tuple[str, ...]:
 
 def _words(plan: SoakPlan) -> str:
     if plan.load == "stall":
-        return f"the knees press with {plan.effort:.0%} of full duty against a weight that stalls them"
+        return f"the knees press with {percent(plan.effort)} of full duty against a weight that stalls them"
     if plan.load == "play":
         return f"the commands of {plan.commands} over and over"
     where = "standing on its feet" if plan.load == "stand" else "hanging on its stand"

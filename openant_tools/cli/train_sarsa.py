@@ -17,6 +17,7 @@ from openant_tools.cli.training import (
     training,
     training_options,
 )
+from openant_tools.numbers import number
 
 __all__ = ["sarsa"]
 
@@ -88,7 +89,7 @@ def sarsa(
     learned = load_checkpoint(out)["agent"] or {"tiles": 0, "shared": 0, "decisions": 0}
     collisions = f"{learned['shared']} look-ups of tiles that share a row" if learned["shared"] else "no collision"
     share = 100 * learned["tiles"] / settings.table
-    words = f"{learned['decisions']} decisions; {learned['tiles']} tiles seen, {share:.1f} % of the table; {collisions}"
+    words = f"{learned['decisions']} decisions; {learned['tiles']} tiles seen, {number(share, decimals=1)} % of the table; {collisions}"
     more = {
         "decisions": learned["decisions"], "tiles": learned["tiles"], "table": settings.table, "collisions": learned["shared"],
     }  # fmt: skip

@@ -22,6 +22,7 @@ from openant_tools.cli.walking import (
     may_walk,
 )
 from openant_tools.errors import BadInput, StorageFault
+from openant_tools.numbers import exact, number
 
 if TYPE_CHECKING:
     from openant_agents.training import TrainingProgress
@@ -71,7 +72,7 @@ def training_options(hour: int, step_s: float, leaves: str) -> Callable[[Callabl
         hardware_options,
         click.option(
             "--steps", type=click.IntRange(min=1), default=hour, show_default=True,
-            help=f"Train until the run is this long; {hour:,} steps of {step_s:g} s are an hour.",
+            help=f"Train until the run is this long; {hour:,} steps of {exact(step_s, 's')} are an hour.",
         ),
         click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True),
         click.option(
@@ -184,8 +185,8 @@ def show_result(
         plot_curves({agent: curve}, picture, learning_from_s=learning_from_s)
     helped = ", ".join(f"{count}× {reason}" for reason, count in result.helped.items())
     click.echo(
-        f"{result.step} steps, {result.robot_seconds / 60:.1f} min of robot time: "
-        f"{100 * result.average_reward_m_s:+.1f} cm/s over the last 120 s"
+        f"{result.step} steps, {number(result.robot_seconds / 60, 'min', decimals=1)} of robot time: "
+        f"{number(100 * result.average_reward_m_s, 'cm/s', sign=True, decimals=1)} over the last 120 s"
         + (f" (set up again: {helped})" if helped else "")
         + (f", {result.late} steps began late" if result.late else "")
         + ("" if result.updates is None else f", {result.updates} updates")

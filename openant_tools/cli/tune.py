@@ -10,6 +10,7 @@ import click
 from openant_tools.cli.learning import LearningBar, kit_option, need_agents, robot_argument
 from openant_tools.cli.options import json_option, robot_option
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number
 
 __all__ = ["tune"]
 
@@ -85,9 +86,11 @@ def tune(
         if trial.value is None:
             click.echo(f"trial {trial.number}: {trial.user_attrs.get('failed', trial.state.name.lower())}", err=True)
         else:
-            each = ", ".join(f"{100 * value:+.1f}" for value in trial.user_attrs["average_reward_m_s"])
+            each = ", ".join(
+                number(100 * value, sign=True, decimals=1) for value in trial.user_attrs["average_reward_m_s"]
+            )
             click.echo(
-                f"trial {trial.number}: {100 * trial.value:+.2f} cm/s ({each}); best {100 * study.best_value:+.2f}",
+                f"trial {trial.number}: {number(100 * trial.value, 'cm/s', sign=True, decimals=2)} ({each}); best {number(100 * study.best_value, sign=True, decimals=2)}",
                 err=True,
             )
 
@@ -103,9 +106,11 @@ def tune(
             done=tell,
         )
     settings, value = best_settings(study)
-    click.echo(f"best of {len(study.trials)} trials: {100 * value:+.2f} cm/s while learning")
+    click.echo(
+        f"best of {len(study.trials)} trials: {number(100 * value, 'cm/s', sign=True, decimals=2)} while learning"
+    )
     for key, chosen in settings.items():
-        click.echo(f"  {key:16} {chosen:.4g}" if isinstance(chosen, float) else f"  {key:16} {chosen}")
+        click.echo(f"  {key:16} {number(chosen)}" if isinstance(chosen, float) else f"  {key:16} {chosen}")
     if json_file is not None:
         answer = {"agent": agent, "average_reward_m_s": value, "settings": settings, "study": study.study_name}
         write_text(json_file, json_text(answer, indent=2))

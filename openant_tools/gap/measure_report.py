@@ -15,8 +15,10 @@ from openant_tools.report import Figure, KeyFigure, Report, ReportSummary, plots
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
-__all__ = ["gap_report", "sentence"]
+__all__ = ["gap_report", "sentence", "table"]
 
+#: places that a terminal is told
+TOLD = 12
 #: s shown around the worst moment
 WINDOW_S = 3.0
 _NAMES = {"pos": "position", "vel": "velocity"}
@@ -35,6 +37,21 @@ def sentence(found: Measurement) -> str:
         f"The simulation is off by {off} (floor {floor}); {part}, {percent(first.share)}, at {first.joint} while "
         f"{first.regime.words}."
     )
+
+
+def table(found: Measurement) -> list[str]:
+    """The numbers for a terminal: each signal's gap and floor, then where most of it lies."""
+    lines = [
+        f"{_NAMES[signal]}: {_shown(signal, value)}, floor {_shown(signal, found.floors[signal])}"
+        for signal, value in found.gaps.items()
+    ]
+    lines.append(f"{'signal':8}  {'joint':13}  {'while':11}  {'share':>7}  {'gap':>11}")
+    lines += [
+        f"{_NAMES[place.signal]:8}  {place.joint:13}  {place.regime:11}  {percent(place.share, decimals=1):>7}  "
+        f"{_shown(place.signal, place.gap):>11}"
+        for place in found.places[:TOLD]
+    ]
+    return lines
 
 
 def gap_report(found: Measurement) -> Report:

@@ -61,6 +61,14 @@ class Evidence:
         return number(self.value, self.unit, self.low, self.high, name=self.name)
 
     @property
+    def outside(self) -> bool:
+        """Whether it is known, and not as it should be."""
+        value = self.value
+        return value is not None and not (
+            (self.least is None or value >= self.least) and (self.most is None or value <= self.most)
+        )
+
+    @property
     def wanted(self) -> str:
         """Between what it is as it should be, in words; "" where nothing is asked of it."""
         ends = [

@@ -9,7 +9,6 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any
 from openant_tools.errors import BadInput
 from openant_tools.files import parse_json
 
-__all__ = ["EepromWrite", "Journal", "JournalEntry", "append_writes"]
+__all__ = ["EepromWrite", "Journal", "JournalEntry"]
 
 
 @dataclass(frozen=True)
@@ -118,13 +117,6 @@ class Journal:
         entries = self.entries()
         gone = {entry.undoes for entry in entries}
         return [entry for entry in entries if entry.undoes is None and entry.number not in gone]
-
-
-def append_writes(path: Path, writes: Iterable[EepromWrite], command: str) -> None:
-    """Add what has been written already, one line a write, in order; `command` is what wrote it."""
-    journal = Journal(path)
-    for write in writes:
-        journal.append(write, command)
 
 
 def _last_byte(file: Any) -> bytes:

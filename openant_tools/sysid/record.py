@@ -16,7 +16,6 @@ from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.errors import BadInput
-from openant_tools.procedure.journal import append_writes
 from openant_tools.recording.run import Facts
 from openant_tools.sysid.excitation import CommandSpace, Multisine
 from openant_tools.sysid.plan_file import as_table
@@ -112,7 +111,6 @@ def record_takes(
     robot_toml: str | None = None,
     progress: Callable[[str, float], None] = lambda words, share: None,
     notice: Callable[[str], None] = lambda text: None,
-    journal: Path | None = None,
     pictures: bool = False,
 ) -> list[Recorded]:
     """Record one take after another, of a robot that stays where it is.
@@ -122,7 +120,6 @@ def record_takes(
         robot_toml: the robot's configuration as text, kept inside the recordings.
         progress: called with what is being done and the share of all that is done.
         notice: called with what the user should know.
-        journal: file that every write to a servo's permanent memory is added to.
         pictures: record the overhead camera's, too.
 
     Raises:
@@ -136,8 +133,6 @@ def record_takes(
     with EngineProcess(config) as engine:
         for event in engine.events():
             notice(_words(event))
-        if journal is not None:
-            append_writes(journal, engine.description["eeprom_writes"], "sysid record")
         found = np.asarray(engine.description["position"], float)
         engine.ask(messages.Torque(True))
 

@@ -18,9 +18,8 @@ from textual.theme import Theme
 from textual.widget import Widget
 from textual.widgets import Input
 
-from openant_tools.bringup.walk import WALK
+from openant_tools.bringup.walk import BENCH, BESIDE, WALK
 from openant_tools.errors import OpenAntError
-from openant_tools.procedure.step import Step
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.kit import KITS
 from openant_tools.tui.dialogs import Help, Question
@@ -55,30 +54,6 @@ THEME = Theme(
     "open-ant", primary=BLUE, secondary="#CC79A7", accent=ORANGE, success=GREEN, warning=ORANGE, error=VERMILION,
     background="#10151b", surface="#171d25", panel="#202833", foreground="#e6e6e6", dark=True,
 )  # fmt: skip
-
-UNDO = Step(
-    "undo",
-    "Undo",
-    "Take back the last step's writes to the servos' memory, newest first, as journal.jsonl has them.",
-    "openant_tools.calib.undo:undo",
-    table="the servos that were written to, plugged in as they were then",
-    changes="registers back to what they were",
-)
-
-CHECK = Step(
-    "check",
-    "Daily check",
-    "Two minutes before a session: bus, supply, zeros, friction of each joint, IMU, heat, and what changed since the passport.",
-    "openant_tools.bringup.check:check",
-    needs=("bounds",),
-    table="the robot on its stand, as it will be used",
-    changes="nothing",
-    moves=True,
-    minutes=2,
-)
-
-#: steps outside the walk
-EXTRA: Mapping[str, Step] = {step.name: step for step in (CHECK, UNDO)}
 
 SCREENS: Mapping[str, tuple[type[Page], str]] = {
     "live": (LiveScreen, "All joints live, torque off"),
@@ -329,7 +304,7 @@ class OpenAnt(App[int]):
         if running is not None and not instead:
             self.notify(f"{running.step.title} is still running: leave it first", severity="warning")
             return
-        screen = StepScreen(EXTRA[name] if name in EXTRA else WALK[name])
+        screen = StepScreen(BESIDE[name] if name in BESIDE else WALK[name])
         if instead:
             self.switch_screen(screen)
         else:
@@ -337,6 +312,16 @@ class OpenAnt(App[int]):
 
     def action_step(self, name: str) -> None:
         self.open_step(name)
+
+    def action_bench(self) -> None:
+        """Ask which of the bench's procedures is meant, and open it."""
+        names = list(BENCH)
+
+        def answered(choice: int | None) -> None:
+            if choice is not None:
+                self.open_step(names[choice])
+
+        self.push_screen(Question("On the bench", *(f"{one.title}: {one.does}" for one in BENCH.values())), answered)
 
     def action_jump(self) -> None:
         if not isinstance(self.screen, Jump):
@@ -372,7 +357,7 @@ class OpenAnt(App[int]):
             yield SystemCommand(kind.TITLE, words, partial(self.action_go, name))
         for name, step in WALK.items():
             yield SystemCommand(f"Step: {step.title}", step.does, partial(self.open_step, name))
-        for name, step in EXTRA.items():
+        for name, step in BESIDE.items():
             yield SystemCommand(step.title, step.does, partial(self.open_step, name))
         yield SystemCommand("Watch the robot", "Live strips, torque off", self.action_watch)
         yield SystemCommand("Virtual robot", "Start one, or end the one that runs", self.action_virtual)

@@ -44,6 +44,9 @@ class Program(Protocol):
     def open_step(self, name: str, *, instead: bool = False) -> None:
         """Open a step, on top or instead of the screen that is open."""
 
+    def action_bench(self) -> None:
+        """Ask for one of the bench's procedures, and open it."""
+
     def action_virtual(self) -> None:
         """Start a virtual robot, or end the one that runs."""
 

@@ -134,6 +134,28 @@ _HELP: Mapping[str, tuple[str, str, str, str]] = {
         "It names the joint and the likely part: a horn that slipped, a cable, a servo that was swapped.",
         "bring-up.md",
     ),
+    "knee-torque": (
+        "Whether the knees can carry this robot at all: for how long on four legs, and on the two of a trot.",
+        "**Nominal torque**: what a servo bears for hours. **Stall torque**: the most it gives, for seconds, at its supply and "
+        "**PWM limit**.",
+        "*Heats*: it carries more than it bears for long; it will walk, with rests. *Gives way*: it cannot stand so.",
+        "bench.md",
+    ),
+    "stiffness": (
+        "How hard a joint pulls towards its goal, by two instruments that know nothing of each other: grams under its foot, and "
+        "the duty that the servo says it gives.",
+        "**Duty**: the share of full power. **P divisor**: by what the firmware divides its gain; the manual and measurements "
+        "differ.",
+        "*Nothing holds the leg*: the foot did not touch. Scale and servo disagree: the torso moved, or the lever is not what "
+        "was measured.",
+        "bench.md",
+    ),
+    "floor-friction": (
+        "How slippery the floor is. Feet that slip in simulation and hold on the floor, or the other way round, spoil every gait.",
+        "**μ**: the tangent of the angle where it slides. **Static** until it slides, **kinetic** while it does.",
+        "One reading has no interval: turn the robot and repeat. Too little: the plate was not level when it was called level.",
+        "bench.md",
+    ),
     "undo": (
         "Takes back the last step's writes to the servos' memory, newest first.",
         "**Journal**: the list of every such write, with the value before.",

@@ -19,7 +19,7 @@ from openant_tools.cli.calib import show_finding
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.files import json_text
 from openant_tools.procedure.finding import Evidence, Finding, keep, latest, together
-from openant_tools.procedure.journal import EepromWrite, Journal, append_writes
+from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.procedure.step import (
     Answer,
     Ask,
@@ -218,7 +218,7 @@ def test_lines_of_older_versions_are_read(tmp_path):
         "new": 442,
     }
     path.write_text(json.dumps(line) + "\n")
-    append_writes(path, [EepromWrite("hip_rr", 10, "pwm_limit", 442, 885)], "config")
+    Journal(path).append(EepromWrite("hip_rr", 10, "pwm_limit", 442, 885), "config")
     assert [(entry.write.old, entry.write.baud) for entry in Journal(path).entries()] == [(885, None), (442, None)]
 
 

@@ -265,7 +265,7 @@ def test_the_back_emf_stands_in_one_place(capsys: pytest.CaptureFixture[str]) ->
         (("--motor", "XM430-W350", "--position-p", "-1"), "counts from 0 to 16383"),
         (("--motor", "XM430-W350", "--position-d", "2.5"), "--position-d 2.5 is no count"),
         (("--motor", "XM430-W350", "--pwm-limit", "0"), "counts from 1 to 885"),
-        (("--motor", "XM430-W350", "--pwm-limit", "0.5"), "for 50% give 442"),
+        (("--motor", "XM430-W350", "--pwm-limit", "0.5"), "for 50 % give 442"),
         (("--motor", "XM430-W350", "--robot", "nowhere"), "nowhere"),
         ((), "--motor"),
     ],
@@ -308,10 +308,10 @@ def test_what_was_identified_stands_beside_the_data_sheet_joint_by_joint(
     assert "XM430-W350-T at 12 V, as the standard kit has" in text
     assert re.search(r"pwm_limit +442 +the robot's", text)
     assert re.search(
-        r"knee_fl +kp +data sheet 18\.88 +identified 17\.2 \[16\.8, 17\.6\] N·m/rad \(fitted in recordings/a\.mcap\)",
+        r"knee_fl +kp +data sheet 18\.88 +identified 17\.2 \(16\.8 to 17\.6\) N·m/rad \(fitted in recordings/a\.mcap\)",
         text,
     )
-    assert re.search(r"knee_fl +forcerange +data sheet 2\.048 +identified 1\.9 N·m", text)
+    assert re.search(r"knee_fl +forcerange +data sheet 2\.048 +identified 1\.90 N·m", text)
     answer = json.loads(file.read_text())
     assert set(answer["joints"]) == {"knee_fl"}  # hips have another servo
     assert answer["joints"]["knee_fl"]["kv"]["identified"] == pytest.approx(0.95)

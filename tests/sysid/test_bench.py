@@ -11,6 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from builder import Builder
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -20,14 +21,15 @@ from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.messages import ImuConfig
 from openant_tools.comms.setup import config_of_unknown_robot
 from openant_tools.errors import BadInput
+from openant_tools.procedure.step import Answer, Ask, Event, Hands, drive
 from openant_tools.robot.folder import create_robot
 from openant_tools.robot.kit import kit
 from openant_tools.robot.servo import servo_model
 from openant_tools.sysid.bench.friction import onset_angle, up_direction
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2, KNEE_TO_GROUND_M, knee_load, knee_torque
-from openant_tools.sysid.bench.press import Pressing, press
-from openant_tools.sysid.bench.stiffness import DutyReading, fit_line, servo_line
-from openant_tools.sysid.bench.tilt import tilt_trials
+from openant_tools.sysid.bench.scale import Pressing, stiffness
+from openant_tools.sysid.bench.stiffness import DutyReading, Lever, fit_line, servo_line
+from openant_tools.sysid.bench.tilt import floor_friction
 
 
 def openant(*words: object) -> int:
@@ -258,12 +260,16 @@ def test_the_servos_own_duty_tells_its_divisor_and_the_finding_is_kept(
 def test_ctrl_c_at_the_scale_leaves_torque_off(held: dict[str, str]) -> None:
     config = config_of_unknown_robot(held["bus"], held["control"])
 
-    def interrupted(deflection: float) -> float | None:
-        assert torque_is_on(held)
-        raise KeyboardInterrupt
+    def interrupted(event: Event) -> None:
+        if isinstance(event, Ask):
+            assert torque_is_on(held)
+            raise KeyboardInterrupt
 
+    procedure = stiffness(
+        config, Pressing("knee_fl", -0.87, steps=1), Lever("knee_fl"), weigh=True, held=True, command="test"
+    )
     with pytest.raises(KeyboardInterrupt):
-        press(config, Pressing("knee_fl", -0.87, steps=1), grams=interrupted)
+        drive(procedure, Builder(held["control"], before=interrupted))
     assert not torque_is_on(held)
 
 
@@ -285,11 +291,18 @@ def test_a_leg_that_nothing_holds_is_no_measurement() -> None:
 # ---- floor friction ----
 
 
+class Level(Builder):
+    """One who says that the plate is level, and touches nothing."""
+
+    def answer(self, event: Event) -> Answer:
+        return True if isinstance(event, Hands) else super().answer(event)
+
+
 def test_the_papers_floor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = create_robot(tmp_path / "ant", "standard")
     angles = ["--static", "31deg", "--static", "30.5deg", "--static", "31.5deg"]
     assert openant("sysid", "tilt", *angles, "--robot", folder.path) == 0
-    assert "μ = 0.601" in capsys.readouterr().out
+    assert "μ = 0.60 (0.57 to 0.63)" in capsys.readouterr().out
     source = folder.config().provenance["bench.floor_friction"]
     assert source.low < 0.6 < source.high  # type: ignore[operator]
 
@@ -344,8 +357,9 @@ def test_the_accelerometer_reads_the_plate_of_a_standing_robot(
     assert at_least == pytest.approx(0.203, abs=0.03)
     # A plate that is called level is level, whatever gravity says: what follows is counted from there.
     config = replace(config_of_unknown_robot(held["bus"], held["control"]), imu=ImuConfig(held["imu"]))
-    (angle,) = tilt_trials(config, 1, level=lambda: True, ended=lambda seconds: seconds >= 0.5)
-    assert angle < 0.02
+    levelled = floor_friction(config, 1, seconds=0.5, command="test")
+    (reading,) = drive(levelled, Level(held["control"])).data["readings"]
+    assert reading["angle_rad"] < 0.02
     assert not torque_is_on(held)
 
 

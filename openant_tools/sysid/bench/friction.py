@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.numbers import exact, number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2
 from openant_tools.sysid.bench.readings import reading_rows
@@ -69,7 +70,7 @@ def checked(angle_rad: float, where: str) -> float:
     """The angle, or BadInput where no plate was tilted so."""
     if not 0 < angle_rad <= STEEPEST_RAD:
         raise BadInput(
-            f"a plate at {angle_rad:g} rad ({math.degrees(angle_rad):.0f}°)",
+            f"a plate at {exact(angle_rad, 'rad')} ({number(angle_rad, 'rad', decimals=0)})",
             where=where,
             remedy="give its angle from level, 0 to 1 rad; write 31deg for degrees. On a steeper one the robot topples",
         )
@@ -111,7 +112,7 @@ def up_direction(acc: Array) -> Array:
     norm = float(np.linalg.norm(mean))
     if abs(norm / GRAVITY_M_S2 - 1) > GRAVITY_TOLERANCE:
         raise BadInput(
-            f"at rest the accelerometer reads {norm:.2f} m/s²",
+            f"at rest the accelerometer reads {number(norm, 'm/s²', decimals=2)}",
             remedy="keep the plate still, or calibrate the accelerometer's scale",
         )
     return np.asarray(mean / norm)
@@ -195,15 +196,14 @@ def friction_finding(
     if not slid:
         most = max(math.tan(slope.angle_rad) for slope in slopes)
         return Finding(
-            "floor-friction", None, f"The robot did not slide: the coefficient is above {most:.2f}.",
+            "floor-friction", None, f"The robot did not slide: the coefficient is above {number(most, decimals=2)}.",
             (Evidence("friction, at least", most, "1", f"μ = tan α by {source}"),),
             "Tilt further, until it slides.", command, data=data,
             unsure=("The coefficient is known from below only.",),
         )  # fmt: skip
     chosen: Kind = "kinetic" if "kinetic" in found else "static"
     mu = found[chosen]
-    interval = "" if mu.low is None or mu.high is None else f" [{mu.low:.3f}, {mu.high:.3f}]"
-    what = f"Floor friction: μ = {mu.value:.3f}{interval} ({chosen}, {mu.readings} readings)."
+    what = f"Floor friction: μ = {of(chosen, '').words} ({chosen}, {mu.readings} readings)."
     actions: list[str] = []
     problems: list[str] = []
     unsure: list[str] = []
@@ -211,11 +211,11 @@ def friction_finding(
         unsure.append("One reading has no interval.")
         actions.append("Take at least three readings, with the robot turned in between.")
     if mu.value < LEAST_FRICTION:
-        problems.append(f"A coefficient of {mu.value:.3f} cannot be.")
+        problems.append(f"A coefficient of {number(mu.value)} cannot be.")
         actions.append("No floor is so slippery: did the plate tilt, and was it level when the reference was taken?")
     if len(found) == 2:
         ratio = found["static"].value / mu.value
-        what += f" It holds up to {found['static'].value:.3f} before it slides, {ratio:.2f} times as much."
+        what += f" It holds up to {number(found['static'].value)} before it slides, {number(ratio, decimals=2)} times as much."
         if ratio < 1 and not _overlap(found["static"], mu):
             problems.append("Static friction below kinetic friction cannot be.")
             actions.append("Look whether the two kinds of readings were swapped.")

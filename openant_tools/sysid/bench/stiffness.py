@@ -22,16 +22,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.numbers import exact, number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.robot.gains import stiffness_nm_rad
+from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE
 from openant_tools.robot.servo import ServoModel
-from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2
+from openant_tools.sysid.bench.knee_torque import GRAVITY_M_S2, KNEE_TO_GROUND_M
 from openant_tools.sysid.bench.readings import reading_rows
 
 __all__ = [
-    "ARM_UNCERTAINTY", "DIVISORS", "DivisorVerdict", "DutyReading", "Line", "Weighing", "decide_divisor", "fit_line", "lever_arm",
-    "read_weighings", "scale_line", "servo_line", "stiffness_finding",
+    "ARM_UNCERTAINTY", "DIVISORS", "DivisorVerdict", "DutyReading", "Lever", "Line", "Weighing", "checked", "decide_divisor", "fit_line",
+    "read_weighings", "scale_line", "servo_line", "stiffness_finding", "weighed_finding",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -142,15 +144,42 @@ def fit_line(x: Array, y: Array, *, left_out: int = 0, rounding: float = 0.0) ->
     return Line(slope, slope - half, slope + half, intercept, residual, len(x), left_out)
 
 
-def lever_arm(length_m: float, knee_rad: float) -> float:
-    """m, the horizontal distance from a knee to the foot on the scale: L cos q, with q = 0 for a leg straight out."""
-    arm = length_m * math.cos(knee_rad)
-    if not arm > 0.1 * length_m:
-        raise BadInput(
-            f"at a knee angle of {knee_rad:.2f} rad the leg stands straight on the scale and has no lever",
-            remedy="choose a pose with the leg further out, such as -0.87",
-        )
-    return arm
+@dataclass(frozen=True)
+class Lever:
+    """How far from a joint's axis the scale takes the foot's force.
+
+    Attributes:
+        joint: a knee's lever follows from its angle, a hip's must be measured.
+        length_m: from the knee's axis to the foot's contact.
+        measured_m: the lever, where somebody measured it instead.
+    """
+
+    joint: str
+    length_m: float = KNEE_TO_GROUND_M
+    measured_m: float | None = None
+
+    @property
+    def of_hip(self) -> bool:
+        return self.joint in JOINTS and JOINTS[self.joint].kind == "hip"
+
+    def at(self, angle_rad: float) -> float:
+        """m, the horizontal distance from the axis to the foot on the scale: of a knee L cos q, with q = 0 for a leg straight
+        out.
+
+        Raises:
+            BadInput: nobody measured a hip's; or the leg stands straight on the scale.
+        """
+        if self.measured_m is not None:
+            return self.measured_m
+        if self.of_hip:
+            raise BadInput("a hip's lever arm is not known", remedy="measure it from axis to hook and give it by --arm")
+        arm = self.length_m * math.cos(angle_rad)
+        if not arm > 0.1 * self.length_m:
+            raise BadInput(
+                f"at a knee angle of {number(angle_rad, 'rad')} the leg stands straight on the scale and has no lever",
+                remedy="choose a pose with the leg further out, such as -50°",
+            )
+        return arm
 
 
 def scale_line(
@@ -197,7 +226,7 @@ def servo_line(readings: Sequence[DutyReading], pwm_limit: float = 1.0) -> Line:
     pressed = [r for r in readings if r.deflection_rad > 0]
     if pressed and max(r.error_rad / r.deflection_rad for r in pressed) < HELD:
         raise BadInput(
-            f"nothing holds the leg: it followed its goal to within {max(abs(r.error_rad) for r in pressed):.3f} rad",
+            f"nothing holds the leg: it followed its goal to within {number(max(abs(r.error_rad) for r in pressed), 'rad', name='error')}",
             remedy="put the scale, or something that does not give, under the foot at the pose where it touches (--pose)",
         )
     free = [reading for reading in readings if abs(reading.duty) < SATURATED * pwm_limit]
@@ -224,10 +253,10 @@ class DivisorVerdict:
     @property
     def words(self) -> str:
         if len(self.supported) == 1:
-            return f"the P divisor is {self.supported[0]:.0f}"
+            return f"the P divisor is {number(self.supported[0])}"
         if self.supported:
-            return f"the data do not tell a P divisor of {' from '.join(f'{d:.0f}' for d in self.supported)}"
-        return f"the data support neither known P divisor ({', '.join(f'{d:.0f}' for d in DIVISORS)}); they say {self.divisor:.0f}"
+            return f"the data do not tell a P divisor of {' from '.join(map(number, self.supported))}"
+        return f"the data support neither known P divisor ({', '.join(map(number, DIVISORS))}); they say {number(self.divisor, decimals=0)}"
 
 
 def decide_divisor(duty_per_rad: Line, p_gain: float, tolerance: float = 0.03) -> DivisorVerdict:
@@ -241,7 +270,7 @@ def decide_divisor(duty_per_rad: Line, p_gain: float, tolerance: float = 0.03) -
     """
     if not duty_per_rad.slope > 0:
         raise BadInput(
-            f"pushing harder gave less ({duty_per_rad.slope:.3g} a rad)",
+            f"pushing harder gave less ({number(duty_per_rad.slope)} a rad)",
             remedy="the leg must be held by the scale: fix the torso, and push downwards",
         )
 
@@ -281,10 +310,12 @@ def checked(reading: Weighing, where: str) -> Weighing:
     """The reading, or BadInput where it cannot be meant."""
     if not abs(reading.deflection_rad) <= LARGEST_DEFLECTION_RAD:
         raise BadInput(
-            f"a deflection of {reading.deflection_rad:g} rad", where=where, remedy="is it in degrees? 5.73° are 0.1 rad"
+            f"a deflection of {exact(reading.deflection_rad, 'rad')}",
+            where=where,
+            remedy="is it in degrees? 5.73° are 0.1 rad",
         )
     if not abs(reading.grams) <= MOST_GRAMS:
-        raise BadInput(f"{reading.grams:g} g on a kitchen scale", where=where, remedy="readings are in grams")
+        raise BadInput(f"{exact(reading.grams, 'g')} on a kitchen scale", where=where, remedy="readings are in grams")
     return reading
 
 
@@ -294,6 +325,42 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def weighed_finding(
+    joint: str,
+    servo: ServoModel,
+    weighings: Sequence[Weighing],
+    lever: Lever,
+    *,
+    pose_rad: float,
+    p_gain: float | None = None,
+    supply_v: float | None = None,
+    pwm_limit: float,
+    command: str,
+) -> Finding:
+    """What a scale alone says of a joint's stiffness, without a robot.
+
+    Args:
+        pose_rad: where the foot touched.
+        p_gain, supply_v: None for the factory's, and for what the servo is meant for.
+
+    Raises:
+        BadInput: too few readings, or readings that cannot be.
+    """
+    supply = servo.nominal_voltage_v if supply_v is None else supply_v
+    arm = lever.at(pose_rad)
+    line = scale_line(
+        [w.deflection_rad for w in weighings],
+        [w.grams for w in weighings],
+        arm,
+        torque_limit_nm=servo.stall_torque_at(supply, pwm_limit),
+        arm_uncertainty_m=ARM_UNCERTAINTY * arm,
+    )
+    return stiffness_finding(
+        joint, servo, p_gain=p_gain or float(servo.register("position_p_gain").default or 0), supply_v=supply,
+        pwm_limit=pwm_limit, scale=line, duty=None, measured_error=False, weighings=weighings, arm_m=arm, command=command,
+    )  # fmt: skip
 
 
 #: Relative spread of what the data sheet says of a single servo: torque constant, friction of the gear.
@@ -327,7 +394,9 @@ def stiffness_finding(
     formula = {d: stiffness_nm_rad(p_gain, d, stall) for d in DIVISORS}
     servo_stiffness = None if duty is None else duty.scaled(stall)
     evidence = [
-        Evidence(f"stiffness by P = {p_gain:.0f} and divisor {d:.0f}", value, "N·m/rad", "register and data sheet")
+        Evidence(
+            f"stiffness by P = {number(p_gain)} and divisor {number(d)}", value, "N·m/rad", "register and data sheet"
+        )
         for d, value in formula.items()
     ]
     parameters: list[Evidence] = []
@@ -338,9 +407,7 @@ def stiffness_finding(
     verdict: DivisorVerdict | None = None
     if duty is not None and servo_stiffness is not None:
         verdict = decide_divisor(duty, p_gain)
-        source = (
-            f"Present PWM over position error, {duty.used} readings, times {stall:.2f} N·m stall at {supply_v:.1f} V"
-        )
+        source = f"Present PWM over position error, {duty.used} readings, times {number(stall, 'N·m', decimals=2)} stall at {number(supply_v, 'V', decimals=1)}"
         evidence.append(_stiffness("stiffness by the servo's duty", servo_stiffness, source))
         evidence.append(
             Evidence("P divisor", verdict.divisor, "1", "Present PWM over position error", verdict.low, verdict.high)
@@ -349,11 +416,11 @@ def stiffness_finding(
         if len(verdict.supported) != 1:
             unsure.append("the servo's own duty does not decide which P divisor this firmware has")
         if i_gain:
-            problems.append(f"position_i_gain is {i_gain:.0f}, so that duty grows while the error stands")
+            problems.append(f"position_i_gain is {number(i_gain)}, so that duty grows while the error stands")
             actions.append("Set position_i_gain to 0 for this measurement.")
     if scale is not None:
         over = "measured position error" if measured_error else "deflection of the goal"
-        arm = "" if arm_m is None else f", lever arm {arm_m:.3f} m"
+        arm = "" if arm_m is None else f", lever arm {number(arm_m, 'm')}"
         source = f"kitchen scale over {over}, {scale.used} readings{arm}"
         evidence.append(_stiffness("stiffness by the scale", scale, source))
         parameters.append(_stiffness(f"scale_stiffness.{joint}", scale, source))
@@ -367,7 +434,7 @@ def stiffness_finding(
             evidence.append(Evidence("scale over servo", ratio, "1", "the two stiffnesses above"))
             if abs(ratio - 1) > _SHEET_TOLERANCE + (scale.high - scale.low) / 2 / scale.slope:
                 problems.append(
-                    f"the scale gives {ratio:.2f} times what duty and data sheet give: more than servos differ"
+                    f"the scale gives {number(ratio, decimals=2)} times what duty and data sheet give: more than servos differ"
                 )
                 actions.append(
                     "Measure the lever arm again (--arm), look whether the torso moves, and repeat with smaller steps."
@@ -382,11 +449,10 @@ def stiffness_finding(
         words.append(f"{left_out} readings at the torque limit are left out")
     best = parameters[0]
     by = "" if scale is not None else ", if its stall torque is the data sheet's"
-    interval = f"[{best.low:.2f}, {best.high:.2f}]"
     return Finding(
-        step=f"stiffness-{joint}",
+        step="stiffness",
         ok=False if problems else None if unsure else True,
-        what=f"{joint}: {best.value:.2f} N·m/rad {interval}{by}. " + "; ".join(words) + ".",
+        what=f"{joint}: {best.words}{by}. " + "; ".join(words) + ".",
         evidence=tuple(evidence),
         next_action=" ".join(dict.fromkeys(actions)),
         problems=tuple(problems),

@@ -14,7 +14,7 @@ from textual.containers import Container, Vertical, VerticalScroll
 from textual.widgets import Input, OptionList, Static
 from textual.widgets.option_list import Option
 
-from openant_tools.bringup.walk import WALK, standing
+from openant_tools.bringup.walk import WALK, Standing, beside, standing
 from openant_tools.errors import OpenAntError
 from openant_tools.numbers import exact, number, percent, span
 from openant_tools.procedure.finding import Finding
@@ -33,6 +33,7 @@ from openant_tools.procedure.step import (
     change_lines,
 )
 from openant_tools.procedure.unfinished import forget, unfinished
+from openant_tools.robot.folder import RobotFolder
 from openant_tools.tui.bars import bars
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.dialogs import Question
@@ -222,8 +223,7 @@ where the number lies. `l` shows the log of what was said and done instead.
             elif progress is not None:
                 text.append(spelled(progress.words))
         elif self.session.folder is not None:
-            one = standing(self.session.folder).get(self.step.name)
-            text.append_text(standing_mark(one) if one is not None else marked("todo", ""))
+            text.append_text(standing_mark(self._standing(self.session.folder)))
         return text
 
     # ---- before and after ----------------------------------------------------------------------------------------
@@ -240,14 +240,18 @@ where the number lies. `l` shows the log of what was said and done instead.
             )
             self.offer("", [StepChoice("Settings", lambda: self.ant.action_go("settings")), self._back()])
             return
-        one = standing(folder).get(step.name)
-        if one is not None and one.waits_for:
+        one = self._standing(folder)
+        if one.waits_for:
             names = ", ".join(WALK[name].title for name in one.waits_for)
             self.say(marked("warn", f"do first: {names}"))
-        if one is not None and one.finding is not None:
+        if one.finding is not None:
             self.show_finding(one.finding, "the last time: ")
         self.offer("", [*self._beginnings("Begin"), self._back()])
         self.draw()
+
+    def _standing(self, folder: RobotFolder) -> Standing:
+        name = self.step.name
+        return standing(folder)[name] if name in WALK else beside(folder, name)
 
     def _needs(self) -> list[str]:
         """What must be at hand, and what it does to the robot."""

@@ -26,7 +26,7 @@ from openant_tools.tui.step_help import step_help
 __all__ = ["WalkScreen", "continues", "standing_mark"]
 
 _MARKS: dict[str, Name] = {"todo": "todo", "ok": "ok", "failed": "fail", "unsure": "unsure", "stale": "stale"}
-CHECK, VIRTUAL = "check", "virtual"
+CHECK, BENCH, VIRTUAL = "check", "bench", "virtual"
 
 
 def standing_mark(one: Standing) -> Text:
@@ -77,6 +77,7 @@ class WalkScreen(Page):
         Binding("v", "app.virtual", "Virtual"),
         Binding("c", "app.watch", "Live"),
         Binding("k", "app.step('check')", "Check", show=False),
+        Binding("b", "app.bench", "Bench", show=False),
         Binding("u", "app.step('undo')", "Undo", show=False),
         Binding("f", "app.go('findings')", "Findings"),
         Binding("r", "app.go('recordings')", "Play"),
@@ -122,6 +123,7 @@ class WalkScreen(Page):
             state = standing_mark(self._standing[name]) if name in self._standing else marked("todo")
             walk.add_option(Option(Text.assemble(f"{n:2} {step.title:21} ", state), id=name))
         walk.add_option(Option(Text(" k Daily check", style="bold"), id=CHECK))
+        walk.add_option(Option(Text(" b On the bench", style="bold"), id=BENCH))
         offer = "End the virtual robot" if self.session.virtual is not None else "Start a virtual robot"
         walk.add_option(Option(Text(f" v {offer}", style="bold"), id=VIRTUAL))
         first = next((k for k, name in enumerate(WALK) if self._state(name) != "ok"), 0)
@@ -146,12 +148,16 @@ class WalkScreen(Page):
             about.update(_ABOUT_VIRTUAL)
         elif event.option_id == CHECK:
             about.update(_ABOUT_CHECK)
+        elif event.option_id == BENCH:
+            about.update(_ABOUT_BENCH)
         else:
             about.update(_about(WALK[event.option_id], self._standing.get(event.option_id)))
 
     def chosen(self, event: OptionList.OptionSelected) -> None:
         if event.option_id == VIRTUAL:
             self.ant.action_virtual()
+        elif event.option_id == BENCH:
+            self.ant.action_bench()
         elif event.option_id is not None:
             self.ant.open_step(event.option_id)
 
@@ -160,6 +166,11 @@ _ABOUT_CHECK = Text.assemble(
     ("Daily check", "bold"),
     "  about 2 min\nBefore each session: the joint and the likely part, where something is not as it was when the passport "
     "was written.",
+)
+_ABOUT_BENCH = Text.assemble(
+    ("On the bench\n", "bold"),
+    "What else can be measured, each by itself: the knees' torque table, a joint's stiffness with a kitchen scale, the floor's "
+    "friction on a tilted plate.",
 )
 _ABOUT_VIRTUAL = Text.assemble(
     ("Virtual robot\n", "bold"),
