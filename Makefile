@@ -10,7 +10,7 @@ DEMO   ?= demo-robot
 # two workers: what CI has, and any laptop; each begins with a half of the files, so that few prepare the same
 PYTEST_ARGS ?= -n 2 --dist worksteal
 
-.PHONY: demo test lint types contracts pytest docs-check ecosystem pictures rooms tour clean
+.PHONY: demo test lint types contracts pytest docs-check api ecosystem pictures rooms tour clean
 
 demo: $(VENV)/.all
 	@$(BIN)/openant demo --robot $(DEMO)
@@ -47,6 +47,10 @@ $(VENV)/.dev: pyproject.toml constraints.txt
 # Every command of README and docs/, page by page in one folder, on a virtual robot; `make test` runs those that are short.
 docs-check: $(VENV)/.dev
 	$(BIN)/pytest $(PYTEST_ARGS) --long tests/docs
+
+# A page a module, from docstrings: build/api/index.html. A minute.
+api: $(VENV)/.dev
+	$(BIN)/python benchmarks/api_pages.py build/api
 
 # docs/ecosystem.md: each peer in a throw-away environment of its own. Minutes a peer; goes on where it was stopped.
 ecosystem:

@@ -2,13 +2,16 @@
 
 The lock stands on a small file of its own, which is never removed nor replaced: two that look for it always find the same
 one. The file names its holder, for whoever is refused.
+
+The one file that knows how a system locks: `flock` on Linux and macOS; on Windows, where only a fake has been tried, a byte
+beyond the file's end.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
+import importlib.util
 import os
 import shlex
 import sys
@@ -21,10 +24,14 @@ from typing import IO
 
 from openant_tools.errors import BadInput
 
-__all__ = ["Claim", "Holder", "held", "holder"]
+__all__ = ["Claim", "Holder", "held", "holder", "wait_for"]
 
 #: s for which a claim is tried again: whoever only asks who holds a lock holds it for a moment, too
 PATIENCE_S = 0.5
+#: whether this system has `flock`; Windows has not
+FLOCK: bool = importlib.util.find_spec("fcntl") is not None
+#: the byte that is locked where a lock is on bytes
+LOCKED_BYTE = 2**30
 #: environment variable that tells the processes we start which of their ancestors' folders they work on, too
 ANCESTORS = "OPENANT_HELD_BY"
 
@@ -58,7 +65,7 @@ class Claim:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file: IO[bytes] = path.open("ab+")
         give_up = time.monotonic() + wait_s
-        while not _locked(self._file, fcntl.LOCK_EX):
+        while not _locked(self._file):
             if time.monotonic() > give_up:
                 who = _named(self._file)
                 self._file.close()
@@ -81,7 +88,7 @@ def holder(path: Path) -> Holder | None:
         return None
     try:
         with path.open("rb") as file:
-            who = None if _locked(file, fcntl.LOCK_SH) else _named(file)
+            who = None if _locked(file, shared=True) else _named(file)
     except FileNotFoundError:
         return None
     return None if who is None or who.pid in _ancestors() else who
@@ -148,7 +155,7 @@ def _leave(key: Path) -> None:
 def _held_by_ancestor(path: Path) -> bool:
     try:
         with path.open("rb") as file:
-            return not _locked(file, fcntl.LOCK_SH) and _named(file).pid in _ancestors()
+            return not _locked(file, shared=True) and _named(file).pid in _ancestors()
     except FileNotFoundError:
         return False
 
@@ -157,11 +164,41 @@ def _ancestors() -> set[int]:
     return {int(pid) for pid in os.environ.get(ANCESTORS, "").split(",") if pid.isdigit()}
 
 
-def _locked(file: IO[bytes], kind: int) -> bool:
+def wait_for(file: IO[bytes]) -> None:
+    """Lock an open file until it is closed, however long another holds it."""
+    while not _locked(file):
+        time.sleep(0.003)
+
+
+def _locked(file: IO[bytes], *, shared: bool = False) -> bool:
+    """Whether the lock was free, and now is ours until the file is closed.
+
+    Args:
+        shared: others may have it so, too: only to see whether somebody has it alone.
+    """
+    if not FLOCK:
+        return _locked_byte(file)
+    import fcntl
+
     try:
-        fcntl.flock(file, kind | fcntl.LOCK_NB)
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
+    return True
+
+
+def _locked_byte(file: IO[bytes]) -> bool:
+    """On Windows nobody else can read what is locked: not the name of the holder, but a byte that the file does not have."""
+    import msvcrt
+
+    at = file.tell()
+    file.seek(LOCKED_BYTE)
+    try:
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+    except OSError:
+        return False
+    finally:
+        file.seek(at)
     return True
 
 
@@ -170,12 +207,13 @@ def _named(file: IO[bytes]) -> Holder:
     file.seek(0)
     pid, _, command = file.read(4096).decode(errors="replace").partition("\n")
     try:
-        os.kill(int(pid), 0)
+        if FLOCK:  # signal 0 would be Ctrl-C on Windows, where a lock dies with its holder all the same
+            os.kill(int(pid), 0)
     except PermissionError:
         pass  # another user's
     except (ValueError, OverflowError, OSError):
         return Holder(0, "")
-    return Holder(int(pid), " ".join(command.split()))
+    return Holder(int(pid) if pid.isdigit() else 0, " ".join(command.split()))
 
 
 def _own_command() -> str:

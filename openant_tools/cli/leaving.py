@@ -11,6 +11,8 @@ from types import FrameType
 
 import click
 
+from openant_tools.signals import SUSPENDED, TERMINAL_GONE, TOLD_TO_GO
+
 __all__ = ["MOVES", "end_with_the_terminal", "heed_signals"]
 
 #: in a click context's meta: the command has the builder's word that it may move
@@ -19,11 +21,11 @@ MOVES = "openant moves"
 
 def heed_signals() -> None:
     """Being told to go, and a terminal that is closed, are as good as Ctrl-C: torque goes off, what was learned is saved."""
-    for number in (signal.SIGTERM, signal.SIGHUP):
+    for number in TOLD_TO_GO:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
             signal.signal(number, _interrupt)
-    if signal.getsignal(signal.SIGTSTP) is not signal.SIG_IGN:
-        signal.signal(signal.SIGTSTP, _suspend)
+    if SUSPENDED is not None and signal.getsignal(SUSPENDED) is not signal.SIG_IGN:
+        signal.signal(SUSPENDED, _suspend)
 
 
 def end_with_the_terminal() -> None:
@@ -31,7 +33,8 @@ def end_with_the_terminal() -> None:
 
     Under nohup, which ignores that, the program goes on.
     """
-    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    gone = TERMINAL_GONE
+    if gone is None or signal.getsignal(gone) is signal.SIG_IGN:
         return
     poll = select.poll()
     for fd in (0, 1, 2):
@@ -41,7 +44,7 @@ def end_with_the_terminal() -> None:
     def wait() -> None:
         while found := poll.poll():
             if any(what & (select.POLLERR | select.POLLHUP) for _, what in found):
-                os.kill(os.getpid(), signal.SIGHUP)
+                os.kill(os.getpid(), gone)
                 return
             for fd, _ in found:  # it was closed from the beginning
                 poll.unregister(fd)
@@ -50,7 +53,7 @@ def end_with_the_terminal() -> None:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    if number == signal.SIGHUP:  # the kernel, the shell and the watch above may all say so: once is enough
+    if number == TERMINAL_GONE:  # the kernel, the shell and the watch above may all say so: once is enough
         signal.signal(number, signal.SIG_IGN)
     raise KeyboardInterrupt
 
@@ -65,8 +68,8 @@ def _suspend(number: int, frame: FrameType | None) -> None:
 
         moves = moves or any(not engine.config.still for engine in EngineProcess.running)
         release_all()
-    signal.signal(signal.SIGTSTP, signal.SIG_DFL)
-    os.kill(os.getpid(), signal.SIGTSTP)
-    signal.signal(signal.SIGTSTP, _suspend)
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)
+    signal.signal(number, _suspend)
     if moves:
         raise KeyboardInterrupt

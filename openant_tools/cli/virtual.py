@@ -66,6 +66,7 @@ def start(
       openant comms scan --port $(jq -r .bus ant.json)
     """
     from openant_tools.optional import installed
+    from openant_tools.signals import TOLD_TO_GO
     from openant_tools.virtual.start import serve
 
     # Interrupting is how one ends it (formats, section 6): no failure. A flag, since an exception that is raised
@@ -79,10 +80,7 @@ def start(
         for name, value in server.addresses.items():
             if value is not None:
                 click.echo(f"{name:8} {value}")
-        before = {
-            number: signal.signal(number, lambda *_: ended.set())
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        }
+        before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, *TOLD_TO_GO)}
         try:
             if ready_file is not None:
                 server.announce(ready_file)

@@ -43,6 +43,7 @@ from openant_tools.comms.servos import Block
 from openant_tools.comms.silence import explained
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
 from openant_tools.recording.writer import RecordingStopped
+from openant_tools.signals import TOLD_TO_GO
 
 __all__ = ["Engine", "main", "run"]
 
@@ -57,7 +58,7 @@ def run(config: EngineConfig, parent: Parent, ring: Ring) -> None:
     def end(number: int, frame: object) -> None:
         parent.ended = True
 
-    for number in (signal.SIGTERM, signal.SIGHUP):
+    for number in TOLD_TO_GO:
         signal.signal(number, end)
     # Ctrl-C at the terminal is for the parent, which then tells us; a loop half way through a cycle is no place.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

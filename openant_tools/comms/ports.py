@@ -8,7 +8,6 @@ on recorded trees of /sys, /proc and /dev.
 from __future__ import annotations
 
 import errno
-import grp
 import os
 import sys
 from collections.abc import Iterator
@@ -197,6 +196,10 @@ class Host:
 
     def missing_group(self, path: str) -> str | None:
         """The group that owns the port, where this user is not in it."""
+        if sys.platform == "win32":
+            return None
+        import grp
+
         try:
             gid = os.stat(path).st_gid
         except OSError:

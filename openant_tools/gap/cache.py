@@ -24,7 +24,7 @@ def cache_folder() -> Path:
     given = os.environ.get(CACHE_VARIABLE)
     base = Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "openant"
     folder = base / "gap"
-    if folder.exists() and (mode := folder.stat()).st_uid != os.geteuid():
+    if folder.exists() and (mode := folder.stat()).st_uid != _user():
         raise BadInput(
             f"the cache belongs to another user (number {mode.st_uid})",
             where=folder,
@@ -33,6 +33,11 @@ def cache_folder() -> Path:
     folder.mkdir(mode=PRIVATE, parents=True, exist_ok=True)
     folder.chmod(PRIVATE)  # where an older version made it
     return folder
+
+
+def _user() -> int:
+    """This user's number; 0, as files have it, where users have none (Windows)."""
+    return os.geteuid() if hasattr(os, "geteuid") else 0
 
 
 def keep_small(newest: Path) -> None:

@@ -6,7 +6,6 @@ may then name a write that did not happen, which undoing finds out by reading.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 from dataclasses import asdict, dataclass
@@ -16,6 +15,7 @@ from typing import Any
 
 from openant_tools.errors import BadInput
 from openant_tools.files import parse_json
+from openant_tools.lock import wait_for
 
 __all__ = ["EepromWrite", "Journal", "JournalEntry"]
 
@@ -77,7 +77,7 @@ class Journal:
             line["undoes"] = undoes
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with open(self.path, "ab+") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)  # until it is closed: two programs' lines follow each other
+            wait_for(file)  # until it is closed: two programs' lines follow each other
             # A line torn by a power cut is ended, so that it does not swallow this one.
             torn = file.seek(0, os.SEEK_END) > 0 and _last_byte(file) != b"\n"
             file.write((b"\n" if torn else b"") + json.dumps(line).encode() + b"\n")

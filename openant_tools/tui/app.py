@@ -22,6 +22,7 @@ from openant_tools.bringup.walk import BENCH, BESIDE, WALK
 from openant_tools.errors import OpenAntError
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.kit import KITS
+from openant_tools.signals import SUSPENDED
 from openant_tools.tui.dialogs import Help, Question
 from openant_tools.tui.feeds import ReplayFeed
 from openant_tools.tui.jump import Jump
@@ -193,8 +194,8 @@ class OpenAnt(App[int]):
 
     def _stop_before_suspension(self) -> None:
         """Whoever suspends the program stops the robot first; nothing that moved goes on when it comes back."""
-        suspend = signal.getsignal(signal.SIGTSTP)
-        if not callable(suspend):  # no terminal: a test
+        suspend = None if SUSPENDED is None else signal.getsignal(SUSPENDED)
+        if SUSPENDED is None or not callable(suspend):  # no terminal: a test
             return
 
         def stop(number: int, frame: FrameType | None) -> None:
@@ -203,7 +204,7 @@ class OpenAnt(App[int]):
                 self._running_step.end("suspended")
             suspend(number, frame)
 
-        signal.signal(signal.SIGTSTP, stop)
+        signal.signal(SUSPENDED, stop)
 
     async def action_quit(self) -> None:
         self.action_leave()
