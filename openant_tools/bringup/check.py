@@ -85,8 +85,8 @@ def check(bench: Bench) -> Procedure:
     baseline = {joint: joint_sweep_of(one) for joint, one in bounds.data["sweep"].items()}
     evidence, problems, unsure = list[Evidence](), list[str](), list[str]()
     for line in START_LIST:
-        if (yield Ask(f"Is it so: {line}?", ("yes", "no"), default="yes")) != "yes":
-            problems.append(f"start list: it is not so that {line} → see to it first")
+        if (yield Ask(f"Before it moves: {line}. Is that so?", ("yes", "no"), default="yes")) != "yes":
+            problems.append(f"not as it must be before it moves: {line} → see to it first")
     if problems:
         return _finding(problems, evidence, {})
     yield Progress(0.0, "bus, supply, temperatures")

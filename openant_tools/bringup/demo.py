@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+from openant_tools.bringup.gait import FIRST_STEPS, first_look
 from openant_tools.errors import BadInput, OpenAntError
 from openant_tools.files import json_text, read_json, write_text
 from openant_tools.robot.config import CONFIG_NAME
@@ -137,7 +138,7 @@ class Demo:
     """
 
     folder: Path
-    steps: int = 7000
+    steps: int = FIRST_STEPS
     record_s: float = 12.0
     eval_s: float = 20.0
     starts: int = 15
@@ -247,14 +248,7 @@ class Demo:
                     (
                         (
                             *("train", "sac", "--robot", robot, "--env", "sim", "--steps", str(self.steps)),
-                            *(
-                                "--learning-start",
-                                str(min(500, self.steps)),
-                                "--entropy-start",
-                                "0.1",
-                                "--batch",
-                                "128",
-                            ),
+                            *first_look(self.steps),
                             *("--out", str(training), "--json", str(training / "train.json")),
                         ),
                     ),

@@ -278,10 +278,9 @@ def standing(folder: RobotFolder) -> dict[str, Standing]:
     }
 
 
-def beside(folder: RobotFolder, name: str) -> Standing:
+def beside(folder: RobotFolder, step: Step) -> Standing:
     """The same of a step that has no place in the order."""
-    step = BESIDE[name]
-    found = {one: latest(folder, one) for one in (*step.needs, name)}
+    found = {one: latest(folder, one) for one in (*step.needs, step.name)}
     return _standing(folder, step, found, ())  # each is a measurement by itself: no other makes it stale
 
 

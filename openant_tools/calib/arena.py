@@ -146,7 +146,7 @@ def arena(bench: Bench) -> Procedure:
             raise HardwareFault(
                 "the robot's tag is not in the picture", where=str(where), remedy="put the robot under the camera"
             )
-        answer = yield Ask("Which tag does the robot wear?", unit="number of the tag", default=float(others[0]))
+        answer = yield Ask("What is the number of the robot's tag?", default=float(others[0]))
         body_id = int(answer) if isinstance(answer, float) else others[0]
     setup = replace(config.camera, body_tag_id=body_id)
     origin = tag_pose(seen[origin_id], setup.origin_tag_size_m, lens)

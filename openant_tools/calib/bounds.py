@@ -254,7 +254,7 @@ def _by_hand(bench: Bench, bus: Bus, servos: Servos, joints: Sequence[str]) -> S
             if enough is True or (both and bus.clock.now() - newest > QUIET_S and bus.clock.now() - start > 4.0):
                 break
         seen.seam = track.seam
-        yield Hands("Let go.", "free")
+        yield Hands("Let go.", "free", while_watching=True)
         if seen.high - seen.low < 0.05:
             raise HardwareFault(
                 f"{joint} was not moved within {number(LONGEST_S, 's', decimals=0)}",

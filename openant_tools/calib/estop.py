@@ -61,7 +61,7 @@ def estop(bench: Bench) -> Procedure:
         if not all(on.values()):
             raise HardwareFault(f"torque does not come on at {', '.join(j for j, value in on.items() if not value)}")
         yield Say("torque is on: the horn resists your fingers", "info")
-        yield Ask("Now stop it: space in the terminal program, Enter on the command line", ("stop",), default="stop")
+        yield Ask("Press space now, the stop key; on the command line Enter.", ("stop",), default="stop")
         engine.stop()
         off = engine.ask(messages.ReadRegister("torque_enable"))
     stopped = not any(off.values())
@@ -84,14 +84,14 @@ def estop(bench: Bench) -> Procedure:
     problems = [f"{joint} kept torque after the stop key" for joint, value in off.items() if value]
     problems += [f"id {id} kept torque after its program was killed" for id in left]
     ok = not problems
+    of_all, source = f"of {len(seen)}", "torque_enable (64), read back"
     return Finding(
         "estop",
         ok,
         "the stop key and a killed program both leave torque off" if ok else "torque stays on: do not go on",
         (
-            Evidence("servos proven", float(len(seen)), "", "torque_enable (64) read back"),
-            Evidence("still on after the stop key", float(sum(map(bool, off.values()))), "", "register 64"),
-            Evidence("still on after a kill", float(len(left)), "", "register 64"),
+            Evidence("torque still on after the stop key", float(sum(map(bool, off.values()))), of_all, source),
+            Evidence("torque still on after the program was killed", float(len(left)), of_all, source),
         ),
         "" if ok else "pull the power plug; report this with the robot's folder",
         COMMAND,

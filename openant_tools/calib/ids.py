@@ -60,7 +60,7 @@ def ids(bench: Bench) -> Procedure:
     config = bench.folder.config()
     motors = [motor for motor in config.motors.values() if not bench.joints or motor.joint in bench.joints]
     named, problems = list[str](), list[str]()
-    yield Progress(None, "who is on the cable, at every baud rate")
+    yield Progress(None, "looking for servos at every baud rate")
     with opened_bus(bench) as bus:
         found = yield from scan_and_mend(bench, bus, COMMAND)
     if _all_named(found, motors, config):
@@ -106,7 +106,7 @@ def _one(
     words = JOINTS[motor.joint].words
     while True:
         yield Hands(
-            f"Plug in one servo for the {words} ({motor.joint}): a {motor.model}, and no other.", "plug", motor.joint
+            f"Plug in one servo for the {words} ({motor.joint}), an {motor.model}, and no other.", "plug", motor.joint
         )
         with opened_bus(bench) as bus:
             wait(bus.clock, BOOT_S)

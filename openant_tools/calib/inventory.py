@@ -50,7 +50,7 @@ def inventory(bench: Bench) -> Procedure:
     table: dict[str, dict[str, int]] = {}
     with opened_bus(bench) as bus:
         bus.names = {motor.id: motor.joint for motor in config.motors.values()}
-        yield Progress(None, "who answers")
+        yield Progress(None, "asking every id whether it answers")
         found, missing = _ping_all(bus, config)
         if len(missing) == len(config.motors):
             yield Hands("Connect the whole robot: all eight servos on the cable, 12 V on.", "plug")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from openant_tools.calib.bounds import Unwrapped
@@ -23,8 +25,9 @@ from openant_tools.robot.kit import ANGLE_LIMIT_RAD
 __all__ = ["legs"]
 
 COMMAND = "openant calib legs"
-#: Reads while the builder wiggles the cables and moves the leg; more than this share lost is a bad contact.
-READ_S, LOST_SHARE = 4.0, 0.005
+#: Reads while the builder moves the leg and wiggles its cables: so long once the range was seen, and the longest that hands
+#: are waited for. More than this share lost is a bad contact.
+READ_S, LONGEST_S, LOST_SHARE = 3.0, 60.0, 0.005
 #: Share of the kit's range that a hand must reach at a leg that is not in its shell yet.
 RANGE_SHARE = 0.6
 NUDGE_RAD, NUDGED_RAD = 0.1, 0.04
@@ -117,8 +120,9 @@ def _by_hand(bus: Bus, joints: list[str], config: RobotConfig) -> Subroutine[lis
             while_watching=True,
         )  # fmt: skip
         asked = lost = 0
-        end = bus.clock.now() + READ_S
-        while bus.clock.now() < end:
+        give_up, end = bus.clock.now() + LONGEST_S, math.inf
+        whole = 2 * ANGLE_LIMIT_RAD[JOINTS[joint].kind]
+        while bus.clock.now() < min(end, give_up):
             answers = bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, servos.ids)
             if bus.clock.lateness.cycle() <= LATE_S:
                 lost += sum(answer.cause not in (None, Cause.LATE) for answer in answers)
@@ -130,10 +134,12 @@ def _by_hand(bus: Bus, joints: list[str], config: RobotConfig) -> Subroutine[lis
                     continue  # a loss like the others; it is counted above
                 for name, angle in now.items():
                     tracks[name][1].append(tracks[name][0].add(angle))
+                if end == math.inf and np.ptp(tracks[joint][1]) >= RANGE_SHARE * whole:
+                    end = bus.clock.now() + READ_S
                 if (yield Live(now, "rad", f"moving {joint}; Enter when it is done", angles_rad=now)) is True:
                     break
             wait(bus.clock, 0.005)
-        yield Hands("Let go.", "free")
+        yield Hands("Let go.", "free", while_watching=True)
         late = bus.clock.lateness.words
         if late:
             yield Say(f"{late}: what was lost meanwhile says nothing of cables → {REMEDY}", "warn")
@@ -143,7 +149,6 @@ def _by_hand(bus: Bus, joints: list[str], config: RobotConfig) -> Subroutine[lis
                 remedy=f"look at the cable before {joint} and at its plugs: press each in to the click",
             )
         seen = float(np.ptp(tracks[joint][1])) if tracks[joint][1] else 0.0
-        whole = 2 * ANGLE_LIMIT_RAD[JOINTS[joint].kind]
         evidence.append(Evidence(f"range of {joint}", seen, "rad", "by hand", least=RANGE_SHARE * whole))
         share = lost / asked if asked else None
         evidence.append(

@@ -23,7 +23,7 @@ from openant_tools.comms.servos import Servos
 from openant_tools.errors import HardwareFault
 from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.step import Ask, Bench, Drawing, Hands, Intent, Live, Procedure, Progress, Say, Subroutine
+from openant_tools.procedure.step import Bench, Drawing, Hands, Intent, Live, Procedure, Progress, Say, Subroutine
 from openant_tools.procedure.unfinished import Parts
 from openant_tools.robot.config import Provenance, RobotConfig
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
@@ -41,15 +41,19 @@ READINGS = 25
 #: Legs that are put straight by a ruler are within this; more is a horn between two splines, or a leg not straight.
 STRAIGHT_RAD = math.radians(8)
 #: By how much the builder moves a joint, and how much of it must be seen.
-BY_HAND_RAD, SEEN_RAD = 0.5, 0.15
+BY_HAND_RAD, SEEN_RAD = math.radians(30), 0.15
+#: s that a joint's way back is waited for, and between two looks at it
+BACK_S, SAMPLE_S = 20.0, 0.1
+#: by what a joint that is held still differs at most between two looks
+STILL_RAD = 0.01
 NUDGE_RAD, NUDGED_RAD = 0.12, 0.07
 #: A torso that answers a nudge stands out of its gyro's noise by so many standard errors, along the joint's axis within
 #: this cosine.
 SEEN_ERRORS, SEEN_COSINE = 6.0, 0.7
-WAYS = {"hip": "counter-clockwise seen from above", "knee": "up: lift its foot"}
+WAYS = {"hip": "counter-clockwise seen from above", "knee": "up (lift its foot)"}
 DRAWING = """\
             front
-     fl \\          / fr        every leg straight out, at 45 degrees to the torso,
+     fl \\          / fr        every leg straight out from the torso,
           \\ ____ /             level, hip and knee in one line:
            |    |              lay a ruler along each leg
           / ---- \\
@@ -139,7 +143,7 @@ def zeros(bench: Bench) -> Procedure:
         servos = Servos(bus, robot_servos(config))
         servos.identify()
         servos.set_torque(False)
-        yield Drawing("Put all legs straight.", DRAWING)
+        yield Drawing("How straight legs look:", DRAWING)
         yield Hands("Put every leg straight out and hold still; torque is off.", "straighten")
         wait(bus.clock, SETTLE_S)
         yield Progress(0.1, f"{READINGS} readings of every encoder")
@@ -148,15 +152,15 @@ def zeros(bench: Bench) -> Procedure:
             moved = servos.servos[int(np.ptp(rows, axis=0).argmax())].joint
             return _failed(f"{moved} moved while it was read", "hold the legs still and run it again")
         level = rows.mean(axis=0)
-        yield Hands("Let go.", "free")
+        yield Hands("Let go.", "free", while_watching=True)
         movements = yield from _by_hand(bench, bus, servos, joints)
     grid = {servo.joint: straight(float(level[k])) for k, servo in enumerate(servos.servos)}
     evidence = [
         Evidence(
-            f"residual of {joint}",
+            f"off the grid of {joint}",
             seen.residual_rad,
             "rad",
-            "encoder with straight legs, from the 45° grid",
+            "encoder with straight legs; horns go on in steps of 45°",
             least=-STRAIGHT_RAD,
             most=STRAIGHT_RAD,
         )
@@ -197,7 +201,7 @@ def zeros(bench: Bench) -> Procedure:
             f"{joint}: {number(degrees, sign=True, decimals=1)}° beside the grid of horn positions → was the leg straight? else its horn or gear slips"
         )
     yield Intent(
-        "write zero offsets and directions into robot.toml, then nudge every joint by "
+        f"write zero offsets{', ids as they are built' if owner else ''} and directions into robot.toml, then nudge every joint by "
         f"{number(NUDGE_RAD, 'rad', decimals=0)} with the motors, on the stand",
         moves=True,
     )
@@ -227,11 +231,15 @@ def zeros(bench: Bench) -> Procedure:
 
 
 def _by_hand(bench: Bench, bus: Bus, servos: Servos, joints: tuple[str, ...]) -> Subroutine[dict[str, Moved]]:
-    """joint → what turned when the builder moved it; a joint at which nothing turned is missing."""
+    """joint → what turned when the builder moved it; a joint at which nothing turned is missing.
+
+    One answer a joint: that it is held. That it is back is seen.
+    """
     found: dict[str, Moved] = {}
     parts = Parts(bench.folder, "zeros", joints, bench.joints)
     if parts.before:
         yield Say(parts.words)
+    first = before = servo_angles(servos)[0]
     for k, joint in enumerate(joints):
         if joint in parts.before:
             found[joint] = Moved(joint, parts.before[joint]["seen"], parts.before[joint]["by_rad"])
@@ -239,22 +247,18 @@ def _by_hand(bench: Bench, bus: Bus, servos: Servos, joints: tuple[str, ...]) ->
         kind = JOINTS[joint].kind
         yield Progress(0.2 + 0.6 * k / len(joints), f"{joint} by hand")
         # Half a turn up or round is beyond no stop; from straight it is safe either way.
-        before = servo_angles(servos)[0]
         yield Hands(
-            f"Move the {JOINTS[joint].words} about 30° {WAYS[kind]}, and hold it.", "turn", joint, (BY_HAND_RAD,)
-        )
+            f"Move the {JOINTS[joint].words} about {number(BY_HAND_RAD, 'rad', decimals=0)} {WAYS[kind]}, and hold it there.",
+            "turn", joint, (BY_HAND_RAD,),
+        )  # fmt: skip
         wait(bus.clock, SETTLE_S)
         row = servo_angles(servos)[0]
-        change = row - before
-        change = (change + math.pi) % (2 * math.pi) - math.pi
-        yield Live(
-            {s.joint: float(change[n]) for n, s in enumerate(servos.servos)}, "rad", f"moved: {joint}",
-            angles_rad=in_joints(servos, row),
-        )  # fmt: skip
+        yield _away(servos, row, first, f"moved: {joint}")
+        # The joint before it may have been put back meanwhile, or not yet: neither is what moved now.
+        change = np.where(
+            np.abs(_turned(row, first)) < np.abs(_turned(row, before)), _turned(row, first), _turned(row, before)
+        )
         most = int(np.abs(change).argmax())
-        yield Hands("Put it back.", "turn", joint, (0.0,))
-        wait(bus.clock, SETTLE_S)
-        yield Hands("Let go.", "free")
         if abs(change[most]) > SEEN_RAD:
             found[joint] = Moved(joint, servos.servos[most].joint, float(change[most]))
             words = f"{joint}: its servo turned {number(change[most], 'rad', sign=True, decimals=0)}"
@@ -262,7 +266,35 @@ def _by_hand(bench: Bench, bus: Bus, servos: Servos, joints: tuple[str, ...]) ->
                 words = f"{joint} was moved, but the servo with the id of {found[joint].seen} turned"
             yield Say(words, "ok" if found[joint].seen == joint else "warn")
             parts.done(joint, seen=found[joint].seen, by_rad=found[joint].by_rad)
+        yield Hands("Put it back.", "turn", joint, (0.0,), while_watching=True)
+        before = yield from _back(bus, servos, first, most)
+        yield Hands("Let go.", "free", while_watching=True)
     return found
+
+
+def _back(bus: Bus, servos: Servos, first: Array, moved: int) -> Subroutine[Array]:
+    """Wait until the servo that was `moved` is where it was at `first` (n,), rad, or for `BACK_S`; where all are then."""
+    give_up, before = bus.clock.now() + BACK_S, first + math.pi
+    while True:
+        row: Array = servo_angles(servos)[0]
+        still = abs(_turned(row, before)[moved]) < STILL_RAD
+        before = row
+        enough = yield _away(servos, row, first, "being put back; Enter goes on")
+        if enough is True or (still and abs(_turned(row, first)[moved]) < SEEN_RAD) or bus.clock.now() > give_up:
+            return row
+        wait(bus.clock, SAMPLE_S)
+
+
+def _away(servos: Servos, row: Array, first: Array, words: str) -> Live:
+    """How far each joint is from where it was at first."""
+    turned = {servo.joint: float(change) for servo, change in zip(servos.servos, _turned(row, first), strict=True)}
+    return Live(turned, "rad", words, angles_rad=in_joints(servos, row))
+
+
+def _turned(row: Array, since: Array) -> Array:
+    """By what each servo has turned, rad, the short way round."""
+    turned: Array = (row - since + math.pi) % (2 * math.pi) - math.pi
+    return turned
 
 
 def _swapped(owner: Mapping[str, str], config: RobotConfig, values: dict[str, object]) -> Subroutine[list[str]]:
@@ -286,7 +318,6 @@ def _swapped(owner: Mapping[str, str], config: RobotConfig, values: dict[str, ob
             )
     for line in words:
         yield Say(line, "warn")
-    yield Ask("Let robot.toml follow how the robot is built?", ("yes",), default="yes")
     for joint, other in owner.items():
         values[f"motors.{joint}.id"] = config.motors[other].id
     return words
@@ -361,7 +392,7 @@ def _nudge_all(bench: Bench, joints: tuple[str, ...]) -> Subroutine[_Nudged]:
         if math.isfinite(answer.share):
             evidence.append(
                 Evidence(
-                    f"torso's answer to {joint}", answer.share, "1", f"gyro over the joint's rate: {answer.verdict}"
+                    f"torso's turn at {joint}", answer.share, "share", f"of the joint's, by the gyro: {answer.verdict}"
                 )
             )
         if board_known and answer.verdict in ("contradicted", "another"):

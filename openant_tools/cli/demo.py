@@ -55,10 +55,11 @@ def demo(robot: Path, steps: int, fresh: bool, json_file: Path | None) -> None:
     whole.prepare(fresh=fresh)
     began = time.monotonic()
     stages = whole.stages()
+    wide = max(len(stage.words) for stage in stages) + 2
     say(f"A virtual Open Ant in {escape(str(robot))}: from its first recording to walking, in about three minutes.")
     try:
         for place, stage in enumerate(stages, 1):
-            line = f"[bold]{place}/{len(stages) + 1} {stage.name:8}[/bold] {escape(stage.words):49}"
+            line = f"[bold]{place}/{len(stages) + 1} {stage.name:8}[/bold] {escape(stage.words):{wide}}"
             if whole.stands(stage):
                 say(f"{line} stands already")
                 continue
@@ -70,7 +71,7 @@ def demo(robot: Path, steps: int, fresh: bool, json_file: Path | None) -> None:
             say("learning is left out: it needs torch (pip install 'openant-tools\\[agents]')")
         elif not whole.video.exists():
             say("no pictures of the walk: there is no OpenGL here (an EGL or OSMesa library would do)")
-        line = f"[bold]{len(stages) + 1}/{len(stages) + 1} {'report':8}[/bold] {'put it all on one page':49}"
+        line = f"[bold]{len(stages) + 1}/{len(stages) + 1} {'report':8}[/bold] {'put it all on one page':{wide}}"
         since = time.monotonic()
         with _bar(console, line):
             figures = write_report(whole)

@@ -143,7 +143,9 @@ class CommandFace:
                 question, console=self.console, default=str(ask.default or ""), show_default=bool(ask.default)
             )
         while True:
-            given = FloatPrompt.ask(f"{question} [{ask.unit}]", console=self.console, default=ask.default)
+            given = FloatPrompt.ask(
+                f"{question} [{ask.unit}]" if ask.unit else question, console=self.console, default=ask.default
+            )
             if (
                 isinstance(given, int | float)
                 and (ask.low is None or given >= ask.low)

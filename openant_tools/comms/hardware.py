@@ -325,5 +325,6 @@ def changes(writes: Sequence[EepromWrite]) -> Iterator[str]:
         alike.setdefault((write.register, write.old, write.new), []).append(write)
     for (register, old, new), found in alike.items():
         who = f"{len(found)} servos" if len(found) > 1 else f"{found[0].joint} (id {found[0].id})"
-        power = f": at most {percent(new / PWM_FULL)} of full power" if register == "pwm_limit" else ""
-        yield f"{who}: {register} {old} → {new}{power}"
+        change = f"{register} {old} → {new}"
+        power = f"at most {percent(new / PWM_FULL)} of full power, as robot.toml says ({change})"
+        yield f"{who}: {power if register == 'pwm_limit' else change}"

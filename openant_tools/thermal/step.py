@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 from openant_tools.calib.wires import engine_config
 from openant_tools.numbers import number
@@ -14,7 +15,7 @@ from openant_tools.thermal.finding import thermal_finding, torque_warning
 from openant_tools.thermal.fit import fit, held_out
 from openant_tools.thermal.forecast import forecast, rest_advice
 from openant_tools.thermal.inputs import inputs_of
-from openant_tools.thermal.soak import SoakPlan, soak, soak_config
+from openant_tools.thermal.soak import Phase, SoakPlan, soak, soak_config
 
 __all__ = ["thermal_soak"]
 
@@ -24,6 +25,9 @@ DEFAULT_MIN, SHORTEST_MIN, LONGEST_MIN = 10.0, 1.0, 240.0
 RATE_HZ = 5.0
 #: share of the time under load that is kept of the cooling: it is what tells the case from the air
 COOLING_SHARE = 0.3
+#: what a phase of the soak is called while it lasts
+PHASES: Mapping[Phase, str] = {"load": "holding the home pose", "cool-down": "cooling, torque off; Enter: enough of it"}
+TEMPERATURES = "temperature of each servo, up to where it switches off"
 
 
 def _minutes(minutes: float) -> str:
@@ -57,8 +61,8 @@ def thermal_soak(bench: Bench) -> Procedure:
                 yield Say(sample.words)
             known = {j: float(v) for j, v in zip(sample.joints, sample.temperature_c, strict=True) if math.isfinite(v)}
             limits = dict(zip(sample.joints, map(float, sample.limit_c), strict=True))
-            yield Progress(sample.share, sample.phase)
-            enough = yield Live(known, "°C", sample.phase, dict.fromkeys(known, 15.0), limits)
+            yield Progress(sample.share, PHASES[sample.phase])
+            enough = yield Live(known, "°C", TEMPERATURES, dict.fromkeys(known, 15.0), limits)
             if enough is True and sample.phase == "cool-down":
                 break
     except StopIteration:

@@ -9,40 +9,53 @@ from rich.text import Text
 from openant_tools.numbers import number, readable
 from openant_tools.procedure.finding import Evidence
 from openant_tools.procedure.step import Live
-from openant_tools.tui.marks import BLUE, GREEN, ORANGE, plain, spelled
+from openant_tools.tui.marks import BLUE, GREEN, ORANGE, overflow, plain, spelled
 
 __all__ = ["allowed_bar", "bars"]
 
 #: of the width of an allowed range: what a bar shows beyond each of its ends
 BEYOND = 0.4
+#: unit → places after the point of what changes many times a second; of others three
+DECIMALS = {"rad": 1, "rad/s": 1, "°C": 0}
 
 
 def bars(live: Live, width: int) -> Text:
-    """The values of a procedure's `Live`, each on its own scale where one is given, in lines of `width` columns."""
-    text = Text(no_wrap=True, overflow="ellipsis")
+    """The values of a procedure's `Live`, each on its own scale where one is given, in lines of `width` columns.
+
+    A bar begins at zero, where its scale has one.
+    """
+    text = Text(no_wrap=True, overflow=overflow())
     if live.words:
         text.append(f"{spelled(live.words)}\n")
     longest = max((len(mark) for mark in live.marks.values()), default=0)
     across = max(8, width - 42 - longest)
-    full, empty, here = ("=", "-", "|") if plain() else ("━", "─", "●")
+    full, empty, here, cross = ("=", "-", "|", "+") if plain() else ("━", "─", "●", "┼")
     for joint, value in live.values.items():
         low, high = live.low.get(joint), live.high.get(joint)
-        shown = number(value, live.unit, sign=True, decimals=1 if live.unit in ("rad", "rad/s") else 3)
+        # What cannot be negative has no sign either.
+        signed = low is None or low < 0.0
+        shown = number(value, live.unit, sign=signed, decimals=DECIMALS.get(live.unit, 3))
         text.append(f"{joint:9}{spelled(shown):>12} ", "bold")
         if low is not None and high is not None and math.isfinite(value) and high > low:
             at = min(max(round((value - low) / (high - low) * (across - 1)), 0), across - 1)
-            text.append(f"{spelled(_end(low, live.unit)):>7} ")
-            text.append(full * at + here + empty * (across - 1 - at), BLUE)
-            text.append(f" {spelled(_end(high, live.unit)):>6}")
+            text.append(f"{spelled(_end(low, live.unit, signed)):>7} ")
+            zero = round(-low / (high - low) * (across - 1)) if low < 0.0 < high else None
+            begin = zero or 0
+            cells = [full if min(begin, at) <= k <= max(begin, at) else empty for k in range(across)]
+            if zero is not None:
+                cells[zero] = cross
+            cells[at] = here
+            text.append("".join(cells), BLUE)
+            text.append(f" {spelled(_end(high, live.unit, signed)):>6}")
         text.append(f" {spelled(live.marks.get(joint, ''))}\n")
     text.rstrip()
     return text
 
 
-def _end(value: float, unit: str) -> str:
+def _end(value: float, unit: str, sign: bool) -> str:
     """An end of a bar, without its unit."""
     factor, read = readable(value, unit)
-    return number(factor * value, sign=True, decimals=0 if read in ("°", "°/s") else 2)
+    return number(factor * value, sign=sign, decimals=0 if read in ("°", "°/s", "°C") else 2)
 
 
 def allowed_bar(evidence: Evidence, width: int) -> Text:

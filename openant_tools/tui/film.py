@@ -1,12 +1,13 @@
 """A film of the terminal program: its own frames as they change, as one animated SVG that needs no script.
 
     film = Film(app)              # takes a frame whenever its timer finds another screen
-    film.press("enter")           # is shown below the screen
+    film.press("enter")           # is shown below the screen; again=True plays what follows faster
     write_text(path, film.svg())
 
 Nothing is drawn for the film: a frame is what the compositor gives the terminal. What takes long plays as the root of its
-time, what does not change is cut to a second, and all of it is played faster where it would last longer than `LONGEST_S`.
-Where motion is unwanted (`prefers-reduced-motion`) the last frame stands still.
+time, what does not change is cut to a second, what is done for the third time plays faster, and so does all of it where it
+would last longer than `LONGEST_S`; a film that would be larger than `MOST_BYTES` shows fewer frames. Where motion is unwanted
+(`prefers-reduced-motion`) the last frame stands still.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import cache
 from html import escape
 
 from rich.cells import cell_len
@@ -27,11 +29,15 @@ from textual.app import App
 __all__ = ["Film"]
 
 #: s between two looks at the screen, and at least between two frames of the film
-LOOK_S = 0.125
+LOOK_S = 0.2
 FRAME_S = 0.2
 #: s that nothing happens in the film, at most; and the film
 STILL_S = 1.0
 LONGEST_S = 170.0
+#: of its time that is left to what is shown again
+AGAIN = 0.3
+#: of the file
+MOST_BYTES = 3_000_000
 #: s for which the last frame stays
 END_S = 4.0
 #: of a cell, in the SVG's own units
@@ -54,14 +60,16 @@ class Look:
     faint: bool
     underline: bool
 
-    @classmethod
-    def of(cls, style: Style | None) -> Look:
+    @staticmethod
+    @cache
+    def of(style: Style | None) -> Look:
+        """The look of a segment's style."""
         style = style or Style()
         ink = style.color.get_truecolor() if style.color and not style.color.is_default else INK
         paper = style.bgcolor.get_truecolor() if style.bgcolor and not style.bgcolor.is_default else PAPER
         if style.reverse:
             ink, paper = paper, ink
-        return cls(
+        return Look(
             ink.hex, None if paper == PAPER else paper.hex, bool(style.bold), bool(style.dim), bool(style.underline)
         )
 
@@ -74,13 +82,13 @@ class Film:
         app: whose frames are taken while it runs.
         clock: s, monotonic.
         frames: (s, its rows) of each frame that differs from the one before, the last row being the key pressed.
-        keys: s of each key.
+        keys: s of each key → whether it does once more what was shown before.
     """
 
     app: App[int]
     clock: Callable[[], float] = time.monotonic
     frames: list[tuple[float, tuple[Row, ...]]] = field(default_factory=list)
-    keys: list[float] = field(default_factory=list)
+    keys: dict[float, bool] = field(default_factory=dict)
     _pressed: str = ""
     _pressed_at: float = -math.inf
 
@@ -88,10 +96,10 @@ class Film:
         """Look at the screen from now on, as long as the app runs."""
         self.app.set_interval(LOOK_S, self.look)
 
-    def press(self, key: str) -> None:
-        """A key is pressed now."""
+    def press(self, key: str, again: bool = False) -> None:
+        """A key is pressed now; `again` where what it does was shown before."""
         self._pressed, self._pressed_at = SHOWN.get(key, key), self.clock()
-        self.keys.append(self._pressed_at)
+        self.keys[self._pressed_at] = again
         self.look()
 
     def look(self) -> None:
@@ -110,32 +118,44 @@ class Film:
         if not self.frames or self.frames[-1][1] != tuple(rows):
             self.frames.append((now, tuple(rows)))
 
-    def cut(self) -> list[tuple[float, tuple[Row, ...]]]:
-        """The frames at the times at which the film shows them, thinned out."""
-        shown: list[tuple[float, tuple[Row, ...]]] = []
-        cuts = sorted({self.frames[0][0], *(key for key in self.keys if key > self.frames[0][0]), math.inf})
+    def cut(self, frame_s: float = FRAME_S) -> list[tuple[float, tuple[Row, ...]]]:
+        """The frames at the times at which the film shows them, s, none sooner than `frame_s` after the one before."""
+        begins = self.frames[0][0]
+        cuts = sorted({begins, *(key for key in self.keys if key > begins), math.inf})
+        timed: list[tuple[float, tuple[Row, ...]]] = []
         at = 0.0
         for begin, end in itertools.pairwise(cuts):
             scene = [frame for frame in self.frames if begin <= frame[0] < end]
             if not scene:
                 continue
+            again = AGAIN if self.keys.get(begin, False) else 1.0
             last = min(end, scene[-1][0] + STILL_S)
             # what takes long plays as the root of its time
-            pace = min(1.0, 1.0 / math.sqrt(max(1.0, last - begin)))
+            pace = again * min(1.0, 1.0 / math.sqrt(max(1.0, last - begin)))
             played, before = at, begin
             for moment, rows in scene:
-                played += min(STILL_S, (moment - before) * pace)
+                played += min(again * STILL_S, (moment - before) * pace)
                 before = moment
-                if shown and played - shown[-1][0] < FRAME_S and moment != scene[-1][0]:
-                    continue
-                shown.append((played, rows))
-            at = played + min(STILL_S, (last - before) * pace if end < math.inf else STILL_S)
+                timed.append((played, rows))
+            at = played + min(again * STILL_S, (last - before) * pace if end < math.inf else STILL_S)
         faster = min(1.0, (LONGEST_S - END_S) / max(at, 1e-9))
-        return [(moment * faster, rows) for moment, rows in shown]
+        shown: list[tuple[float, tuple[Row, ...]]] = []
+        for moment, rows in timed:
+            if shown and faster * moment - shown[-1][0] < frame_s:  # what is seen is never older than it must be
+                shown[-1] = (shown[-1][0], rows)
+            else:
+                shown.append((faster * moment, rows))
+        return shown
 
     def svg(self, title: str = "The terminal program, walked") -> str:
-        """The film as an SVG with one strip of pictures for each row of the screen, of which each moment shows one."""
-        frames = self.cut()
+        """The film as an SVG of at most `MOST_BYTES`; what is too much for that is left out, frame by frame."""
+        frame_s = FRAME_S
+        while len((drawn := self._svg(self.cut(frame_s), title)).encode()) > MOST_BYTES and frame_s < STILL_S:
+            frame_s *= 1.25
+        return drawn
+
+    def _svg(self, frames: list[tuple[float, tuple[Row, ...]]], title: str) -> str:
+        """One strip of pictures for each row of the screen, of which each moment shows one."""
         lasts = frames[-1][0] + END_S
         columns = max(sum(cell_len(text) for text, _ in row) for _, rows in frames for row in rows)
         width, height = round(columns * WIDTH + 2 * MARGIN), len(frames[0][1]) * HEIGHT + 2 * MARGIN
@@ -172,7 +192,7 @@ class Film:
             for look, number in looks.items()
         )
         return (
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img" '
+            f'<svg xmlns="http://www.w3.org/2000/svg" xml:space="preserve" viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img" '
             f'aria-label="{escape(title)}"><title>{escape(title)}</title><style>'
             f"text{{font:{FONT}px 'DejaVu Sans Mono',Menlo,Consolas,monospace;white-space:pre}}{classes}"
             f"@media (prefers-reduced-motion:no-preference){{.m{{animation:{_plain(lasts)}s step-end infinite}}}}"

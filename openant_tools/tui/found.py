@@ -88,9 +88,13 @@ class _Column:
 
     @cached_property
     def worst(self) -> str:
-        """The joint whose error, loss or friction is the largest of three or more; "" where none is worse than another."""
+        """The joint whose error, loss or friction is the largest of three or more; "" where none reads worse than another."""
         values = {joint: abs(one.value) for joint, one in self.rows.items() if one.value is not None}
-        if len(values) < 3 or not (is_error(self.name) or _WORST.search(self.name)) or len(set(values.values())) == 1:
+        if (
+            len(values) < 3
+            or not (is_error(self.name) or _WORST.search(self.name))
+            or len({words.lstrip("+−-") for words in self.words.values()}) == 1
+        ):
             return ""
         return max(values, key=lambda joint: values[joint])
 

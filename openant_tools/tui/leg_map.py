@@ -145,7 +145,9 @@ Arrow keys choose a joint, here and among the strips.
         return self._with_marks(lines, points, feet)
 
     def _angle(self, joint: str) -> float:
-        if joint not in self._history.joints:
+        """rad; of a servo without the other of its leg, which is in no leg yet, straight."""
+        leg = joint.partition("_")[2]
+        if not {f"hip_{leg}", f"knee_{leg}"} <= set(self._history.joints):
             return 0.0
         angle = self._history.last_known(f"pos.{joint}")
         return angle if np.isfinite(angle) else 0.0

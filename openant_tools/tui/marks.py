@@ -10,7 +10,7 @@ from typing import Literal
 
 from rich.text import Text
 
-__all__ = ["BLUE", "MARKS", "Name", "StateMark", "can_unicode", "mark", "marked", "plain", "spelled"]
+__all__ = ["BLUE", "MARKS", "Name", "StateMark", "can_unicode", "mark", "marked", "overflow", "plain", "spelled"]
 
 Name = Literal["ok", "warn", "fail", "unsure", "wait", "todo", "stale", "info", "off", "on"]
 
@@ -66,14 +66,19 @@ def plain(on: bool | None = None) -> bool:
 
 #: what stands in words and units → how it is spelled in ASCII
 _SPELLED = str.maketrans({
-    "→": "->", "…": "...", "°": " deg ", "×": "x", "–": "-", "—": "-", "−": "-", "²": "2", "·": "*", "μ": "u", "µ": "u",
+    "→": "->", "…": "...", "°": " deg", "×": "x", "–": "-", "—": "-", "−": "-", "²": "2", "·": "*", "μ": "u", "µ": "u",
     "λ": "lambda", "τ": "tau", "±": "+-", "✓": "+", "✗": "x", "▲": "!", "“": '"', "”": '"', "’": "'", "Ω": "ohm",
 })  # fmt: skip
 
 
 def spelled(words: str) -> str:
     """Words as this terminal can show them."""
-    return words if _unicode else words.translate(_SPELLED).encode("ascii", "replace").decode()
+    return words if _unicode else words.replace("°C", "C").translate(_SPELLED).encode("ascii", "replace").decode()
+
+
+def overflow() -> Literal["crop", "ellipsis"]:
+    """How a line that is too long ends: the ellipsis is no ASCII."""
+    return "ellipsis" if _unicode else "crop"
 
 
 def mark(name: Name) -> str:

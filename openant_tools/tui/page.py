@@ -18,14 +18,16 @@ from openant_tools.numbers import number
 from openant_tools.tui.feeds import ReplayFeed
 from openant_tools.tui.joint_table import JointTable
 from openant_tools.tui.leg_map import JointChosen, LegMap
-from openant_tools.tui.marks import MARKS, mark, marked, plain, spelled
+from openant_tools.tui.marks import MARKS, mark, marked, overflow, plain, spelled
 from openant_tools.tui.session import Session
 from openant_tools.tui.strips import JointStrips
 
-__all__ = ["Page", "Program", "help_of"]
+__all__ = ["Page", "Program", "help_of", "put"]
 
 #: columns and lines that every screen needs
 LEAST = (80, 24)
+#: from where on a screen shows the robot beside the rest
+ROOMY = (110, 34)
 STOP_STYLE = "bold #000000 on #FFE14D"
 
 
@@ -78,9 +80,8 @@ class Page(Screen[None]):
     def __init__(self) -> None:
         super().__init__()
         # From which size on a screen uses the room beside and below.
-        self.HORIZONTAL_BREAKPOINTS = [(0, "-small"), (LEAST[0], "-narrow"), (110, "-wide")]
-        self.VERTICAL_BREAKPOINTS = [(0, "-low"), (LEAST[1], "-short"), (34, "-tall")]
-        self._drawn_top: Text | None = None
+        self.HORIZONTAL_BREAKPOINTS = [(0, "-small"), (LEAST[0], "-narrow"), (ROOMY[0], "-wide")]
+        self.VERTICAL_BREAKPOINTS = [(0, "-low"), (LEAST[1], "-short"), (ROOMY[1], "-tall")]
 
     @property
     def ant(self) -> Program:
@@ -104,6 +105,11 @@ class Page(Screen[None]):
     def small(self) -> bool:
         """Whether the window has no room for the screen."""
         return self.size.width < LEAST[0] or self.size.height < LEAST[1]
+
+    @property
+    def roomy(self) -> bool:
+        """Whether the robot has its place beside the rest; told by the size, since classes follow it later."""
+        return self.size.width >= ROOMY[0] and self.size.height >= ROOMY[1]
 
     def compose(self) -> ComposeResult:
         yield Static(id="top")
@@ -132,23 +138,17 @@ class Page(Screen[None]):
         if not self.query("#top"):
             return  # not there yet, or gone already
         session = self.session
-        top = self._top()
-        if top != self._drawn_top:
-            self._drawn_top = top
-            self.query_one("#top", Static).update(top)
+        put(self.query_one("#top", Static), self._top())
         if self.small:
             least = f"Make the window larger: {LEAST[0]} columns and {LEAST[1]} lines at least."
-            self.query_one("#small", Static).update(Text("\n").join([self.verdict, Text(least, style="bold")]))
+            put(self.query_one("#small", Static), Text("\n").join([self.verdict, Text(least, style="bold")]))
         faults = session.faults.unseen
         bar = self.query_one("#faults", Static)
         bar.display = bool(faults)
         if faults:
             more = f"  and {len(faults) - 1} more" if len(faults) > 1 else ""
-            bar.update(
-                Text.assemble(
-                    (f"{mark('fail')} FAULT {spelled(str(faults[0]))}{more}  ", "bold"), ("F8: seen", "reverse")
-                )
-            )
+            words = f"{mark('fail')} FAULT {spelled(str(faults[0]))}{more}  "
+            put(bar, Text.assemble((words, "bold"), ("F8: seen", "reverse")))
         replay = session.replay
         line = self.query_one("#replay", Static)
         line.display = replay is not None
@@ -168,7 +168,7 @@ class Page(Screen[None]):
 
     def _top(self) -> Text:
         session = self.session
-        text = Text.assemble(("Open Ant", "bold"), f"  {self.title}  ", no_wrap=True, overflow="ellipsis")
+        text = Text.assemble(("Open Ant", "bold"), f"  {self.title}  ", no_wrap=True, overflow=overflow())
         text.append(session.name if session.folder is not None else "no robot's folder", "bold")
         if session.doing:
             text.append(f"  {mark('wait')} {session.doing}", MARKS["wait"].colour)
@@ -184,7 +184,7 @@ class Page(Screen[None]):
             text.append_text(marked("on" if on else "off", "torque ON" if on else "torque off"))
         stop = "[SPACE: STOP]" if plain() else " SPACE: STOP "
         room = max(self.size.width - 2 - len(stop) - 1, 0)
-        text.truncate(room, overflow="ellipsis", pad=True)
+        text.truncate(room, overflow=overflow(), pad=True)
         # The brightest thing of every screen, by its brightness alone where there are no colours.
         return text.append(" ").append(stop, STOP_STYLE)
 
@@ -205,6 +205,16 @@ class Page(Screen[None]):
     def on_joint_chosen(self, message: JointChosen) -> None:
         self.session.selected = message.joint
         self.draw()
+
+
+def put(place: Static, words: Text) -> None:
+    """Show words in a place, where they are not shown already; the page is laid out anew only if the place may grow."""
+    shown = place.content
+    if not isinstance(shown, Text) or shown != words or shown.style != words.style:
+        alike = isinstance(shown, Text) and [len(line) for line in shown.split()] == [
+            len(line) for line in words.split()
+        ]
+        place.update(words, layout=not alike)
 
 
 def help_of(widget: Widget) -> str:

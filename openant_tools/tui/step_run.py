@@ -110,7 +110,8 @@ class StepRun:
                     raise self._ended
                 keep(finding, self._bench.folder)
         except (OpenAntError, OSError) as error:
-            self._done(None, str(error))
+            # Of what was ended from here that is the reason, whatever broke off by it.
+            self._done(None, str(self._ended or error))
         except ModuleNotFoundError as error:
             self._done(None, f"this step is not part of this version ({error.name} is missing)")
         except Exception as error:  # a fault of the program: the builder sees it, torque is off, the file has the rest

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -40,6 +41,8 @@ PATIENCE_S = 120.0
 LONG_S = 3600.0
 #: s in which a viewer sees what a key answers
 READ_S = 0.7
+#: what differs where the same is asked of another joint
+_SAME = re.compile(r"\d|\b(front|rear|left|right|hip|knee)\b|(hip|knee)_\w\w|counter-|clockwise.*|up:.*")
 
 #: picture → heading and words of the page
 PAGES: dict[str, tuple[str, str]] = {
@@ -221,10 +224,10 @@ async def film_walk(folder: Path) -> Film:
     try:
         async with app.run_test(size=(80, 24)) as pilot:
 
-            async def press(*keys: str) -> None:
+            async def press(*keys: str, again: bool = False) -> None:
                 for key in keys:
                     await pilot.pause(READ_S)
-                    film.press(key)
+                    film.press(key, again)
                     await pilot.press(key)
                 await pilot.pause()
 
@@ -233,8 +236,8 @@ async def film_walk(folder: Path) -> Film:
             await _until(pilot, lambda: app.session.virtual is not None and not app.session.doing)
             await press("1", "enter")
             await _go_through(pilot, app, press)
-            await press("escape", "t", "tab", "tab")  # the screen on which agents learn
-            await press("enter")
+            await press("escape", "t")  # the screen on which agents learn
+            await press("tab", "tab", "enter")  # a first look
             await _until(pilot, lambda: app.session.learning, LONG_S)
             await _until(pilot, lambda: not app.session.learning, LONG_S)
             await pilot.pause(2.0)
@@ -247,9 +250,14 @@ async def film_walk(folder: Path) -> Film:
 async def _go_through(pilot: Pilot[int], app: OpenAnt, press: Callable[..., Awaitable[None]]) -> None:
     """Every step to the last: what is offered first is chosen; the virtual robot's hands do what hands do."""
     names = list(WALK)
+    met = Counter[str]()
     while True:
         await _until(pilot, lambda: isinstance(app.screen, Question) or bool(_offered(pilot)) or _asked(pilot), LONG_S)
         screen = app.screen
+        # What is asked of one joint after the other has been seen after the second.
+        words = _SAME.sub("", screen.verdict.plain) if isinstance(screen, StepScreen) else ""
+        met[words] += 1
+        again = met[words] > 2
         if not isinstance(screen, StepScreen):
             await press("enter")
         elif STOP in _offered(pilot):
@@ -261,8 +269,8 @@ async def _go_through(pilot: Pilot[int], app: OpenAnt, press: Callable[..., Awai
             at = next((k for words in wanted for k, line in enumerate(_offered(pilot)) if line.startswith(words)), None)
             chooser = screen.query_one("#choices", Choices)
             while at is not None and chooser.highlighted is not None and chooser.highlighted != at:
-                await press("down" if chooser.highlighted < at else "up")
-            await press("enter")
+                await press("down" if chooser.highlighted < at else "up", again=again)
+            await press("enter", again=again)
 
 
 def _asked(pilot: Pilot[int]) -> bool:

@@ -32,6 +32,7 @@ class TrainingProcess(Process):
         robot: the robot's folder.
         folder: of the run; one that stands there goes on.
         where: in the robot's simulation, on the robot itself, or on a virtual robot (started for it, on its floor).
+        options: more of the command's.
     """
 
     agent: str
@@ -40,10 +41,11 @@ class TrainingProcess(Process):
     seed: int
     folder: Path
     where: Place = "sim"
+    options: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         arguments = (
-            *("train", self.agent, "--robot", str(self.robot), "--steps", str(self.steps)),
+            *("train", self.agent, "--robot", str(self.robot), "--steps", str(self.steps), *self.options),
             *("--seed", str(self.seed), "--out", str(self.folder)),
             # Who starts it on the screen has said there that the robot may move.
             *(() if self.where == "sim" else ("--env", "hardware", "--yes")),

@@ -15,6 +15,7 @@ from builder import robot
 from hypothesis import given
 from hypothesis import strategies as st
 
+from openant_tools.bringup.simulated_builder import SimulatedBuilder
 from openant_tools.calib import arena as arena_step
 from openant_tools.calib.arena import LYING_M, STANDING_M, arena, judge_sizes
 from openant_tools.calib.bounds import Unwrapped, bounds
@@ -37,7 +38,7 @@ from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import EepromWrite, Journal
-from openant_tools.procedure.step import Ask, Bench, Declined, Event, Hands, Intent, Progress, drive
+from openant_tools.procedure.step import Ask, Bench, Declined, Event, Hands, Intent, Live, Progress, drive
 from openant_tools.procedure.unfinished import unfinished
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
@@ -281,6 +282,35 @@ def test_zeros_and_ranges_that_were_left_go_on_with_the_next_joint(tmp_path):
         assert "knee_rr has another zero than when it was moved; it is done again" in builder.said
 
 
+class Late(SimulatedBuilder):
+    """Hands that read first: a task that is watched begins only once it has been watched for a while."""
+
+    waiting: Hands | None = None
+    looks = 0
+
+    def do(self, hands: Hands) -> None:
+        if hands.while_watching and hands.task == "turn":
+            self.waiting, self.looks = hands, 0
+        else:
+            super().do(hands)
+
+    def look(self, event: Event) -> None:
+        if isinstance(event, Live) and self.waiting is not None:
+            self.looks += 1
+            if self.looks > 100:
+                super().do(self.waiting)
+                self.waiting = None
+
+
+def test_a_leg_is_watched_until_hands_have_moved_it(tmp_path):
+    with robot(tmp_path / "ant") as ant:
+        builder = ant.builder()
+        builder.hands = late = Late(ant.control)
+        builder.before = late.look
+        finding, _ = ant.do(legs(replace(ant.bench, joints=("hip_fl",))), builder)
+        assert finding.ok, builder.said
+
+
 def test_legs_are_proven_one_by_one_and_a_bad_cable_is_named(tmp_path):
     fault = [{"cause": "bad_cable", "where": "knee_fr", "fraction": 0.2}]
     with robot(tmp_path / "ant", fault=fault) as ant:
@@ -393,6 +423,28 @@ def test_a_well_built_robot_has_its_zeros_on_the_grid(tmp_path):
         assert "the stand holds the torso so still that its gyro does not see the nudges" in builder.said
         assert ant.folder.config().motors["knee_rr"].zero_offset_rad == pytest.approx(math.pi + 0.03, abs=0.004)
         assert not any(ant.torque())
+
+
+class Slow(SimulatedBuilder):
+    """Hands that leave every joint where they moved it."""
+
+    def do(self, hands: Hands) -> None:
+        if hands.path_rad != (0.0,):
+            super().do(hands)
+
+
+def test_zeros_ask_once_a_joint_and_what_was_not_put_back_is_not_what_moved_next(tmp_path):
+    with robot(tmp_path / "ant") as ant:
+        builder = ant.builder()
+        builder.hands = Slow(ant.control)
+        finding, _ = ant.do(zeros(replace(ant.bench, joints=FAST)), builder)
+        asked = [event.words for event in builder.events if isinstance(event, Hands) and not event.while_watching]
+        assert [words.split(" about")[0] for words in asked] == [
+            "Put every leg straight out and hold still; torque is off.",
+            "Move the rear right hip", "Move the rear right knee", "Move the front right hip",
+        ]  # fmt: skip
+        assert finding.data["swapped"] == {}
+        assert set(finding.data["direction"].values()) == {1}
 
 
 def test_a_wrong_spline_a_mirrored_leg_and_exchanged_ids_are_all_named(tmp_path):

@@ -77,6 +77,6 @@ def test_what_eight_servos_are_told_alike_is_one_line():
     writes = [EepromWrite(joint, 10 + k, "pwm_limit", 885, 442) for k, joint in enumerate(joints)]
     writes.append(EepromWrite("knee_fl", 31, "drive_mode", 1, 0))
     assert list(changes(writes)) == [
-        "3 servos: pwm_limit 885 → 442: at most 50 % of full power",
+        "3 servos: at most 50 % of full power, as robot.toml says (pwm_limit 885 → 442)",
         "knee_fl (id 31): drive_mode 1 → 0",
     ]

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import re
+from itertools import pairwise
 from xml.etree import ElementTree
 
+import pytest
 from textual.app import App, ComposeResult
 from textual.widgets import Static
 
-from openant_tools.tui.film import END_S, LONGEST_S, STILL_S, Film
+from openant_tools.tui import film
+from openant_tools.tui.film import AGAIN, END_S, LONGEST_S, STILL_S, Film
 
 
 class Counter(App[int]):
@@ -36,7 +39,7 @@ class Clock:
         return self.now
 
 
-def filmed(pauses: list[float]) -> Film:
+def filmed(pauses: list[float], *, again: bool = False) -> Film:
     async def run() -> Film:
         app, clock = Counter(), Clock()
         film = Film(app, clock)
@@ -44,7 +47,7 @@ def filmed(pauses: list[float]) -> Film:
             film.look()
             for pause in pauses:
                 clock.now += pause
-                film.press("a")
+                film.press("a", again)
                 await pilot.press("a")
                 await pilot.pause()
                 clock.now += 0.5
@@ -72,3 +75,19 @@ def test_waiting_is_cut_and_the_whole_is_never_long() -> None:
     assert frames[-1][0] < 8 * STILL_S
     assert [moment for moment, _ in frames] == sorted(moment for moment, _ in frames)
     assert filmed([30.0] * 400).cut()[-1][0] <= LONGEST_S - END_S
+
+
+def test_what_was_shown_before_plays_faster() -> None:
+    first, again = (filmed([1.0] * 6, again=again).cut() for again in (False, True))
+    assert again[-1][0] - again[0][0] < 1.5 * AGAIN * (first[-1][0] - first[0][0])
+
+
+def test_a_film_is_never_too_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = filmed([0.3] * 30)
+    most = len(whole.svg().encode()) * 2 // 3
+    monkeypatch.setattr(film, "MOST_BYTES", most)
+    assert len(whole.svg().encode()) <= most
+    sooner, later = whole.cut(), whole.cut(1.0)
+    assert len(later) < len(sooner)
+    assert all(two - one >= 1.0 for (one, _), (two, _) in pairwise(later))
+    assert later[-1][1] == sooner[-1][1]

@@ -31,6 +31,7 @@ from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui import leg_map
 from openant_tools.tui.app import SCREENS, OpenAnt
 from openant_tools.tui.feeds import History
+from openant_tools.tui.found import numbers_lines
 from openant_tools.tui.marks import plain
 from openant_tools.tui.page import Page
 from openant_tools.tui.process import Process
@@ -320,7 +321,10 @@ def within(a: Widget, b: Widget) -> bool:
     return a in b.ancestors or b in a.ancestors
 
 
-def test_too_small_a_window_has_the_verdict_the_stop_key_and_what_to_do(worked: Run) -> None:
+@pytest.mark.parametrize("ascii_only", [False, True])
+def test_too_small_a_window_has_the_verdict_the_stop_key_and_what_to_do(worked: Run, ascii_only: bool) -> None:
+    plain(ascii_only)
+
     async def look() -> str:
         app = OpenAnt(Path("my-ant"), ticking=False)
         async with app.run_test(size=(60, 14)) as pilot:
@@ -331,4 +335,15 @@ def test_too_small_a_window_has_the_verdict_the_stop_key_and_what_to_do(worked: 
     assert "SPACE: STOP" in text
     assert "torque stays on: do not go on" in text
     assert "Make the window larger: 80 columns and 24 lines at least." in text
+    assert text.isascii() or not ascii_only
     assert json.dumps(text)  # one line of the screen is one line here
+
+
+def test_of_numbers_that_read_alike_none_is_marked_as_the_worst() -> None:
+    alike, other = (
+        tuple(Evidence(f"off the grid of {joint}", k * step, "rad", "encoder") for k, joint in enumerate(JOINT_NAMES))
+        for step in (1e-6, 1e-2)
+    )
+    for evidence, marked in ((alike, False), (other, True)):
+        lines = numbers_lines(Finding("zeros", True, "zeros", evidence, "", "zeros"))
+        assert any("the largest of its column" in line.plain for line in lines) == marked

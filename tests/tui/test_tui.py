@@ -19,9 +19,11 @@ import mujoco
 import numpy as np
 import pytest
 from rich.text import Text
+from textual.app import App
 from textual.pilot import Pilot
 from textual.widgets import Input
 
+from openant_tools.bringup.gait import first_look
 from openant_tools.bringup.walk import WALK
 from openant_tools.calib.wires import engine_config
 from openant_tools.comms import messages
@@ -32,17 +34,18 @@ from openant_tools.errors import HardwareFault
 from openant_tools.files import write_text
 from openant_tools.gap.diagnosis import Diagnosis, Found, Span
 from openant_tools.procedure.finding import Evidence, Finding, keep
-from openant_tools.procedure.step import Ask, Bench, Intent, Procedure, Say, Step
+from openant_tools.procedure.step import Ask, Bench, Intent, Live, Procedure, Say, Step
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run, write_table
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.app import SCENARIOS, SCREENS, OpenAnt
+from openant_tools.tui.bars import bars
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.dialogs import Question
 from openant_tools.tui.faults import FaultList, condition
 from openant_tools.tui.feeds import History, ReplayFeed
-from openant_tools.tui.leg_map import REST_S
+from openant_tools.tui.leg_map import REST_S, LegMap
 from openant_tools.tui.marks import plain
 from openant_tools.tui.page import Page
 from openant_tools.tui.process import Process
@@ -755,6 +758,80 @@ def test_what_was_stopped_finds_nothing(robot: RobotFolder, key: str) -> None:
     assert not list(robot.findings.glob("heedless-*"))
 
 
+def breaks(bench: Bench) -> Procedure:
+    """A procedure whose engine is gone once the robot was stopped."""
+    yield Say("it has begun")
+    HEEDED.wait(PATIENCE_S)
+    raise HardwareFault("stopped by hand", where="/dev/ttyUSB0")
+
+
+def test_a_step_that_was_suspended_says_so_and_not_what_broke_off_by_it(robot: RobotFolder) -> None:
+    HEEDED.clear()
+
+    async def suspend() -> None:
+        app = OpenAnt(robot.path)
+        async with app.run_test(size=(80, 24)) as pilot:
+            screen = StepScreen(Step("breaks", "Breaks", "Breaks.", f"{__name__}:breaks"))
+            app.push_screen(screen)
+            await choose(pilot, "Begin")
+            await until(pilot, lambda: "it has begun" in screen_text(app))
+            screen.end("suspended")
+            HEEDED.set()
+            await until(pilot, lambda: "Begin again" in offered(app))
+            assert "suspended → torque is off" in screen_text(app)
+            assert "stopped by hand" not in screen_text(app)
+        app.session.close()
+
+    asyncio.run(suspend())
+
+
+def test_a_step_shows_the_robot_beside_it_from_its_first_moment_where_there_is_room(robot: RobotFolder) -> None:
+    async def look() -> None:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(120, 40)) as pilot:
+            app.push_screen(StepScreen(WALK["centre"]))
+            await until(pilot, lambda: "Begin" in offered(app))
+            assert "servo         angle torque" in screen_text(app)
+        app.session.close()
+
+    asyncio.run(look())
+
+
+def test_a_bar_begins_at_zero_and_has_a_sign_only_where_it_can_be_negative() -> None:
+    plain(True)
+    angles = Live(
+        {"hip_rr": -0.4, "knee_rr": 0.4}, "rad", "", {"hip_rr": -0.8, "knee_rr": -0.8}, {"hip_rr": 0.8, "knee_rr": 0.8}
+    )
+    left, right = bars(angles, 80).plain.splitlines()
+    assert ("-22.9" in left, "+22.9" in right) == (True, True)
+    for line, runs in ((left, "|=+"), (right, "+=|")):
+        assert runs == "".join(dict.fromkeys(char for char in line.split(" deg ")[-1][9:-6] if char in "|=+"))
+    [warm] = bars(Live({"hip_rr": 25.0}, "°C", "", {"hip_rr": 15.0}, {"hip_rr": 80.0}), 80).plain.splitlines()
+    assert "+" not in warm
+    assert " 25 C " in warm
+
+
+def drawn(angles_rad: Mapping[str, float]) -> str:
+    """The lines of the robot from above, with these joints read, without what stands at its joints."""
+
+    async def draw() -> str:
+        history = History(tuple(angles_rad))
+        history.read(angles_rad, 0.0)
+        app = App[None]()
+        async with app.run_test(size=(36, 14)) as pilot:
+            await app.mount(LegMap(history))
+            await pilot.pause()
+            lines = app.screen._compositor.render_strips()
+            return "".join(char for line in lines for segment in line for char in segment.text if char > "\u2800")
+
+    return asyncio.run(draw())
+
+
+def test_a_servo_that_is_in_no_leg_yet_bends_none() -> None:
+    assert drawn({"knee_fr": 2.9}) == drawn({"knee_fr": 0.0})
+    assert drawn({"hip_fr": 0.0, "knee_fr": 1.2}) != drawn({"hip_fr": 0.0, "knee_fr": 0.0})
+
+
 def test_ctrl_c_leaves_with_130_and_nothing_running(robot: RobotFolder, loose: Mapping[str, str | None]) -> None:
     async def leave() -> int | None:
         app = OpenAnt(robot.path)
@@ -842,6 +919,8 @@ def test_training_is_the_command_that_one_would_type(robot: RobotFolder) -> None
     real = replace(training, where="robot")
     assert real.command == f"{training.command} --env hardware --yes"
     assert replace(training, where="virtual").command == f"{real.command} --virtual"
+    first = replace(training, options=first_look())
+    assert "--steps 2000 --learning-start 500 --entropy-start 0.1 --batch 128 --seed 1" in first.command
     training.folder.mkdir(parents=True)
     (training.folder / "learning_curve.csv").write_text("step,seconds,average_reward_m_s\n100,12.0,0.01\n200,2")
     assert [point.step for point in curve_so_far(training.folder)] == [100]

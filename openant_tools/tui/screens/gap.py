@@ -20,7 +20,7 @@ from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.dialogs import Question
-from openant_tools.tui.marks import BLUE, GREEN, ORANGE, Name, mark, marked, plain, spelled
+from openant_tools.tui.marks import BLUE, GREEN, ORANGE, Name, mark, marked, overflow, plain, spelled
 from openant_tools.tui.page import Page
 from openant_tools.tui.process import Process
 from openant_tools.tui.screens.recordings import runs_of
@@ -95,7 +95,7 @@ improved model, which `w` writes beside the robot's own. The full report with pi
         self.draw_process()
 
     def _line(self, path: Path) -> Text:
-        return Text(f"[{'x' if path in self._chosen else ' '}] {path.name}", no_wrap=True, overflow="ellipsis")
+        return Text(f"[{'x' if path in self._chosen else ' '}] {path.name}", no_wrap=True, overflow=overflow())
 
     def _list(self) -> None:
         """Read which diagnoses there are."""
@@ -104,7 +104,7 @@ improved model, which `w` writes beside the robot's own. The full report with pi
         chooser = self.query_one("#diagnoses", Choices)
         chooser.clear_options()
         for path in self._files:
-            chooser.add_option(Option(Text(_when(path), no_wrap=True, overflow="ellipsis")))
+            chooser.add_option(Option(Text(_when(path), no_wrap=True, overflow=overflow())))
         if self._files:
             chooser.highlighted = 0
         else:

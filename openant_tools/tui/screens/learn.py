@@ -14,7 +14,7 @@ from textual.containers import Horizontal, Vertical
 from textual.widgets import Input, Label, OptionList, Static
 from textual.widgets.option_list import Option
 
-from openant_tools.bringup.gait import walks_at
+from openant_tools.bringup.gait import FIRST_STEPS, first_look, walks_at
 from openant_tools.numbers import number, percent
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.curve import PAPER_CM_S, curve_lines
@@ -27,6 +27,7 @@ __all__ = ["LearnScreen"]
 
 REFRESH_S = 1.0
 ON_ROBOT = " robot"
+FIRST = "first"
 EVALUATE, PLAY, COMPARE, DIAGNOSE = "evaluate", "play", "compare", "diagnose"
 #: lines of the curve
 MOST_ROWS = 16
@@ -47,8 +48,11 @@ class LearnScreen(Page):
 
 Choose an agent and where it trains: in the simulation of this robot, or on the robot itself, on its floor under the camera
 (on a virtual robot where one is in use: one of its own, in stepped time). It is a process of its own, with the command that
-stands on the screen. You may leave this screen meanwhile. Stopping saves; the same choice goes on from there. `Space` stops
+stands on the screen. *A first look* trains for a quarter of an hour of robot time with settings that walk sooner, as the
+demo does; the others have the paper's. You may leave this screen meanwhile. Stopping saves; the same choice goes on from there. `Space` stops
 training on the robot, too, with torque off.
+
+A step is 0.12 s. The seed is what chance begins with; each number has a run of its own.
 
 The curve is the average reward over the last 120 s of robot time, in cm/s: how fast it walks where it should. The dotted line
 is what the paper's agents reached.
@@ -63,12 +67,11 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
             with Horizontal(classes="line"):
                 yield Label("steps")
                 yield Input("30000", type="integer", id="steps")
-                yield Label("of 0.12 s; 30000 are an hour of robot time", classes="after")
-            with Horizontal(classes="line"):
                 yield Label("seed")
                 yield Input("0", type="integer", id="seed")
-                yield Label("what chance begins with; each has a run of its own", classes="after")
+                yield Label("30000 steps are an hour of robot time", classes="after")
             yield Choices(
+                Option(f"A first look, in simulation: {FIRST_STEPS} steps with settings that walk sooner", id=FIRST),
                 *(Option(f"Train {name} in simulation: {_WORDS[name]}", id=name) for name in AGENTS),
                 *(Option(f"Train {name} on the robot: it moves", id=f"{name}{ON_ROBOT}") for name in AGENTS),
                 Option("Stop and save", id="stop"),
@@ -163,6 +166,8 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         if event.option_id == "stop":
             if self.session.training is not None:
                 self.session.training.stop()
+        elif event.option_id == FIRST:
+            self.start("sac", first=True)
         elif event.option_id in (EVALUATE, PLAY, COMPARE, DIAGNOSE):
             self._use(event.option_id)
         elif event.option_id is not None and event.option_id.endswith(ON_ROBOT):
@@ -186,8 +191,8 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
 
         self.app.push_screen(Question(BEFORE, f"Yes, {what}", "No"), answered)
 
-    def start(self, agent: str, where: Place = "sim") -> None:
-        """Train, or go on with the run of the same agent, place and seed."""
+    def start(self, agent: str, where: Place = "sim", *, first: bool = False) -> None:
+        """Train, or go on with the run of the same agent, place and seed; `first` as the demo does."""
         folder = self.session.folder
         progress = self.query_one("#progress", Static)
         if folder is None:
@@ -200,8 +205,14 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         if not steps.isdigit() or int(steps) < 1 or not seed.isdigit():
             progress.update(marked("fail", "steps and seed are whole numbers"))
             return
-        out = folder.runs / (f"{agent}-{seed}" if where == "sim" else f"{agent}-{where}-{seed}")
-        training = TrainingProcess(agent, folder.path, int(steps), int(seed), out, where)
+        name = agent if where == "sim" else f"{agent}-{where}"
+        length = int(steps)
+        options: tuple[str, ...] = ()
+        if first:
+            name, length, options = f"{name}-first", FIRST_STEPS, first_look()
+        training = TrainingProcess(
+            agent, folder.path, length, int(seed), folder.runs / f"{name}-{seed}", where, options
+        )
         training.start()
         self.session.training = training
         self.draw_progress()

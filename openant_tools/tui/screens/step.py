@@ -34,14 +34,15 @@ from openant_tools.procedure.step import (
 )
 from openant_tools.procedure.unfinished import forget, unfinished
 from openant_tools.robot.folder import RobotFolder
+from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.tui.bars import bars
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.dialogs import Question
 from openant_tools.tui.found import numbers_lines, verdict
 from openant_tools.tui.joint_table import JointTable
 from openant_tools.tui.leg_map import LegMap
-from openant_tools.tui.marks import MARKS, Name, mark, marked, plain, spelled
-from openant_tools.tui.page import Page
+from openant_tools.tui.marks import MARKS, Name, mark, marked, overflow, plain, spelled
+from openant_tools.tui.page import Page, put
 from openant_tools.tui.screens.walk import standing_mark
 from openant_tools.tui.step_help import step_help
 from openant_tools.tui.step_run import BY_VIRTUAL_HANDS, StepRun
@@ -65,6 +66,10 @@ class StepChoice:
 
     words: str
     do: Callable[[], None]
+
+
+def _under_way(intent: Intent) -> str:
+    return f"Under way: {intent.words}."
 
 
 class Log(VerticalScroll):
@@ -173,18 +178,18 @@ where the number lies. `l` shows the log of what was said and done instead.
         super().draw()
         if not self.query("#numbers"):
             return  # not filled yet
-        self.query_one("#head", Static).update(self._head())
+        put(self.query_one("#head", Static), self._head())
         now, found = self.query_one("#now", Static), self.query_one("#found", Static)
         now.display, found.display = bool(self._now) and not self.small, self._found is not None and not self.small
-        now.update(Text(spelled(self._now), style="bold"))
+        put(now, Text(spelled(self._now), style="bold"))
         if self._found is not None:
-            found.update(self._pinned())
+            put(found, self._pinned())
         if self._live is not self._drawn_live:
             self._drawn_live = self._live
             line = self.query_one("#bars", Static)
             line.display = self._live is not None and not self._in_table
             if self._live is not None:
-                line.update(bars(self._live, line.size.width or self.size.width - 4))
+                put(line, bars(self._live, line.size.width or self.size.width - 4))
                 self.session.read(self._live.angles_rad)
         result = self._found is not None and not self._log_wanted
         self.query_one("#log").display = not result
@@ -192,28 +197,23 @@ where the number lies. `l` shows the log of what was said and done instead.
         self.query_one("#robot").display = self._robot_shown
 
     @property
-    def _roomy(self) -> bool:
-        """Whether the robot has its place beside the rest."""
-        return self.has_class("-wide") and self.has_class("-tall")
-
-    @property
     def _in_table(self) -> bool:
         """Whether the robot's table tells what live bars would, in a small window."""
         live = self._live
         joints = live is not None and live.unit == "rad" and len(live.values) > FEW_BARS
-        return joints and self.session.feed is not None and not self._roomy
+        return joints and self.session.feed is not None and not self.roomy
 
     @property
     def _robot_shown(self) -> bool:
         """Where there is room always; in a small window while it is read, unless bars of all its joints stand there."""
-        if self._roomy:
+        if self.roomy:
             return True
         if self._live is not None and len(self._live.values) > FEW_BARS and not self._in_table:
             return False
         return self.running and len(self.session.history.rows) > 0
 
     def _head(self) -> Text:
-        text = Text(no_wrap=True, overflow="ellipsis")
+        text = Text(no_wrap=True, overflow=overflow())
         if self.running:
             progress = self._progress
             share = "" if progress is None or progress.share is None else f" {percent(progress.share)}"
@@ -250,8 +250,7 @@ where the number lies. `l` shows the log of what was said and done instead.
         self.draw()
 
     def _standing(self, folder: RobotFolder) -> Standing:
-        name = self.step.name
-        return standing(folder)[name] if name in WALK else beside(folder, name)
+        return standing(folder)[self.step.name] if self.step.name in WALK else beside(folder, self.step)
 
     def _needs(self) -> list[str]:
         """What must be at hand, and what it does to the robot."""
@@ -354,7 +353,7 @@ where the number lies. `l` shows the log of what was said and done instead.
             return whole
         first = whole.split("\n")[0]
         return first.append(
-            f"\n  {mark('warn')} {len(self._found.lines)} things are to be seen to:", MARKS["warn"].colour
+            f"\n  {mark('warn')} {len(self._found.lines)} to be seen to, listed below", MARKS["warn"].colour
         )
 
     def _fits(self, whole: Text) -> bool:
@@ -363,7 +362,7 @@ where the number lies. `l` shows the log of what was said and done instead.
     def _draw_numbers(self) -> None:
         if self._found is None:
             return
-        beside = ROBOT if self._roomy else 0
+        beside = ROBOT if self.roomy else 0
         lines = numbers_lines(self._found, self.size.width - beside - 3)
         whole = verdict(self._found)
         if not self._fits(whole):
@@ -391,7 +390,14 @@ where the number lies. `l` shows the log of what was said and done instead.
             self.app.call_from_thread(callback, *arguments)
 
     def shown(self, event: Event) -> None:
-        """Draw one event, and offer the answers that it takes."""
+        """Draw one event, and offer the answers that it takes; the joint that it is about is the chosen one."""
+        about = event.joint if isinstance(event, Hands) else ""
+        if isinstance(event, Live) and len(event.values) == 1:
+            about = next(iter(event.values))
+        if about in JOINT_NAMES:
+            self.session.selected = about
+        if isinstance(event, Intent | Ask | Hands) and not (isinstance(event, Hands) and event.while_watching):
+            self._live = None  # what is asked has nothing to do with what was seen before
         if isinstance(event, Live):
             self._live = event
         elif isinstance(event, Progress):
@@ -403,10 +409,8 @@ where the number lies. `l` shows the log of what was said and done instead.
             if event.picture is not None:
                 self.say(Text(f"picture: {event.picture}"))
         elif isinstance(event, Intent):
-            self._live = None
             self._intend(event)
         elif isinstance(event, Ask):
-            self._live = None
             self._ask(event)
         elif isinstance(event, Hands):
             self._hands(event)
@@ -421,6 +425,7 @@ where the number lies. `l` shows the log of what was said and done instead.
             lines = [*lines[: max(room - 1, 0)], f"and {len(left)} more, below"]
         self._now = "\n".join([words, *(f"  {line}" for line in lines)])
         if self._granted_all and not event.moves:
+            self._now = _under_way(event)
             self._log_intent(event)
             self.say(marked("ok", "granted with the rest"))
             self._reply_later(True)
@@ -435,7 +440,7 @@ where the number lies. `l` shows the log of what was said and done instead.
         ]
         if event.registers and not event.moves:
             choices.insert(1, StepChoice("Yes, and all further writes of this step", self._grant_all))
-        self.ask(event, f"May it?{count}{motion}", choices)
+        self.ask(event, f"Do it?{count}{motion}", choices)
 
     def _log_intent(self, event: Intent) -> None:
         self.say(Text(f"{mark('info')} It will {event.words}.", style="bold"))
@@ -457,9 +462,11 @@ where the number lies. `l` shows the log of what was said and done instead.
             default = event.choices.index(str(event.default)) if event.default in event.choices else 0
             self.ask(event, "", choices, default)
             return
-        of = [event.unit] if event.unit not in ("", "text") else []
-        of += [span(event.low, event.high)] if event.low is not None and event.high is not None else []
-        self.ask(event, f"Your answer ({', '.join(of)}), then Enter:" if of else "Your answer, then Enter:", [])
+        unit = "" if event.unit == "text" else event.unit
+        of = f"A number, in {unit}" if unit else "Your answer"
+        if event.low is not None and event.high is not None:
+            of = f"{exact(event.low)} to {exact(event.high, unit)}"
+        self.ask(event, f"{of}, then Enter:", [])
         field = self.query_one("#value", Input)
         field.display = True
         given = event.default
@@ -514,6 +521,7 @@ where the number lies. `l` shows the log of what was said and done instead.
             self._log_intent(self._pending)
         elif isinstance(self._pending, Hands):
             self.say(Text(f"{mark('info')} {self._pending.words}", style="bold"))
+        self._now = _under_way(self._pending) if isinstance(self._pending, Intent) else self.step.does
         self._pending = None
         self.say(Text(f"  {mark('ok')} {asked}{words}", style=MARKS["todo"].colour))
         self.offer("", [])
