@@ -138,7 +138,7 @@ All strips of a signal share one scale, which stands in the top line; it grows w
         height = max(1, min(MOST_LINES, (self.size.height - 2) // max(1, len(history.joints))))
         stop = float(history.t[-1]) if len(history.rows) else WINDOW_S
         grey = Style(color="#A8A8A8")
-        unit = spelled(chosen.unit)
+        unit = spelled(chosen.unit).strip()
         title = f"{chosen.title} {unit}"
         scale = f"{spelled(span(low, high, chosen.unit))}, {number(WINDOW_S)} s"
         head = f"{'joint':9}{'servo':9}{title}"
