@@ -206,7 +206,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     except (
         Exception
     ):  # a fault of the program: its traceback goes to stderr as ever, and where `openant support` finds it
-        _log.debug("a fault of the program", exc_info=True)
+        _log.info("a fault of the program", exc_info=True)
         raise
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import signal
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import ClassVar
 
+from rich.text import Text
 from textual import work
 from textual.app import App, SystemCommand
 from textual.binding import Binding, BindingType
@@ -47,6 +50,7 @@ TICK_S = 0.1
 END_S = 10.0
 
 INTERRUPTED = 130
+_log = logging.getLogger(__name__)
 #: the folder that is offered where there is none
 NEW_ROBOT = "my-ant"
 SCENARIOS = Path(__file__).parent / "scenarios"
@@ -205,6 +209,18 @@ class OpenAnt(App[int]):
             suspend(number, frame)
 
         signal.signal(SUSPENDED, stop)
+
+    def _fatal_error(self) -> None:
+        """Textual's end for a fault of the program: torque goes off, the log has the traceback, the terminal one line."""
+        self.session.release()
+        error = sys.exc_info()[1]
+        _log.info("a fault of the program", exc_info=True)
+        files = [one.baseFilename for one in logging.getLogger().handlers if isinstance(one, logging.FileHandler)]
+        log = f"the log is {files[0]}" if files else "nothing is logged here"
+        what = " ".join(f"{type(error).__name__}: {error}".split())
+        self.panic(
+            Text(f"openant: a fault of the program, torque is off: {what} → report it (`openant support`); {log}")
+        )
 
     async def action_quit(self) -> None:
         self.action_leave()
