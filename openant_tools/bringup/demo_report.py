@@ -254,7 +254,6 @@ def _gap_figure(moment: Moment) -> MatplotlibFigure:
     figure: MatplotlibFigure
     figure, (above, below) = plots.figure(2, 1, height=2.2, sharex=True)
     draw_moment(above, below, moment)
-    plots.legend(above)
     return figure
 
 
@@ -318,7 +317,7 @@ def _overview_figure(
     from matplotlib.figure import Figure as Canvas
     from matplotlib.image import imread
 
-    figure = Canvas(figsize=(11.0, 5.0))
+    figure = Canvas(figsize=(plots.WIDTH, 4.6))
     with plots.style():
         figure.set_layout_engine("constrained")
         left, right = np.ravel(np.asarray(figure.subfigures(1, 2, width_ratios=(1.0, 1.35))))

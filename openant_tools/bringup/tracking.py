@@ -63,13 +63,7 @@ def worst_moment(run: Run, nominal: Path, calibrated: Path) -> Moment:
 
 def draw_moment(above: Any, below: Any, moment: Moment) -> None:
     """Positions into the upper axes, errors of both models into the lower."""
-    with plots.style():
-        above.plot(moment.t, plots.DEGREES * moment.command, color=plots.INK, linewidth=0.8, alpha=0.5, label="command")
-        above.plot(moment.t, plots.DEGREES * moment.measured, color=plots.INK, linewidth=2.2, label="measured")
-        above.plot(moment.t, plots.DEGREES * moment.nominal, "--", color=plots.VERMILLION, label="data sheets")
-        above.plot(moment.t, plots.DEGREES * moment.calibrated, color=plots.BLUE, label="calibrated")
-        above.set_ylabel(plots.axis_label(moment.joint, "°"))
-        below.plot(moment.t, 1e3 * (moment.measured - moment.nominal), "--", color=plots.VERMILLION)
-        below.plot(moment.t, 1e3 * (moment.measured - moment.calibrated), color=plots.BLUE)
-        below.set_ylabel(plots.axis_label("measured − simulated", "mrad"))
-        below.set_xlabel(plots.axis_label("time in run", "s"))
+    plots.draw_tracking(
+        above, below, moment.joint, moment.t, moment.command, moment.measured, moment.nominal, moment.calibrated,
+        names=("data sheets", "calibrated"),
+    )  # fmt: skip

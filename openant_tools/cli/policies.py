@@ -18,7 +18,6 @@ from openant_tools.numbers import number, percent
 
 if TYPE_CHECKING:
     from openant_agents.ranking import PlaceResult
-    from openant_tools.report import Report
 
 __all__ = ["policies"]
 
@@ -122,7 +121,7 @@ def rank(
     need_agents()
     from openant_agents.exploits import DISTURBANCES, flag
     from openant_agents.ranking import agreement, find_policies
-    from openant_agents.ranking_figure import draw_ranking
+    from openant_agents.ranking_report import ranking_report
     from openant_tools.files import json_text, write_text
 
     places = _simulations(simulations)
@@ -166,9 +165,7 @@ def rank(
     for one in flags:
         click.echo(f"exploit? {one.words}")
     if report is not None:
-        picture = report / "ranking.png"
-        draw_ranking(names, on_robot, simulated, found, [one.policy for one in flags], picture)
-        write_report(_page(picture, found, [one.words for one in flags]), report, [folder])
+        write_report(ranking_report(names, on_robot, simulated, found, flags), report, [folder])
     if json_file is not None:
         answer = {
             "schema": "openant.ranking/1",
@@ -206,38 +203,6 @@ def _print(names: list[str], real: Mapping[str, Any], simulated: Mapping[str, An
             f" rank violation {number(100 * v.value, 'cm/s', decimals=1)}, regret {number(100 * r.value, 'cm/s', decimals=1)}"
             f" ({percent(one.regret_share)}): its best is number {one.best_is} of {one.policies} on the robot"
         )
-
-
-def _page(picture: Path, found: Mapping[str, Any], flags: list[str]) -> Report:
-    """The ranking as a report."""
-    from openant_tools.numbers import number, percent
-    from openant_tools.report import Picture, Report, ReportSummary
-
-    def words(one: Any, factor: float = 1.0, unit: str = "") -> str:
-        return number(factor * one.value, unit, factor * one.low, factor * one.high)
-
-    best, agreed = max(found.items(), key=lambda item: item[1].spearman.value)
-    told = agreed.spearman.low > 0
-    answer = ReportSummary(
-        f"{best} ranks {agreed.policies} policies most as the robot does (Spearman {words(agreed.spearman)})."
-        if told
-        else f"Of {agreed.policies} policies, no simulation is known to rank them as the robot does.",
-        Picture(picture, "Each policy's reward in a simulation and on the robot, with a standard error."),
-        f"Choosing by {best} costs {words(agreed.regret_m_s, 100, 'cm/s')} of reward: its best is number {agreed.best_is} on the robot."
-        + "".join(f"\n\nPerhaps an exploit of the simulation: {line}" for line in flags),
-        f"Choose policies by {best}."
-        if told
-        else "Play more policies on the robot, or calibrate: `openant sysid fit`.",
-        "good" if told else "warn",
-    )
-    return Report("Ranking of policies", ", ".join(found), answer).section("Figures").table(
-        ["simulation", "Spearman", "Kendall", "rank violation", "regret", "of the best"],
-        [
-            [name, words(one.spearman), words(one.kendall), words(one.rank_violation_m_s, 100, "cm/s"),
-             words(one.regret_m_s, 100, "cm/s"), percent(one.regret_share)]
-            for name, one in found.items()
-        ],
-    )  # fmt: skip
 
 
 def _simulations(given: tuple[str, ...]) -> dict[str, str]:

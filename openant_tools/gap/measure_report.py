@@ -155,24 +155,12 @@ def worst(found: Measurement) -> MatplotlibFigure:
     one = found.played[k]
     t = one.run.t
     near = np.abs(t - t[row]) <= WINDOW_S / 2
-    figure, axes = plots.figure(height=2.6)
-    start = t[0]
-    command = one.run.signal("cmd", found.joints)[near, j]
-    axes.step(
-        t[near] - start, plots.DEGREES * command, where="post", color=plots.INK, lw=0.8, alpha=0.6, label="command"
-    )
-    axes.plot(t[near] - start, plots.DEGREES * one.measured["pos"][near, j], color=plots.BLUE, label="measured")
-    axes.plot(
-        t[near] - start,
-        plots.DEGREES * one.simulated["pos"][near, j],
-        color=plots.VERMILLION,
-        ls="--",
-        label="simulated",
-    )
-    axes.set_xlabel(plots.signal_label("t"))
-    axes.set_ylabel(plots.signal_label("pos"))
-    axes.set_title(f"{found.joints[j]}, {one.run.name}", loc="left", fontsize=10, fontweight="bold")
-    plots.legend(axes)
+    figure, (above, below) = plots.figure(2, 1, height=1.8, sharex=True)
+    plots.draw_tracking(
+        above, below, found.joints[j], t[near] - t[0], one.run.signal("cmd", found.joints)[near, j],
+        one.measured["pos"][near, j], one.simulated["pos"][near, j], names=("simulated", ""),
+    )  # fmt: skip
+    above.set_title(one.run.name, loc="left", fontsize=10, fontweight="bold")
     return figure
 
 

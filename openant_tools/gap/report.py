@@ -251,25 +251,13 @@ def worst(found: Diagnosis, runs: Sequence[Run], model: Path) -> MatplotlibFigur
     _, run, row, j, both = best
     t = run.t
     near = np.abs(t - t[row]) <= WINDOW_S / 2
-    figure, axes = plots.figure(height=2.8)
-    since = t[near] - t[0]
-    axes.step(
-        since,
-        plots.DEGREES * run.signal("cmd", joints)[near, j],
-        where="post",
-        color=plots.INK,
-        lw=0.8,
-        alpha=0.6,
-        label="command",
-    )
-    axes.plot(since, plots.DEGREES * run.signal("pos", joints)[near, j], color=plots.BLUE, label="measured")
-    axes.plot(since, plots.DEGREES * both[0][near, j], color=plots.VERMILLION, ls="--", label="given model")
-    if selected or found.calibration:
-        axes.plot(since, plots.DEGREES * both[1][near, j], color=plots.GREEN, ls="-.", label="improved model")
-    axes.set_xlabel(plots.signal_label("t"))
-    axes.set_ylabel(plots.signal_label("pos"))
-    axes.set_title(f"{joints[j]}, {run.name}", loc="left", fontsize=10, fontweight="bold")
-    plots.legend(axes)
+    figure, (above, below) = plots.figure(2, 1, height=1.8, sharex=True)
+    improved_too = both[1][near, j] if selected or found.calibration else None
+    plots.draw_tracking(
+        above, below, joints[j], t[near] - t[0], run.signal("cmd", joints)[near, j], run.signal("pos", joints)[near, j],
+        both[0][near, j], improved_too, names=("given model", "improved model"),
+    )  # fmt: skip
+    above.set_title(run.name, loc="left", fontsize=10, fontweight="bold")
     return figure
 
 

@@ -318,13 +318,17 @@ class Details:
         return {"kind": "details", "summary": self.summary, "parts": [part.json() for part in self.parts]}
 
 
+#: characters of a command that stays on one line; a browser breaks after each of its dashes
+FEW, SHORT = 24, " class=short"
+
+
 def _inline(text: str) -> str:
     """Escaped text with `code`, **bold**, *em* and [links](url); code is left as it is inside."""
     out = []
     for k, piece in enumerate(re.split(r"`([^`]+)`", text)):
         safe = escape(re.sub(r"(?<=\d) (?=%)", "\u00a0", piece))
         if k % 2:
-            out.append(f"<code>{safe}</code>")
+            out.append(f"<code{SHORT if len(piece) <= FEW else ''}>{safe}</code>")
             continue
         safe = re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", safe)
         safe = re.sub(r"\*(\S(?:[^*]*[^*\s])?)\*", r"<em>\1</em>", safe)

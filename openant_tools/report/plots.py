@@ -21,12 +21,16 @@ from typing import TYPE_CHECKING, Any
 from openant_tools.numbers import readable
 
 if TYPE_CHECKING:
+    import numpy as np
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
 
 __all__ = [
     "BLUE", "CYCLE", "DEGREES", "GREEN", "INK", "ORANGE", "PURPLE", "SIGNAL_LABELS", "SKY", "VERMILLION", "YELLOW", "as_png",
-    "as_svg", "axis_label", "figure", "legend", "signal_label", "signal_unit", "style",
+    "as_svg", "axis_label", "draw_tracking", "figure", "legend", "signal_label", "signal_unit", "style",
 ]  # fmt: skip
 
 # Okabe and Ito's palette (https://jfly.uni-koeln.de/color/): eight colours that all kinds of eyes tell apart.
@@ -131,6 +135,39 @@ def signal_label(signal: str) -> str:
 def signal_unit(signal: str) -> str:
     """The unit that files have a signal or column of a run in."""
     return "rad" if signal == "base.yaw" else SIGNAL_LABELS.get(signal.partition(".")[0], ("", ""))[1]
+
+
+def draw_tracking(
+    above: Axes,
+    below: Axes,
+    joint: str,
+    t: Array,
+    command: Array,
+    measured: Array,
+    given: Array,
+    better: Array | None = None,
+    *,
+    names: tuple[str, str] = ("given model", "calibrated"),
+) -> None:
+    """One joint's position into the upper axes, and what each model leaves of it into the lower; alike in every report.
+
+    Args:
+        t: (rows,) s. command, measured: (rows,) rad. given, better: (rows,) rad as simulated; None for no second model.
+        names: of both models.
+    """
+    with style():
+        above.step(t, DEGREES * command, where="post", color=INK, linewidth=0.8, alpha=0.5, label="command")
+        # Broad, since a good model lies upon it.
+        above.plot(t, DEGREES * measured, color=INK, linewidth=2.2, label="measured")
+        for values, name, line, colour in ((given, names[0], "--", VERMILLION), (better, names[1], "-", BLUE)):
+            if values is not None:
+                above.plot(t, DEGREES * values, line, color=colour, label=name)
+                below.plot(t, 1e3 * (measured - values), line, color=colour)
+        below.axhline(0.0, color=INK, linewidth=0.6)
+        above.set_ylabel(axis_label(joint, "°"))
+        below.set_ylabel(axis_label("error", "mrad"))
+        below.set_xlabel(axis_label("time in run", "s"))
+    legend(above)
 
 
 def legend(axes: Axes, **options: Any) -> None:

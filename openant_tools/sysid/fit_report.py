@@ -260,18 +260,7 @@ def _moments(result: Identification, data: Dataset) -> Sequence[_Moment]:
         at = np.arange(part.start, part.stop)[rows]
         measured, given, calibrated = data.measured[at, j], pos[0, at, j], pos[1, at, j]
         figure, (above, below) = plots.figure(2, 1, height=1.8, sharex=True)
-        with plots.style():
-            command = plots.DEGREES * run.column(f"cmd.{joint}")[rows]
-            above.plot(t, command, color=plots.INK, linewidth=0.8, alpha=0.6, label="command")
-            above.plot(t, plots.DEGREES * measured, color=plots.GREEN, label="measured")
-            above.plot(t, plots.DEGREES * given, "--", color=plots.ORANGE, label="given model")
-            above.plot(t, plots.DEGREES * calibrated, color=plots.BLUE, label="calibrated")
-            above.set_ylabel(plots.axis_label(joint, "°"))
-            below.plot(t, 1e3 * (measured - given), "--", color=plots.ORANGE)
-            below.plot(t, 1e3 * (measured - calibrated), color=plots.BLUE)
-            below.set_ylabel(plots.axis_label("error", "mrad"))
-            below.set_xlabel(plots.axis_label("time in run", "s"))
-        plots.legend(above)
+        plots.draw_tracking(above, below, joint, t, run.column(f"cmd.{joint}")[rows], measured, given, calibrated)
         before, after = (gap(data.measured[:, j], pos[v, :, j]) for v in (0, 1))
         moments.append(_Moment(joint, run.name, before, after, figure))
     return moments
