@@ -124,7 +124,7 @@ def fit_once(length: float, kinds: Sequence[str] | None) -> dict[str, Any]:
     wall, cpu = time.perf_counter(), cpu_s()
     progress = 0
 
-    def tell(what: str, done: float) -> None:
+    def tell(done: float, what: str) -> None:
         nonlocal progress
         progress += 1
 

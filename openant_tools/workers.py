@@ -74,7 +74,7 @@ def end_with_who_started_us() -> None:
         end_with(int(parent), orderly=True)
 
 
-def pass_on(words: str, share: float) -> None:
+def pass_on(share: float, words: str) -> None:
     """Tell whoever started this command how far it is (share from 0 to 1), where that was asked for (`PROGRESS`)."""
     fd = _progress_fd()
     if fd is not None:

@@ -64,7 +64,7 @@ def make_set(
     answers: Sequence[Answer] | None = None,
     maker: str | None = None,
     jobs: int = 1,
-    progress: Callable[[str, float], None] = lambda words, share: None,
+    progress: Callable[[float, str], None] = lambda share, words: None,
 ) -> str:
     """Draw robots, simulate them, write their tables; what is there already is kept, so that it can go on.
 
@@ -101,15 +101,15 @@ def make_set(
     batches = [by_batch[at : at + SIDE_BY_SIDE] for at in range(0, len(by_batch), SIDE_BY_SIDE)]
     batches += [[name] for name in todo if robots[name].maker == BUS]
     work = (delayed(tied(_make_batch))(out, [(name, robots[name]) for name in batch], played) for batch in batches)
-    progress("simulating", 0.0)
+    progress(0.0, "simulating")
     # A robot of the bus takes about as long as a batch of the others.
     for done, _ in enumerate(Parallel(n_jobs=jobs, return_as="generator_unordered")(work), 1):
-        progress("simulating", done / len(batches))
+        progress(done / len(batches), "simulating")
     return commitment
 
 
 def _make_by_command(
-    out: Path, robots: Mapping[str, Answer], command: str, jobs: int, progress: Callable[[str, float], None]
+    out: Path, robots: Mapping[str, Answer], command: str, jobs: int, progress: Callable[[float, str], None]
 ) -> None:
     facts = read_toml(out / "set.toml")
     left_out = list(facts.get("left_out", []))
@@ -118,14 +118,14 @@ def _make_by_command(
     def one(name: str) -> tuple[str, bool]:
         return name, make_by_command(command, robots[name], out / name, out / "model.xml")
 
-    progress("simulating", 0.0)
+    progress(0.0, "simulating")
     # Threads: each waits for a process.
     made = Parallel(n_jobs=jobs, prefer="threads", return_as="generator_unordered")(delayed(one)(name) for name in todo)
     for done, (name, could) in enumerate(made, 1):
         if not could:
             left_out.append(name)
             write_text(out / "set.toml", tomlkit.dumps(facts | {"left_out": sorted(left_out)}))
-        progress("simulating", done / len(todo))
+        progress(done / len(todo), "simulating")
 
 
 def _name(k: int) -> str:

@@ -67,7 +67,7 @@ def run_set(
     backend: Backend = "loky",
     scheduler: str | None = None,
     diagnose: Diagnose = diagnose_robot,
-    progress: Callable[[str, float], None] = lambda words, share: None,
+    progress: Callable[[float, str], None] = lambda share, words: None,
 ) -> int:
     """Diagnose what has no verdict yet; how many that were.
 
@@ -88,7 +88,7 @@ def run_set(
         judge = tied(_judge) if backend == "loky" else _judge  # the others' workers may be on other machines
         work = (delayed(judge)(folder, robot, diagnose) for robot in todo)
         for done, name in enumerate(Parallel(return_as="generator_unordered")(work), 1):
-            progress(name, done / len(todo))
+            progress(done / len(todo), name)
     return len(todo)
 
 

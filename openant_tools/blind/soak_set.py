@@ -27,10 +27,10 @@ __all__ = ["SCHEMA", "make_soaks", "read_soak_answers", "read_verdicts", "run_so
 
 SCHEMA = "openant.blind-comms/1"
 
-Progress = Callable[[str, float], None]
+Progress = Callable[[float, str], None]
 
 
-def _quiet(words: str, share: float) -> None:
+def _quiet(share: float, words: str) -> None:
     """Nobody looks."""
 
 
@@ -81,7 +81,7 @@ def make_soaks(
     todo = [k for k in range(count) if not (out / f"{_name(k)}.parquet").exists()]
     work = (delayed(tied(_make))(out, _name(k), answers[k]) for k in todo)
     for done, name in enumerate(Parallel(n_jobs=jobs, return_as="generator_unordered")(work), 1):
-        progress(name, done / len(todo))
+        progress(done / len(todo), name)
     return commitment
 
 
@@ -131,7 +131,7 @@ def run_soaks(folder: Path, *, jobs: int = 1, progress: Progress = _quiet) -> in
     todo = [path for path in sorted(folder.glob("soak-*.parquet")) if not _verdict(folder, path.stem).exists()]
     work = (delayed(tied(_diagnose))(folder, path) for path in todo)
     for done, name in enumerate(Parallel(n_jobs=jobs, return_as="generator_unordered")(work), 1):
-        progress(name, done / len(todo))
+        progress(done / len(todo), name)
     return len(todo)
 
 

@@ -14,7 +14,6 @@ from dataclasses import replace
 import numpy as np
 
 from openant_tools.bringup.gap_check import gap_by_joint
-from openant_tools.bringup.relay import relayed
 from openant_tools.calib.inventory import silence_words
 from openant_tools.calib.sweep import FOLLOWED, JointSweep, analyse, joint_sweep_of, play_watched, sweep
 from openant_tools.calib.wires import engine_config, opened_bus, opened_imu, robot_servos
@@ -29,6 +28,7 @@ from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.gap.measure import measure
 from openant_tools.numbers import number, percent
 from openant_tools.procedure.finding import Evidence, Finding, latest
+from openant_tools.procedure.relay import relayed
 from openant_tools.procedure.step import Ask, Bench, Intent, Procedure, Progress, Say, Subroutine
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from openant_tools.bringup.relay import relayed
 from openant_tools.calib.comms_health import comms_health
 from openant_tools.calib.wires import engine_config
 from openant_tools.comms.dropouts.diagnose import diagnose_dropouts
@@ -12,6 +11,7 @@ from openant_tools.comms.dropouts.outcome import dropouts_finding
 from openant_tools.comms.soak import soak
 from openant_tools.numbers import exact, number
 from openant_tools.procedure.finding import together
+from openant_tools.procedure.relay import relayed
 from openant_tools.procedure.step import Ask, Bench, Intent, Procedure
 from openant_tools.recording.tables import read_run
 
@@ -44,8 +44,7 @@ def comms_step(bench: Bench) -> Procedure:
     config, text = engine_config(bench), bench.folder.config_file.read_text(encoding="utf-8")
     soaked = yield from relayed(
         lambda progress, notice: soak(
-            config, path, 60 * minutes, robot_toml=text, notice=notice,
-            progress=lambda share, statistics: progress("the legs swing", share),
+            config, path, 60 * minutes, robot_toml=text, notice=notice, progress=progress,
         )
     )  # fmt: skip
     told = yield from relayed(lambda progress, notice: diagnose_dropouts([read_run(path, need=())]))

@@ -315,7 +315,7 @@ class Demo:
             return False
         return all(path.exists() for path in stage.results) and not _older(stage.results, stage.inputs)
 
-    def run(self, stage: Stage, progress: Callable[[str, float], None] = lambda words, share: None) -> None:
+    def run(self, stage: Stage, progress: Callable[[float, str], None] = lambda share, words: None) -> None:
         """Do a stage; its commands and what they say go to the log.
 
         Args:
@@ -332,8 +332,8 @@ class Demo:
                 _remove(path)
         for number, command in enumerate(stage.commands):
 
-            def tell(words: str, share: float, number: int = number) -> None:
-                progress(words, (number + share) / len(stage.commands))
+            def tell(share: float, words: str, number: int = number) -> None:
+                progress((number + share) / len(stage.commands), words)
 
             with self.log.open("a", encoding="utf-8") as log:
                 log.write(f"$ {words_of(command)}\n")
@@ -362,7 +362,7 @@ def words_of(command: Sequence[str]) -> str:
 
 
 def openant(
-    command: Sequence[str], log: IO[str] | None = None, progress: Callable[[str, float], None] | None = None
+    command: Sequence[str], log: IO[str] | None = None, progress: Callable[[float, str], None] | None = None
 ) -> int:
     """Run `openant` with these arguments and return its exit code.
 
@@ -389,7 +389,7 @@ def openant(
         raise
     finally:
         os.close(tells)
-    hears = threading.Thread(target=_hear, args=(told, progress or (lambda words, share: None)), daemon=True)
+    hears = threading.Thread(target=_hear, args=(told, progress or (lambda share, words: None)), daemon=True)
     hears.start()
     interrupted = False
     while True:
@@ -406,13 +406,13 @@ def openant(
     return code
 
 
-def _hear(told: int, progress: Callable[[str, float], None]) -> None:
+def _hear(told: int, progress: Callable[[float, str], None]) -> None:
     """What `workers.pass_on` says in the command, until it has ended."""
     with open(told, encoding="utf-8", errors="replace") as lines:
         for line in lines:
             share, _, words = line.rstrip("\n").partition(" ")
             with contextlib.suppress(ValueError):
-                progress(words, float(share))
+                progress(float(share), words)
 
 
 def _older(results: Sequence[Path], inputs: Sequence[Path]) -> bool:

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from openant_tools.bringup.relay import relayed
 from openant_tools.errors import BadInput
 from openant_tools.gap.measure import Measurement, difference, measure
 from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding, latest
+from openant_tools.procedure.relay import relayed
 from openant_tools.procedure.step import Bench, Procedure
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.folder import NOMINAL_MODEL

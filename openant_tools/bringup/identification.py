@@ -5,10 +5,10 @@ from __future__ import annotations
 import datetime
 
 from openant_tools import sysid
-from openant_tools.bringup.relay import relayed
 from openant_tools.calib.wires import engine_config
 from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
+from openant_tools.procedure.relay import relayed
 from openant_tools.procedure.step import Bench, Intent, Procedure
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.folder import NOMINAL_MODEL

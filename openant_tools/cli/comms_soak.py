@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -15,9 +15,7 @@ from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_optio
 from openant_tools.numbers import number, percent
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from rich.console import Console
+    pass
 
 __all__ = ["soak"]
 
@@ -117,7 +115,7 @@ def _on_the_bus(
                 f"all {len(config.servos)} joints swing by up to 0.25 rad; the robot must be on its stand, legs free"
             )
             may_move(yes, remedy="add --yes if it may, or --still")
-        shown = stack.enter_context(_bar(console))
+        shown = stack.enter_context(progress_bar("soaking", console=console))
         try:
             done = soak_bus(
                 config, path, seconds, move=not still, resume=resume, thin_s=None if every_cycle else THIN_S,
@@ -146,21 +144,7 @@ def _on_the_bus(
         raise SystemExit(1)
 
 
-@contextlib.contextmanager
-def _bar(console: Console) -> Iterator[Callable[[float, Mapping[str, Any]], None]]:
-    with progress_bar("soaking", console=console) as tell:
-
-        def update(share: float, statistics: Mapping[str, Any]) -> None:
-            asked = sum(servo["asked"] for servo in statistics["servos"])
-            answered = sum(servo["answered"] for servo in statistics["servos"])
-            tell(f"{asked - answered} of {asked} answers lost", share)
-
-        yield update
-
-
 def _transactions(source: str, out: Path, seconds: float, rate_hz: float, still: bool) -> None:
-    from rich.console import Console
-
     from openant_tools.blind.soak_virtual import swinging_soak
     from openant_tools.errors import BadInput
     from openant_tools.recording.tables import write_table
@@ -175,9 +159,9 @@ def _transactions(source: str, out: Path, seconds: float, rate_hz: float, still:
             "a running robot has ports only", where=source, remedy="name a scenario, or leave out --transactions"
         )
     scenario = Scenario() if source == VIRTUAL_DEFAULT else load_scenario(Path(source))
-    with _bar(Console(stderr=True)) as progress:
+    with progress_bar("soaking") as tell:
         run = swinging_soak(
-            scenario, seconds, rate_hz, out.stem, still=still, progress=lambda share: progress(share, {"servos": []})
+            scenario, seconds, rate_hz, out.stem, still=still, progress=lambda share: tell(share, "soaking")
         )
     write_table(run, out)
     click.echo(f"{out}  {number(run.duration_s, 's', decimals=0)}, {len(run.t)} rows")

@@ -90,7 +90,7 @@ def demo(robot: Path, steps: int, fresh: bool, json_file: Path | None) -> None:
 
 
 @contextlib.contextmanager
-def _bar(console: Console, line: str) -> Iterator[Callable[[str, float], None]]:
+def _bar(console: Console, line: str) -> Iterator[Callable[[float, str], None]]:
     """A step's line with a bar of its own below, which goes when the step is done; yields what is told how far it is."""
     from rich.console import Group
     from rich.live import Live
@@ -102,7 +102,7 @@ def _bar(console: Console, line: str) -> Iterator[Callable[[str, float], None]]:
     bar = Progress(*columns, console=console)
     task = bar.add_task("", total=1.0)
     with Live(Group(Text.from_markup(line), bar), console=console, transient=True):
-        yield lambda words, share: bar.update(task, completed=share, description=escape(words))
+        yield lambda share, words: bar.update(task, completed=share, description=escape(words))
 
 
 def _print(whole: Any, figures: dict[str, Any]) -> None:

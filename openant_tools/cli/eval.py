@@ -161,7 +161,7 @@ def eval_(
                         f"{way} {number(100 * average, 'cm/s', sign=True, decimals=1)}",
                     )
                     bar.update(task, completed=so_far, description=words)
-                    pass_on(words, so_far / (len(ways) * starts * seconds))
+                    pass_on(so_far / (len(ways) * starts * seconds), words)
 
                 found.append(evaluate(env, policy, way=way, seconds=seconds, starts=starts, seed=seed, report=tell))
         sampled = found[0]

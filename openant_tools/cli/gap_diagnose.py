@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,8 +20,6 @@ __all__ = ["apply", "diagnose", "next_experiment", "prepare"]
 
 #: effects shown in the terminal; the JSON has all
 SHOWN = 6
-#: lines of progress at most
-TOLD = 20
 
 runs_argument = click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RUN…")
 model_option = click.option(
@@ -83,7 +78,7 @@ def diagnose(
     everything, given = model_of([*fitted, *held], model, robot)
     everything = checked(everything, given, joints)
     recordings, held_out = everything[: len(fitted)], everything[len(fitted) :]
-    with progress() as tell:
+    with progress_bar("reading", lines=True) as tell:
         found = diagnosed(recordings, given, hold_out=held_out, joints=joints or None, prior=prior, progress=tell)
         if json_file:
             write_text(json_file, json_text(found.as_json()))
@@ -107,7 +102,7 @@ def prepare(runs: tuple[Path, ...], model: Path | None, joints: tuple[str, ...],
 
     recordings, given = model_of(read_runs(runs), model, robot)
     recordings = checked(recordings, given, joints)
-    with progress() as tell:
+    with progress_bar("reading", lines=True) as tell:
         made = prepared(recordings, given, joints or None, tell)
     click.echo(f"ready: {made} simulated robots")
 
@@ -164,31 +159,13 @@ def next_experiment(diagnosis: Path, model: Path | None, json_file: Path | None)
     from openant_tools.gap.next import experiments
 
     found = read_diagnosis(diagnosis)
-    with progress() as tell:
+    with progress_bar("reading", lines=True) as tell:
         answer = experiments(found, model or Path(found.model), progress=tell)
     click.echo(answer.sentence)
     for one in answer.experiments:
         click.echo(f"  {one.name:22}  {one.words}")
     if json_file:
         write_text(json_file, json_text(answer.as_json()))
-
-
-@contextlib.contextmanager
-def progress() -> Iterator[Callable[[float, str], None]]:
-    """A bar on stderr, told a share and words; where that is no terminal, a line for every twentieth."""
-    if not sys.stderr.isatty():
-        said = -1
-
-        def say(share: float, words: str) -> None:
-            nonlocal said
-            if int(share * TOLD) > said:
-                said = int(share * TOLD)
-                click.echo(f"{percent(share):>5}  {words}", err=True)
-
-        yield say
-        return
-    with progress_bar("reading") as tell:
-        yield lambda share, words: tell(words, share)
 
 
 def _print(found: Diagnosis) -> None:

@@ -158,7 +158,7 @@ class LearningBar:
             words="  ".join(words),
         )
         pass_on(
-            number(100 * progress.average_reward_m_s, "cm/s", sign=True, decimals=1), progress.step / progress.steps
+            progress.step / progress.steps, number(100 * progress.average_reward_m_s, "cm/s", sign=True, decimals=1)
         )
         drop = self._watch.see(progress) if self._watch is not None else None
         if drop is not None:

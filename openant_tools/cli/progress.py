@@ -6,6 +6,9 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
+import click
+
+from openant_tools.numbers import percent
 from openant_tools.workers import pass_on
 
 if TYPE_CHECKING:
@@ -13,29 +16,38 @@ if TYPE_CHECKING:
 
 __all__ = ["progress_bar"]
 
+#: lines that are said of one piece of work where there is no terminal
+TOLD = 20
+
 
 @contextlib.contextmanager
 def progress_bar(
-    words: str = "", *, remaining: bool = True, console: Console | None = None
-) -> Iterator[Callable[[str, float], None]]:
-    """A bar that goes when the block is left; yields what it is to be told: words, and the share that is done.
+    words: str = "", *, remaining: bool = True, console: Console | None = None, lines: bool = False
+) -> Iterator[Callable[[float, str], None]]:
+    """A bar that goes when the block is left; yields what it is to be told: the share that is done, and words.
 
     Args:
         words: before anything is told.
         remaining: whether the time left is guessed.
         console: of other lines meanwhile.
+        lines: whether a line is said for every twentieth where there is no terminal.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+    said = -1
     columns = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
     if remaining:
         columns.append(TimeRemainingColumn())
     with Progress(*columns, console=console or Console(stderr=True), transient=True) as bar:
         task = bar.add_task(words, total=1.0)
 
-        def tell(words: str, share: float) -> None:
+        def tell(share: float, words: str) -> None:
+            nonlocal said
+            if lines and not bar.console.is_terminal and int(share * TOLD) > said:
+                said = int(share * TOLD)
+                click.echo(f"{percent(share):>5}  {words}", err=True)
             bar.update(task, description=words, completed=share)
-            pass_on(words, share)
+            pass_on(share, words)
 
         yield tell

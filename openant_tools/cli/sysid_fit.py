@@ -124,7 +124,7 @@ def fit(
             tell=tell,
             progress=progress,
         )
-        progress("writing the report", 1.0)
+        progress(1.0, "writing the report")
         written = sysid.report(found, out, robot=None if folder is None else folder.path)
 
     if report is not None:

@@ -264,9 +264,9 @@ def _record_here(
     bar = stack.enter_context(Progress(*columns, TimeElapsedColumn(), console=console, transient=True))
     task = bar.add_task("connecting", total=1.0)
 
-    def tell(words: str, share: float) -> None:
+    def tell(share: float, words: str) -> None:
         bar.update(task, description=words, completed=share)
-        pass_on(words, share)
+        pass_on(share, words)
 
     try:
         return record_takes(

@@ -105,7 +105,7 @@ def soak(
     resume: bool = False,
     thin_s: float | None = THIN_S,
     robot_toml: str | None = None,
-    progress: Callable[[float, Mapping[str, Any]], None] = lambda share, statistics: None,
+    progress: Callable[[float, str], None] = lambda share, words: None,
     notice: Callable[[str], None] = lambda words: None,
 ) -> BusSoaked:
     """Soak until the log is `seconds` (s) long.
@@ -115,7 +115,7 @@ def soak(
         move: swing the legs; else the robot stays limp.
         resume: go on with the soak that stands at `out`.
         thin_s: one healthy cycle in so many s is kept; None keeps all.
-        progress: called with the share done and the bus's statistics.
+        progress: called with the share done, and what was lost until then in words.
 
     Raises:
         HardwareFault: the robot does not answer at the start.
@@ -163,7 +163,7 @@ def soak(
             done += length
             with contextlib.suppress(HardwareFault):  # a port that is gone has nothing to add
                 statistics = engine.ask(messages.Statistics())
-            progress(min(1.0, done / seconds), statistics)
+            progress(min(1.0, done / seconds), _losses(statistics))
         if moving:
             engine.ask(messages.Torque(False))
         try:
@@ -175,6 +175,12 @@ def soak(
             path, cycles = str(out), _rows_of(out)
     whole = done >= seconds and not interlock.ended
     return BusSoaked(Path(path), cycles, done, statistics, tuple(stops), interlock.ended, whole)
+
+
+def _losses(statistics: Mapping[str, Any]) -> str:
+    asked = sum(servo["asked"] for servo in statistics["servos"])
+    answered = sum(servo["answered"] for servo in statistics["servos"])
+    return f"{asked - answered} of {asked} answers lost"
 
 
 def _what_follows(restart: Restart | None) -> str:

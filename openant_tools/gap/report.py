@@ -48,6 +48,7 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
     """
     gap, share = found.gap, closed(found)
     healthy = found.verdict == NONE
+    improved = bool(found.selected or found.calibration)
     left = f" {rest_words(found)}" if found.rest and found.verdict != UNEXPLAINED else ""  # there the verdict says it
     answer = ReportSummary(
         sentence(found),
@@ -60,10 +61,10 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
         what_next(found),
         "good" if healthy or share > 0.7 else "warn",
         (
-            KeyFigure("gap before", _error(gap["before"]), "the model as given"),
-            KeyFigure("gap after", _error(gap["after"]), "the improved model"),
+            KeyFigure("gap before" if improved else "gap", _error(gap["before"]), "the model as given"),
+            *([KeyFigure("gap after", _error(gap["after"]), "the improved model")] if improved else []),
             KeyFigure("floor", _error(gap["floor"]), "what no model could beat"),
-            KeyFigure("closed", percent(share), "of the excess, on held-out runs"),
+            *([KeyFigure("closed", percent(share), "of the excess, on held-out runs")] if improved else []),
         ),
     )
     report = Report(

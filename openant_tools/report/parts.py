@@ -318,6 +318,8 @@ class Details:
         return {"kind": "details", "summary": self.summary, "parts": [part.json() for part in self.parts]}
 
 
+#: the blank between a number and its unit, where no line ends
+_UNIT = re.compile(r"(?<=\d) (?=(?:%|°C|min|[mcµ]?[smAVW]|k?g|m?rad|k?Hz|K|h|N·m|cm/s)(?!\w))")
 #: characters of a command that stays on one line; a browser breaks after each of its dashes
 FEW, SHORT = 24, " class=short"
 
@@ -326,7 +328,7 @@ def _inline(text: str) -> str:
     """Escaped text with `code`, **bold**, *em* and [links](url); code is left as it is inside."""
     out = []
     for k, piece in enumerate(re.split(r"`([^`]+)`", text)):
-        safe = escape(re.sub(r"(?<=\d) (?=%)", "\u00a0", piece))
+        safe = escape(_UNIT.sub("\u00a0", piece))
         if k % 2:
             out.append(f"<code{SHORT if len(piece) <= FEW else ''}>{safe}</code>")
             continue

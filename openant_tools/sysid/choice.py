@@ -41,7 +41,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Progress = Callable[[str, float], None]
+Progress = Callable[[float, str], None]
 #: asks for what options of kept parameters leave, is answered with that of each fold, ends with a choice
 Choosing = Generator["_Ask", Sequence[Sequence["_Left"]], "Choice"]
 
@@ -216,7 +216,7 @@ def settle(
         masks |= {mask.tobytes(): mask for mask in (gone, *(mask for _, mask in sets[-1]))}
     del masks[nothing.tobytes()]
     found = problem.solve_without(
-        list(masks.values()), estimate.found, progress=progress and (lambda what, done: progress(what, done / 2))
+        list(masks.values()), estimate.found, progress=progress and (lambda done, what: progress(done / 2, what))
     )
     without: dict[bytes, Posterior] = dict(zip(masks, found, strict=True))
     unseen = {id(fold): prepare(fold.runs) for each in sets for fold, _ in each}
@@ -239,7 +239,7 @@ def settle(
         )
         return [replace(trial, posterior=end) for (trial, _), end in zip(asked, ends, strict=True)]
 
-    choices = choose(trials, parameters, refit, progress and (lambda what, done: progress(what, (1 + done) / 2)))
+    choices = choose(trials, parameters, refit, progress and (lambda done, what: progress((1 + done) / 2, what)))
     shown = [list[Dataset](), *(unseen[id(turn)] for turn in turns)]
     return [
         Settled(choice, _at(posterior, choice.kept), runs)
@@ -296,7 +296,7 @@ def choose(
     told = 0.0
     while answers:
         if progress:
-            progress("choosing what is kept", told)
+            progress(told, "choosing what is kept")
         told += (1.0 - told) / 3  # how many rounds there are nobody knows beforehand
         asked: dict[int, _Ask] = {}
         for k, answer in answers.items():

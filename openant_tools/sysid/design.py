@@ -37,7 +37,7 @@ from openant_tools.sysid.protocols import Protocol
 __all__ = ["Design", "design"]
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, float], None]
+Progress = Callable[[float, str], None]
 
 #: s each motion of a design takes, and how many of them are drawn to choose from
 SLOT_S = 4.0
@@ -85,16 +85,16 @@ def design(asked: Planned, seconds: float, progress: Progress | None = None) -> 
     forecasts: list[Forecast] = []
     for number, protocol in enumerate(played):
         if progress:
-            progress("simulating motions", 0.4 * number / len(drawn))
+            progress(0.4 * number / len(drawn), "simulating motions")
         forecasts.append(_alone(expected, asked, protocol, number))
     good = [k for k, one in enumerate(forecasts) if not _refused(one)]
     if not good:
         raise BadInput("no motion may be played within these limits", remedy="widen min_rad and max_rad in robot.toml")
     if progress:
-        progress("what each motion says", 0.4)
+        progress(0.4, "what each motion says")
     says = information(plant, [forecasts[k].run for k in good], parameters, asked.residual)
     if progress:
-        progress("choosing", 0.95)
+        progress(0.95, "choosing")
     kinds = [type(_core(drawn[k])).__name__ for k in good]
     chosen, nats = _exchange(says, kinds, slots, len(parameters))
     # Releases last: a leg that was caught need not be waited for.

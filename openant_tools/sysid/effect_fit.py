@@ -24,7 +24,7 @@ from openant_tools.sysid.weights import WHITE
 
 __all__ = ["TRIED", "better", "brakes_alike", "chosen_in_turn", "with_effects"]
 
-Progress = Callable[[str, float], None]
+Progress = Callable[[float, str], None]
 
 #: the effects, as kinds of parameters: on real gears (docs/effects.md) no law of constant friction explains as much
 TRIED = ("load_friction", "load_friction_at_rest")

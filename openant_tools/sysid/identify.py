@@ -66,7 +66,7 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, float], None]
+Progress = Callable[[float, str], None]
 
 #: what is identified where nothing is said; `damping` stands for whichever of damping and velocity gain the model has
 DEFAULT_KINDS = (
@@ -396,7 +396,7 @@ def identify(
     total = 2 * len(supplies) + 1  # each a fit and its folds; and judging
 
     def share(part: int) -> Progress | None:
-        return progress and (lambda what, done: progress(what, (part + done) / total))
+        return progress and (lambda done, what: progress((part + done) / total, what))
 
     ways = list[tuple[Problem, Estimate, list[Settled]]]()
     for supply in supplies:
@@ -415,7 +415,7 @@ def identify(
     problem, estimate, (settled, *_) = ways[best]
     data, kept, u = list(problem.datasets), settled.choice.kept, settled.u
     if progress:
-        progress("judging what was chosen", (total - 1) / total)
+        progress((total - 1) / total, "judging what was chosen")
     sent_back = list[str]()
     told = [_turn(ways[way][2][1 + k], fold, chosen) for k, (way, fold) in enumerate(zip(anew, turns, strict=True))]
     if told:

@@ -190,7 +190,7 @@ def fit(
         declared=declared,
         measured_supply=measured_supply,
         effects=effects,
-        progress=progress and (lambda what, done: progress(f"with effects: {what}", done)),
+        progress=progress and (lambda done, what: progress(done, f"with effects: {what}")),
     )
     if tried and brakes_alike(found, tried):
         found = plain(also=[*also, ELECTRICAL_DAMPING])

@@ -35,7 +35,7 @@ from openant_tools.sysid.verdict import TIED, told
 __all__ = ["Expectation", "Plan", "Planned", "Residual", "information", "make_plan", "marginal", "parameters_of"]
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, float], None]
+Progress = Callable[[float, str], None]
 
 #: difference step in prior deviations on the floor, where contacts chatter and only a change that is physically large stands out
 FLOOR_STEP = 1.0
@@ -183,7 +183,7 @@ def make_plan(asked: Planned, protocols: Sequence[Protocol], progress: Progress 
     forecasts = []
     for number, protocol in enumerate(protocols, 1):
         if progress:
-            progress(f"simulating, {protocol.setup}", 0.3 * (number - 1) / len(protocols))
+            progress(0.3 * (number - 1) / len(protocols), f"simulating, {protocol.setup}")
         plant = plants[setup_of(protocol.setup)]
         as_expected = _as_expected(plant, parameters)
         commands, limp = (
@@ -198,7 +198,7 @@ def make_plan(asked: Planned, protocols: Sequence[Protocol], progress: Progress 
     on_stand = Setup.STAND in plants
     for done, (setup, plant) in enumerate(plants.items()):
         if progress:
-            progress(f"sensitivities, {setup}", 0.3 + 0.7 * done / len(plants))
+            progress(0.3 + 0.7 * done / len(plants), f"sensitivities, {setup}")
         runs = [one.run for one in forecasts if setup_of(one.protocol.setup) is setup]
         # What joints are like shows far better on the stand, and every column on the floor costs a rollout of its own.
         some = [p.definition.body or not on_stand for p in parameters] if setup is Setup.FLOOR else None

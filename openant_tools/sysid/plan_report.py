@@ -50,7 +50,7 @@ def plan_report(plan: Plan) -> Report:
         ),
         f"{first.words[:1].upper()}{first.words[1:]}. "
         + (
-            f"Not settled by it: {', '.join(open_[:6])}{' …' if len(open_) > 6 else ''}."
+            f"Not settled by it: {', '.join(open_[:6])}{f' and {len(open_) - 6} more' if len(open_) > 6 else ''}."
             if open_
             else "It settles everything."
         ),

@@ -47,7 +47,7 @@ __all__ = ["Problem"]
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Progress = Callable[[str, float], None]
+Progress = Callable[[float, str], None]
 
 #: squared length of a step in posterior deviations, per parameter, below which a descent is near, if the step is short in prior
 #: deviations too; and where it started near
@@ -156,7 +156,7 @@ class Problem:
                 nonlocal left
                 left *= 1 - TOLD
                 if progress:
-                    progress(what, 1 - left)
+                    progress(1 - left, what)
 
             return side_by_side(
                 descents,

@@ -109,7 +109,7 @@ def record_takes(
     wanted: Sequence[Take],
     *,
     robot_toml: str | None = None,
-    progress: Callable[[str, float], None] = lambda words, share: None,
+    progress: Callable[[float, str], None] = lambda share, words: None,
     notice: Callable[[str], None] = lambda text: None,
     pictures: bool = False,
 ) -> list[Recorded]:
@@ -140,14 +140,14 @@ def record_takes(
             commands, limp = protocol.commands(space, config.rate_hz, seed), protocol.limp(space, config.rate_hz)
             motion = messages.Play(commands, protocol.name, limp if limp.any() else None)
             for share in _while_playing(engine, engine.start(motion), len(commands) / config.rate_hz, notice):
-                progress(words, (past + share * protocol.seconds) / total)
+                progress((past + share * protocol.seconds) / total, words)
 
         for take in wanted:
             protocol, extra = take.protocol, dict[str, Any]()
             if take.work_s:
                 extra["work_s"], extra["rise_k"] = _work(engine, take.work_s, play, notice)
                 past += take.work_s
-            progress("to the home pose", past / total)
+            progress(past / total, "to the home pose")
             engine.ask(messages.Ramp(protocol.commands(space, config.rate_hz, take.seed)[0]))
             engine.ask(messages.Hold(SETTLE_S))
             facts = Facts(
@@ -178,7 +178,7 @@ def record_takes(
             limits = np.array([config.limits_rad.get(joint, (-np.inf, np.inf)) for joint in space.joints])
             engine.ask(messages.Ramp(np.clip(found, limits[:, 0], limits[:, 1])))
         engine.ask(messages.Torque(False))
-        progress("done", 1.0)
+        progress(1.0, "done")
     return done
 
 

@@ -221,9 +221,7 @@ def test_twitching_is_counted_and_flagged():
         assert twitch.reversals_hz == pytest.approx(hz, rel=0.1, abs=0.01)
     found = flag("jitter", 0.2, {"smoothed commands": 0.01, "late commands": 0.15}, 8.0)
     assert found is not None
-    assert (
-        found.words == "jitter: does not stand smoothed commands (keeps 5 %); its joints turn back 8.0 times a second"
-    )
+    assert found.words == "jitter does not stand smoothed commands (keeps 5 %); its joints turn back 8.0 times a second"
     assert flag("walks", 0.2, {"smoothed commands": 0.15}, 1.0) is None
     assert flag("stands", 0.001, {"smoothed commands": 0.0}, 1.0) is None
 

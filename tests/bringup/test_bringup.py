@@ -13,12 +13,12 @@ from builder import robot
 
 from openant_tools.bringup.passport import write_passport
 from openant_tools.bringup.persistent_robot import persistent_robot
-from openant_tools.bringup.relay import relayed
 from openant_tools.bringup.walk import WALK, do, standing, step, walk
 from openant_tools.cli.calib import calib
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.procedure.finding import Finding, keep
+from openant_tools.procedure.relay import relayed
 from openant_tools.procedure.step import Answer, Declined, Event, Intent, Progress, Say
 from openant_tools.robot.folder import create_robot
 
@@ -163,7 +163,7 @@ def test_work_with_callbacks_is_a_procedure_and_ends_when_it_is_closed():
         try:
             notice("begun")
             for k in range(1000):
-                progress("working", k / 1000)
+                progress(k / 1000, "working")
         finally:
             ended.append(True)
         return 7

@@ -46,7 +46,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Demo:
     for stage in demo.stages():
         assert not demo.stands(stage)
         shares: list[float] = []
-        demo.run(stage, lambda words, share, shares=shares: shares.append(share))
+        demo.run(stage, lambda share, words, shares=shares: shares.append(share))
         assert demo.stands(stage), stage.name
         assert shares == sorted(shares)
         assert stage.name == "robot" or 0.9 < shares[-1] <= 1.0, stage.name

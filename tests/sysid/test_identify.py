@@ -566,7 +566,7 @@ def test_progress_runs_from_start_to_end(model: Path) -> None:
     runs = [robot.record("a", 1.5), robot.record("b", 1.5, seed=1)]
     said: list[str] = []
 
-    def tell(what: str, done: float) -> None:
+    def tell(done: float, what: str) -> None:
         said.append(what)
         seen.append(done)
 

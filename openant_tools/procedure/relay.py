@@ -19,7 +19,7 @@ class _Cancelled(Exception):
 
 
 def relayed(
-    work: Callable[[Callable[[str, float], None], Callable[[str], None]], T],
+    work: Callable[[Callable[[float, str], None], Callable[[str], None]], T],
 ) -> Subroutine[T]:
     """Run `work(progress, notice)` and yield what it reports; its result.
 
@@ -28,7 +28,7 @@ def relayed(
     events: queue.SimpleQueue[Event | None] = queue.SimpleQueue()
     cancelled, outcome, failure = threading.Event(), list[T](), list[BaseException]()
 
-    def progress(words: str, share: float) -> None:
+    def progress(share: float, words: str) -> None:
         if cancelled.is_set():
             raise _Cancelled
         events.put(Progress(share, words))
