@@ -72,6 +72,11 @@ def _under_way(intent: Intent) -> str:
     return f"Under way: {intent.words}."
 
 
+def _sentence(words: str) -> str:
+    """What is to be done as a sentence; a command stays as it is typed."""
+    return words if not words or words.startswith("openant") else f"{words[0].upper()}{words[1:]}."
+
+
 class Log(VerticalScroll):
     """Lines below each other. What was said last is what is seen, however the rest of the screen grows, until one scrolls."""
 
@@ -310,7 +315,7 @@ where the number lies. `l` shows the log of what was said and done instead.
             self.offer("It ended without a finding.", [*self._beginnings("Begin again"), self._back()])
         else:
             self.show_finding(finding)
-            self._now = finding.next_action or "Nothing is left to do here."
+            self._now = _sentence(finding.next_action) or "Nothing is left to do here."
             [*ahead, again] = self._beginnings("Begin again")
             names = list(WALK)
             after = names.index(self.step.name) + 1 if self.step.name in names else len(names)
