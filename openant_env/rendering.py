@@ -10,6 +10,7 @@ import platform
 import shutil
 import subprocess
 import time
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -44,26 +45,31 @@ def _backends() -> list[str]:
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
     if chosen in ("glfw", "egl", "osmesa", "cgl"):
         return [chosen]
+    if chosen in ("disabled", "off", "false", "0"):  # `disable` is what our own commands set, to load faster
+        return []
     if platform.system() == "Darwin":
         return ["cgl", "glfw"]
     has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     return ["glfw", "egl"] if has_display else ["egl", "osmesa"]
 
 
-def _gl_context(width: int, height: int) -> Any:
+def _gl_context(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
+    """OpenGL's context, current from now on, and MuJoCo's in it."""
     # MuJoCo's own Renderer takes its backend from the environment as it was when mujoco was first imported, and
     # fails on a machine without display unless that was set; here the choice is made when a picture is wanted.
     reasons = []
     for backend in _backends():
         try:
-            context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
-            context.make_current()
+            with warnings.catch_warnings():  # the reason stands in the error
+                warnings.simplefilter("ignore")
+                context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+                context.make_current()
+                # GLFW makes none where there is no display, and says nothing of it: MuJoCo does.
+                return context, mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except Exception as error:  # each backend fails in its own way: ImportError, AttributeError, GLError, …
             reasons.append(f"{backend}: {error or type(error).__name__}".splitlines()[0])
-        else:
-            return context
     raise NoOpenGL(
-        f"no picture of the robot can be drawn, there is no OpenGL here ({'; '.join(reasons)})",
+        f"no picture of the robot can be drawn, there is no OpenGL here ({'; '.join(reasons) or 'MUJOCO_GL says so'})",
         remedy="pip install 'openant-tools[view]' and an EGL or OSMesa library, or go on without pictures",
     )
 
@@ -82,12 +88,11 @@ class Painter:
     def __init__(self, model: mujoco.MjModel, width: int = 480, height: int = 360) -> None:
         model.vis.global_.offwidth = max(width, model.vis.global_.offwidth)
         model.vis.global_.offheight = max(height, model.vis.global_.offheight)
-        self._gl = _gl_context(width, height)
+        self._gl, self._context = _gl_context(model, width, height)
         self._model = model
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._scene = mujoco.MjvScene(model, 1000)
         self._option = mujoco.MjvOption()
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
 
     def frame(

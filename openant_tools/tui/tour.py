@@ -207,7 +207,7 @@ async def _walk(take: Callable[[OpenAnt, str], None]) -> None:
             await pilot.pause(0.2)
             take(app, "mistake")
             await pilot.press("space")
-            await _until(pilot, lambda: "Begin again" in _offered(pilot))
+            await _until(pilot, lambda: any(line.startswith("Begin again") for line in _offered(pilot)))
     finally:
         app.session.close()
 

@@ -452,6 +452,18 @@ def test_without_opengl_only_the_picture_fails_and_says_why(monkeypatch):
     assert make().unwrapped.render() is None
 
 
+@pytest.mark.parametrize(("named", "why"), [("glfw", "glfw: "), ("off", "MUJOCO_GL says so")])
+def test_a_backend_that_has_no_display_or_none_at_all_is_no_opengl(monkeypatch, named, why):
+    monkeypatch.setenv("MUJOCO_GL", named)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    env = make(render_mode="rgb_array")
+    env.reset(seed=0)
+    with pytest.raises(NoOpenGL, match=why):
+        env.render()
+    env.close()
+
+
 def test_names_of_an_observation_are_those_of_run_tables():
     names = layout(JOINT_NAMES).names
     assert names[:2] == ("pos.hip_rr", "pos.knee_rr")
