@@ -2,6 +2,7 @@
 
     film = Film(app)              # takes a frame whenever its timer finds another screen
     film.press("enter")           # is shown below the screen; again=True plays what follows faster
+    film.end()
     write_text(path, film.svg())
 
 Nothing is drawn for the film: a frame is what the compositor gives the terminal. What takes long plays as the root of its
@@ -25,6 +26,7 @@ from rich.color_triplet import ColorTriplet
 from rich.segment import Segment
 from rich.style import Style
 from textual.app import App
+from textual.timer import Timer
 
 __all__ = ["Film"]
 
@@ -89,12 +91,19 @@ class Film:
     clock: Callable[[], float] = time.monotonic
     frames: list[tuple[float, tuple[Row, ...]]] = field(default_factory=list)
     keys: dict[float, bool] = field(default_factory=dict)
+    _timer: Timer | None = None
     _pressed: str = ""
     _pressed_at: float = -math.inf
 
     def roll(self) -> None:
-        """Look at the screen from now on, as long as the app runs."""
-        self.app.set_interval(LOOK_S, self.look)
+        """Look at the screen from now on, until the end."""
+        self._timer = self.app.set_interval(LOOK_S, self.look)
+
+    def end(self) -> None:
+        """The last look: how a program takes its screens down is not shown."""
+        self.look()
+        if self._timer is not None:
+            self._timer.stop()
 
     def press(self, key: str, again: bool = False) -> None:
         """A key is pressed now; `again` where what it does was shown before."""
@@ -109,8 +118,8 @@ class Film:
             return
         update = app.screen._compositor.render_update(full=True, screen_stack=app._background_screens)
         strips = getattr(update, "strips", ())
-        if len(strips) != app.size.height:  # between two screens
-            return
+        if len(strips) != app.size.height or any(strip is None for line in strips for strip in line):
+            return  # between two screens, or nothing is drawn in a place yet
         rows = [_row(segment for strip in line for segment in strip) for line in strips]
         now = self.clock()
         pressed = self._pressed if now - self._pressed_at < STILL_S else ""
