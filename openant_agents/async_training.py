@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_agents.learner import Job, SharedWeights
-from openant_agents.sac import CURVE_EVERY, Sac, SacSettings, device_of, one_thread, run_facts_of, sizes
+from openant_agents.runs import has_checkpoint
+from openant_agents.sac import CURVE_EVERY, Sac, SacSettings, device_of, learned_by, one_thread, run_facts_of, sizes
 from openant_agents.training import Training, TrainingProgress, finite_or_raise, reset_or_stop, training_run
 from openant_tools.errors import BadInput, HardwareFault, StorageFault
 
@@ -135,6 +136,7 @@ def train_async(
     settings: SacSettings | None = None,
     updates_per_step: float = 1.0,
     env_facts: Mapping[str, Any] | None = None,
+    source: Path | None = None,
     device: str = "cpu",
     tensorboard: bool = False,
     report: Callable[[TrainingProgress], None] | None = None,
@@ -153,11 +155,16 @@ def train_async(
     observations, actions = sizes(env)
     # Its replay stays empty and its critics are not used: the learner has both.
     agent = Sac(observations, actions, replace(settings, buffer=1), seed=seed)
-    facts = run_facts_of(env, settings, seed, env_facts) | {"learning": {"updates_per_step": updates_per_step}}
+    facts = run_facts_of(env, settings, seed, env_facts, source) | {"learning": {"updates_per_step": updates_per_step}}
     device_of(device)
+    source = None if has_checkpoint(folder) else source
+    if source is not None:
+        learned_by(source, env)  # refuses what does not suit, while nothing is begun
     with one_thread(), training_run(folder, facts, tensorboard) as (run, events, stop):
         checkpoint, rows = run.go_on(agent.replay.width)
-        learner = LearnerProcess(Job(folder, settings, observations, actions, seed, device, updates_per_step), agent)
+        learner = LearnerProcess(
+            Job(folder, settings, observations, actions, seed, device, updates_per_step, source), agent
+        )
         try:
             acting = _Acting(Training(env, run, steps, report, stop), agent, settings, learner, events)
             acting.remember(checkpoint, rows)
@@ -208,7 +215,7 @@ class _Acting:
         told = time.monotonic()
         while observation is not None and training.going:
             learner.follow()
-            random = training.step < settings.learning_start
+            random = training.step < settings.learning_start and "from" not in training.run.facts
             action = agent.random_action() if random else agent.act(observation)
             seen, reward, terminated, truncated, info = training.env.step(action)
             finite_or_raise(seen, float(reward), training.step, training.run.folder)

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from openant_agents.runs import load_checkpoint, save_checkpoint
+from openant_agents.runs import has_checkpoint, load_checkpoint, save_checkpoint
 from openant_agents.sac import Sac, SacSettings
 from openant_agents.training import CHECKPOINT_EVERY_S
 from openant_tools.errors import OpenAntError
@@ -48,6 +48,7 @@ class Job:
         folder: the run's.
         settings, observations, actions, seed, device: of the agent.
         updates_per_step: at most so many for each transition, on average.
+        source: the run whose agent it begins with; None: with nothing.
     """
 
     folder: Path
@@ -57,6 +58,7 @@ class Job:
     seed: int
     device: str
     updates_per_step: float
+    source: Path | None = None
 
 
 class SharedWeights:
@@ -124,7 +126,9 @@ class Learner:
         self._state: Mapping[str, Any] = {}
         self._log = (job.folder / "transitions.f32").open("rb", buffering=0)
         self._saved_at = time.monotonic()
-        if (job.folder / "checkpoint.pt").is_file():
+        if job.source is not None:
+            self._agent.begin_with(load_checkpoint(job.source)["agent"])
+        if has_checkpoint(job.folder):
             checkpoint = load_checkpoint(job.folder)
             self._agent.set_state(checkpoint["agent"])
             self._state = {name: checkpoint[name] for name in ("step", "seconds", "helped") if name in checkpoint}

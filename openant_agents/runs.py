@@ -40,6 +40,7 @@ __all__ = [
     "SCHEMA",
     "CurvePoint",
     "TrainingRun",
+    "has_checkpoint",
     "load_checkpoint",
     "making_sense",
     "read_curve",
@@ -254,6 +255,11 @@ def read_facts(folder: Path) -> dict[str, Any]:
     if not isinstance(facts, dict) or facts.get("schema") != SCHEMA:
         raise BadInput(f"its schema is not {SCHEMA}", where=path, remedy="train into another folder")
     return facts
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Whether a run was ever saved."""
+    return (folder / "checkpoint.pt").is_file()
 
 
 def load_checkpoint(folder: Path) -> dict[str, Any]:

@@ -37,7 +37,7 @@ from torch.nn import functional as F
 
 from openant_agents.adam import Adam
 from openant_agents.by_hand import Gradients, acting, flatten, squashed
-from openant_agents.runs import load_checkpoint, making_sense, read_facts
+from openant_agents.runs import has_checkpoint, load_checkpoint, making_sense, read_facts
 from openant_agents.training import (
     Training,
     TrainingProgress,
@@ -399,8 +399,8 @@ class Sac:
             "updates": self.updates,
         }
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on where `get_state` was called; the replay is restored apart from this.
+    def begin_with(self, state: Mapping[str, Any]) -> None:
+        """Take over what another agent has learned; chance, updates and transitions are this one's own.
 
         Raises:
             BadInput: it is of other networks, or of an earlier version of this software.
@@ -410,11 +410,19 @@ class Sac:
                 getattr(self, name).load_state_dict(state[name])
         except (KeyError, RuntimeError, ValueError) as error:
             raise BadInput(
-                "the checkpoint does not fit the agent that run.json describes; an earlier version may have written it",
-                remedy="train into another folder",
+                "what was saved is of an agent with other networks, or an earlier version wrote it",
+                remedy="train into another folder, with the settings of the run that it begins with",
             ) from error
         with torch.no_grad():
             self.log_alpha.copy_(state["log_alpha"])
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on where `get_state` was called; the replay is restored apart from this.
+
+        Raises:
+            BadInput: it is of other networks, or of an earlier version of this software.
+        """
+        self.begin_with(state)
         self.noise.set_state(state["noise"].cpu())
         self.random.bit_generator.state = state["random"]
         self.updates = int(state["updates"])
@@ -427,10 +435,15 @@ CURVE_EVERY = 100
 
 
 def run_facts_of(
-    env: gymnasium.Env[Any, Any], settings: SacSettings, seed: int, env_facts: Mapping[str, Any] | None
+    env: gymnasium.Env[Any, Any],
+    settings: SacSettings,
+    seed: int,
+    env_facts: Mapping[str, Any] | None,
+    source: Path | None = None,
 ) -> dict[str, Any]:
     """What `run.json` says of a run of SAC."""
-    return run_facts("sac", env, settings.as_dict(), seed, env_facts, sizes(env), {"torch": torch.__version__})
+    versions = {"torch": torch.__version__}
+    return run_facts("sac", env, settings.as_dict(), seed, env_facts, sizes(env), versions, source)
 
 
 @contextmanager
@@ -452,6 +465,7 @@ def train(
     seed: int,
     settings: SacSettings | None = None,
     env_facts: Mapping[str, Any] | None = None,
+    source: Path | None = None,
     device: str = "cpu",
     tensorboard: bool = False,
     report: Callable[[TrainingProgress], None] | None = None,
@@ -466,6 +480,7 @@ def train(
         seed: of the agent and of the first reset.
         settings: the paper's by default.
         env_facts: how to make the environment again, for `run.json`.
+        source: another run, whose policy acts from the first step on, in place of chance, and learns on from there.
         device: where torch computes; acting and learning on `"cpu"` take one thread.
         tensorboard: also write the learning curve and α as TensorBoard events into the folder.
         report: called a few times a second.
@@ -478,15 +493,20 @@ def train(
     settings = settings or SacSettings()
     observations, actions = sizes(env)
     agent = Sac(observations, actions, settings, seed=seed, device=device_of(device))
-    facts = run_facts_of(env, settings, seed, env_facts)
+    facts = run_facts_of(env, settings, seed, env_facts, source)
+    learned = None if source is None or has_checkpoint(folder) else learned_by(source, env)
     with one_thread(), training_run(folder, facts, tensorboard) as (run, events, stop):
-        return _train(Training(env, run, steps, report, stop), agent, seed, events)
+        return _train(Training(env, run, steps, report, stop), agent, seed, events, learned)
 
 
-def _train(training: Training, agent: Sac, seed: int, events: Any) -> TrainingProgress:
+def _train(
+    training: Training, agent: Sac, seed: int, events: Any, learned: Mapping[str, Any] | None
+) -> TrainingProgress:
     env, run, settings, replay = training.env, training.run, agent.settings, agent.replay
     observation = training.begin(seed)
     checkpoint = run.resume()
+    if learned is not None:
+        agent.begin_with(learned)
     if checkpoint is not None:
         with making_sense(run.folder):
             agent.set_state(checkpoint["agent"])
@@ -502,7 +522,7 @@ def _train(training: Training, agent: Sac, seed: int, events: Any) -> TrainingPr
         saved, training.saved_at = replay.added, time.monotonic()
 
     while training.going:
-        random = training.step < settings.learning_start
+        random = training.step < settings.learning_start and "from" not in run.facts
         action = agent.random_action() if random else agent.act(observation)
         try:
             next_observation, reward, terminated, truncated, info = env.step(action)
@@ -549,8 +569,32 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
     Raises:
         BadInput: no such run, or one whose observations or actions are not the environment's.
     """
+    facts, checkpoint = _of_run(folder, env)
+    with making_sense(folder):
+        settings = SacSettings(**{**facts["settings"], "buffer": 1})
+        agent = Sac(facts["observations"], facts["actions"], settings, seed=int(facts["seed"]))
+        agent.actor.load_state_dict(checkpoint["agent"]["actor"])
+        return agent, int(checkpoint["step"])
+
+
+def learned_by(folder: Path, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
+    """What the agent of a run has learned, as `Sac.begin_with` takes it.
+
+    Raises:
+        BadInput: no such run, or one whose observations or actions are not the environment's.
+    """
+    state: dict[str, Any] = _of_run(folder, env)[1]["agent"]
+    return state
+
+
+def _of_run(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Facts and checkpoint of a run of SAC that suits an environment."""
     with making_sense(folder):
         facts = read_facts(folder)
+        if facts["agent"] != "sac":
+            raise BadInput(
+                f"it is a run of {facts['agent']}, not of sac", where=folder, remedy="name a run of `openant train sac`"
+            )
         observations, actions = sizes(env)
         if (facts["observations"], facts["actions"]) != (observations, actions):
             raise BadInput(
@@ -560,10 +604,7 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
                 remedy="play it on a robot like the one it was trained on",
             )
         check_trained_on(facts, described(env), ("observation_names", "action_names", "action_range"), folder)
-        checkpoint = load_checkpoint(folder)
-        agent = Sac(observations, actions, SacSettings(**{**facts["settings"], "buffer": 1}), seed=int(facts["seed"]))
-        agent.actor.load_state_dict(checkpoint["agent"]["actor"])
-        return agent, int(checkpoint["step"])
+        return facts, load_checkpoint(folder)
 
 
 def device_of(name: str) -> torch.device:

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from openant_agents.compiled import compiled
 from openant_agents.primitives import PrimitiveGait
-from openant_agents.runs import load_checkpoint, making_sense, read_facts
+from openant_agents.runs import has_checkpoint, load_checkpoint, making_sense, read_facts
 from openant_agents.tile_coding import Rows, TileCoder
 from openant_agents.training import (
     Training,
@@ -385,6 +385,7 @@ def train(
     seed: int,
     settings: SarsaSettings | None = None,
     env_facts: Mapping[str, Any] | None = None,
+    source: Path | None = None,
     tensorboard: bool = False,
     report: Callable[[TrainingProgress], None] | None = None,
 ) -> TrainingProgress:
@@ -399,6 +400,8 @@ def train(
         seed: of the agent and of the first reset.
         settings: the paper's by default.
         env_facts: how to make the environment again, for `run.json`.
+        source: another run of the same settings, whose agent acts from the first step on and learns on from there: its decisions
+            are the first of this run's log.
         tensorboard: also write the learning curve and the errors as TensorBoard events into the folder.
         report: called a few times a second.
 
@@ -411,12 +414,13 @@ def train(
     gait = _gait(env, described(env))
     _compile()
     bounds = _Bounds.of(env)
-    facts = run_facts("sarsa", env, settings.as_dict(), seed, env_facts, (len(bounds.low), len(gait)), {})
+    facts = run_facts("sarsa", env, settings.as_dict(), seed, env_facts, (len(bounds.low), len(gait)), {}, source)
+    begun = None if source is None or has_checkpoint(folder) else _begun(source, env, settings, seed)
     with training_run(folder, facts, tensorboard) as (run, events, stop):
         scribe = _Scribe()
         try:
             training = Training(env, run, steps, report, stop, scribe.write)
-            return _train(training, gait, bounds, scribe, settings, seed, events)
+            return _train(training, gait, bounds, scribe, settings, seed, events, begun)
         finally:
             scribe.close()
 
@@ -429,6 +433,7 @@ def _train(
     settings: SarsaSettings,
     seed: int,
     events: Any,
+    begun: tuple[_Bounds, Sarsa, Array] | None,
 ) -> TrainingProgress:
     env, run = training.env, training.run
     columns = _Columns(len(bounds.low))
@@ -438,6 +443,9 @@ def _train(
     action: int | None = None
     checkpoint = run.resume()
     log: list[Array] = []  # decisions not yet handed to the scribe
+    if begun is not None:
+        bounds, agent, decisions = begun
+        log.extend(decisions)
     if checkpoint is not None:
         with making_sense(run.folder):
             random.bit_generator.state = checkpoint["random"]
@@ -508,9 +516,9 @@ def _train(
             observation, action = seen, next_action
             if terminated or truncated:
                 training.note_help(info)
-                begun = reset_or_stop(env, None, training.stop)
-                if begun is not None:
-                    observation = begun
+                set_up = reset_or_stop(env, None, training.stop)
+                if set_up is not None:
+                    observation = set_up
                     gait.rest()
                     action = choose(observation)
             if training.save_is_due:
@@ -605,6 +613,24 @@ class SarsaPolicy:
         return command
 
 
+def _begun(
+    folder: Path, env: gymnasium.Env[Any, Any], settings: SarsaSettings, seed: int
+) -> tuple[_Bounds, Sarsa, Array]:
+    """Bounds, agent and decisions of a run that another begins with; its chance is the other's own."""
+    with making_sense(folder):
+        if (theirs := read_facts(folder)["settings"]) != settings.as_dict():
+            other = next(name for name, value in settings.as_dict().items() if theirs.get(name) != value)
+            raise BadInput(
+                f"it was trained with another {other.replace('_', ' ')}: {theirs.get(other)}", where=folder,
+                remedy="give the settings that it was trained with",
+            )  # fmt: skip
+        bounds, agent, _ = _of_run(folder, env)
+        agent.random = np.random.default_rng((seed, agent.decisions))
+        width = _Columns(len(bounds.low)).width
+        decisions = np.fromfile(folder / "transitions.f32", np.float32, agent.decisions * width).reshape(-1, width)
+        return bounds, agent, decisions
+
+
 def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[SarsaPolicy, int]:
     """The agent of a run, ready to act in an environment, and the step it was saved at.
 
@@ -612,22 +638,32 @@ def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[SarsaPolicy
         BadInput: no such run, or one whose observations or actions are not the environment's.
     """
     with making_sense(folder):
-        facts = read_facts(folder)
-        here = described(env)
-        gait = _gait(env, here)
-        check_trained_on(facts, here, ("observation_names", "action_names", "action_range", "dt"), folder)
-        checkpoint = load_checkpoint(folder)
-        _compile()
-        settings, seed = SarsaSettings(**facts["settings"]), int(facts["seed"])
-        _, agent = _learned(folder, checkpoint, len(gait), settings, seed)
-        if agent is None:
-            raise BadInput(
-                "it had not begun to learn when it was saved: its first minute measures the bounds of observations",
-                where=folder,
-                remedy="train a little longer",
-            )
+        _, agent, checkpoint = _of_run(folder, env)
         agent.settle()
-        return SarsaPolicy(agent, gait), int(checkpoint["step"])
+        return SarsaPolicy(agent, _gait(env, described(env))), int(checkpoint["step"])
+
+
+def _of_run(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[_Bounds, Sarsa, dict[str, Any]]:
+    """Bounds, agent and checkpoint of a run of SARSA(λ) that suits an environment."""
+    facts = read_facts(folder)
+    if facts["agent"] != "sarsa":
+        raise BadInput(
+            f"it is a run of {facts['agent']}, not of sarsa", where=folder, remedy="name a run of `openant train sarsa`"
+        )
+    here = described(env)
+    gait = _gait(env, here)
+    check_trained_on(facts, here, ("observation_names", "action_names", "action_range", "dt"), folder)
+    checkpoint = load_checkpoint(folder)
+    _compile()
+    settings, seed = SarsaSettings(**facts["settings"]), int(facts["seed"])
+    bounds, agent = _learned(folder, checkpoint, len(gait), settings, seed)
+    if agent is None:
+        raise BadInput(
+            "it had not begun to learn when it was saved: its first minute measures the bounds of observations",
+            where=folder,
+            remedy="train a little longer",
+        )
+    return bounds, agent, checkpoint
 
 
 def _gait(env: gymnasium.Env[Any, Any], described: Mapping[str, Any]) -> PrimitiveGait:

@@ -89,14 +89,16 @@ def run_facts(
     env_facts: Mapping[str, Any] | None,
     sizes: tuple[int, int],
     versions: Mapping[str, str],
+    source: Path | None = None,
 ) -> dict[str, Any]:
     """What `run.json` says of a run.
 
     Args:
         env_facts: how to make the environment again. sizes: how many observations and actions there are.
-        versions: of what computes the agent.
+        versions: of what computes the agent. source: the run whose agent it begins with.
     """
-    return {
+    begun = {} if source is None else {"from": str(source.resolve())}
+    return begun | {
         "agent": agent, "seed": seed, "settings": dict(settings), "env": dict(env_facts or {}),
         "trained_on": described(env), "observations": sizes[0], "actions": sizes[1],
         "versions": {**versions, "numpy": np.__version__, "gymnasium": gymnasium.__version__},

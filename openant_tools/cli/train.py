@@ -67,6 +67,7 @@ def sac(
     steps: int,
     seed: int,
     out: Path,
+    source: Path | None,
     dt: float | None,
     action_range: str | None,
     randomise: bool,
@@ -87,6 +88,7 @@ def sac(
       openant train sac --robot my-ant --steps 30000 --seed 1 --out my-ant/runs/sac-1
       openant eval my-ant/runs/sac-1 --seconds 120
       openant train sac --env hardware --robot my-ant --out my-ant/runs/real-1
+      openant train sac --env hardware --robot my-ant --from my-ant/runs/sac-1 --out my-ant/runs/real-2
     """
     if randomise and place.hardware:
         raise BadInput("--randomise is for the simulation", remedy="leave it out on a robot")
@@ -110,6 +112,7 @@ def sac(
             seed=seed,
             settings=settings,
             env_facts={"id": place.name, "options": place.options},
+            source=source,
             device=device,
             tensorboard=tensorboard,
             report=bar.show,

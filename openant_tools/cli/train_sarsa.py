@@ -47,6 +47,7 @@ def sarsa(
     steps: int,
     seed: int,
     out: Path,
+    source: Path | None,
     dt: float,
     action_range: str,
     epsilon: float | None,
@@ -83,6 +84,7 @@ def sarsa(
             seed=seed,
             settings=settings,
             env_facts={"id": place.name, "options": place.options},
+            source=source,
             tensorboard=tensorboard,
             report=bar.show,
         )

@@ -80,6 +80,10 @@ def training_options(hour: int, step_s: float, leaves: str) -> Callable[[Callabl
             help=f"The run's folder: {leaves}. A run that stands there goes on.",
         ),
         click.option(
+            "--from", "source", type=click.Path(path_type=Path, file_okay=False), metavar="RUN",
+            help="Begin with the agent of another run: its policy acts from the first step on, and learns on.",
+        ),
+        click.option(
             "--task", type=click.Choice(["back-and-forth", "forward"]), default="back-and-forth", show_default=True
         ),
     )  # fmt: skip

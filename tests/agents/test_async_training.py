@@ -89,6 +89,13 @@ def test_it_learns_beside_acting_and_goes_on_with_every_transition(tmp_path):
     with pytest.raises(BadInput, match="this folder holds another run: it differs in learning"):
         train(Robot(), folder=tmp_path, steps=200, seed=0, settings=SMALL)
 
+    train_async(Robot(), folder=tmp_path / "more", steps=20, seed=1, settings=SMALL, source=tmp_path)
+    begun, _ = load_policy(tmp_path / "more", Robot())
+    seen = np.full(1, 0.3, np.float32)
+    np.testing.assert_array_equal(
+        begun.act(seen, explore=False), agent.act(seen, explore=False)
+    )  # nothing is learned from so few
+
 
 def test_kill_9_loses_no_transition(tmp_path):
     code = f"""

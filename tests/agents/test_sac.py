@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -213,6 +214,26 @@ def test_stopping_and_going_on_changes_nothing(tmp_path, straight):
     again = train(env, folder=tmp_path, steps=230, seed=3, settings=SMALL)
     assert again.step == 230
     assert everything(tmp_path) == straight
+
+
+def test_a_run_begins_with_the_agent_of_another_and_needs_it_no_more(tmp_path, monkeypatch):
+    source, again = tmp_path / "source", tmp_path / "again"
+    train(ant(), folder=source, steps=230, seed=3, settings=SMALL)
+    policy, _ = load_policy(source, ant())
+    wide = dataclasses.replace(SMALL, hidden=16)
+    with pytest.raises(BadInput, match="other networks"):
+        train(ant(), folder=tmp_path / "wide", steps=10, seed=4, settings=wide, source=source)
+    monkeypatch.setattr(Sac, "random_action", None)  # its policy acts, not chance
+    train(ant(), folder=again, steps=40, seed=4, settings=SMALL, source=source)  # nothing is learned from so few
+    begun, _ = load_policy(again, ant())
+    observation = np.zeros(policy.replay.observations, np.float32)
+    np.testing.assert_array_equal(begun.act(observation, explore=False), policy.act(observation, explore=False))
+    assert json.loads((again / "run.json").read_text())["from"] == str(source)
+    shutil.rmtree(source)
+    done = train(ant(), folder=again, steps=120, seed=4, settings=SMALL, source=source)
+    assert done.step == 120
+    with pytest.raises(BadInput, match="differs in from"):
+        train(ant(), folder=again, steps=130, seed=4, settings=SMALL)
 
 
 def test_ctrl_c_saves_and_the_same_call_goes_on(tmp_path, straight, monkeypatch):

@@ -3,10 +3,12 @@ that no kill undoes."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -387,6 +389,22 @@ def test_a_policy_plays_what_it_learned_and_only_where_it_fits(tmp_path):
     rows[: 53 * 5].tofile(tmp_path / "run" / "transitions.f32")
     with pytest.raises(BadInput, match="its log has 5 of 25 decisions"):
         load_policy(tmp_path / "run", env)
+
+
+def test_a_run_begins_with_the_agent_of_another_and_needs_it_no_more(tmp_path):
+    source, again = tmp_path / "source", tmp_path / "again"
+    train(ant(), folder=source, steps=300, seed=2, settings=QUICK)
+    learned = load_checkpoint(source)["agent"]["decisions"]
+    with pytest.raises(BadInput, match="another step size"):
+        train(ant(), folder=again, steps=30, seed=5, settings=dataclasses.replace(QUICK, step_size=1e-3), source=source)
+    train(ant(), folder=again, steps=100, seed=5, settings=QUICK, source=source)
+    assert load_checkpoint(again)["agent"]["decisions"] == learned + 10, "it learns from the first decision on"
+    log = (source / "transitions.f32").read_bytes()
+    assert (again / "transitions.f32").read_bytes().startswith(log)
+    shutil.rmtree(source)
+    done = train(ant(), folder=again, steps=200, seed=5, settings=QUICK, source=source)
+    assert done.step == 200
+    assert load_policy(again, ant()).step == 200
 
 
 def test_a_decision_never_waits_for_the_disk(tmp_path, monkeypatch):
