@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import select
 import sys
-import termios
 from collections.abc import Callable
 
 import click
@@ -158,7 +157,8 @@ class CommandFace:
         """Bars that stay in place on a terminal, nothing where the output goes to a file; whether Enter was pressed since."""
         watched = not self._yes and sys.stdin.isatty()
         if watched and not self._watching:  # a key that was pressed before counts for nothing that comes later
-            termios.tcflush(sys.stdin, termios.TCIFLUSH)
+            while _entered():
+                pass
         self._watching = watched
         if self.console.is_terminal and live.low:
             if self._live:
@@ -171,13 +171,15 @@ class CommandFace:
                     f"\x1b[2K  {joint:8} {bar} {number(value, live.unit, sign=True, decimals=1)} {live.marks.get(joint, '')}\n"
                 )
             self._live = len(live.values)
-        if watched and select.select([sys.stdin], [], [], 0)[0]:
-            sys.stdin.readline()
-            return True
-        return False
+        return watched and _entered()
 
     def _end_live(self) -> None:
         self._live, self._watching = 0, False
+
+
+def _entered() -> bool:
+    """Whether a line was entered that nobody has read yet; it is read."""
+    return bool(select.select([sys.stdin], [], [], 0)[0] and sys.stdin.readline())
 
 
 def echo_finding(finding: Finding) -> None:
