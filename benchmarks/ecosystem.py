@@ -72,6 +72,10 @@ ROWS = {
         ("stable-baselines3", "torch", "gymnasium"),
     ),
     "torchrl": Row("TorchRL collects and checks specs", ((".", "torchrl"),), ("examples/torchrl_ant.py",), ("torchrl", "torch")),
+    "cleanrl": Row(
+        "CleanRL's own file learns, nothing changed but the id", ((".", "torch", "tyro", "tensorboard"),), peer("cleanrl"),
+        ("torch", "tyro", "gymnasium"), "git",
+    ),
     "gymnasium": Row(
         "Gymnasium's own checker on every id", ((".",),), peer("gymnasium_checker"), ("gymnasium", "mujoco-core")
     ),

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import runpy
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
+from places import ROOT
 
 torch = pytest.importorskip("torch")
 
@@ -14,15 +18,14 @@ torch.set_num_threads(1)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_stable_baselines3_trains_and_plays(tmp_path):
+def test_the_example_for_stable_baselines3_learns_evaluates_and_is_kept(tmp_path, capsys, monkeypatch):
     toolkit = pytest.importorskip("stable_baselines3")
-    env = gymnasium.make("openant/Ant-v0", dt=0.02, time_limit_s=0.4)
-    model = toolkit.SAC("MlpPolicy", env, learning_starts=40, batch_size=16, policy_kwargs={"net_arch": [16]}, seed=0)
-    before = [weight.clone() for weight in model.actor.parameters()]
-    model.learn(80)
-    assert model.num_timesteps == 80
-    assert any((now != then).any() for now, then in zip(model.actor.parameters(), before, strict=True))
-    assert len(model.ep_info_buffer) >= 3  # SB3's own monitor saw our time limits
+    monkeypatch.setattr(sys, "argv", ["sb3.py", "200"])
+    played = runpy.run_path(str(ROOT / "examples" / "sb3.py"), run_name="__main__")
+    assert "after 200 steps: " in capsys.readouterr().out
+    model, env = played["model"], played["env"]
+    assert model.num_timesteps == 200
+    assert len(model.ep_info_buffer) == 2  # SB3's own monitor saw our time limits
     model.save(tmp_path / "walker.zip")
     again = toolkit.SAC.load(tmp_path / "walker.zip")
     observation, _ = env.reset(seed=0)
