@@ -19,7 +19,7 @@ from openant_tools.effects.catalogue import enter
 from openant_tools.effects.robot import USUAL_NOISE, Robot
 from openant_tools.gap.descent import END, LEAST_GAIN, Descent
 from openant_tools.gap.features import COLUMNS, Floats, around_switching
-from openant_tools.gap.hypothesis import Part, Refit, bounds_within, extent, quantities, refit_at, sizes
+from openant_tools.gap.hypothesis import Part, Refit, bounds_of, quantities, refit_at, scaled, sizes
 from openant_tools.gap.nuisance import BODY, HEAT_LOSS, LESS, ONE_SIDED, TILTS, adjust, nuisances
 from openant_tools.gap.protocol import Played, RunSet
 from openant_tools.gap.simulation import simulate
@@ -58,9 +58,9 @@ class Closure:
     Attributes:
         before, after, floor: rad, of joints. closed: share of the excess that is gone; low, high: over the folds, 95 %.
         squares: (folds, channels) summed over rows; counts: (folds, channels) of how many errors.
-        fitted: (channels,) mean square of what it leaves of all that it was fitted to; likelihood: the logarithm of how likely that is,
-            where errors of each channel in each run have a size of their own, and that of sizes and tolerances.
-            known: (channels,) mean square of sensors.
+        apart: (folds, channels) squares of how far it is from what it is asked about beside, summed over the same rows.
+        likelihood: the logarithm of how likely all is that it was fitted to, where errors of each channel in each run have a size of
+            their own, and that of sizes and tolerances. known: (channels,) mean square of sensors.
         refit: on all training runs together.
         std: of the coordinates of its causes, in order: by curvature with errors as large as the fit leaves them, or by how much folds
             differ (jackknife), whichever is more.
@@ -72,9 +72,9 @@ class Closure:
     closed: float
     low: float
     high: float
-    fitted: Array
     likelihood: float
     squares: Array
+    apart: Array
     counts: Array
     known: Array
     refit: Refit
@@ -86,19 +86,21 @@ class Closure:
         Up to a factor that of their likelihoods, where errors of each channel on each fold have a size of their own that nobody knows,
         but not less than sensors'.
         """
-        rows = np.maximum(self.counts, 1.0)  # of a fold without any nothing is left
-        return self._less(other.squares / rows, self.squares / rows) / len(self.counts)
+        return self._less(other.squares)
+
+    @property
+    def foretold(self) -> float:
+        """What support would be if it were right: what it leaves is none of what it says that the other leaves beside that."""
+        return self._less(self.squares + self.apart)
 
     def likelier(self, other: Closure) -> float:
         """nats by which what it was fitted to is likelier."""
         return self.likelihood - other.likelihood
 
-    def foretold(self, other: Closure) -> float:
-        """The same of what it was fitted to."""
-        return self._less(other.fitted, self.fitted)
-
-    def _less(self, other: Array, own: Array) -> float:
-        return float(0.5 * np.log((other + self.known) / (own + self.known)).sum())
+    def _less(self, squares: Array) -> float:
+        rows = np.maximum(self.counts, 1.0)  # of a fold without any nothing is left
+        each = np.log((squares / rows + self.known) / (self.squares / rows + self.known))
+        return float(0.5 * each.sum()) / len(rows)
 
 
 class Windows:
@@ -247,16 +249,19 @@ class Windows:
         Returns:
             of each the fit, those without a group, standard deviations of its sizes, and the logarithm of how likely it is.
         """
-        descents = self._descend(starts, list(training))
+        fitted = list(training)
+        descents = self._no_worse(self._descend(starts, fitted), fitted)
         for one in descents:
             if not one.causes:
                 self._keep(one)
         out = []
         for one in descents:
             folds = [[k for k in one.blocks if k not in left] for left in leave_out]
-            # Where a fold leads otherwise than all of them together, from where these came to.
+            # Where a fold leads otherwise than all of them together, from where these came to; held back it would not leave there.
+            one.damping = 0.0
             low, high = self._bounds(one)
-            each = [np.clip(one.at + self._solve(one, fold) - one.u, low, high) for fold in folds]
+            whole_way = self._solve(one, list(one.blocks))
+            each = [np.clip(one.at + self._solve(one, fold) - whole_way, low, high) for fold in folds]
             whole, parts = refit_at(one.start, one.at), [refit_at(one.start, u) for u in each]
             out.append((whole, parts, refit_at(one.start, self._deviations(one, parts)).x, -0.5 * one.least))
         return out
@@ -273,6 +278,17 @@ class Windows:
         spread = np.sqrt((len(each) - 1) / len(each) * np.square(each - each.mean(axis=0)).sum(axis=0))
         out: Array = np.maximum(curvature, spread)
         return out
+
+    def _no_worse(self, descents: list[Descent], fitted: Sequence[int]) -> list[Descent]:
+        """Where a cause leaves more than it does when it is not there, a descent from there in its place."""
+        absent = [scaled(one.start, 0.0) if one.causes else one.start for one in descents]
+        without = [Descent.of(one, len(self.names), self._learnt) for one in absent]
+        self._look(without, fitted, slopes=False)
+        again = [n for n, (one, other) in enumerate(zip(descents, without, strict=True)) if other.least < one.least]
+        if again:
+            for n, one in zip(again, self._descend([absent[n] for n in again], fitted), strict=True):
+                descents[n] = one
+        return descents
 
     def _descend(self, starts: Sequence[Refit], fitted: Sequence[int]) -> list[Descent]:
         """Follow each start to where it leaves least on these runs."""
@@ -316,33 +332,32 @@ class Windows:
 
     def _solve(self, descent: Descent, runs: Sequence[int]) -> Array:
         """Where the blocks of some runs lead, made where the descent was best."""
-        u, prior, scale, held = descent.at, descent.prior, descent.scale, 1 + descent.damping
+        u, prior, scale = descent.at, descent.prior, descent.scale
         low, high = self._bounds(descent)
         within = np.minimum(low - u, 0) - TINY, np.maximum(high - u, 0) + TINY
         blocks, found = [descent.blocks[k] for k in runs], u
         for _ in range(INFLATIONS):
-            more, slope = np.diag(held / scale**2), (u - prior) / scale**2
+            more, slope = np.diag(1 / scale**2), (u - prior) / scale**2
             for block in blocks:
                 own, along = block.weighted(1 / block.inflation(block.left(found - u)))
                 more, slope = more + own, slope + along
             # What ends at a bound leaves its part to the others: clipped afterwards it would leave it undone.
-            root = np.linalg.cholesky(more)
+            root = np.linalg.cholesky(more + descent.damping * np.diag(np.diag(more)))
             found = np.clip(u + lsq_linear(root.T, -np.linalg.solve(root, slope), bounds=within).x, low, high)
         return found
 
     def _bounds(self, descent: Descent) -> tuple[Array, Array]:
         """Between which each coordinate may be."""
-        each = zip(quantities(descent.start), descent.prior, extent(descent.start), strict=False)
-        ends = [bounds_within(q, float(at), float(far)) for q, at, far in each]
+        ends = [bounds_of(q) for q in quantities(descent.start)]
         low, high = np.array([*ends, *[(-END, END)] * len(self.names)]).T
         return low, high
 
-    def _look(self, descents: Sequence[Descent], fitted: Sequence[int]) -> None:
-        """Simulate runs where descents look next, and what varies there."""
+    def _look(self, descents: Sequence[Descent], fitted: Sequence[int], slopes: bool = True) -> None:
+        """Simulate runs where descents look next, and, for slopes, what varies there."""
         found: list[dict[int, Floats]] = [{} for _ in descents]
         for mine, rollouts in self._side_by_side(fitted):
             first = mine[0]
-            columns = [self._columns(first, one) for one in descents]
+            columns = [self._columns(first, one) if slopes else [] for one in descents]
             steps = [one.steps_on(self.protocol.runs[first].plant.setup) for one in descents]
             robots = [
                 self.robot(refit_at(one.start, u), first)
@@ -353,15 +368,15 @@ class Windows:
                 weight, at = self._weight(k), 0
                 for one, some, by, seen in zip(descents, columns, steps, found, strict=True):
                     seen[k] = (np.nan_to_num(errors[at]) * weight).astype(np.float32)
-                    slopes = np.zeros((len(one.u), *seen[k].shape), np.float32)
+                    change_by = np.zeros((len(one.u), *seen[k].shape), np.float32)
                     if k in one.slopes:
-                        slopes[:] = one.slopes[k]
+                        change_by[:] = one.slopes[k]
                     for row, members in enumerate(some, at + 1):
                         change = np.nan_to_num(errors[row] - errors[at]) * weight
                         for p, mask in members:
-                            slopes[p] = np.where(mask, change, 0.0) / by[p]
+                            change_by[p] = np.where(mask, change, 0.0) / by[p]
                     at += 1 + len(some)
-                    one.slopes[k] = slopes
+                    one.slopes[k] = change_by
         for one, seen in zip(descents, found, strict=True):
             one.told(seen, {k: self._count(k) for k in fitted})
 
@@ -442,39 +457,34 @@ def closures(
     """What each hypothesis leaves of the gap.
 
     Args:
+        starts: the first is what the others are asked about beside.
         folds: runs judged together by fits that have not seen them. training: the runs to fit on, but for those of the fold.
     """
     fits = windows.refit(starts, training, folds)
-    judged = {k for fold in folds for k in fold}
     channels = len(windows.sigma)
     each, counts = np.zeros((len(starts), len(folds), channels)), np.zeros((len(folds), channels))
-    seen, rows = np.zeros((len(starts), channels)), np.zeros(channels)
+    apart = np.zeros_like(each)
     gaps, known = np.zeros((len(starts) + 1, len(folds))), np.zeros(len(folds))
-    for k in sorted(judged | set(training)):
-        mine = [f for f, fold in enumerate(folds) if k in fold]
-        refits = [one for whole, parts, *_ in fits for one in (whole, *(parts[f] for f in mine))]
-        squares, good = _squares(windows.over_windows(k, refits))
-        of = squares.reshape(len(starts), 1 + len(mine), channels)
-        if k in training:
-            seen, rows = seen + of[:, 0], rows + good
-        each[:, mine] += of[:, 1:]
-        counts[mine] += good
-        if mine:
-            held_out = [parts[f] for _, parts, *_ in fits for f in mine]
+    for f, fold in enumerate(folds):
+        held_out = [parts[f] for _, parts, *_ in fits]
+        for k in sorted(fold):
+            errors = windows.over_windows(k, held_out)
+            squares, good = _squares(errors)
+            each[:, f], counts[f] = each[:, f] + squares, counts[f] + good
+            apart[:, f] += _squares(errors - errors[0])[0]
             squares, good = _squares(np.concatenate([windows.before(k)[None], windows.errors(k, held_out)]))
-            gaps[0, mine] += squares[0].sum()
-            gaps[1:, mine] += squares[1:].sum(axis=1).reshape(len(starts), len(mine))
-            known[mine] += good.sum()
+            gaps[:, f] += squares.sum(axis=1)
+            known[f] += good.sum()
     floor = float(np.sqrt(np.mean(windows.floor**2)))
     out = []
     for n, (whole, _, std, likelihood) in enumerate(fits):
         both = gaps[[0, n + 1]]
         before, after = (float(one) for one in np.sqrt(both.sum(axis=1) / known.sum()))
         low, high = _interval(both[0], both[1], known, floor)
-        closed, fitted = _closed(before, after, floor), seen[n] / np.maximum(rows, 1.0)
         out.append(
             Closure(
-                before, after, floor, closed, low, high, fitted, likelihood, each[n], counts, windows.sigma**2, whole, std
+                before, after, floor, _closed(before, after, floor), low, high, likelihood, each[n], apart[n], counts,
+                windows.sigma**2, whole, std,
             )
         )  # fmt: skip
     return out

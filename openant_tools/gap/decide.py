@@ -1,8 +1,8 @@
 """The decision: a pure function of frozen rows, one for each hypothesis, of learned weights and of explicit costs.
 
 A row says how likely its cause is to lead by the evidence, and what its fit says of it: how much less of the gap it leaves on held-out data
-than a re-fit within tolerance does, how much less it left where it was fitted, and how much likelier it made that. So data speak for a cause
-and against it: one that leaves more, or that should leave less and does not, is no longer likely, whatever the evidence said.
+than a re-fit within tolerance does, how much less it should leave there, and how much likelier it made what it was fitted to. So data speak
+for a cause and against it: one that leaves more, or that should leave less and does not, is no longer likely, whatever the evidence said.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Row:
         support: logarithm of how much less it leaves of the gap on held-out folds, mean of them and summed over joints, than what it is asked
             about beside does (no further cause, or the others); None where it was not fitted, or where nothing that was recorded
             tells.
-        foretold: the same of what it was fitted to; likelier: nats by which that is likelier, its sizes and tolerances with it.
+        foretold: what that would be if it were right; likelier: nats by which what it was fitted to is, its sizes and tolerances with it.
         gain: share of the excess gap that it closes on held-out folds beyond what is closed without it, for the report.
     """
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.gap.features import Floats
-from openant_tools.gap.hypothesis import Refit, extent, quantities, sizes
+from openant_tools.gap.hypothesis import Refit, prior_of, quantities, sizes
 from openant_tools.model.plant import Setup
 
 __all__ = ["END", "LEAST_GAIN", "Block", "Descent"]
@@ -19,16 +19,14 @@ Array = NDArray[np.float64]
 
 #: standard deviation of a prior, as a share of the tolerance; and where it ends: a re-fit within tolerance is no effect
 SPREAD, END = 0.6, 1.0
-#: standard deviation that sizes of causes keep from where they were found, as a share
-POLISH = 0.3
-#: the step, in prior deviations, and the gain, in nats, below which a fit has settled
-SETTLED, LEAST_GAIN = 0.02, 0.25
-#: times its prior by which a step is held back that made things worse, by so much more each time; and at most
+#: the step, in those by which slopes are learnt, and the gain, in nats, below which slopes lead no farther: feet that chatter make as much
+SETTLED, LEAST_GAIN = 0.03, 2.0
+#: times all that is known of each coordinate by which a step is held back that made things worse, by so much more each time; and at most
 HELD_BACK, MOST = 4.0, 64.0
-#: by how much each is varied to learn its slope, in tolerances and as a share of a size or of a shape's range: on a floor so far that it is
-#: not the slope of feet that chatter
+#: by how much each is varied to learn its slope, in tolerances, on a floor so far that it is not the slope of feet that chatter; as a share of
+#: a size, of the least that matters where there is none, and of a shape's range
 NEARBY = {Setup.STAND: 0.3, Setup.FLOOR: 1.0}
-NEARBY_SIZE, NEARBY_SHAPE = 0.15, 0.1
+NEARBY_SIZE, NEARBY_NONE, NEARBY_SHAPE = 0.15, 0.5, 0.1
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ class Descent:
         u: where it looks next, sizes of causes, then tolerances. prior, scale: around what, and how far it may go.
         at, least, errors: where it was best, what it cost there, and of each run the weighted errors (rows, channels).
         slopes: of each run, weighted, (coordinates, rows, channels); blocks: what each run says where it was best.
-        bends: which of them are other ones wherever it comes to. damping: how much steps are held back, in priors.
+        bends: which of them are other ones wherever it comes to. damping: how much steps are held back.
         gained: nats, by its last step that gained.
     """
 
@@ -108,25 +106,24 @@ class Descent:
     @classmethod
     def of(cls, start: Refit, tolerances: int, learnt: Mapping[int, Floats]) -> Descent:
         """From a start, with what slopes are known of the tolerances alone."""
-        centre, far = sizes(start), extent(start)
-        shares = np.array([q.share for q in quantities(start)], bool)
-        deviations = np.where(shares, POLISH, np.maximum(POLISH * far, 1e-3))
-        steps = np.where(shares, NEARBY_SHAPE, np.maximum(NEARBY_SIZE * far, 1e-3))
-        u: Array = np.concatenate([centre, start.nuisance])
+        at = sizes(start)
+        centre, deviations = prior_of(start)
+        least = [NEARBY_SHAPE if q.share else 0.0 if q.shape else NEARBY_NONE * q.small for q in quantities(start)]
+        steps = np.maximum(NEARBY_SIZE * np.abs(at), least)
+        u: Array = np.concatenate([at, start.nuisance])
         slopes = {
-            k: np.concatenate([np.zeros((len(centre), *known.shape[1:]), np.float32), known])
-            for k, known in learnt.items()
+            k: np.concatenate([np.zeros((len(at), *known.shape[1:]), np.float32), known]) for k, known in learnt.items()
         }
         return cls(
             start,
-            len(centre),
+            len(at),
             u,
             np.concatenate([centre, np.zeros(tolerances)]),
             np.concatenate([deviations, np.full(tolerances, SPREAD)]),
             np.concatenate([steps, np.ones(tolerances)]),
             slopes,
             u,
-            np.array([True] * len(centre) + [False] * tolerances),
+            np.array([True] * len(at) + [False] * tolerances),
         )
 
     def begin(self) -> None:
@@ -139,7 +136,7 @@ class Descent:
         return (
             self.damping <= MOST
             and self.gained > LEAST_GAIN
-            and bool((np.abs(self.u - self.at) > SETTLED * self.scale).any())
+            and bool((np.abs(self.u - self.at) > SETTLED * self.steps).any())
         )
 
     def steps_on(self, setup: Setup) -> Array:

@@ -71,7 +71,7 @@ def diagnose(
     chosen = tuple(name for row in decision.selected for name in row.causes)
     while decision.verdict != AMBIGUOUS and chosen in trials.closures and 0 < len(chosen) < CAUSES:
         tell(0.8 + 0.05 * len(chosen), f"what acts beside {' and '.join(chosen)}")
-        trials.fit(further := _beside(assessment, chosen))
+        trials.fit([chosen, *(further := _beside(assessment, chosen))])
         more = adds([trials.row(causes, assessment.present[causes[-1]]) for causes in further])
         if more is None:
             break
@@ -88,9 +88,9 @@ def hypotheses(experiment: Experiment, prior: Sequence[str], progress: Progress)
     suspects = ranked[:SUSPECTS] + [name for name in prior if name in ranked[SUSPECTS:]]
     progress(0.8, "what the likeliest causes close on held-out parts")
     trials = Trials.of(experiment, assessment)
-    # By itself first: causes begin where tolerances have come to, with what was learnt of them.
+    # By itself first: causes begin where tolerances have come to, with what was learnt of them, and so does none.
     trials.fit([()])
-    trials.fit([(name,) for name in suspects])
+    trials.fit([(), *((name,) for name in suspects)])
     return trials, [Row((), probability=assessment.none), *(trials.row((name,), leads[name]) for name in ranked)]
 
 

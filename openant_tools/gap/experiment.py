@@ -62,7 +62,7 @@ class Experiment:
         plants = [
             load_plant(own or model, joints, setup_of(run.facts.setup)) for run, own in zip(every, models, strict=True)
         ]
-        selection = select(every, plants, at_most_s=at_most_s)
+        selection = select(every, plants, at_most_s=at_most_s, held_out=len(hold_out))
         whole, parts, of = [], [], []
         for k, (run, own) in enumerate(zip(every, models, strict=True)):
             if k < len(runs) and selection.windows[k]:

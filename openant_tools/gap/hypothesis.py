@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.effect import Cause, Quantity
 
-__all__ = ["Hypothesis", "Part", "Refit", "bounds_of", "bounds_within", "extent", "quantities", "refit_at", "sizes"]
+__all__ = ["Hypothesis", "Part", "Refit", "bounds_of", "prior_of", "quantities", "refit_at", "scaled", "sizes"]
 
 Array = NDArray[np.float64]
 
@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 BEYOND = 2.5
 #: the largest share that anything may take
 WHOLE = 0.98
-#: times what it was found to be that a size may become
-FARTHEST = 2.5
+#: standard deviation that shapes keep from where they were found, as a share
+POLISH = 0.3
 
 
 @dataclass(frozen=True)
@@ -64,22 +64,20 @@ class Refit:
     nuisance: Array
 
 
-def bounds_within(quantity: Quantity, at: float, from_none: float) -> tuple[float, float]:
-    """Between which a size may be polished that was found somewhere: it keeps its sign, and a shape its reason."""
-    if quantity.shape:
-        return bounds_of(quantity)
-    far = FARTHEST * from_none
-    return -far if at < 0 or (quantity.signed and not at) else 0.0, far if at > 0 or not at else 0.0
+def prior_of(refit: Refit) -> tuple[Array, Array]:
+    """(coordinates,) around what each is sought, and how widely: a size around none, a shape around what was found."""
+    centre, deviation = [], []
+    for q, x in zip(quantities(refit), sizes(refit), strict=True):
+        centre.append(float(x) if q.shape else 0.0)
+        deviation.append(q.large if not q.shape else POLISH if q.share else POLISH * float(x))
+    return np.array(centre), np.array(deviation)
 
 
-def extent(refit: Refit) -> Array:
-    """(coordinates,) how far each is from none; of a vector what it would be if it had its part in how long that is."""
-    out = []
-    for part, x in zip(refit.hypothesis, refit.x, strict=True):
-        amounts = [q for q in part.definition.quantities if not q.shape]
-        long = max((abs(x[q.name]) / q.small for q in amounts), default=0.0) if part.definition.vector else 0.0
-        out += [max(abs(x[q.name]), 0.0 if q.shape else q.small * long) for q in part.definition.quantities]
-    return np.array(out)
+def scaled(refit: Refit, times: float) -> Refit:
+    """The same with so many times the sizes of its last cause."""
+    sized = {q.name for q in refit.hypothesis[-1].definition.quantities if not q.shape}
+    x = {name: value * (times if name in sized else 1.0) for name, value in refit.x[-1].items()}
+    return dataclasses.replace(refit, x=(*refit.x[:-1], x))
 
 
 def quantities(refit: Refit) -> list[Quantity]:

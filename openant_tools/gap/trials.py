@@ -37,7 +37,7 @@ class Trials:
         return cls(experiment, assessment, Windows(experiment.parts, assessment.set_aside))
 
     def fit(self, sets: Sequence[Causes]) -> None:
-        """Fit sets of causes, each at its best place, on all parts but those of each fold."""
+        """Fit sets of causes, each at its best place, on all parts but those of each fold; the first is asked about beside."""
         starts = [self._start(causes) for causes in sets]
         done = closures(self.windows, starts, self.experiment.folds, self.experiment.training)
         self.closures |= zip(sets, done, strict=True)
@@ -86,4 +86,4 @@ class Trials:
 
 def _beyond(one: Closure, other: Closure) -> tuple[float, float, float, float]:
     """What a row says of held-out data, and of the data that were fitted."""
-    return one.support(other), one.foretold(other), one.likelier(other), one.closed - other.closed
+    return one.support(other), one.foretold, one.likelier(other), one.closed - other.closed

@@ -78,13 +78,18 @@ def window_s(setup: Setup) -> float:
 
 
 def select(
-    runs: Sequence[Run], plants: Sequence[Plant], length_s: float | None = None, at_most_s: float = AT_MOST_S
+    runs: Sequence[Run],
+    plants: Sequence[Plant],
+    length_s: float | None = None,
+    at_most_s: float = AT_MOST_S,
+    held_out: int = 0,
 ) -> Selection:
     """The windows of some runs that are simulated: all, where they are no more than `at_most_s` together, else those that tell most.
 
     Args:
         plants: of each run, the model set up as it was made.
         length_s: of a window, about; default as `window_s`.
+        held_out: how many of the last runs are judged on alone: of them as much time is simulated again, because few robots are.
 
     Raises:
         BadInput: too little of them can be simulated.
@@ -102,7 +107,12 @@ def select(
         # What the same motion tells on a floor is another matter than on a stand.
         floor = np.array([plants[piece.run].setup is Setup.FLOOR for piece in pieces])[:, None]
         what = np.hstack([np.where(floor, 0.0, what), np.where(floor, what, 0.0)])
-        pieces = _most_telling(pieces, what, at_most_s)
+        judged = np.array([piece.run >= len(runs) - held_out for piece in pieces])
+        chosen = _most_telling(pieces, what, at_most_s)
+        alone = _most_telling(
+            [piece for piece, one in zip(pieces, judged, strict=True) if one], what[judged], at_most_s
+        )
+        pieces = [piece for piece in chosen if piece.run < len(runs) - held_out] + alone
     # A fold of which nothing is simulated cannot be held out.
     there = sorted({piece.fold for piece in pieces})
     own = [[piece for piece in pieces if piece.run == k] for k in range(len(runs))]
@@ -148,7 +158,7 @@ def cut(stretches: Sequence[tuple[float, float]], part: Part, length_s: float) -
 def _most_telling(pieces: Sequence[_Piece], what: Array, at_most_s: float) -> list[_Piece]:
     """Those of the windows that tell most, in order of time; `what` (windows, numbers) each shows."""
     seconds = np.array([piece.seconds for piece in pieces])
-    fold = np.array([piece.fold for piece in pieces])
+    fold = np.array([piece.fold for piece in pieces], int)
     share = _shares(np.bincount(fold, seconds).astype(np.float64), at_most_s)
     spent, inverse = np.zeros(len(share)), np.eye(what.shape[1])
     left, follows = np.ones(len(pieces), bool), np.zeros(len(pieces), bool)
