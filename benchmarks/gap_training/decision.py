@@ -34,11 +34,12 @@ START = {
     "none": 0.0,
     "outside": 0.0,
     "outside: support": 0.0,
+    "outside: left": 0.0,
 }
 FAR = 1.0
 POSITIVE = ("evidence", "support", "shortfall", "likelier")
 #: the weights of what held-out data say
-HELD_OUT = ("support", "shortfall", "likelier", "outside: support")
+HELD_OUT = ("support", "shortfall", "likelier", "outside: support", "outside: left")
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,8 @@ def robot(found: Mapping[str, object], truth: Mapping[str, object]) -> Judged:
         if row["causes"] == [OUTSIDE]:
             outside = row["probability"]
             continue
-        rows.append(Row(tuple(row["causes"]), (), row["probability"], row["support"], row["foretold"], row["likelier"]))
+        kept = (row[name] for name in ("probability", "support", "foretold", "likelier", "left"))
+        rows.append(Row(tuple(row["causes"]), (), *kept))
     effects = truth.get("effect", [])
     right = {one["effect"] for one in effects}
     # What is hardly beyond tolerance need not be found.

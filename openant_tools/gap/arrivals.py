@@ -49,13 +49,13 @@ class Arrivals:
 
     Attributes:
         t: (rows,) s. counts: (rows,) which are looked at.
-        late: of each joint, (rows, commands) rad beside the rows about for each second that a command is late.
+        behind: of each joint, (rows, commands) rad beside the rows about for each second that a command is late.
         command: (rows, joints) rad in force.
     """
 
     t: Array
     counts: Bools
-    late: tuple[csr_array, ...]
+    behind: tuple[csr_array, ...]
     command: Array
 
     @classmethod
@@ -93,7 +93,7 @@ class Arrivals:
         off = against_neighbours(x, self.t) * self.counts[:, None]
         model = np.gradient(simulated.astype(np.float64), self.t, axis=0)
         said = []
-        for j, answers in enumerate(self.late):
+        for j, answers in enumerate(self.behind):
             usual = self._usual(simulated[:, j].astype(np.float64), model[:, j], self.command[:, j])
             left = off[:, :, j] - (off[:, :, j] @ usual) @ usual.T
             shows = np.asarray(answers.multiply(answers).sum(axis=0)) - np.square(answers.T @ usual).sum(axis=1)
@@ -143,7 +143,7 @@ def _servos(run: Run, plant: Plant) -> tuple[Array, Array]:
 
 
 def _answers(t: Array, times: Array, steps: Array, natural: float, damped: float, counts: Bools) -> csr_array:
-    """(rows, commands) as `Arrivals.late`: what rows lie behind, beside those about them, for each second a step is late."""
+    """(rows, commands) as `Arrivals.behind`: what rows lie behind, beside those about them, for each second a step is late."""
     grid = np.arange(0.0, ANSWERS_S + STEP_S, STEP_S)
     position = _step_response(grid, natural, damped)
     found = []

@@ -160,7 +160,7 @@ def _simulated(
             progress(0.9 * len(found) / len(work), "what each cause does to this recording")
         return {"templates": np.concatenate(found[:parts]), "healthy": np.concatenate(found[parts:])}
 
-    stored = _kept(name, make)
+    stored = _cached(name, make)
     return stored["templates"], stored["healthy"]
 
 
@@ -172,7 +172,7 @@ def _more(protocol: RunSet, name: str, cases: Sequence[Case], jobs: int) -> Floa
         return {"templates": np.concatenate([np.concatenate(part, axis=1) for part in done])}
 
     asked = hashlib.sha256(json.dumps([list(case.causes.items()) for case in cases]).encode()).hexdigest()
-    return _kept(f"{name}-{asked[:12]}", make)["templates"]
+    return _cached(f"{name}-{asked[:12]}", make)["templates"]
 
 
 def _of_templates(protocol: RunSet, cases: Sequence[Case]) -> list[object]:
@@ -181,7 +181,7 @@ def _of_templates(protocol: RunSet, cases: Sequence[Case]) -> list[object]:
     return [joblib.delayed(tied(templates_at))(protocol, cases[n : n + step]) for n in range(0, len(cases), step)]
 
 
-def _kept(name: str, make: Callable[[], dict[str, Floats]]) -> Mapping[str, Floats]:
+def _cached(name: str, make: Callable[[], dict[str, Floats]]) -> Mapping[str, Floats]:
     """What was made once, under the name of all that it follows from."""
     place = cache_folder() / f"{name}.npz"
     if place.exists():

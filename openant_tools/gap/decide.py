@@ -21,8 +21,8 @@ from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED
 __all__ = ["OUTSIDE", "WEIGHTS", "Decision", "Row", "adds", "chances", "decide", "weights"]
 
 #: the weights by their names: of logarithms of probabilities by the evidence, of what held-out data say of a cause, of how much more
-#: its fit had promised, and of how much likelier it made what it was fitted to; of nothing and of something unknown by themselves, and of this by the best that any cause does
-WEIGHTS = ("evidence", "support", "shortfall", "likelier", "none", "outside", "outside: support")
+#: its fit had promised, and of how much likelier it made what it was fitted to; of nothing and of something unknown by themselves, and of this by the most that any cause does, and by the least that any leaves
+WEIGHTS = ("evidence", "support", "shortfall", "likelier", "none", "outside", "outside: support", "outside: left")
 #: where they lie in this package
 FILE = "decision.json"
 #: of what no catalogue has, beside the names of causes
@@ -51,6 +51,7 @@ class Row:
             about beside does (no further cause, or the others); None where it was not fitted, or where nothing that was recorded
             tells.
         foretold: what that would be if it were right; likelier: nats by which what it was fitted to is, its sizes and tolerances with it.
+        left: logarithm of how many times its sensors' errors it leaves on held-out folds; None where it was not fitted.
         gain: share of the excess gap that it closes on held-out folds beyond what is closed without it, for the report.
     """
 
@@ -60,6 +61,7 @@ class Row:
     support: float | None = None
     foretold: float = 0.0
     likelier: float = 0.0
+    left: float | None = None
     gain: float | None = None
 
     def held_out(self, weights: Mapping[str, float]) -> float:
@@ -102,9 +104,9 @@ def weights() -> Mapping[str, float]:
 def chances(rows: Sequence[Row], outside: float, weights: Mapping[str, float]) -> dict[str, float]:
     """NONE, OUTSIDE and the cause of each hypothesis → probability; they come to one."""
     most = max((row.support for row in rows if row.support is not None), default=0.0)
-    logits = {
-        OUTSIDE: weights["outside"] + weights["outside: support"] * max(most, 0.0) + weights["evidence"] * _log(outside)
-    }
+    left = min((row.left for row in rows if row.left is not None), default=0.0)
+    fits = weights["outside: support"] * max(most, 0.0) + weights["outside: left"] * left
+    logits = {OUTSIDE: weights["outside"] + fits + weights["evidence"] * _log(outside)}
     for row in rows:
         name, more = (row.causes[0], row.held_out(weights)) if row.causes else (NONE, weights["none"])
         logits[name] = weights["evidence"] * _log(row.probability) + more

@@ -30,7 +30,7 @@ __all__ = ["diagnose", "hypotheses", "prepare"]
 Progress = Callable[[float, str], None]
 
 #: causes that are fitted by themselves, the likeliest by the evidence; and beside what is chosen
-SUSPECTS, BESIDE = 5, 3
+SUSPECTS, FURTHER = 5, 3
 #: causes of one improved model
 CAUSES = 3
 #: what a builder's word is worth who expects a cause: odds, to one
@@ -71,7 +71,7 @@ def diagnose(
     chosen = tuple(name for row in decision.selected for name in row.causes)
     while decision.verdict != AMBIGUOUS and chosen in trials.closures and 0 < len(chosen) < CAUSES:
         tell(0.8 + 0.05 * len(chosen), f"what acts beside {' and '.join(chosen)}")
-        trials.fit([chosen, *(further := _beside(assessment, chosen))])
+        trials.fit([chosen, *(further := _further(assessment, chosen))])
         more = adds([trials.row(causes, assessment.present[causes[-1]]) for causes in further])
         if more is None:
             break
@@ -91,7 +91,7 @@ def hypotheses(experiment: Experiment, prior: Sequence[str], progress: Progress)
     # By itself first: causes begin where tolerances have come to, with what was learnt of them, and so does none.
     trials.fit([()])
     trials.fit([(), *((name,) for name in suspects)])
-    return trials, [Row((), probability=assessment.none), *(trials.row((name,), leads[name]) for name in ranked)]
+    return trials, [trials.none(), *(trials.row((name,), leads[name]) for name in ranked)]
 
 
 def prepare(
@@ -106,10 +106,10 @@ def prepare(
     return assess(experiment.protocol, progress or (lambda share, words: None)).robots
 
 
-def _beside(assessment: Assessment, chosen: tuple[str, ...]) -> list[tuple[str, ...]]:
+def _further(assessment: Assessment, chosen: tuple[str, ...]) -> list[tuple[str, ...]]:
     """What is chosen with one cause more, the likeliest ones."""
     present = sorted(assessment.present, key=lambda name: -assessment.present[name])
-    return [(*chosen, name) for name in present if name not in chosen][:BESIDE]
+    return [(*chosen, name) for name in present if name not in chosen][:FURTHER]
 
 
 def _expected(assessment: Assessment, prior: Sequence[str]) -> dict[str, float]:

@@ -69,7 +69,7 @@ class Layout:
         seconds: how long the protocol's run is: a log that goes on longer is cut there.
         unsure: (rows, joints) as `around_switching`.
         arrivals: the run's commands; None where nothing is asked of when they came.
-        following: the rows at which body and legs are compared; None where no body moves.
+        imu_delay: the rows at which body and legs are compared; None where no body moves.
     """
 
     t: Array
@@ -136,7 +136,7 @@ class Layout:
             size = np.log10(np.sqrt(_mean(np.square(means))) + _least(signal))
             rough = self._roughness(signal, x)
             parts += [np.nan_to_num(means).reshape(n, -1), np.nan_to_num(size), np.nan_to_num(rough)]
-        parts += self._late(apart["pos"], simulated["pos"])
+        parts += self._lateness(apart["pos"], simulated["pos"])
         if self.arrivals is not None:
             parts += self.arrivals(apart["pos"], simulated["pos"][0])
         if self.imu_delay is not None:
@@ -162,7 +162,7 @@ class Layout:
             parts += [np.full(len(groups[IMU_DELAY]), "gyro" in seen)]
         return np.concatenate(parts)
 
-    def _late(self, x: Floats, simulated: Floats) -> list[Floats]:
+    def _lateness(self, x: Floats, simulated: Floats) -> list[Floats]:
         """Logarithms of how far rows scatter in time, and of how much of that is in few of them; (robots, joints + 1) each.
 
         A row that is late by τ lies τ times its speed behind those about it: each joint says so, as far as it moves, and where one

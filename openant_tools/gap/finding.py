@@ -50,7 +50,7 @@ def finding(
     Args:
         rows: the causes by themselves. chosen: causes that go into the improved model, the one that leads first.
     """
-    experiment, windows = trials.experiment, trials.windows
+    experiment, predictions = trials.experiment, trials.fits.predictions
     best, plain = trials.closures.get(chosen), trials.closures[()]
     judged = sorted({k for fold in experiment.folds for k in fold})
     parts = [experiment.parts.runs[k].run for k in judged]
@@ -59,12 +59,12 @@ def finding(
     where, rest, calibration = measured.as_json()["where"], None, {}
     notes = [str(experiment.selection), *_notes(trials, given, decision)]
     if best is not None and chosen:
-        rest, where = residual_after(windows, best.refit, judged, measured)
-        calibration = calibration_of(windows, best.refit, judged)
-        if (loss := heat_loss_of(windows, best.refit)) is not None:
+        rest, where = residual_after(predictions, best.refit, judged, measured)
+        calibration = calibration_of(predictions, best.refit, judged)
+        if (loss := heat_loss_of(predictions, best.refit)) is not None:
             notes.append(
                 f"servos lose {100 * loss:.2f} % of their torque per °C; a written model is always as warm as on average here, and "
-                f"leaves {1e3 * windows.written(best.refit, judged):.2f} mrad"
+                f"leaves {1e3 * predictions.written(best.refit, judged):.2f} mrad"
             )
     effects = sorted(
         (_found(trials, row, best) for row in rows if row.causes), key=lambda one: -_rank(one, rows, chosen)
@@ -99,7 +99,7 @@ def finding(
 def _rows(trials: Trials, rows: Sequence[Row]) -> tuple[dict[str, Any], ...]:
     """What was decided on, so that it can be decided anew and weights be learned from it."""
     outside = Row((OUTSIDE,), probability=trials.assessment.outside)
-    kept = ("causes", "probability", "support", "foretold", "likelier")
+    kept = ("causes", "probability", "support", "foretold", "likelier", "left")
     return tuple({name: getattr(row, name) for name in kept} for row in (*rows, outside))
 
 

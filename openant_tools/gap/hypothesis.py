@@ -56,7 +56,7 @@ class Refit:
     """A model re-fitted within tolerance, with causes.
 
     Attributes:
-        x: of each part of the hypothesis, its coordinates. nuisance: what else moved, in tolerances, see `Windows.names`.
+        x: of each part of the hypothesis, its coordinates. nuisance: what else moved, in tolerances, see `Predictions.names`.
     """
 
     hypothesis: Hypothesis

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.gap.closure import Windows
 from openant_tools.gap.hypothesis import Refit
 from openant_tools.gap.measure import Measurement
+from openant_tools.gap.prediction import Predictions
 from openant_tools.recording.run import Run
 
 __all__ = ["Residual", "places_left", "residual_after", "residual_of"]
@@ -103,17 +103,19 @@ def residual_of(
 
 
 def residual_after(
-    windows: Windows, refit: Refit, judged: Sequence[int], measured: Measurement
+    predictions: Predictions, refit: Refit, judged: Sequence[int], measured: Measurement
 ) -> tuple[Residual | None, list[dict[str, Any]]]:
     """What a re-fitted model leaves on these runs: what it follows, and the places of the gap with what is left there.
 
     Args:
         judged: of the protocol's runs, those that were measured, in that order.
     """
-    joints = windows.protocol.joints
-    runs = [windows.protocol.runs[k].run for k in judged]
-    simulated = [windows.simulated(k, refit, ("pos", "vel", "torque")) for k in judged]
-    errors = [windows.measured[k][:, : windows.joints] - one["pos"] for k, one in zip(judged, simulated, strict=True)]
+    joints = predictions.protocol.joints
+    runs = [predictions.protocol.runs[k].run for k in judged]
+    simulated = [predictions.simulated(k, refit, ("pos", "vel", "torque")) for k in judged]
+    errors = [
+        predictions.measured[k][:, : predictions.joints] - one["pos"] for k, one in zip(judged, simulated, strict=True)
+    ]
     return residual_of(runs, joints, errors, simulated), places_left(measured, simulated)
 
 

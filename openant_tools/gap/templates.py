@@ -74,7 +74,7 @@ class Templates:
         return [np.flatnonzero(names == cause) for cause in self.causes]
 
     @cached_property
-    def _beside(self) -> list[NDArray[np.int64]]:
+    def _same_place(self) -> list[NDArray[np.int64]]:
         """Of each template, those of the same cause at the same place."""
         groups: dict[tuple[str, tuple[int, ...]], list[int]] = {}
         for k, (name, where, _) in enumerate(self.bank):
@@ -98,7 +98,7 @@ class Templates:
         """(features,) what is left of one robot's differences once the causes that fit best are taken out, one after another."""
         left = z.astype(np.float64)
         for _ in range(times):
-            mine = self._beside[int((self._unit @ left).argmax())]
+            mine = self._same_place[int((self._unit @ left).argmax())]
             unit = self._unit[mine].astype(np.float64)
             left = left - np.linalg.solve(unit @ unit.T + NOISE * np.eye(len(mine)), unit @ left) @ unit
         return left.astype(np.float32)
@@ -130,7 +130,7 @@ class Templates:
         along, size = (z @ self._unit.T).astype(np.float64), np.square(z, dtype=np.float64).sum(axis=1)
         for _ in range(times):
             for r, best in enumerate(along.argmax(axis=1)):
-                mine = self._beside[int(best)]
+                mine = self._same_place[int(best)]
                 alike = self._alike[np.ix_(mine, mine)] + NOISE * np.eye(len(mine))
                 share = np.linalg.solve(alike, along[r, mine])
                 size[r] -= share @ along[r, mine]

@@ -9,10 +9,12 @@ import numpy as np
 
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap.assess import Assessment
-from openant_tools.gap.closure import Closure, Windows, closures, nothing, unmoved
+from openant_tools.gap.closure import Closure, closures
 from openant_tools.gap.decide import Row
 from openant_tools.gap.experiment import Experiment
+from openant_tools.gap.fitting import Fits
 from openant_tools.gap.hypothesis import Part, Refit, bounds_of
+from openant_tools.gap.prediction import Predictions
 
 __all__ = ["Trials"]
 
@@ -29,17 +31,17 @@ class Trials:
 
     experiment: Experiment
     assessment: Assessment
-    windows: Windows
+    fits: Fits
     closures: dict[Causes, Closure] = field(default_factory=dict)
 
     @classmethod
     def of(cls, experiment: Experiment, assessment: Assessment) -> Trials:
-        return cls(experiment, assessment, Windows(experiment.parts, assessment.set_aside))
+        return cls(experiment, assessment, Fits(Predictions(experiment.parts, assessment.set_aside)))
 
     def fit(self, sets: Sequence[Causes]) -> None:
         """Fit sets of causes, each at its best place, on all parts but those of each fold; the first is asked about beside."""
         starts = [self._start(causes) for causes in sets]
-        done = closures(self.windows, starts, self.experiment.folds, self.experiment.training)
+        done = closures(self.fits, starts, self.experiment.folds, self.experiment.training)
         self.closures |= zip(sets, done, strict=True)
 
     def row(self, causes: Causes, probability: float) -> Row:
@@ -48,9 +50,20 @@ class Trials:
         one, other = self.closures.get(causes), self.closures.get(causes[:-1])
         effect = catalogue()[causes[-1]]
         # What joints' positions hardly show, without a sensor of the body, or no simulation repeats, held-out data do not tell.
-        if one is None or other is None or effect.random or (effect.unseen_in_joints and not self.windows.sensed):
+        if (
+            one is None
+            or other is None
+            or effect.random
+            or (effect.unseen_in_joints and not self.fits.predictions.sensed)
+        ):
             return Row(causes, places, probability)
-        return Row(causes, places, probability, *_beyond(one, other))
+        return Row(
+            causes, places, probability, one.support(other), one.foretold, one.likelier(other), one.left, one.closed - other.closed
+        )  # fmt: skip
+
+    def none(self) -> Row:
+        """What is known of no cause at all."""
+        return Row((), probability=self.assessment.none, left=self.closures[()].left)
 
     def removal(self, causes: Causes) -> dict[str, float]:
         """Of causes together, what closes less without each, the most first; of those that were tried without it."""
@@ -76,14 +89,9 @@ class Trials:
     def _start(self, causes: Causes) -> Refit:
         """From what is known: the same without its last cause, and that one as large as templates say."""
         if not causes:
-            return nothing(self.windows)
+            return self.fits.nothing()
         parts = [Part(name, self.assessment.place(name)) for name in causes]
         before = self.closures.get(causes[:-1]) if len(causes) > 1 else None
         if before is None:
-            return unmoved(self.windows, parts, [self.size(name) for name in causes])
+            return self.fits.of(parts, [self.size(name) for name in causes])
         return Refit(tuple(parts), (*before.refit.x, self.size(causes[-1])), before.refit.nuisance)
-
-
-def _beyond(one: Closure, other: Closure) -> tuple[float, float, float, float]:
-    """What a row says of held-out data, and of the data that were fitted."""
-    return one.support(other), one.foretold, one.likelier(other), one.closed - other.closed

@@ -44,14 +44,14 @@ def velocity_delay(runs: Sequence[Run], joints: Sequence[str]) -> VelocityDelay 
 
     Rows that are too far apart for a slope tell less, but they tell: both ends of it lie around the row.
     """
-    found = [late for run in runs for joint in joints if (late := _late(run, joint)) is not None]
+    found = [late for run in runs for joint in joints if (late := _delay_s(run, joint)) is not None]
     if not found:
         return None
     spread = float(np.std(found, ddof=1)) / math.sqrt(len(found)) if len(found) > 1 else math.inf
     return VelocityDelay(float(np.mean(found)), max(spread, LEAST_STD_S)) if math.isfinite(spread) else None
 
 
-def _late(run: Run, joint: str) -> float | None:
+def _delay_s(run: Run, joint: str) -> float | None:
     if not run.has("pos", [joint]) or not run.has("vel", [joint]):
         return None
     pos, vel = run.column(f"pos.{joint}"), run.column(f"vel.{joint}")

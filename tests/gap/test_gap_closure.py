@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 from plants import BENCH, ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, write
 
-import openant_tools.gap.closure as closure
 import openant_tools.gap.descent as descent
+import openant_tools.gap.prediction as prediction
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.robot import Robot
-from openant_tools.gap.closure import Closure, Windows, calibration_of, closures, heat_loss_of, nothing
+from openant_tools.gap.closure import Closure, calibration_of, closures, heat_loss_of
+from openant_tools.gap.fitting import Fits
 from openant_tools.gap.hypothesis import Part, Refit
+from openant_tools.gap.prediction import Predictions
 from openant_tools.gap.protocol import Played, RunSet
 from openant_tools.gap.simulation import Log, simulate
 from openant_tools.model.plant import load_plant
@@ -49,19 +51,19 @@ def protocol(folder: Path, *, kp: float, dry: float) -> RunSet:
 
 def test_a_refit_stays_within_tolerance_and_is_the_best_there(tmp_path: Path) -> None:
     """Stiffness is half as large again, far beyond its 15 %: some end at their bounds, the others where they then serve best."""
-    windows = Windows(protocol(tmp_path, kp=12.0, dry=0.05))
-    ((found, *_),) = windows.refit([nothing(windows)], [0, 1], ())
+    fits = Fits(predictions := Predictions(protocol(tmp_path, kp=12.0, dry=0.05)))
+    found = fits.refit([fits.nothing()], [0, 1], ())[0].whole
     assert np.abs(found.nuisance).max() == pytest.approx(1.0)
 
     def cost(u: np.ndarray[Any, np.dtype[np.float64]]) -> float:
         """Minus twice the logarithm of how likely it is, of 2 · 30 independent errors as large as it leaves them."""
         refits = [dataclasses.replace(found, nuisance=u)]
-        left = sum(float(np.nansum(windows.errors(k, refits) ** 2)) for k in (0, 1))
+        left = sum(float(np.nansum(predictions.errors(k, refits) ** 2)) for k in (0, 1))
         return 60 * math.log(left) + float(np.sum((u / descent.SPREAD) ** 2))
 
     least = cost(found.nuisance)
-    assert least < cost(np.zeros(len(windows.names))) - 60
-    for k in range(len(windows.names)):
+    assert least < cost(np.zeros(len(predictions.names))) - 60
+    for k in range(len(predictions.names)):
         for step in (-0.3, 0.3):
             moved = found.nuisance.copy()
             moved[k] = np.clip(moved[k] + step, -1.0, 1.0)
@@ -79,28 +81,29 @@ def test_a_warm_motor_is_weaker_and_the_refit_says_by_how_much(tmp_path: Path) -
         columns["temp.joint"] = np.full(len(T), 30.0 + warm)
         runs.append(run_of(columns, T, ["joint"], f"sweep-{n}"))
     model = write(tmp_path / "given.xml", pendulum(f'<position {SERVO} kp="8" forcerange="-4 4"/>'))
-    windows = Windows(RunSet.of(runs, model, ["joint"], [None] * 3))
-    (left,) = closures(windows, [nothing(windows)], [(2,)], [0, 1])
+    fits = Fits(predictions := Predictions(RunSet.of(runs, model, ["joint"], [None] * 3)))
+    (left,) = closures(fits, [fits.nothing()], [(2,)], [0, 1])
     assert left.closed > 0.8
-    warmest = calibration_of(windows, left.refit, [2])["stiffness"]["joint"]
+    warmest = calibration_of(predictions, left.refit, [2])["stiffness"]["joint"]
     assert warmest == pytest.approx(1 / (1 + loss * 50), rel=0.03)
-    assert calibration_of(windows, left.refit, [0])["stiffness"]["joint"] == pytest.approx(1.0, rel=0.03)
-    assert heat_loss_of(windows, left.refit) == pytest.approx(loss, rel=0.15)
+    assert calibration_of(predictions, left.refit, [0])["stiffness"]["joint"] == pytest.approx(1.0, rel=0.03)
+    assert heat_loss_of(predictions, left.refit) == pytest.approx(loss, rel=0.15)
     # One model for the warmest run alone is as good as knowing how warm it was; one for all three is not.
-    assert windows.written(left.refit, [2]) == pytest.approx(left.after, rel=0.01)
-    assert windows.written(left.refit, [0, 1, 2]) > 2 * left.after
+    assert predictions.written(left.refit, [2]) == pytest.approx(left.after, rel=0.01)
+    assert predictions.written(left.refit, [0, 1, 2]) > 2 * left.after
     unmeasured = [
         dataclasses.replace(run, columns={k: v for k, v in run.columns.items() if k != "temp.joint"}) for run in runs
     ]
-    assert "heat_loss" not in [one.name for one in Windows(RunSet.of(unmeasured, model, ["joint"], [None] * 3)).names]
+    assert "heat_loss" not in [
+        one.name for one in Predictions(RunSet.of(unmeasured, model, ["joint"], [None] * 3)).names
+    ]
 
 
 @pytest.mark.parametrize("name", ["actuator_lag", "action_delay", "load_friction", "backlash"])
 def test_a_cause_that_is_not_there_ends_at_nothing_and_not_beyond(name: str, tmp_path: Path) -> None:
-    windows = Windows(protocol(tmp_path, kp=8.0, dry=0.03))
+    fits = Fits(Predictions(protocol(tmp_path, kp=8.0, dry=0.03)))
     start = catalogue()[name].starts(0.2)[0]
-    cause = Refit((Part(name, (0,)),), (start,), np.zeros(len(windows.names)))
-    plain, found = closures(windows, [nothing(windows), cause], [(0,), (1,)], [0, 1])
+    plain, found = closures(fits, [fits.nothing(), fits.of([Part(name, (0,))], [start])], [(0,), (1,)], [0, 1])
     size = catalogue()[name].quantities[0].name
     assert 0 <= found.refit.x[0][size] < start[size]
     assert found.support(plain) < 0.2, "held-out data do not speak for it"
@@ -110,20 +113,9 @@ def test_a_cause_that_is_not_there_ends_at_nothing_and_not_beyond(name: str, tmp
 def test_what_leaves_nothing_at_all_and_a_fold_without_rows_say_nothing() -> None:
     """Of a log without noise: no sensor has a floor there."""
     none = Closure(
-        0,
-        0,
-        0,
-        1,
-        1,
-        1,
-        np.zeros(1),
-        0.0,
-        np.zeros((2, 1)),
-        np.array([[0.0], [50.0]]),
-        np.full(1, 4e-8),
-        Refit((), (), np.zeros(0)),
-        (),
-    )
+        before=0, after=0, floor=0, closed=1, low=1, high=1, likelihood=0.0, squares=np.zeros((2, 1)), apart=np.zeros((2, 1)),
+        counts=np.array([[0.0], [50.0]]), known=np.full(1, 4e-8), refit=Refit((), (), np.zeros(0)), std=(),
+    )  # fmt: skip
     some = dataclasses.replace(none, squares=np.array([[0.0], [0.5]]))
     assert none.support(none) == none.foretold == 0.0
     assert 0 < none.support(some) == -some.support(none) < 10
@@ -169,23 +161,20 @@ def test_a_board_that_sits_askew_is_told_by_what_it_reads(tmp_path: Path) -> Non
         names = ("pos.joint", *(f"{name}.{axis}" for name in ("gyro", "acc") for axis in "xyz"))
         columns = {"cmd.joint": command[:, 0], **dict(zip(names, seen.T, strict=True))}
         turned.append(run_of(columns, t, ["joint"], f"sweep-{seed}", setup="floor"))
-    windows = Windows(
+    predictions = Predictions(
         RunSet.of(turned, write(tmp_path / "box.xml", BOX.replace("IMU", "0 0 0")), ["joint"], [None] * 2)
     )
-    assert windows.sensed == ("gyro", "acc")
+    assert predictions.sensed == ("gyro", "acc")
     parts = [Part("imu_misalignment", (0,)), Part("payload", (0,))]
     starts = [{"x_rad": 0.0, "y_rad": 0.07, "z_rad": 0.0}, catalogue()["payload"].starts(0.3)[0]]
-    plain, askew, loaded = closures(
-        windows,
-        [nothing(windows), *(Refit((part,), (x,), windows.found) for part, x in zip(parts, starts, strict=True))],
-        [(0,), (1,)],
-        [0, 1],
-    )
+    fits = Fits(predictions)
+    asked = [fits.nothing(), *(fits.of([part], [x]) for part, x in zip(parts, starts, strict=True))]
+    plain, askew, loaded = closures(fits, asked, [(0,), (1,)], [0, 1])
     assert askew.refit.x[0]["y_rad"] == pytest.approx(0.12, abs=0.025)
     assert askew.support(plain) > max(0.2, loaded.support(plain) + 0.2)
     assert askew.likelier(plain) > max(10, loaded.likelier(plain) + 10)
     assert askew.after == pytest.approx(plain.after, rel=0.05)
-    without = Windows(windows.protocol, without=("gyro", "acc"))
+    without = Predictions(predictions.protocol, without=("gyro", "acc"))
     assert without.sensed == ()
     assert without.measured[0].shape == (len(t), 1)
 
@@ -193,18 +182,18 @@ def test_a_board_that_sits_askew_is_told_by_what_it_reads(tmp_path: Path) -> Non
 def test_a_simulation_that_falls_apart_is_wrong_and_not_unknown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    windows = Windows(protocol(tmp_path, kp=8.0, dry=0.03))
-    sound = closure.simulate
+    predictions = Predictions(protocol(tmp_path, kp=8.0, dry=0.03))
+    sound = prediction.simulate
 
     def falls_apart(*args: Any, **options: Any) -> Log:
         found = sound(*args, **options).signals["pos"]
         found[1, len(T) // 2 :] = np.nan
         return Log({"pos": found})
 
-    monkeypatch.setattr(closure, "simulate", falls_apart)
-    right, wrong = windows.errors(0, [None, None])
+    monkeypatch.setattr(prediction, "simulate", falls_apart)
+    right, wrong = predictions.errors(0, [None, None])
     assert np.nanmax(np.abs(right)) < 0.1
-    assert np.nanmin(np.abs(wrong[len(T) // 2 :])) == pytest.approx(closure.LOST_RAD)
+    assert np.nanmin(np.abs(wrong[len(T) // 2 :])) == pytest.approx(prediction.LOST_RAD)
 
 
 def falls_apart(folder: Path, one: Played) -> float:

@@ -1,0 +1,248 @@
+"""Fits of hypotheses to runs, within tolerance: all of them side by side, and without each part that is held out."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from openant_tools.gap.descent import END, LEAST_GAIN, Descent
+from openant_tools.gap.features import Floats
+from openant_tools.gap.hypothesis import Part, Refit, bounds_of, quantities, refit_at, scaled, sizes
+from openant_tools.gap.nuisance import TILTS
+from openant_tools.gap.prediction import Predictions
+from openant_tools.gap.protocol import Played
+from openant_tools.model.plant import Setup
+
+__all__ = ["Fit", "Fits"]
+
+Array = NDArray[np.float64]
+
+#: rows (of some tens of milliseconds each) of one window say about as much as one: errors within it go together
+INDEPENDENT_S = 0.1
+#: how often slopes are followed at most
+ITERATIONS = 30
+#: how often slopes of tolerances are measured, each time where those before lead no farther
+MEASURED = 3
+#: how often errors of each joint in each run are taken to be as large as a step leaves them: no model of a real servo is true, and one
+#: that trusts its sensors follows what no parameter explains, to the ends of all of them
+INFLATIONS = 4
+#: by which bounds are wider than what lies on them
+TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One hypothesis, fitted.
+
+    Attributes:
+        whole: to all runs to train on. folds: without each group that is held out.
+        std: of the coordinates of its causes, in order: by curvature with errors as large as the fit leaves them, or by how much folds
+            differ (jackknife), whichever is more.
+        likelihood: the logarithm of how likely all is that it was fitted to, where errors of each channel in each run have a size of
+            their own, and that of sizes and tolerances.
+    """
+
+    whole: Refit
+    folds: list[Refit]
+    std: tuple[Mapping[str, float], ...]
+    likelihood: float
+
+
+class Fits:
+    """Fits to some runs.
+
+    Attributes:
+        found: where a fit of `nothing` came to, in tolerances as `Predictions.names`; 0 before.
+    """
+
+    def __init__(self, predictions: Predictions) -> None:
+        self.predictions = predictions
+        self._learnt: dict[int, Floats] = {}
+        self.found = np.zeros(len(predictions.names))
+
+    def nothing(self) -> Refit:
+        """No cause at all, only what tolerances let move, from where it was last found to be."""
+        return Refit((), (), self.found)
+
+    def of(self, parts: Iterable[Part], x: Iterable[Mapping[str, float]]) -> Refit:
+        """Causes at these coordinates, from where a fit without them came to."""
+        return Refit(tuple(parts), tuple(x), self.found)
+
+    def refit(
+        self, starts: Sequence[Refit], training: Sequence[int], leave_out: Sequence[Collection[int]]
+    ) -> list[Fit]:
+        """Fit within tolerance, and polish sizes: each on all the runs to train on, and without each group of some of them.
+
+        All share one linearisation each, at what is found on all of the training runs; and are simulated side by side.
+        """
+        fitted = list(training)
+        descents = self._no_worse(self._descend(starts, fitted), fitted)
+        for one in descents:
+            if not one.causes:
+                self._keep(one)
+        out = []
+        for one in descents:
+            folds = [[k for k in one.blocks if k not in left] for left in leave_out]
+            # Where a fold leads otherwise than all of them together, from where these came to; held back it would not leave there.
+            one.damping = 0.0
+            low, high = self._bounds(one)
+            whole_way = self._solve(one, list(one.blocks))
+            each = [np.clip(one.at + self._solve(one, fold) - whole_way, low, high) for fold in folds]
+            whole, parts = refit_at(one.start, one.at), [refit_at(one.start, u) for u in each]
+            out.append(Fit(whole, parts, refit_at(one.start, self._deviations(one, parts)).x, -0.5 * one.least))
+        return out
+
+    def _deviations(self, descent: Descent, folds: Sequence[Refit]) -> Array:
+        """Standard deviations of a fit's coordinates."""
+        normal = np.diag(1 / descent.scale**2)
+        for block in descent.blocks.values():
+            normal += block.weighted(1 / block.inflation(block.cost))[0]
+        curvature: Array = np.sqrt(np.diag(np.linalg.inv(normal)))
+        if len(folds) < 2:
+            return curvature
+        each = np.array([np.concatenate([sizes(fold), fold.nuisance]) for fold in folds])
+        spread = np.sqrt((len(each) - 1) / len(each) * np.square(each - each.mean(axis=0)).sum(axis=0))
+        out: Array = np.maximum(curvature, spread)
+        return out
+
+    def _no_worse(self, descents: list[Descent], fitted: Sequence[int]) -> list[Descent]:
+        """Where a cause leaves more than it does when it is not there, a descent from there in its place."""
+        absent = [scaled(one.start, 0.0) if one.causes else one.start for one in descents]
+        without = [Descent.of(one, len(self.predictions.names), self._learnt) for one in absent]
+        self._look(without, fitted, slopes=False)
+        again = [n for n, (one, other) in enumerate(zip(descents, without, strict=True)) if other.least < one.least]
+        if again:
+            for n, one in zip(again, self._descend([absent[n] for n in again], fitted), strict=True):
+                descents[n] = one
+        return descents
+
+    def _descend(self, starts: Sequence[Refit], fitted: Sequence[int]) -> list[Descent]:
+        """Follow each start to where it leaves least on these runs."""
+        # Slopes cost the most: causes begin with what was learnt of tolerances without them.
+        learnt = {k: known for k, known in self._learnt.items() if k in fitted}
+        descents = [Descent.of(start, len(self.predictions.names), learnt) for start in starts]
+        begun = descents
+        for _ in range(1 if learnt else MEASURED):
+            before = [one.least for one in begun]
+            for one in begun if not learnt else ():
+                one.begin()
+            moving = begun
+            for _ in range(ITERATIONS):
+                self._look(moving, fitted)
+                for one in moving:
+                    one.u = self._solve(one, list(one.blocks))
+                moving = [one for one in moving if one.goes_on]
+                if not moving:
+                    break
+            begun = [one for one, cost in zip(begun, before, strict=True) if cost - one.least > 2 * LEAST_GAIN]
+            if not begun:
+                break
+        return descents
+
+    def _keep(self, found: Descent) -> None:
+        """Remember what was learnt of tolerances."""
+        self._learnt = {k: slopes[found.causes :] for k, slopes in found.slopes.items()}
+        self.found = found.at[found.causes :]
+
+    def _weight(self, k: int) -> Array:
+        """(channels,) that errors of a run are multiplied by: its rows go together."""
+        period = float(np.median(np.diff(self.predictions.protocol.runs[k].run.t)))
+        out: Array = np.sqrt(1 / max(1.0, INDEPENDENT_S / period)) / self.predictions.sigma
+        return out
+
+    def _count(self, k: int) -> Array:
+        """(channels,) how many independent errors the rows of a run are, as weighted."""
+        weight = np.square(self._weight(k) * self.predictions.sigma)
+        count: Array = (np.isfinite(self.predictions.measured[k]) & self.predictions.there[k][:, None]).sum(
+            axis=0
+        ) * weight
+        return count
+
+    def _solve(self, descent: Descent, runs: Sequence[int]) -> Array:
+        """Where the blocks of some runs lead, made where the descent was best."""
+        u, prior, scale = descent.at, descent.prior, descent.scale
+        low, high = self._bounds(descent)
+        within = np.minimum(low - u, 0) - TINY, np.maximum(high - u, 0) + TINY
+        blocks, found = [descent.blocks[k] for k in runs], u
+        for _ in range(INFLATIONS):
+            more, slope = np.diag(1 / scale**2), (u - prior) / scale**2
+            for block in blocks:
+                own, along = block.weighted(1 / block.inflation(block.left(found - u)))
+                more, slope = more + own, slope + along
+            # What ends at a bound leaves its part to the others: clipped afterwards it would leave it undone.
+            root = np.linalg.cholesky(more + descent.damping * np.diag(np.diag(more)))
+            found = np.clip(u + lsq_linear(root.T, -np.linalg.solve(root, slope), bounds=within).x, low, high)
+        return found
+
+    def _bounds(self, descent: Descent) -> tuple[Array, Array]:
+        """Between which each coordinate may be."""
+        ends = [bounds_of(q) for q in quantities(descent.start)]
+        low, high = np.array([*ends, *[(-END, END)] * len(self.predictions.names)]).T
+        return low, high
+
+    def _look(self, descents: Sequence[Descent], fitted: Sequence[int], slopes: bool = True) -> None:
+        """Simulate runs where descents look next, and, for slopes, what varies there."""
+        found: list[dict[int, Floats]] = [{} for _ in descents]
+        for mine, rollouts in self.predictions.side_by_side(fitted):
+            first = mine[0]
+            columns = [self._columns(first, one) if slopes else [] for one in descents]
+            steps = [one.steps_on(self.predictions.protocol.runs[first].plant.setup) for one in descents]
+            robots = [
+                self.predictions.robot(refit_at(one.start, u), first)
+                for one, some, by in zip(descents, columns, steps, strict=True)
+                for u in (one.u, *(one.moved(members, by) for members in some))
+            ]
+            for k, errors in zip(mine, self.predictions.coarse(mine, robots, rollouts), strict=True):
+                weight, at = self._weight(k), 0
+                for one, some, by, seen in zip(descents, columns, steps, found, strict=True):
+                    seen[k] = (np.nan_to_num(errors[at]) * weight).astype(np.float32)
+                    change_by = np.zeros((len(one.u), *seen[k].shape), np.float32)
+                    if k in one.slopes:
+                        change_by[:] = one.slopes[k]
+                    for row, members in enumerate(some, at + 1):
+                        change = np.nan_to_num(errors[row] - errors[at]) * weight
+                        for p, mask in members:
+                            change_by[p] = np.where(mask, change, 0.0) / by[p]
+                    at += 1 + len(some)
+                    one.slopes[k] = change_by
+        for one, seen in zip(descents, found, strict=True):
+            one.told(seen, {k: self._count(k) for k in fitted})
+
+    def _columns(self, k: int, descent: Descent) -> list[list[tuple[int, NDArray[np.bool_]]]]:
+        """What is varied on a run. A joint within tolerance moves little: slopes once known are not looked at again."""
+        columns = self._colours(self.predictions.protocol.runs[k], descent.start)
+        if k not in descent.slopes:
+            return columns
+        return [members for members in columns if descent.bends[members[0][0]]]
+
+    def _colours(self, one: Played, start: Refit) -> list[list[tuple[int, NDArray[np.bool_]]]]:
+        """Coordinates that one simulation can vary, because on the stand legs do not move each other."""
+        everywhere = np.ones(len(self.predictions.sigma), bool)
+        on_stand = one.plant.setup is Setup.STAND
+        out: list[list[tuple[int, NDArray[np.bool_]]]] = []
+        n = 0
+        for part in start.hypothesis:
+            for _ in part.definition.quantities:
+                out.append([(n, everywhere)])
+                n += 1
+        tree = one.plant.tree
+        used: list[tuple[set[int], list[tuple[int, NDArray[np.bool_]]]]] = []
+        for k, nuisance in enumerate(self.predictions.names):
+            mine = {int(tree[j]) for j in nuisance.joints} if on_stand else set(tree.tolist())
+            if not mine:  # of the floor, which does nothing to who hangs on a stand, unless it turns both
+                if nuisance.name not in TILTS:
+                    continue
+                mine = set(tree.tolist())
+            mask = np.concatenate([np.isin(tree, list(mine)), ~on_stand & everywhere[self.predictions.joints :]])
+            for trees, members in used:
+                if not trees & mine:
+                    trees |= mine
+                    members.append((n + k, mask))
+                    break
+            else:
+                used.append((mine, [(n + k, mask)]))
+        return out + [members for _, members in used]
