@@ -5,6 +5,7 @@ python benchmarks/api_pages.py build/api [MODULE ...]
 
 from __future__ import annotations
 
+import pkgutil
 import sys
 import warnings
 from collections.abc import Sequence
@@ -14,17 +15,30 @@ from typing import get_type_hints
 
 import pdoc
 import pdoc.render
+from pdoc.extract import walk_specs
 
 from openant_tools.comms.reply import Answer
 
-MODULES = (
-    "openant_tools", "openant_env", "openant_agents", "!openant_tools.cli", "!openant_tools.tui", "!openant_tools.__main__",
-)  # fmt: skip
+PACKAGES = ("openant_tools", "openant_env", "openant_agents")
+#: what is no interface: the two faces
+LEFT_OUT = ("openant_tools.cli", "openant_tools.tui", "openant_tools.__main__")
 #: rooms whose names are loaded when they are asked for; pdoc shows what is there
 LAZY = ("openant_tools.sysid",)
 
 
-def write_pages(out: Path, modules: Sequence[str] = MODULES) -> int:
+def modules() -> list[str]:
+    """Every module that has a page, as pdoc is told: by itself it passes over those that a package's `__all__` does not name."""
+    asked = [*PACKAGES, *(f"!{name}" for name in LEFT_OUT)]
+    for package in PACKAGES:
+        found = set(walk_specs(asked))
+        for one in pkgutil.walk_packages(import_module(package).__path__, f"{package}."):
+            if one.name not in found and not one.name.startswith(LEFT_OUT):
+                asked.append(one.name)
+                found |= set(walk_specs([one.name]))
+    return asked
+
+
+def write_pages(out: Path, modules: Sequence[str]) -> int:
     """Write the pages of `modules` and what is below them; returns how many there are.
 
     Raises:
@@ -44,7 +58,7 @@ def write_pages(out: Path, modules: Sequence[str] = MODULES) -> int:
 
 def main() -> None:
     out = Path(sys.argv[1])
-    print(f"{out / 'index.html'}: {write_pages(out, sys.argv[2:] or MODULES)} pages")
+    print(f"{out / 'index.html'}: {write_pages(out, sys.argv[2:] or modules())} pages")
 
 
 if __name__ == "__main__":
