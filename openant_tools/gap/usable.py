@@ -34,6 +34,9 @@ ANSWERS = 0.5
 RELEASE_S = 4.0
 #: s until a robot stands again that lay, was carried or had no torque
 SETTLES_S = 0.5
+#: s of commands that a servo may still have to carry out: the longest delay that is looked for; and rad from where it is commanded at
+#: the first row from which it was commanded elsewhere before
+REMEMBERED_S, ELSEWHERE_RAD = 0.15, 0.1
 
 
 class Reason(StrEnum):
@@ -48,6 +51,7 @@ class Reason(StrEnum):
     LIFTED = "the robot carried, lifted or turned by hand"
     RAMP = "a ramp to a pose"
     PUSHED = "joints moved by hand"
+    BEGUN = "what was commanded before it began"
     SHORT = f"under {LEAST_S:g} s between two others"
 
 
@@ -126,6 +130,7 @@ def usable(run: Run, plant: Plant) -> Usable:
         Reason.LIFTED: _until_settled(t, carried),
         Reason.RAMP: ways,
         Reason.PUSHED: pushed(run, plant),
+        Reason.BEGUN: (t - t[0] < REMEMBERED_S) & (np.abs(cmd[0] - pos[0]) > ELSEWHERE_RAD).any(),
     }
     reasons = list(found)
     marked = np.stack([found[reason] for reason in reasons], axis=1)[:-1]

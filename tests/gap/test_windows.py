@@ -227,6 +227,16 @@ def test_nothing_counts_before_every_joint_was_measured_and_commanded(floor: Pla
     assert (before.stop, told.stop) == pytest.approx((1, 2), abs=0.02)
 
 
+def test_what_a_servo_was_told_before_a_run_began_is_still_carried_out(pendulum: Plant) -> None:
+    """A run that begins with a step: nobody knows what a servo that acts late does first."""
+    t = np.arange(300) / 100
+    columns = {"cmd.joint": 0.6 + 0 * t, "pos.joint": 0.6 * minimum_jerk(t / 0.3)}
+    [begun] = usable(plants.run_of(columns, t, ["joint"]), pendulum).excluded
+    assert begun.reason is Reason.BEGUN
+    assert (begun.start, begun.stop) == pytest.approx((0, 0.15), abs=0.02)
+    assert usable(plants.run_of({**columns, "pos.joint": 0.58 + 0 * t}, t, ["joint"]), pendulum).share == 1.0
+
+
 def test_a_hand_on_a_leg_that_holds_still_is_no_motion_of_the_robot(stand: Plant) -> None:
     """Pushed away and let go; what sinks with its own weight and stays down is the servo's own doing."""
     t = np.arange(1000) / 100
