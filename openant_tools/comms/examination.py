@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -18,6 +19,9 @@ from openant_tools.errors import HardwareFault, OpenAntError
 from openant_tools.recording.writer import RecordingStopped
 
 __all__ = ["cause_of", "examined", "watchdogs_tripped"]
+
+#: how often a servo is asked alone, and again where its answers are not all alike; and the share of them that says what they are
+TRIES, MOSTLY = (3, 6), 2 / 3
 
 
 def cause_of(error: OpenAntError) -> StopCause:
@@ -97,13 +101,18 @@ def _who_is_silent(trip: Trip, hardware: Hardware) -> Trip:
 
 
 def _asked_alone(bus: Bus, servos: Sequence[Servo]) -> tuple[list[Servo], list[Servo]]:
-    """Who is silent, and whose answers are broken; only what is the same every time: a busy host meets now this, now that."""
+    """Who is silent, and whose answers are broken; only what is nearly always the same: a busy host meets now this, now that."""
     silent, broken = list[Servo](), list[Servo]()
     for servo in servos:
-        seen = [answer for _ in range(3) for answer in bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, [servo.id])]
-        causes = {answer.cause for answer in seen}
-        if causes == {Cause.CRC}:
+        causes = Counter[Cause | None]()
+        for tries in TRIES:
+            causes.update(
+                answer.cause for _ in range(tries) for answer in bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, [servo.id])
+            )
+            if len(causes) == 1:
+                break
+        if causes[Cause.CRC] > MOSTLY * causes.total():
             broken.append(servo)
-        elif causes == {Cause.TIMEOUT}:
+        elif set(causes) == {Cause.TIMEOUT}:
             silent.append(servo)
     return silent, broken

@@ -21,6 +21,7 @@ from openant_tools.errors import BadInput
 from openant_tools.files import json_text, read_json, write_text
 from openant_tools.model.gap import HORIZON_S
 from openant_tools.model.mjcf import write_model
+from openant_tools.numbers import number
 from openant_tools.robot.config import EffectEntry, Provenance
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.pair import PLAIN, mark_of
@@ -88,13 +89,13 @@ def write_fit(result: Identification, out: Path) -> list[Path]:
 def stating_both(plain: Identification, tried: Identification) -> Identification:
     """The plain fit with a note of what it and one with effects leave of what they are judged by; and with that one, if it wins."""
     full, short = (
-        f"plain {_rad(one)} rad, with effects {_rad(other)} rad"
+        f"plain {number(one, 'rad', name='gap')}, with effects {number(other, 'rad', name='gap')}"
         for one, other in ((plain.after.full, tried.after.full), (plain.after.horizon, tried.after.horizon))
     )
     judged = "runs left out in turn" if plain.in_turn else "held-out runs"
     errors = f"Error on {judged}: {full} over full runs; {short} at {HORIZON_S:g} s."
     if both := chosen_in_turn(tried, plain):
-        errors += f" Chosen between the two anew without each: {_rad(both.full)} and {_rad(both.horizon)} rad."
+        errors += f" Chosen between the two anew without each: {number(both.full, 'rad', name='gap')} and {number(both.horizon, 'rad', name='gap')}."
     found = [
         f"{value.name} = {value.value:.3g} {value.unit}"
         for value in tried.values
@@ -110,10 +111,6 @@ def stating_both(plain: Identification, tried: Identification) -> Identification
         note = f"{errors} What plain MuJoCo has no feature for ({', '.join(TRIED)}) does not pay here: the plain model is the best."
     winner = replace(tried, notes=(*tried.notes, errors)) if wins else None
     return replace(plain, notes=(*plain.notes, note), with_effects=winner)
-
-
-def _rad(error: float) -> str:
-    return f"{error:.3f}" if error >= 0.01 else f"{error:.5f}"
 
 
 def pair_of(result: Identification) -> str | None:

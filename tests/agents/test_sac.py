@@ -160,7 +160,9 @@ def test_a_checkpoint_of_other_networks_or_versions_is_refused():
         {**state, "actor_optimiser": {"state": {}, "param_groups": []}},
         Sac(3, 1, SMALL, seed=0).get_state(),
     ):
-        with pytest.raises(BadInput, match=r"the checkpoint does not fit the agent .* → train into another folder"):
+        with pytest.raises(
+            BadInput, match=r"an agent with other networks, or an earlier version .* → train into another folder"
+        ):
             agent.set_state(broken)
 
 
