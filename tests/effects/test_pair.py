@@ -25,6 +25,7 @@ from openant_tools.gap.measure import measure
 from openant_tools.model.mjcf import write_model
 from openant_tools.model.plant import Setup, load_plant
 from openant_tools.model.rollout import Rollouts
+from openant_tools.numbers import number
 from openant_tools.procedure.finding import Finding, keep
 from openant_tools.procedure.step import Bench
 from openant_tools.recording.run import Facts, Run
@@ -218,7 +219,8 @@ def test_a_fit_goes_on_from_a_pair_and_its_entries_go_along(
 def test_what_was_tried_is_stated_where_it_does_not_pay_too(fits: tuple[Identification, Identification]) -> None:
     plain, richer = fits
     won, lost = stating_both(plain, richer), stating_both(richer, plain)
-    figures = f"plain {plain.after.full:.3f} rad, with effects {richer.after.full:.5f} rad over full runs"
+    left = [number(one.after.full, "rad", name="gap") for one in (plain, richer)]
+    figures = "plain {}, with effects {} over full runs".format(*left)
     assert figures in won.notes[-1]
     assert won.with_effects is not None
     assert figures in won.with_effects.notes[-1]
