@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
 from typing import cast
 
 from textual.pilot import Pilot
@@ -153,3 +154,31 @@ class Walker:
         else:
             await self.choose(GRANT if isinstance(event, Intent) else BY_HANDS)
         await self.until(lambda: self._waits() is not event)
+
+
+def walk(
+    folder: Path,
+    virtual: Mapping[str, str | None] | None,
+    steps: Callable[[Walker], Awaitable[None]],
+    replies: Mapping[str, Reply] | None = None,
+    *,
+    size: tuple[int, int],
+    truth: Callable[[], object] | None = None,
+) -> str:
+    """Let a builder walk with the terminal program, at a virtual robot's addresses; all that it said."""
+    said = []
+
+    async def run() -> None:
+        app = OpenAnt(folder, ticking=False)
+        app.session.virtual = virtual
+        try:
+            async with app.run_test(size=size) as pilot:
+                walker = Walker(pilot, replies, truth)
+                await steps(walker)
+                said.append(walker.said)
+                await walker.leave()
+        finally:
+            app.session.close()
+
+    asyncio.run(run())
+    return said[0]

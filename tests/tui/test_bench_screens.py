@@ -7,13 +7,13 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
+import walker
 from walker import Reply, Walker
 
 from openant_tools.bringup.walk import BENCH
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.procedure.finding import Finding, latest
 from openant_tools.robot.folder import RobotFolder, create_robot
-from openant_tools.tui.app import OpenAnt
 from openant_tools.tui.dialogs import Question
 from openant_tools.tui.screens.step import StepScreen
 from openant_tools.virtual.process import virtual_robot
@@ -42,22 +42,7 @@ def walk(
     replies: Mapping[str, Reply] | None = None,
 ) -> str:
     """Let a builder use the program; all that it said."""
-    said = []
-
-    async def run() -> None:
-        app = OpenAnt(folder.path, ticking=False)
-        app.session.virtual = robot
-        try:
-            async with app.run_test(size=SIZE) as pilot:
-                walker = Walker(pilot, replies)
-                await steps(walker)
-                said.append(walker.said)
-                await walker.leave()
-        finally:
-            app.session.close()
-
-    asyncio.run(run())
-    return said[0]
+    return walker.walk(folder.path, robot, steps, replies, size=SIZE)
 
 
 def torque_is_on(robot: Mapping[str, str | None]) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import json
 import math
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import walker
 from builder import RUBS, SMALL_PICTURES
 from walker import AGAIN, BY_ITSELF, Reply, Walker
 
@@ -26,7 +26,6 @@ from openant_tools.procedure.journal import Journal
 from openant_tools.procedure.step import Step
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
-from openant_tools.tui.app import OpenAnt
 from openant_tools.tui.screens.walk import WalkScreen
 from openant_tools.virtual.process import VIRTUAL_DEFAULT, virtual_robot
 
@@ -58,23 +57,9 @@ class Robot:
 
     def walk(self, steps: Callable[[Walker], Awaitable[None]], replies: Mapping[str, Reply] | None = None) -> str:
         """Let a builder walk with the terminal program; all that it said. Torque is off when it has been left."""
-        said = []
-
-        async def run() -> None:
-            app = OpenAnt(self.folder.path, ticking=False)
-            app.session.virtual = self.addresses
-            try:
-                async with app.run_test(size=WIDE) as pilot:
-                    walker = Walker(pilot, replies, self.truth)
-                    await steps(walker)
-                    said.append(walker.said)
-                    await walker.leave()
-            finally:
-                app.session.close()
-
-        asyncio.run(run())
+        said = walker.walk(self.folder.path, self.addresses, steps, replies, size=WIDE, truth=self.truth)
         assert not any(self.torque())
-        return said[0]
+        return said
 
     def plug(self, *joints: str) -> Callable[[Walker], Awaitable[str | None]]:
         """A builder's own hands, which plug these in and say that it is done."""
