@@ -8,7 +8,8 @@ command (`info["period_s"]`), counted (`info["overruns"]`) and told, and `info["
 What a robot cannot do is a truncation with a reason. What `comms.restart.RULES` lets begin again by itself, `reset` waits
 for, and says what for; what has ended for good begins again by the builder's word alone, and `reset` raises until then. A
 virtual robot has nobody beside it: one that walked out of the camera's view, fell or wound up its cable is put back after
-a while.
+a while, unless it is to be `unattended` as a real one. A policy that turns one way winds up the cable: before that is too
+much, `reset` turns the robot back on the spot.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from openant_env.base import AntBase, Observation, OnFall
 from openant_env.link import RobotLink, engine_config, engine_rate
 from openant_env.robots import simulated_robot
 from openant_env.tasks import BackAndForth
-from openant_tools.comms.restart import Interlock, MotionStopped, Restart, StopCause
+from openant_env.turning import HALF_S, turning_action
+from openant_tools.comms.restart import Interlock, MotionStopped, Restart, StopCause, longest_wait_s
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.files import read_toml
 from openant_tools.recording.run import Facts
@@ -48,8 +50,10 @@ IMU_PATIENCE_S = 0.5
 FALLEN_S = 1.0
 #: m/s² along the body's z axis that a robot on its feet reads at least
 UPRIGHT_M_S2 = 5.0
-#: turns of the torso either way that a cable from above takes
-CABLE_TURNS = 2.0
+#: turns of the torso either way that a cable from above takes, and from which on `reset` turns it back
+CABLE_TURNS, WINDING_TURNS = 2.0, 1.5
+#: s for which turning back is tried; in simulation a turn and a half takes less than 8 (tests/env/test_turning.py)
+TURN_BACK_S = 30.0
 #: share of an engine's cycle by which a period may be too long before it counts as an overrun
 LATE_SHARE = 0.5
 #: K below the limit that stops a motion, to which a servo cools before it goes on
@@ -90,6 +94,8 @@ class AntHardware(AntBase):
         patience_s: s that `reset` waits for a robot that needs help before it gives up; None: for ever.
         attended: somebody is there who calls `resume` (as the space bar of our commands does): where motion has ended for
             good, `reset` waits for that instead of raising.
+        unattended: nobody is there, nor comes: `reset` waits no longer than `comms.restart.longest_wait_s`, and a virtual robot
+            is not put back.
         notice: called with what the user should know; default: the log.
         render_mode: None, or `"rgb_array"`: what the overhead camera sees.
 
@@ -120,6 +126,7 @@ class AntHardware(AntBase):
         tag_patience_s: float = 2.0,
         patience_s: float | None = None,
         attended: bool = False,
+        unattended: bool = False,
         notice: Callable[[str], None] | None = None,
         render_mode: str | None = None,
     ) -> None:
@@ -139,7 +146,9 @@ class AntHardware(AntBase):
             (self.task.ox, self.task.oy), self._chosen_origin = centre, True
         self._tag_patience_s = float(tag_patience_s)
         self._patience_s = math.inf if patience_s is None else float(patience_s)
-        self._attended = attended
+        if attended and unattended:
+            raise BadInput("a robot is attended or unattended", remedy="give one of them")
+        self._attended, self._unattended = attended, unattended
         self._notice = notice or _log.warning
         self._interlock = Interlock("openant_env")
         #: why motion may begin again, where it was stopped
@@ -222,6 +231,8 @@ class AntHardware(AntBase):
         #: s, the host's clock: when the newest observation was made
         self._observed_at = time.monotonic()
         self._fallen_s = self._wound_rad = 0.0
+        #: turning back did not help
+        self._tangled = False
         self._overruns = 0
         self._told_late = self._told_warm = -math.inf
         self._shares = np.ones(len(joints))
@@ -242,7 +253,7 @@ class AntHardware(AntBase):
 
         Whoever gives it has looked at the robot, so its cable counts as unwound.
         """
-        self._wound_rad = 0.0
+        self._unwound()
         self._restart = self._interlock.word()
         self.link.forget_stop()
         self._paused.clear()
@@ -428,8 +439,9 @@ class AntHardware(AntBase):
         elif silent > IMU_PATIENCE_S:
             self._truncate(info, StopCause.IMU, f"the IMU has sent nothing for {silent:.1f} s")
         elif self._wound:
-            turns, side = abs(self._wound_rad) / (2.0 * math.pi), "left" if self._wound_rad > 0 else "right"
-            self._truncate(info, StopCause.CABLE, f"the cable is wound up by {turns:.1f} turns to the {side}")
+            self._truncate(info, StopCause.CABLE, self._winding)
+        elif self._turns > WINDING_TURNS:
+            self._truncate(info, StopCause.WINDING, f"{self._winding}, and is turned back")
         elif self._paused.is_set():
             info["reason"], info["stop_cause"] = self._why_paused, StopCause.BY_HAND.value
         elif self._seconds >= self._time_limit_s - 0.5 * self.dt:
@@ -449,7 +461,7 @@ class AntHardware(AntBase):
         self._stop_cause, self._said_why = cause, why
         if cause is StopCause.HARDWARE_ERROR:
             return  # counted for each servo that is rebooted
-        if self.link.virtual and cause in (StopCause.FALL, StopCause.CABLE):
+        if self.link.virtual and not self._unattended and cause in (StopCause.FALL, StopCause.CABLE):
             self._restart = Restart()  # who puts it back gives the word
             return
         self._restart = self._interlock.stopped(cause, why, self.link.now())
@@ -483,6 +495,7 @@ class AntHardware(AntBase):
     def _stand_up(self) -> None:
         """Wait until nothing is in the way, saying what it is, and stand."""
         said, said_at, waited, helped_at = "", -math.inf, 0.0, 0.0
+        began = self.link.now()
         while True:
             self._need_word()
             why = self._in_the_way()
@@ -495,6 +508,8 @@ class AntHardware(AntBase):
                     self._restart = None
                     self._take(rows)
                     why = self._unseen()
+                    if why is None and self._turns > WINDING_TURNS:
+                        why = self._turn_back()
                     if why is None:
                         break
                     self.link.let_down()  # it may wait for long
@@ -505,21 +520,55 @@ class AntHardware(AntBase):
                     self.link.drop()
             self._need_word()
             why = why or self._why_paused
+            if self._unattended and waited > (longest := longest_wait_s(self._stop_cause)):
+                self._interlock.end(f"{why} (for {longest / 60:g} min, and nobody is there)")
+                self._need_word()
             if waited > self._patience_s:
                 raise HardwareFault(f"the robot cannot go on: {why}", remedy="help it, and start again")
             kind = why[:24]
             if kind != said or waited - said_at > REPEAT_S:
                 self._notice(f"waiting: {why}")
                 said, said_at = kind, waited
-            if waited - helped_at > HELP_S and self._out_of_place and self.link.put_back():
+            hands = waited - helped_at > HELP_S and self._out_of_place and not self._unattended
+            if hands and self.link.put_back():
                 self._notice("the virtual robot is put back where it began")
-                self._wound_rad, helped_at = 0.0, waited
-            began = time.monotonic()
+                self._unwound()
+                helped_at = waited
             self.link.look(LOOK_S)
-            waited += LOOK_S if self.link.stepped else time.monotonic() - began
+            waited = self.link.now() - began
         if said:
             self._notice(f"going on after {waited:.0f} s")
         self._fallen_s, self._stop_cause = 0.0, None
+
+    def _turn_back(self) -> str | None:
+        """Turn on the spot until the cable is not wound up any more; why not, in words, where that does not work."""
+        self._notice(f"{self._winding}: turning back")
+        way, wound_up = -math.copysign(1.0, self._wound_rad), abs(self._turns)
+        half_s, began, k = max(1, round(HALF_S / self.dt)) * self.dt, self.link.now(), 0
+        while self._wound_rad * way < 0.0:
+            if self._paused.is_set():
+                return self._why_paused
+            if self.link.now() - began > TURN_BACK_S:
+                self._tangled = True
+                why = f"the cable was wound up by {wound_up:.1f} turns, and turning back left {self._turns:.1f}"
+                self._ended_by(StopCause.CABLE, why)
+                return why
+            self._set_command(turning_action(self.robot.joints, way, k))
+            self._derate()
+            rows, _ = self.link.go(self._command, half_s)
+            k += 1
+            self._take(rows)
+            up = self._observation[self.layout.slices["acc"]][2]
+            self._fallen_s = self._fallen_s + half_s if up < 0.0 else 0.0
+            if self._fallen_s >= FALLEN_S and self._on_fall != "ignore":
+                self.link.release()
+                return "the robot fell while it turned back"
+            why_unseen = self._unseen()
+            if why_unseen is not None:
+                return why_unseen
+        self._notice(f"turned back in {self.link.now() - began:.0f} s")
+        self._take(self.link.stand(self.actions.rest, SETTLE_S))
+        return None
 
     def _need_word(self) -> None:
         """Where motion has ended for good: have whoever is there asked, or refuse."""
@@ -574,8 +623,21 @@ class AntHardware(AntBase):
         return bool(self._observation[self.layout.slices["acc"]][2] < UPRIGHT_M_S2) and self._on_fall != "ignore"
 
     @property
+    def _turns(self) -> float:
+        """By which the cable is wound up, either way."""
+        return abs(self._wound_rad) / (2.0 * math.pi)
+
+    @property
+    def _winding(self) -> str:
+        return f"the cable is wound up by {self._turns:.1f} turns to the {'left' if self._wound_rad > 0 else 'right'}"
+
+    @property
     def _wound(self) -> bool:
-        return abs(self._wound_rad) > 2.0 * math.pi * CABLE_TURNS
+        return self._tangled or self._turns > CABLE_TURNS
+
+    def _unwound(self) -> None:
+        """Somebody has looked after the cable."""
+        self._wound_rad, self._tangled = 0.0, False
 
     @property
     def _seen(self) -> bool:
@@ -599,8 +661,7 @@ class AntHardware(AntBase):
             return f"{', '.join(errors)} had shut down, and are started again"
         if self._wound:
             self.link.let_down()
-            turns = abs(self._wound_rad) / (2.0 * math.pi)
-            why = f"the cable is wound up by {turns:.1f} turns: turn the robot back by hand, in the camera's view"
+            why = f"{self._winding}: turn the robot back by hand, in the camera's view"
             self._ended_by(StopCause.CABLE, why)
             return why
         if self._lying:

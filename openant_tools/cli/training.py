@@ -21,7 +21,7 @@ from openant_tools.cli.walking import (
     hardware_robot,
     may_walk,
 )
-from openant_tools.errors import BadInput, StorageFault
+from openant_tools.errors import BadInput, HardwareFault, StorageFault
 from openant_tools.numbers import exact, number
 
 if TYPE_CHECKING:
@@ -44,11 +44,13 @@ class TrainingPlace:
     Attributes:
         name, options: the environment's id and options, as `run.json` keeps them.
         yes: a robot there may move without a question.
+        unattended: nobody looks after it once it moves.
     """
 
     name: str
     options: dict[str, Any]
     yes: bool
+    unattended: bool
 
     @property
     def hardware(self) -> bool:
@@ -70,6 +72,11 @@ def training_options(hour: int, step_s: float, leaves: str) -> Callable[[Callabl
             help="Where to train: in the simulation, or on the robot itself (with --virtual on a virtual one).",
         ),
         hardware_options,
+        click.option(
+            "--unattended", is_flag=True,
+            help="Nobody looks after the robot: tells beforehand what goes on by itself and how often, asks nothing afterwards, "
+            "and where someone is needed ends, torque off and saved.",
+        ),
         click.option(
             "--steps", type=click.IntRange(min=1), default=hour, show_default=True,
             help=f"Train until the run is this long; {hour:,} steps of {exact(step_s, 's')} are an hour.",
@@ -97,6 +104,7 @@ def training_options(hour: int, step_s: float, leaves: str) -> Callable[[Callabl
             virtual_source: str | None,
             clock: str | None,
             yes: bool,
+            unattended: bool,
             task: str,
             effects: bool,
             record_pictures: bool,
@@ -104,7 +112,11 @@ def training_options(hour: int, step_s: float, leaves: str) -> Callable[[Callabl
         ) -> Any:
             need_agents()
             name, chosen = _place_of(where, robot, kit, virtual_source, clock, task, effects, record_pictures)
-            return command(place=TrainingPlace(name, chosen, yes), **rest)
+            if unattended and name != HARDWARE_ID:
+                raise BadInput(
+                    "--unattended is for a robot", remedy="add --env hardware; nobody looks after a simulation"
+                )
+            return command(place=TrainingPlace(name, chosen, yes, unattended), **rest)
 
         for option in reversed(options):
             placed = option(placed)
@@ -144,14 +156,14 @@ def _place_of(
 
 @contextlib.contextmanager
 def training(place: TrainingPlace, steps: int, out: Path) -> Iterator[tuple[Any, LearningBar]]:
-    """The environment, once a robot may move, and the bar; Ctrl-C says how to go on."""
+    """The environment, once a robot may move, and the bar; what ends it early says how to go on."""
     if place.hardware:
-        may_walk(place.options, place.yes)
-    with environment(place.name, place.options, out / "recordings") as env:
+        may_walk(place.options, place.yes, place.unattended)
+    with environment(place.name, place.options, out / "recordings", unattended=place.unattended) as env:
         try:
             with LearningBar(steps, out) as bar:
                 yield env, bar
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, HardwareFault):
             click.echo(f"saved in {out}; the same command goes on from there", err=True)
             raise
         except OSError as error:

@@ -58,13 +58,17 @@ def hardware_robot(
     return options
 
 
-def may_walk(options: Mapping[str, Any], yes: bool) -> None:
-    """Ask whether the robot may walk.
+def may_walk(options: Mapping[str, Any], yes: bool, unattended: bool = False) -> None:
+    """Ask whether the robot may walk, after telling what it will do alone.
 
     Raises:
         BadInput: nobody is there to ask.
     """
     which = "The virtual robot" if "virtual" in options else f"The robot of {options['robot']}"
+    if unattended:
+        from openant_tools.comms.restart import unattended_words
+
+        click.echo("\n".join(unattended_words()), err=True)
     place = "it must be on the floor, in the camera's view, with room around it."
     may_move(yes, move="walk", question=f"{which} will stand up and walk: {place}\nMay it?")
 
@@ -75,12 +79,14 @@ def _notice(words: str) -> None:
 
 
 @contextlib.contextmanager
-def environment(name: str, options: Mapping[str, Any], recordings: Path, **more: Any) -> Iterator[Any]:
+def environment(
+    name: str, options: Mapping[str, Any], recordings: Path, *, unattended: bool = False, **more: Any
+) -> Iterator[Any]:
     """An environment by its id, closed in the end; a robot can be paused meanwhile.
 
     Args:
         options: what a run's `run.json` keeps, to make it again.
-        recordings: where a robot's runs go. more: for the simulated one.
+        recordings: where a robot's runs go. unattended: nobody looks after it. more: for the simulated one.
     """
     import gymnasium
 
@@ -99,7 +105,10 @@ def environment(name: str, options: Mapping[str, Any], recordings: Path, **more:
             env.close()
         return
     # With a terminal the space bar is the word that motion may go on where it has ended for good; without one nobody gives it.
-    env = gymnasium.make(name, **options, recordings=recordings, notice=_notice, attended=sys.stdin.isatty())
+    attended = sys.stdin.isatty() and not unattended
+    env = gymnasium.make(
+        name, **options, recordings=recordings, notice=_notice, attended=attended, unattended=unattended
+    )
     try:
         with _pause_key(env.unwrapped):
             yield env

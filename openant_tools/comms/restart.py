@@ -24,7 +24,9 @@ __all__ = [
     "Restart",
     "RestartRule",
     "StopCause",
+    "longest_wait_s",
     "restart_page",
+    "unattended_words",
 ]
 
 #: Who goes on by itself at all; any other command ends with the first stop.
@@ -53,6 +55,7 @@ class StopCause(StrEnum):
     TAG = "tag"
     IMU = "imu"
     FALL = "fall"
+    WINDING = "winding"
     CABLE = "cable"
     #: nobody has said why: the safe reading is the worst
     UNKNOWN = "unknown"
@@ -79,6 +82,8 @@ class RestartRule:
     each_joint: bool = False
 
 
+#: from here on a condition is the environment's own
+_HERE = "; in openant_env: "
 _SAME = "the same servos answer anew, every joint that was seen since is where it was seen last"
 
 RULES: Mapping[StopCause, RestartRule] = {
@@ -92,24 +97,28 @@ RULES: Mapping[StopCause, RestartRule] = {
         RestartRule(StopCause.PORT, "the bus adapter is gone, or its line never falls silent"),
         RestartRule(StopCause.GUARDIAN, "the guardian process has died"),
         RestartRule(StopCause.FALL, "the robot lies on its back or side"),
-        RestartRule(StopCause.CABLE, "the cable is wound up by two turns"),
+        RestartRule(StopCause.CABLE, "the cable is wound up by two turns, or by less and turning back does not help"),
         RestartRule(StopCause.BY_HAND, "the stop key, or a pause by hand"),
         RestartRule(StopCause.UNKNOWN, "anything that is not in this table"),
         RestartRule(
             StopCause.HARDWARE_ERROR, "a servo has shut itself down", ("openant_env",), 1, 3600.0,
-            "after one reboot; one that reports an error again within that time ends motion for good", each_joint=True,
+            "it was started anew; one that reports an error again within that time ends motion for good", each_joint=True,
         ),
         RestartRule(
             StopCause.SILENCE, "servos are silent, or their answers are broken", FACES, 12, 600.0,
-            f"all answer again; in openant_env: {_SAME}",
+            f"all answer again{_HERE}{_SAME}",
         ),
         RestartRule(
             StopCause.STALL, "this computer stood still, and the servos' Bus Watchdog stopped the motion", FACES, 3, 600.0,
-            f"all answer again; in openant_env: {_SAME}",
+            f"all answer again{_HERE}{_SAME}",
         ),
         RestartRule(
             StopCause.HEAT, "a servo comes near its temperature limit", ("openant_env",), 10, 3600.0,
             "it has rested, torque off, until it is 15 °C cooler",
+        ),
+        RestartRule(
+            StopCause.WINDING, "the cable is wound up by a turn and a half", ("openant_env",), 30, 3600.0,
+            "it has turned itself back on the spot, in the camera's view",
         ),
         RestartRule(
             StopCause.TAG, "the camera does not see the robot", ("openant_env",), 20, 600.0,
@@ -205,14 +214,40 @@ def _span(seconds: float) -> str:
     return f"{seconds / 3600:g} h" if seconds >= 3600 else f"{seconds / 60:g} min"
 
 
+def longest_wait_s(cause: StopCause | None) -> float:
+    """s for which a robot that nobody looks after waits for what must hold first: the time in which its restarts are counted.
+
+    Args:
+        cause: of the stop; None, or one that nothing begins again after: the longest of the table.
+    """
+    within = 0.0 if cause is None else RULES[cause].within_s
+    return within or max(rule.within_s for rule in RULES.values())
+
+
+def unattended_words() -> list[str]:
+    """Lines for whoever gives the word and goes: what a walking robot does alone, how often, and what ends it."""
+    alone = [rule for rule in RULES.values() if "openant_env" in rule.faces]
+    ends = [rule.what for rule in RULES.values() if "openant_env" not in rule.faces]
+    return [
+        "Unattended, it goes on by itself after",
+        *(f"  {rule.what}: {_often(rule)}, once {rule.condition.rpartition(_HERE)[2]}" for rule in alone),
+        "and waits no longer for that than the time named. All else ends the run, torque off and saved:",
+        *(f"  {what}" for what in ends),
+        "The same command is your word that it may go on.",
+    ]
+
+
+def _often(rule: RestartRule) -> str:
+    return f"{rule.times}× in {_span(rule.within_s)}" + (", each servo" if rule.each_joint else "")
+
+
 def restart_page() -> str:
     """`docs/restart.md`, as Markdown."""
     rows = []
     for rule in RULES.values():
         if rule.faces:
-            often = f"{rule.times} in {_span(rule.within_s)}" + (", each servo" if rule.each_joint else "")
             rows.append(
-                f"| {rule.what} | `{rule.cause.value}` | {', '.join(rule.faces)} | {often} | {rule.condition} |"
+                f"| {rule.what} | `{rule.cause.value}` | {', '.join(rule.faces)} | {_often(rule)} | {rule.condition} |"
             )
         else:
             rows.append(
@@ -242,6 +277,11 @@ event (`stopped`, `restart`). Everything else has ended for good. Single lost an
   out). While motion may go on, `reset()` waits for the condition and goes on. Where it has ended for good `reset()` raises
   one line. Your word is `reset(options={{"resume": True}})`, `env.unwrapped.resume()`, or the environment made anew; in
   `openant train` and `openant eval` the space bar where a terminal is attached, else the same command again.
+- **`openant train … --unattended`** tells this table before it asks for your word, and asks nothing afterwards. It waits for a
+  condition no longer than the time in which its restarts are counted. Where a person is needed the run ends: torque off, saved,
+  exit code 1, one line with what is needed; the same command is your word, and goes on. A virtual robot is no exception then.
+- **A cable that winds up** is turned back before it is too late: at a turn and a half the step is truncated, and `reset()` turns
+  the robot on the spot, with a gait of its own, until nothing is wound up or half a minute has passed.
 - **A virtual robot** has nobody beside it: one that fell, wound up its cable or left the picture is put back by its
   environment, which is the word.
 - **In the engine** `messages.Torque(True)` after a stop is refused unless it brings the `Restart` that the table or the

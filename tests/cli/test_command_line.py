@@ -239,6 +239,7 @@ def test_a_fit_without_model_and_robot_asks_for_one(bench: Path) -> None:
         (("sysid", "record", "--protocol", "dance", "--virtual", "--out", "x.mcap", "--yes"), "dance"),
         (("virtual", "start", "--scenario", "broken.xml"), "broken.xml"),
         (("train", "sac", "--robot", "nowhere", "--out", "x"), "nowhere"),
+        (("train", "sac", "--kit", "standard", "--unattended", "--out", "x"), "--unattended is for a robot"),
         (("eval", "nowhere"), "nowhere"),
         (("demo", "--robot", "arm.xml"), "arm.xml"),
     ],
@@ -250,6 +251,19 @@ def test_other_commands_refuse_in_one_line_too(
     before = set(bench.rglob("*"))
     assert said in refusal(within(*arguments))
     assert set(bench.rglob("*")) == before
+
+
+def test_unattended_training_tells_what_goes_on_alone_before_anybody_gives_the_word(
+    within: Callable[..., Result], tmp_path: Path
+) -> None:
+    pytest.importorskip("torch")
+    result = within("train", "sac", "--env", "hardware", "--virtual", "--unattended", "--out", str(tmp_path / "run"))
+    assert result.returncode == 2
+    table, asked = result.stderr.split("openant: ")
+    assert "the camera does not see the robot: 20× in 10 min" in table
+    assert "All else ends the run, torque off and saved:" in table
+    assert "nobody is there to ask" in asked
+    assert not (tmp_path / "run").exists()
 
 
 # ---- a full disk ----

@@ -20,7 +20,16 @@ from places import ROOT
 from openant_tools.cli.comms import comms
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.messages import EngineConfig
-from openant_tools.comms.restart import RULES, Interlock, MotionStopped, Restart, StopCause, restart_page
+from openant_tools.comms.restart import (
+    RULES,
+    Interlock,
+    MotionStopped,
+    Restart,
+    StopCause,
+    longest_wait_s,
+    restart_page,
+    unattended_words,
+)
 from openant_tools.comms.setup import config_of_unknown_robot
 from openant_tools.comms.soak import soak as soak_bus
 from openant_tools.errors import OpenAntError
@@ -89,6 +98,16 @@ def test_what_may_go_on_does_so_a_stated_number_of_times() -> None:
         assert str(restart) == f"motion begins again by itself after silence, {k + 1} of {rule.times}"
     assert interlock.stopped(StopCause.SILENCE, "knee_fl is silent", rule.times) is None
     assert Interlock("comms soak").stopped(StopCause.HEAT, "hot", 0.0) is None  # the environment's row
+
+
+def test_who_leaves_is_told_all_of_the_table_and_nothing_waits_longer_than_it_counts() -> None:
+    said = "\n".join(unattended_words())
+    alone, ends = said.split("All else ends the run")
+    for rule in RULES.values():
+        assert rule.what in (alone if "openant_env" in rule.faces else ends)
+    assert "the camera does not see the robot: 20× in 10 min, once it is seen again" in alone
+    assert longest_wait_s(StopCause.TAG) == 600.0
+    assert longest_wait_s(StopCause.HEAT) == longest_wait_s(None) == longest_wait_s(StopCause.BY_HAND) == 3600.0
 
 
 # ---- disks ---------------------------------------------------------------------------------------------------------

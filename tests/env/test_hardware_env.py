@@ -245,11 +245,70 @@ def test_a_cable_wound_up_and_a_fall_need_someone(walker: Walker) -> None:
         walker.env.reset()
     up, info = walker.env.layout.slices["acc"].start + 2, dict[str, object]()
     walker.env.resume()  # someone has looked
+    walker.env._patience_s = 20.0
+    walker.env.reset()
     walker.env._observation[up] = -9.8
     endings = [walker.env._judge(0.12, info) for _ in range(9)]
     assert endings[:8] == [(False, False)] * 8
     assert endings[8] == (False, True)
     assert info["reason"] == "the robot lies on its back"
+
+
+def test_a_cable_that_winds_up_is_turned_back_before_it_is_too_late(
+    walker: Walker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env, turn = walker.env, 2.0 * math.pi
+    monkeypatch.setattr(hardware, "WINDING_TURNS", 0.4)
+    env._wound_rad = -0.52 * turn
+    info = walker.until_it_ends(1)
+    assert info["reason"] == "the cable is wound up by 0.5 turns to the right, and is turned back"
+    assert info["stop_cause"] == "winding"
+    before = env._pose[2]
+    env.reset()
+    assert 0.0 <= env._wound_rad < 0.4 * turn
+    assert math.remainder(env._pose[2] - before - 0.52 * turn, turn) == pytest.approx(env._wound_rad, abs=0.05)
+    assert any(words.startswith("turned back in ") for words in walker.said)
+    assert "motion begins again by itself after winding, 1 of 30" in walker.said
+    assert not env.step(STILL)[3]
+
+    # A robot that is held fast, or whose floor is too slippery, does not turn: that is for a person.
+    monkeypatch.setattr(hardware, "TURN_BACK_S", 0.2)
+    monkeypatch.setattr(env, "_unattended", True)
+    env._wound_rad = 0.52 * turn
+    walker.until_it_ends(1)
+    with pytest.raises(MotionStopped, match=r"wound up by 0\.5 turns, and turning back left 0\.\d") as no:
+        env.reset()
+    assert no.value.cause is StopCause.CABLE
+    assert walker.torque() == 0
+
+
+def test_unattended_nobody_puts_a_robot_back_and_a_wait_has_an_end(
+    walker: Walker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = walker.env
+    monkeypatch.setattr(env, "_unattended", True)
+    with walker.fault("camera_stalled"):
+        assert walker.until_it_ends()["stop_cause"] == "tag"
+    env.reset()  # it is seen again: that was announced
+    assert "motion begins again by itself after tag, 1 of 20" in walker.said
+    monkeypatch.setattr(hardware, "longest_wait_s", {StopCause.TAG: 1.5}.__getitem__)
+    with walker.fault("camera_stalled"):
+        walker.until_it_ends()
+        with pytest.raises(MotionStopped, match=r"the camera does not see the robot: look at light.*nobody is there"):
+            env.reset()
+        assert walker.torque() == 0
+    env.resume()
+    env.reset()
+    env.link.let_down()
+    walker._control.ask("put", rotation_rad=[math.pi, 0.0, 0.0])
+    env.link.look(1.0)
+    with pytest.raises(MotionStopped, match="the robot lies on its back or side: put it on its feet"):
+        env.reset()
+    assert "the virtual robot is put back where it began" not in walker.said
+    assert walker.torque() == 0
+    with pytest.raises(BadInput, match="attended or unattended"):
+        gymnasium.make("openant/AntHardware-v0", virtual="default", attended=True, unattended=True)
+    walker._control.ask("put")
 
 
 @pytest.mark.parametrize(
