@@ -262,11 +262,6 @@ class AntHardware(AntBase):
     def paused(self) -> bool:
         return self._paused.is_set()
 
-    @property
-    def overruns(self) -> int:
-        """Steps so far that began later than a whole period after the one before."""
-        return self._overruns
-
     # ---------------------------------------------------------------------------------------------- reset and step
 
     def reset(

@@ -48,7 +48,6 @@ class Walker:
         self.replies = dict(replies or {})
         self.truth = truth
         self.said = ""
-        self._log: list[str] = []
 
     @property
     def screen(self) -> StepScreen:

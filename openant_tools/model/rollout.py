@@ -173,12 +173,6 @@ class Rollouts:
         #: whoever makes variants of this one's model saves a copy of each
         self.plant = replace(plant, model=self.lean(plant.model))
 
-    def thinned(self, every: int) -> Rollouts:
-        """The same with each so many-th of the segments alone: rows of the others are not simulated."""
-        few = copy.copy(self)
-        few._segments, few._batches, few._finer = self._segments[::every], {}, {}
-        return few
-
     def finer(self, parts: int) -> Rollouts:
         """The same with each step cut into so many; as it is where actuators have delay buffers, whose samples count steps."""
         model = self.plant.model

@@ -125,26 +125,6 @@ class MotorSection:
     def kind(self) -> Kind:
         return JOINTS[self.joint].kind
 
-    def to_joint(self, servo_rad: float, turns: int = 0) -> float:
-        """The joint's angle for a servo's, with `turns` as `turns_at` gave them when the bus was opened."""
-        return self.direction * (servo_rad - turns * TURN - self.zero_offset_rad)
-
-    def to_servo(self, joint_rad: float, turns: int = 0) -> float:
-        """The servo's angle for a joint's; the inverse of `to_joint`."""
-        return self.direction * joint_rad + self.zero_offset_rad + turns * TURN
-
-    def turns_at(self, servo_rad: float) -> int:
-        """Whole turns that the servo has counted beyond the zero offset, so that the joint is nearest to mid-range.
-
-        A servo in extended position mode counts on over turns, and starts anywhere within one after power-on.
-        """
-        middle = self.to_servo((self.min_rad + self.max_rad) / 2)
-        return round((servo_rad - middle) / TURN)
-
-    def clip(self, joint_rad: float) -> float:
-        """The nearest angle within the limits of commands."""
-        return min(max(joint_rad, self.min_rad), self.max_rad)
-
 
 @dataclass(frozen=True)
 class ImuSection:

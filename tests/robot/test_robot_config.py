@@ -513,22 +513,6 @@ def test_no_value_anywhere_breaks_the_reader(junk: Any, path: str) -> None:
     assert (config is None) == any(problem.severity == "error" for problem in problems)
 
 
-# Angles
-
-
-@given(
-    st.sampled_from([1, -1]), st.floats(-6, 6), st.floats(-1.2, 1.2), st.integers(-5, 5),
-)  # fmt: skip
-def test_joint_and_servo_angles_are_inverse_over_any_turn(
-    direction: int, offset: float, angle: float, turns: int
-) -> None:
-    motor = MotorSection("knee_fl", 31, "XM430-W350-T", offset, -1.22, 1.22, direction)
-    servo = motor.to_servo(angle, turns)
-    assert motor.to_joint(servo, turns) == pytest.approx(angle, abs=1e-12)
-    assert motor.turns_at(servo) == turns
-    assert motor.clip(3.0) == 1.22
-
-
 def test_an_action_range_is_a_preset_and_what_differs(ant: RobotFolder) -> None:
     assert ant.config().actions.range == ACTION_PRESETS["platform"]
     config = ant.update({"actions.preset": "sac", "actions.knee_half_range_rad": 0.3})
