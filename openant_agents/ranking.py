@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from openant_agents.evaluate import LIKELIEST, SAMPLED, evaluate
-from openant_agents.exploits import TwitchCounter
+from openant_agents.exploits import Flag, TwitchCounter, flag
 from openant_agents.policies import load_policy
 from openant_agents.runs import read_facts
 from openant_tools.errors import BadInput
@@ -31,8 +31,8 @@ from openant_tools.files import json_text, read_json, write_text
 from openant_tools.procedure.intervals import Interval
 
 __all__ = [
-    "Agreement", "PlaceResult", "agreement", "find_policies", "kendall", "play", "rank_violation", "read_measured", "regret",
-    "spearman", "write_measured",
+    "Agreement", "PlaceResult", "Ranking", "agreement", "find_policies", "kendall", "play", "rank", "rank_violation",
+    "read_measured", "regret", "spearman", "write_measured",
 ]  # fmt: skip
 
 SCHEMA = "openant.policies/1"
@@ -173,6 +173,68 @@ def agreement(simulated: Sequence[PlaceResult], real: Sequence[PlaceResult], *, 
         regret_share=spans["regret_m_s"].value / best if best > 0.0 else math.nan,
         best_is=1 + int((r > r[int(np.argmax(s))]).sum()),
     )
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Policies on the robot and in simulations of it.
+
+    Attributes:
+        real: by policy. simulated: by simulation and policy, of the same policies.
+        agreements: by simulation. flags: policies that perhaps exploit the simulation that they would be chosen by.
+    """
+
+    real: Mapping[str, PlaceResult]
+    simulated: Mapping[str, Mapping[str, PlaceResult]]
+    agreements: Mapping[str, Agreement]
+    flags: tuple[Flag, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """As it stands in files."""
+        rewards = {"real": self.real, **self.simulated}
+        return {
+            "schema": "openant.ranking/1",
+            "policies": {
+                policy: {f"{place}_m_s": measured[policy].average_reward_m_s for place, measured in rewards.items()}
+                for policy in self.real
+            },
+            "agreement": {name: one.as_dict() for name, one in self.agreements.items()},
+            "flags": [
+                {"policy": one.policy, "keeps": dict(one.depends_on), "reversals_hz": one.reversals_hz} for one in self.flags
+            ],
+        }  # fmt: skip
+
+
+def rank(
+    real: Mapping[str, PlaceResult],
+    simulated: Mapping[str, Mapping[str, PlaceResult]],
+    chooser: str | None = None,
+    worse: Mapping[str, Mapping[str, PlaceResult]] | None = None,
+) -> Ranking:
+    """Say which simulation ranks policies as the robot does.
+
+    Args:
+        real: what was measured on the robot, by policy. simulated: in simulations of it, of these policies and perhaps others.
+        chooser: the simulation that one would choose by, whose exploits are flagged; None leaves that out.
+        worse: what policies achieve where it is disturbed, by disturbance.
+
+    Raises:
+        BadInput: a simulation lacks a policy, or there are fewer than three.
+    """
+    for name, measured in simulated.items():
+        for policy in real:
+            if policy not in measured:
+                raise BadInput(
+                    f"{name} has no reward of {policy}", remedy="play it there, or leave it out of --policies"
+                )
+    same = {name: {policy: measured[policy] for policy in real} for name, measured in simulated.items()}
+    agreements = {name: agreement([*measured.values()], [*real.values()]) for name, measured in same.items()}
+    others = {f"the {name} simulation": measured for name, measured in same.items() if name != chooser}
+    flags = []
+    for policy, here in same[chooser].items() if chooser is not None else ():
+        otherwise = {words: one[policy].average_reward_m_s for words, one in {**(worse or {}), **others}.items()}
+        flags.append(flag(policy, here.average_reward_m_s, otherwise, here.reversals_hz))
+    return Ranking(real, same, agreements, tuple(one for one in flags if one is not None))
 
 
 # ---------------------------------------------------------------------------------------------------------- playing

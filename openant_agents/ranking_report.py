@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from openant_agents.exploits import Flag
-from openant_agents.ranking import Agreement, PlaceResult
+from openant_agents.ranking import Ranking
 from openant_tools.numbers import number, percent
 from openant_tools.procedure.intervals import Interval
 from openant_tools.report import Figure, Report, ReportSummary, plots
@@ -17,21 +15,9 @@ if TYPE_CHECKING:
 __all__ = ["ranking_report"]
 
 
-def ranking_report(
-    names: Sequence[str],
-    real: Mapping[str, PlaceResult],
-    simulated: Mapping[str, Mapping[str, PlaceResult]],
-    found: Mapping[str, Agreement],
-    flags: Sequence[Flag],
-) -> Report:
-    """Which simulation ranks policies as the robot does, and what choosing by it costs.
-
-    Args:
-        names: of the policies.
-        real, simulated: rewards by policy; by simulation and policy.
-        found: by simulation.
-        flags: policies that should not reach the robot.
-    """
+def ranking_report(ranking: Ranking) -> Report:
+    """Which simulation ranks policies as the robot does, and what choosing by it costs."""
+    found = ranking.agreements
     best, agreed = max(found.items(), key=lambda item: item[1].spearman.value)
     told = agreed.spearman.low > 0
     answer = ReportSummary(
@@ -39,12 +25,14 @@ def ranking_report(
         if told
         else f"Of {agreed.policies} policies, no simulation is known to rank them as the robot does.",
         Figure(
-            _picture(names, real, simulated, found, [one.policy for one in flags]),
+            _picture(ranking),
             "Each policy's reward in a simulation and on the robot, with a standard error. On the line both are alike.",
         ),
         f"Choosing by “{best}” costs {_words(agreed.regret_m_s, 100, 'cm/s')} of reward: its best is number {agreed.best_is} "
         "on the robot."
-        + "".join(f"\n\nPerhaps {one.policy} exploits its simulation: it does not stand {one.what}." for one in flags),
+        + "".join(
+            f"\n\nPerhaps {one.policy} exploits its simulation: it does not stand {one.what}." for one in ranking.flags
+        ),
         f"Choose policies by “{best}”."
         if told
         else "Play more policies on the robot, or calibrate: `openant sysid fit`.",
@@ -64,14 +52,10 @@ def _words(one: Interval, factor: float = 1.0, unit: str = "") -> str:
     return number(factor * one.value, unit, factor * one.low, factor * one.high)
 
 
-def _picture(
-    names: Sequence[str],
-    real: Mapping[str, PlaceResult],
-    simulated: Mapping[str, Mapping[str, PlaceResult]],
-    found: Mapping[str, Agreement],
-    flagged: Sequence[str],
-) -> MatplotlibFigure:
+def _picture(ranking: Ranking) -> MatplotlibFigure:
     """One panel a simulation: each policy's reward there and on the robot, ± a standard error, and the line of equality."""
+    real, simulated, names = ranking.real, ranking.simulated, list(ranking.real)
+    flagged = {one.policy for one in ranking.flags}
     figure: MatplotlibFigure
     figure, panels = plots.figure(1, len(simulated), height=3.6, sharex=True, sharey=True, squeeze=False)
     values = [one.average_reward_m_s for part in (real, *simulated.values()) for one in part.values()]
@@ -97,7 +81,8 @@ def _picture(
                 marker="o", markersize=12, markerfacecolor="none", markeredgecolor=plots.INK, linestyle="",
                 label="best in this simulation",
             )  # fmt: skip
-            rho, lost = found[name].spearman, 100 * found[name].regret_m_s.value
+            agreed = ranking.agreements[name]
+            rho, lost = agreed.spearman, 100 * agreed.regret_m_s.value
             panel.set_title(f"{name}: Spearman {_words(rho)},\nregret {number(lost, 'cm/s', decimals=1)}")
             panel.set_xlabel(plots.axis_label("simulated reward", "cm/s"))
         panels[0][0].set_ylabel(plots.axis_label("reward on the robot", "cm/s"))

@@ -17,7 +17,7 @@ from openant_tools.errors import BadInput
 from openant_tools.numbers import number, percent
 
 if TYPE_CHECKING:
-    from openant_agents.ranking import PlaceResult
+    from openant_agents.ranking import PlaceResult, Ranking
 
 __all__ = ["policies"]
 
@@ -119,8 +119,9 @@ def rank(
         --sim nominal=nominal --sim calibrated=my-ant --sim diagnosed=my-ant-diagnosed --report ranking
     """
     need_agents()
-    from openant_agents.exploits import DISTURBANCES, flag
-    from openant_agents.ranking import agreement, find_policies
+    from openant_agents.exploits import DISTURBANCES
+    from openant_agents.ranking import find_policies
+    from openant_agents.ranking import rank as ranked
     from openant_agents.ranking_report import ranking_report
     from openant_tools.files import json_text, write_text
 
@@ -131,63 +132,25 @@ def rank(
     on_robot = dict(_play(runs, real, seconds, starts, yes))
     runs = {name: path for name, path in runs.items() if name in on_robot}
     simulated = {name: dict(_play(runs, place, seconds, starts, False)) for name, place in places.items()}
-    names = list(runs)
-    for name, measured in simulated.items():
-        missing = [policy for policy in names if policy not in measured]
-        if missing:
-            raise BadInput(
-                f"{name} has no reward of {missing[0]}", remedy="play it there, or leave it out of --policies"
-            )
-
-    found = {
-        name: agreement([measured[policy] for policy in names], [on_robot[policy] for policy in names])
-        for name, measured in simulated.items()
-    }
-    chooser = next(iter(places)) if flag_by is None else flag_by
-    flags = []
-    if chooser != "none":
-        worse: dict[str, dict[str, PlaceResult]] = {}
-        if not places[chooser].endswith(".json"):
-            few = max(1, (starts or STARTS_IN_SIMULATION) // 5)
-            for words, wrapper in DISTURBANCES.items():
-                worse[words] = dict(_play(runs, places[chooser], seconds, few, False, wrapper=wrapper))
-        for policy in names:
-            otherwise = {words: measured[policy].average_reward_m_s for words, measured in worse.items()}
-            otherwise |= {
-                f"the {name} simulation": measured[policy].average_reward_m_s
-                for name, measured in simulated.items() if name != chooser
-            }  # fmt: skip
-            here = simulated[chooser][policy]
-            one = flag(policy, here.average_reward_m_s, otherwise, here.reversals_hz)
-            flags += [one] if one is not None else []
-
-    _print(names, on_robot, simulated, found)
-    for one in flags:
-        click.echo(f"exploit? {one.words}")
+    chooser = None if flag_by == "none" else flag_by or next(iter(places))
+    worse = {}
+    if chooser is not None and not places[chooser].endswith(".json"):
+        few = max(1, (starts or STARTS_IN_SIMULATION) // 5)
+        for words, wrapper in DISTURBANCES.items():
+            worse[words] = dict(_play(runs, places[chooser], seconds, few, False, wrapper=wrapper))
+    found = ranked({name: on_robot[name] for name in runs}, simulated, chooser, worse)
+    _print(found)
     if report is not None:
-        write_report(ranking_report(names, on_robot, simulated, found, flags), report, [folder])
+        write_report(ranking_report(found), report, [folder])
     if json_file is not None:
-        answer = {
-            "schema": "openant.ranking/1",
-            "policies": {
-                policy: {
-                    "real_m_s": on_robot[policy].average_reward_m_s,
-                    **{f"{name}_m_s": measured[policy].average_reward_m_s for name, measured in simulated.items()},
-                }
-                for policy in names
-            },
-            "agreement": {name: one.as_dict() for name, one in found.items()},
-            "flags": [
-                {"policy": one.policy, "keeps": dict(one.depends_on), "reversals_hz": one.reversals_hz} for one in flags
-            ],
-        }  # fmt: skip
-        write_text(json_file, json_text(answer))
+        write_text(json_file, json_text(found.as_dict()))
 
 
-def _print(names: list[str], real: Mapping[str, Any], simulated: Mapping[str, Any], found: Mapping[str, Any]) -> None:
+def _print(ranking: Ranking) -> None:
     """Rewards by policy, the best on the robot first, and the figures of each simulation."""
+    real, simulated = ranking.real, ranking.simulated
     click.echo(f"{'policy, cm/s':24} {'robot':>11}" + "".join(f" {name:>11}" for name in simulated))
-    for policy in sorted(names, key=lambda name: -real[name].average_reward_m_s):
+    for policy in sorted(real, key=lambda name: -real[name].average_reward_m_s):
         cells = [real[policy], *(measured[policy] for measured in simulated.values())]
         click.echo(
             f"{policy:24} "
@@ -196,13 +159,15 @@ def _print(names: list[str], real: Mapping[str, Any], simulated: Mapping[str, An
                 for one in cells
             )
         )
-    for name, one in found.items():
+    for name, one in ranking.agreements.items():
         s, k, v, r = one.spearman, one.kendall, one.rank_violation_m_s, one.regret_m_s
         click.echo(
             f"{name}: Spearman {number(s.value, low=s.low, high=s.high)}, Kendall {number(k.value, low=k.low, high=k.high)},"
             f" rank violation {number(100 * v.value, 'cm/s', decimals=1)}, regret {number(100 * r.value, 'cm/s', decimals=1)}"
             f" ({percent(one.regret_share)}): its best is number {one.best_is} of {one.policies} on the robot"
         )
+    for suspect in ranking.flags:
+        click.echo(f"exploit? {suspect.words}")
 
 
 def _simulations(given: tuple[str, ...]) -> dict[str, str]:

@@ -109,10 +109,8 @@ def plan(
 
     Exit code 1: it must not be played, since the robot would touch itself or fall.
     """
-
-    from openant_tools.errors import BadInput
     from openant_tools.files import json_text, write_text
-    from openant_tools.sysid.design import design
+    from openant_tools.sysid.design import optimised
     from openant_tools.sysid.plan import Planned, Residual, make_plan
     from openant_tools.sysid.plan_file import write_plan
     from openant_tools.sysid.plan_report import plan_report
@@ -129,9 +127,6 @@ def plan(
         else:
             model = folder.model_path(described)
     played = protocols_of(name, plan_file, seconds, setup)
-    stand = [one for one in played if one.setup == "stand"]
-    if optimise and not stand:
-        raise BadInput("there is nothing on the stand to optimise", remedy="leave out --optimise, or --setup floor")
     assumed = Residual()
     asked = Planned(
         model,
@@ -146,25 +141,9 @@ def plan(
             memory_s=assumed.memory_s if memory_s is None else memory_s,
         ),
     )
-    notes = []
     with progress_bar("planning", remaining=False) as step:
-        result = make_plan(asked, played, step)
-        if optimise:
-            found = design(asked, sum(one.seconds for one in stand), step)
-            better = make_plan(asked, (found.protocol, *(one for one in played if one.setup == "floor")), step)
-            gain = better.nats - result.nats
-            of = stand[0].name
-            if gain > 0 and not better.objections:
-                notes.append(
-                    f"of {found.considered} motions ({found.refused} refused), {len(found.protocol.segments)} were chosen: "
-                    f"intervals narrower by {percent(_narrower(result, better))} in the mean than of {of}"
-                )
-                result = better
-            else:
-                notes.append(f"none of {found.considered} motions together say more than {of}: it stays")
+        result = (optimised if optimise else make_plan)(asked, played, step)
     _print(result)
-    for note in notes:
-        click.echo(note)
     for note in result.notes:
         click.echo(note)
     for objection in result.objections:
@@ -182,21 +161,7 @@ def plan(
     return 1 if result.objections else 0
 
 
-def _narrower(before: Plan, after: Plan) -> float:
-    """By what share intervals shrink, geometric mean over the parameters that both know of."""
-    import math
-
-    widths = {one.name: one.high - one.low for one in before.expectations}
-    ratios = [
-        math.log((one.high - one.low) / widths[one.name])
-        for one in after.expectations
-        if widths.get(one.name, 0.0) > 0 and one.high > one.low
-    ]
-    return 1 - math.exp(sum(ratios) / len(ratios)) if ratios else 0.0
-
-
 def _print(result: Plan) -> None:
-
     for one in result.forecasts:
         protocol = one.protocol
         heading = f" at {number(protocol.heading_rad, 'rad', decimals=0)}" if protocol.heading_rad else ""

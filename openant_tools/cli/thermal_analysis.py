@@ -46,16 +46,12 @@ def fit(
     """
     from openant_tools.numbers import number
     from openant_tools.thermal.finding import BELIEVED_K
-    from openant_tools.thermal.fit import PARAMETER_WORDS, Known, held_out
-    from openant_tools.thermal.fit import fit as fit_runs
+    from openant_tools.thermal.fit import PARAMETER_WORDS, Known, fit_and_judge
     from openant_tools.thermal.forecast import forecast as look_ahead
     from openant_tools.thermal.forecast import rest_advice
 
     inputs = [_read(path) for path in runs]
-    known = None if after is None else Known.read(after)
-    earlier = fit_runs(inputs[:-1], after=known).known if len(inputs) > 1 else known
-    found = fit_runs(inputs[-1:], after=earlier)
-    held = held_out(inputs[-1], after=earlier) if inputs[-1].duration_s >= LEAST_HELD_OUT_S else None
+    found, held = fit_and_judge(inputs, after=None if after is None else Known.read(after))
     for one in found.estimates:
         if one.name in SHOWN:
             mark = "" if one.informed > 0.5 else "  mostly believed before"
@@ -103,8 +99,6 @@ def fit(
     return 1 if held is not None and held.rms_k > BELIEVED_K else 0
 
 
-#: s; a shorter run has no later part to speak of
-LEAST_HELD_OUT_S = 300.0
 SHOWN = ("case_j_k", "air_w_k", "winding_w_k", "scale", "leg_w_k", "room_c", "exponent", "held_w")
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, load_plant
+from openant_tools.numbers import percent
 from openant_tools.sysid.excitation import (
     Around,
     Chirp,
@@ -31,10 +32,10 @@ from openant_tools.sysid.excitation import (
     Steps,
 )
 from openant_tools.sysid.forecast import Forecast, forecast
-from openant_tools.sysid.plan import Planned, information, marginal, parameters_of
+from openant_tools.sysid.plan import Plan, Planned, information, make_plan, marginal, parameters_of
 from openant_tools.sysid.protocols import Protocol
 
-__all__ = ["Design", "design"]
+__all__ = ["Design", "design", "optimised"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
@@ -101,6 +102,40 @@ def design(asked: Planned, seconds: float, progress: Progress | None = None) -> 
     segments = sorted((drawn[good[k]] for k in chosen), key=lambda segment: isinstance(_core(segment), Releases))
     words = f"D-optimal for {len(parameters)} parameters within this robot's limits"
     return Design(Protocol("designed", words, tuple(segments)), nats, len(drawn), len(drawn) - len(good))
+
+
+def optimised(asked: Planned, played: Sequence[Protocol], progress: Progress | None = None) -> Plan:
+    """A plan whose motions on the stand are chosen anew in the same time, where those say more; its first note says what came of it.
+
+    Raises:
+        BadInput: nothing is on the stand, or as `design`.
+    """
+    stand = [one for one in played if one.setup == "stand"]
+    if not stand:
+        raise BadInput("there is nothing on the stand to optimise", remedy="leave out --optimise, or --setup floor")
+    plan = make_plan(asked, played, progress)
+    found = design(asked, sum(one.seconds for one in stand), progress)
+    better = make_plan(asked, (found.protocol, *(one for one in played if one.setup == "floor")), progress)
+    name = stand[0].name
+    words = f"none of {found.considered} motions together say more than {name}: it stays"
+    if better.nats > plan.nats and not better.objections:
+        words = (
+            f"of {found.considered} motions ({found.refused} refused), {len(found.protocol.segments)} were chosen: "
+            f"intervals narrower by {percent(_narrower(plan, better))} in the mean than of {name}"
+        )
+        plan = better
+    return replace(plan, notes=(words, *plan.notes))
+
+
+def _narrower(before: Plan, after: Plan) -> float:
+    """By what share intervals shrink, geometric mean over the parameters that both know of."""
+    widths = {one.name: one.high - one.low for one in before.expectations}
+    ratios = [
+        np.log((one.high - one.low) / widths[one.name])
+        for one in after.expectations
+        if widths.get(one.name, 0.0) > 0 and one.high > one.low
+    ]
+    return float(1 - np.exp(np.mean(ratios))) if ratios else 0.0
 
 
 def _candidates(space: CommandSpace, chance: np.random.Generator) -> list[Segment]:

@@ -25,7 +25,19 @@ from openant_tools.robot.joints import JOINTS
 from openant_tools.thermal.inputs import Inputs
 from openant_tools.thermal.physics import ServoHeat, State, advance, by_duty
 
-__all__ = ["ALIKE", "PRIORS", "Fit", "HeatEstimate", "HeatPrior", "HeldOut", "Known", "Variants", "fit", "held_out"]
+__all__ = [
+    "ALIKE",
+    "PRIORS",
+    "Fit",
+    "HeatEstimate",
+    "HeatPrior",
+    "HeldOut",
+    "Known",
+    "Variants",
+    "fit",
+    "fit_and_judge",
+    "held_out",
+]
 
 Array = NDArray[np.float64]
 
@@ -33,6 +45,8 @@ Array = NDArray[np.float64]
 Z95 = 1.959964
 #: share of a run that is fitted where the rest is to judge it
 TRAINED = 0.6
+#: s; a shorter run has no later part to speak of
+LEAST_HELD_OUT_S = 300.0
 #: of a disturbance: standard deviations (K) and correlation times (s) that are tried
 DISTURBANCE_K = (0.1, 0.2, 0.35, 0.6, 1.0, 1.8)
 DISTURBANCE_S = (120.0, 400.0, 1200.0)
@@ -327,6 +341,17 @@ def fit(runs: Sequence[Inputs], *, after: Known | None = None) -> Fit:
         known = found.known
     assert found is not None
     return found
+
+
+def fit_and_judge(runs: Sequence[Inputs], *, after: Known | None = None) -> tuple[Fit, HeldOut | None]:
+    """Fit as `fit` does, and judge it on the last run; None where that is too short to have a later part.
+
+    Raises:
+        BadInput: as `fit`.
+    """
+    before = fit(runs[:-1], after=after).known if len(runs) > 1 else after
+    found = fit(runs[-1:], after=before)
+    return found, held_out(runs[-1], after=before) if runs[-1].duration_s >= LEAST_HELD_OUT_S else None
 
 
 def _models(run: Inputs) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from openant_tools.procedure.step import Ask, Bench, Intent, Live, Procedure, Pr
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.kit import kit as kit_by_name
 from openant_tools.thermal.finding import thermal_finding, torque_warning
-from openant_tools.thermal.fit import fit, held_out
+from openant_tools.thermal.fit import fit_and_judge
 from openant_tools.thermal.forecast import forecast, rest_advice
 from openant_tools.thermal.inputs import inputs_of
 from openant_tools.thermal.soak import Phase, SoakPlan, soak, soak_config
@@ -71,9 +71,9 @@ def thermal_soak(bench: Bench) -> Procedure:
         steps.close()
     run = inputs_of(read_run(path, need=()))
     # What is forecast is the load, not the cooling after it.
-    found = fit([run]).at(run.loaded_s)
+    whole, held = fit_and_judge([run])
+    found = whole.at(run.loaded_s)
     told = forecast(found, from_cold=True)
-    held = held_out(run) if run.duration_s > 300 else None
     finding: Finding = thermal_finding(
         found, told, command=COMMAND, recording=bench.folder.relative(path), held=held, rest=rest_advice(found), warning=warning,
     )  # fmt: skip
