@@ -1,40 +1,20 @@
-"""The whole way on a virtual robot: each stage is made of the commands that a user would type, and stands on their files.
-
-A stage is done again only where it must be: its result is missing or older than what it is made from, or its commands
-have changed. So an interrupted demo goes on where it stopped, and one whose scenario was edited does what follows from it.
-"""
+"""The whole way on a virtual robot, stage by stage: an interrupted demo goes on where it stopped, and one whose scenario was
+edited does what follows from it."""
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
-import os
-import shlex
-import shutil
-import signal
-import subprocess
-import sys
-import threading
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import ClassVar
 
 from openant_tools.bringup.gait import FIRST_STEPS, first_look
-from openant_tools.errors import BadInput, OpenAntError
-from openant_tools.files import json_text, read_json, write_text
+from openant_tools.bringup.stages import Stage, StagedFolder, remove
+from openant_tools.errors import BadInput
+from openant_tools.files import write_text
 from openant_tools.robot.config import CONFIG_NAME
-from openant_tools.workers import PROGRESS, environment
 
-__all__ = ["Demo", "Stage", "StageFailed", "openant"]
-
-INTERRUPTED = 130
-#: of what a command said that failed
-LAST_LINES = 15
-#: s for its last words on how far it is
-HEARD_S = 1.0
-#: marks a folder as the demo's own, and remembers the commands that made what stands in it
-STATE = "demo.json"
+__all__ = ["Demo"]
 
 SCENARIO = """\
 # What is wrong with the demo's virtual robot. `openant sysid fit` does not see this file: it has to find these values
@@ -81,51 +61,8 @@ parameters = { angle_rad = -0.008 }
 """
 
 
-class StageFailed(OpenAntError):
-    """A command of a stage ended with another exit code than 0.
-
-    Attributes:
-        said: the last lines that it said.
-    """
-
-    def __init__(self, stage: str, command: Sequence[str], code: int, said: str) -> None:
-        super().__init__(
-            f"the stage {stage!r} ended with exit code {code}, for the reason above",
-            remedy=f"repeat `{words_of(command)}`; the demo goes on from there",
-        )
-        self.said = said
-        self.exit_code = code if code in (1, 2, INTERRUPTED) else 2
-
-
 @dataclass(frozen=True)
-class Stage:
-    """One stage.
-
-    Attributes:
-        name: one word.
-        words: what it does.
-        commands: arguments of `openant`, one tuple a command.
-        inputs, results: files that it is made from, and that it makes; the last command writes the last result.
-        replaced: what must go before it is done again, because its commands never write over it.
-        outdated: what must go if it is older than the inputs; younger, the commands go on from it.
-    """
-
-    name: str
-    words: str
-    commands: tuple[tuple[str, ...], ...]
-    inputs: tuple[Path, ...]
-    results: tuple[Path, ...]
-    replaced: tuple[Path, ...] = ()
-    outdated: tuple[Path, ...] = ()
-
-    @property
-    def command_lines(self) -> tuple[str, ...]:
-        """The commands as they are typed."""
-        return tuple(words_of(command) for command in self.commands)
-
-
-@dataclass(frozen=True)
-class Demo:
+class Demo(StagedFolder):
     """A robot's folder and how much is done in it.
 
     Attributes:
@@ -137,7 +74,7 @@ class Demo:
         learns: whether torch is there to train with.
     """
 
-    folder: Path
+    name: ClassVar[str] = "demo"
     steps: int = FIRST_STEPS
     record_s: float = 12.0
     eval_s: float = 20.0
@@ -182,11 +119,6 @@ class Demo:
     @property
     def video(self) -> Path:
         return self.pictures / "walk.webp"
-
-    @property
-    def log(self) -> Path:
-        """What the commands said."""
-        return self.folder / "demo.log"
 
     @property
     def report(self) -> Path:
@@ -282,7 +214,7 @@ class Demo:
         Raises:
             BadInput: the folder holds a robot that is not the demo's.
         """
-        state = self.folder / STATE
+        state = self.state
         if (self.folder / CONFIG_NAME).exists() and not state.exists():
             raise BadInput(
                 "holds a robot that is not the demo's, which would be mixed with a virtual one",
@@ -291,7 +223,9 @@ class Demo:
             )
         if fresh and state.exists():
             made = {path for stage in self.stages() for path in (*stage.results, *stage.replaced, *stage.outdated)}
-            kept_by_others = {self.folder / name for name in ("calibrated.xml", "journal.jsonl", "backups", STATE)}
+            kept_by_others = {
+                self.folder / name for name in ("calibrated.xml", "journal.jsonl", "backups", self.state.name)
+            }
             for path in {
                 *made,
                 *kept_by_others,
@@ -302,127 +236,9 @@ class Demo:
                 self.report,
                 self.scenario,
             }:
-                _remove(path)
+                remove(path)
         self.folder.mkdir(parents=True, exist_ok=True)
         if not state.exists():
             write_text(state, "{}\n")
         if not self.scenario.exists():
             write_text(self.scenario, SCENARIO)
-
-    def stands(self, stage: Stage) -> bool:
-        """Whether a stage's results are there, made by the same commands, and not older than what they are made from."""
-        if self._done().get(stage.name) != [list(command) for command in stage.commands]:
-            return False
-        return all(path.exists() for path in stage.results) and not _older(stage.results, stage.inputs)
-
-    def run(self, stage: Stage, progress: Callable[[float, str], None] = lambda share, words: None) -> None:
-        """Do a stage; its commands and what they say go to the log.
-
-        Args:
-            progress: called in a thread of its own, with what is being done and the share of the stage that is done.
-
-        Raises:
-            StageFailed: a command ended with another exit code than 0.
-            KeyboardInterrupt: Ctrl-C; what was running has ended in its own orderly way before it is raised.
-        """
-        for path in stage.replaced:
-            _remove(path)
-        for path in stage.outdated:
-            if path.exists() and _older((path,), stage.inputs):
-                _remove(path)
-        for number, command in enumerate(stage.commands):
-
-            def tell(share: float, words: str, number: int = number) -> None:
-                progress((number + share) / len(stage.commands), words)
-
-            with self.log.open("a", encoding="utf-8") as log:
-                log.write(f"$ {words_of(command)}\n")
-                log.flush()
-                since = log.tell()
-                code = openant(command, log, tell)
-            if code != 0:
-                with self.log.open(encoding="utf-8", errors="replace") as lines:
-                    lines.seek(since)
-                    said = "".join(lines.readlines()[-LAST_LINES:]).rstrip()
-                raise StageFailed(stage.name, command, code, said)
-        write_text(self.folder / STATE, json_text({**self._done(), stage.name: stage.commands}))
-
-    def _done(self) -> dict[str, list[list[str]]]:
-        try:
-            done = read_json(self.folder / STATE)
-        except (OSError, BadInput):
-            # Whatever is unreadable here only costs doing a stage again.
-            return {}
-        return done if isinstance(done, dict) else {}
-
-
-def words_of(command: Sequence[str]) -> str:
-    """A command as it is typed."""
-    return shlex.join(["openant", *command])
-
-
-def openant(
-    command: Sequence[str], log: IO[str] | None = None, progress: Callable[[float, str], None] | None = None
-) -> int:
-    """Run `openant` with these arguments and return its exit code.
-
-    The command runs in a process group of its own, so that a Ctrl-C reaches it once, by way of this process, which then
-    waits until it has ended in its own way (torque off, checkpoint saved) and raises KeyboardInterrupt.
-
-    Args:
-        log: where everything goes that it says; None: where this process' own words go.
-        progress: called in a thread of its own, with what the command is doing and how far it is, from 0 to 1.
-    """
-    told, tells = os.pipe()
-    try:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "openant_tools.cli", *command],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=None if log is None else subprocess.STDOUT,
-            process_group=0,
-            pass_fds=(tells,),
-            env={**environment(), PROGRESS: str(tells)},
-        )
-    except BaseException:
-        os.close(told)
-        raise
-    finally:
-        os.close(tells)
-    hears = threading.Thread(target=_hear, args=(told, progress or (lambda share, words: None)), daemon=True)
-    hears.start()
-    interrupted = False
-    while True:
-        try:
-            code = process.wait()
-        except KeyboardInterrupt:
-            interrupted = True
-            process.send_signal(signal.SIGINT)
-        else:
-            break
-    hears.join(HEARD_S)
-    if interrupted or code in (INTERRUPTED, -signal.SIGINT):
-        raise KeyboardInterrupt
-    return code
-
-
-def _hear(told: int, progress: Callable[[float, str], None]) -> None:
-    """What `workers.pass_on` says in the command, until it has ended."""
-    with open(told, encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            share, _, words = line.rstrip("\n").partition(" ")
-            with contextlib.suppress(ValueError):
-                progress(float(share), words)
-
-
-def _older(results: Sequence[Path], inputs: Sequence[Path]) -> bool:
-    """Whether any result is older than any input."""
-    newest = max((path.stat().st_mtime_ns for path in inputs if path.exists()), default=0)
-    return any(path.stat().st_mtime_ns < newest for path in results)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

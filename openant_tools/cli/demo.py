@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-import functools
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from openant_tools.cli.options import json_option
 from openant_tools.numbers import number
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 __all__ = ["demo"]
 
@@ -42,67 +36,32 @@ def demo(robot: Path, steps: int, fresh: bool, json_file: Path | None) -> None:
     already is not done again: after Ctrl-C the same command goes on, and after a change of DIR/scenario.toml it does what
     follows from it.
     """
-    from rich.console import Console
     from rich.markup import escape
 
-    from openant_tools.bringup.demo import Demo, StageFailed
+    from openant_tools.bringup.demo import Demo
     from openant_tools.bringup.demo_report import write_report
+    from openant_tools.cli.stages import StageLines
     from openant_tools.files import json_text, write_text
 
-    console = Console(stderr=True, highlight=False)
-    say = functools.partial(console.print, soft_wrap=True)
     whole = Demo(robot, steps=steps)
     whole.prepare(fresh=fresh)
-    began = time.monotonic()
     stages = whole.stages()
-    wide = max(len(stage.words) for stage in stages) + 2
-    say(f"A virtual Open Ant in {escape(str(robot))}: from its first recording to walking, in about three minutes.")
-    try:
-        for place, stage in enumerate(stages, 1):
-            line = f"[bold]{place}/{len(stages) + 1} {stage.name:8}[/bold] {escape(stage.words):{wide}}"
-            if whole.stands(stage):
-                say(f"{line} stands already")
-                continue
-            since = time.monotonic()
-            with _bar(console, line) as tell:
-                whole.run(stage, tell)
-            say(f"{line} [green]done[/green], {number(time.monotonic() - since, 's', decimals=0)}")
-        if not whole.learns:
-            say("learning is left out: it needs torch (pip install 'openant-tools\\[agents]')")
-        elif not whole.video.exists():
-            say("no pictures of the walk: there is no OpenGL here (an EGL or OSMesa library would do)")
-        line = f"[bold]{len(stages) + 1}/{len(stages) + 1} {'report':8}[/bold] {'put it all on one page':{wide}}"
-        since = time.monotonic()
-        with _bar(console, line):
-            figures = write_report(whole)
-        say(
-            f"{line} [green]done[/green], {number(time.monotonic() - since, 's', decimals=0)}; {number(time.monotonic() - began, 's', decimals=0)} in all"
+    with StageLines(whole, stages) as lines:
+        lines.say(
+            f"A virtual Open Ant in {escape(str(robot))}: from its first recording to walking, in about three minutes."
         )
-    except StageFailed as failure:
-        say(escape(failure.said))
-        raise
-    except KeyboardInterrupt:
-        say(f"stopped; the same command goes on from here (in {escape(str(robot))})")
-        raise
+        for place, stage in enumerate(stages, 1):
+            lines.do(stage, place, len(stages) + 1)
+        if not whole.learns:
+            lines.say("learning is left out: it needs torch (pip install 'openant-tools\\[agents]')")
+        elif not whole.video.exists():
+            lines.say("no pictures of the walk: there is no OpenGL here (an EGL or OSMesa library would do)")
+        with lines.step("report", "put it all on one page", len(stages) + 1, len(stages) + 1):
+            figures = write_report(whole)
+        lines.say(f"{number(time.monotonic() - lines.began, 's', decimals=0)} in all")
     _print(whole, figures)
     if json_file is not None:
         write_text(json_file, json_text(figures, indent=2))
-
-
-@contextlib.contextmanager
-def _bar(console: Console, line: str) -> Iterator[Callable[[float, str], None]]:
-    """A step's line with a bar of its own below, which goes when the step is done; yields what is told how far it is."""
-    from rich.console import Group
-    from rich.live import Live
-    from rich.markup import escape
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-    from rich.text import Text
-
-    columns = (TextColumn("   "), BarColumn(28), TimeElapsedColumn(), TextColumn("{task.description}"))
-    bar = Progress(*columns, console=console)
-    task = bar.add_task("", total=1.0)
-    with Live(Group(Text.from_markup(line), bar), console=console, transient=True):
-        yield lambda share, words: bar.update(task, completed=share, description=escape(words))
 
 
 def _print(whole: Any, figures: dict[str, Any]) -> None:

@@ -18,9 +18,10 @@ import pytest
 
 from openant_env import rendering
 from openant_tools.bringup import robot_picture
-from openant_tools.bringup.demo import STATE, Demo, Stage, StageFailed, openant
+from openant_tools.bringup.demo import Demo
 from openant_tools.bringup.demo_report import compare, truth, write_report
 from openant_tools.bringup.gait import walks_at
+from openant_tools.bringup.stages import Stage, StageFailed, openant
 from openant_tools.cli import main
 from openant_tools.errors import BadInput
 from openant_tools.robot.folder import RobotFolder, create_robot
@@ -114,12 +115,12 @@ def test_the_command_skips_what_stands_and_says_where_everything_is(
 ) -> None:
     # The command has no options for short recordings; their stages stand by what the folder remembers.
     whole = Demo(done.folder, steps=150)
-    remembered = (done.folder / STATE).read_text()
-    (done.folder / STATE).write_text(json.dumps({stage.name: stage.commands for stage in whole.stages()}))
+    remembered = done.state.read_text()
+    done.state.write_text(json.dumps({stage.name: stage.commands for stage in whole.stages()}))
     monkeypatch.chdir(done.folder)
     with pytest.raises(SystemExit) as end:
         main(["demo", "--robot", str(done.folder), "--steps", "150", "--json", "figures-again.json"])
-    (done.folder / STATE).write_text(remembered)
+    done.state.write_text(remembered)
     said, progress = capfd.readouterr()
     assert end.value.code == 0
     assert progress.count("stands already") == len(whole.stages())
