@@ -35,14 +35,27 @@ def config() -> None:
 
 @config.command()
 @robot_option
-@click.option("--kit", type=click.Choice(["standard", "lite"]), default="standard", show_default=True)
+@click.option("--kit", type=click.Choice(["standard", "lite"]), help="[default: standard]")
 @click.option("--name", help="What to call the robot. Default: the folder's name.")
-def new(robot: Path | None, kit: str, name: str | None) -> None:
-    """Make a robot's folder with the nominal values of its kit."""
-    from openant_tools.robot.folder import create_robot
+@click.option(
+    "--from", "source", type=click.Path(path_type=Path), metavar="DIR",
+    help="In place of nominal values those of this robot, and its model: the same robot, to be simulated otherwise.",
+)  # fmt: skip
+def new(robot: Path | None, kit: str | None, name: str | None, source: Path | None) -> None:
+    """Make a robot's folder with the nominal values of its kit, or with those of another folder."""
+    from openant_tools.robot.folder import RobotFolder, create_robot
 
-    folder = create_robot(robot_folder(robot, must_exist=False), kit, name)
-    click.echo(f"made {folder.config_file} with the nominal values of the {kit} kit")
+    path = robot_folder(robot, must_exist=False)
+    if source is None:
+        folder = create_robot(path, kit or "standard", name)
+        click.echo(f"made {folder.config_file} with the nominal values of the {kit or 'standard'} kit")
+        return
+    if kit is not None or name is not None:
+        raise BadInput("--from is a robot with its own kit and name", remedy="leave --kit and --name out")
+    from openant_tools.model.copy import copy_robot
+
+    folder = copy_robot(RobotFolder.at(source), path)
+    click.echo(f"made {folder.config_file} as {source} has it, with its model")
 
 
 @config.command()

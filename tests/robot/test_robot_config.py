@@ -695,6 +695,26 @@ def test_new_show_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str], m
     assert run(capsys, "config", "new")[0] == 2
 
 
+def test_a_second_folder_of_a_robot_has_its_values_and_its_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = create_robot(tmp_path / "ant", "lite", values={"motors.hip_rr.zero_offset_rad": 0.79})
+    (first.recordings / "a.mcap").touch()
+    (first.path / "models").mkdir()
+    (first.path / "nominal.xml").rename(first.path / "models" / "mine.xml")
+    text = first.config_file.read_text(encoding="utf-8")
+    first.config_file.write_text(text.replace("nominal.xml", "models/mine.xml"), encoding="utf-8")
+    code, out, _ = run(capsys, "config", "new", "--from", first.path, "--robot", tmp_path / "other")
+    assert (code, "with its model" in out) == (0, True)
+    other = RobotFolder.at(tmp_path / "other")
+    assert other.config() == dataclasses.replace(first.config(), model="mine.xml")
+    assert other.check()[1] == []
+    assert not other.recordings.exists()
+    for words in (("--kit", "lite"), ()):
+        code, _, err = run(capsys, "config", "new", "--from", first.path, "--robot", other.path, *words)
+        assert (code, err.count("\n"), "→" in err) == (2, 1, True)
+
+
 def test_a_robot_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for command in ("check", "show", "export"):
         code, _, err = run(capsys, "config", command, "--robot", tmp_path / "nobody")
