@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -90,6 +91,7 @@ def _full_disk(words: str, k: int) -> bool:
         done = subprocess.run(
             [sys.executable, "-m", "openant_tools.cli", *command], text=True, capture_output=True, timeout=PATIENCE_S,
             preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)), stdin=subprocess.DEVNULL,
+            env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"},  # or Python leaves parts of compiled modules
         )  # fmt: skip
         lines = [line for line in done.stderr.splitlines() if line.startswith("openant: ")]
         told = len(lines) == 1 and "Traceback" not in done.stderr

@@ -39,9 +39,11 @@ def openant(*arguments: str | Path, cwd: Path | None = None, largest_file: int |
         assert largest_file is not None
         resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
 
+    # On such a disk Python leaves a part of a compiled module, which nothing that comes later can load.
+    cached = {} if largest_file is None else {"PYTHONDONTWRITEBYTECODE": "1"}
     return subprocess.run(
         [*OPENANT, *map(str, arguments)], cwd=cwd, text=True, capture_output=True, timeout=PATIENCE_S,
-        preexec_fn=None if largest_file is None else limit, stdin=subprocess.DEVNULL,
+        preexec_fn=None if largest_file is None else limit, stdin=subprocess.DEVNULL, env=os.environ | cached,
     )  # fmt: skip
 
 
