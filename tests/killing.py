@@ -116,6 +116,7 @@ ELSEWHERE: Mapping[str, str] = {
     "calib arena": "needs a camera, which a shared machine renders slowly",
     "train sac": "it walks in the environment that `train sarsa` walks in",
     "eval": "it walks in the environment that `train sarsa` walks in",
+    "loop": "it walks by `eval`, as a command of its own",
     "policies play": "it walks in the environment that `train sarsa` walks in",
     "policies rank": "it walks in the environment that `train sarsa` walks in",
 }

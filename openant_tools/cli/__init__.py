@@ -42,6 +42,7 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     "eval": ("eval", "Learning", "Play a trained agent and measure its reward per second."),
     "plot": ("plot", "Learning", "Learning curves of several runs in one picture."),
     "policies": ("policies", "Learning", "Which simulation ranks policies as the robot does, and which fool it."),
+    "loop": ("loop", "Learning", "From simulation to robot and back, beside a control: what improving it is worth."),
     "tune": ("tune", "Learning", "Search for settings of an agent, on as many machines as you like."),
     "support": ("support", "Help", "One bundle for a bug report: versions, ports, config, findings, log."),
 }

@@ -187,6 +187,7 @@ def eval_(
         answer: dict[str, Any] = {
             "average_reward_m_s": sampled.mean, "starts": starts, **{plays.way: plays.as_dict() for plays in found},
             "seconds": seconds, "seed": seed, "run": str(run), "step": policy.step,
+            "recordings": [str(path) for path in recorded],
             "plays": {plays.way: [asdict(play) for play in plays.plays] for plays in found},
         }  # fmt: skip
         write_text(json_file, json_text(answer, indent=2))

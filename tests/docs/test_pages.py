@@ -39,7 +39,7 @@ MARKS = {
 }
 #: option → the most of it that is run here, in its own unit
 AMOUNTS = {
-    "--steps": 100, "--minutes": 1, "--trials": 2, "--seeds": 2, "--seconds": 12, "--robots": 2, "--soaks": 2, "--starts": 2,
+    "--steps": 100, "--fine-tune-steps": 50, "--minutes": 1, "--trials": 2, "--seeds": 2, "--seconds": 12, "--robots": 2, "--soaks": 2, "--starts": 2,
 }  # fmt: skip
 PATIENCE_S = 1800.0
 
