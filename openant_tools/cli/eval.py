@@ -144,7 +144,7 @@ def eval_(
             f"the robot it was trained on is no longer at {options['robot']}", where=run, remedy="name it with --robot"
         )
     simulated = name != HARDWARE_ID
-    more = {"render_mode": "rgb_array"} if name == SIMULATED_ID else {}
+    more: dict[str, Any] = {"render_mode": "rgb_array"} if name == SIMULATED_ID else {}
     starts = starts or (STARTS_IN_SIMULATION if simulated else STARTS_ON_A_ROBOT)
     ways = (SAMPLED, LIKELIEST) if simulated or likeliest else (SAMPLED,)
     before = set((run / "recordings").glob("*.mcap"))
