@@ -27,7 +27,7 @@ from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.lateness import REMEDY, losses
 from openant_tools.comms.servos import Servos
 from openant_tools.errors import HardwareFault
-from openant_tools.numbers import number, percent
+from openant_tools.numbers import number, percent, span
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Ask, Bench, Drawing, Hands, Intent, Live, Procedure, Progress, Say, Subroutine
 from openant_tools.procedure.unfinished import Parts
@@ -136,6 +136,9 @@ def bounds(bench: Bench) -> Procedure:
             "bounds", False, f"{', '.join(blocked)} can hardly be moved", tuple(evidence), "free the joint and run it again", COMMAND,
             problems=(*problems, *(f"{joint} can hardly be moved → free it" for joint in blocked)),
         )  # fmt: skip
+    for kind in ("hip", "knee"):
+        ends = (f"{joint} {span(*limits[joint], 'rad', decimals=0)}" for joint in limits if JOINTS[joint].kind == kind)
+        yield Say(f"limits of {kind}s: {', '.join(ends)}")
     yield Intent(
         "write these limits into robot.toml; then sweep every joint slowly through its range, and play "
         f"{len(LIBRARY)} motions on the stand",

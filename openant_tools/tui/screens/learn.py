@@ -74,7 +74,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
                 Option(f"A first look, in simulation: {FIRST_STEPS} steps with settings that walk sooner", id=FIRST),
                 *(Option(f"Train {name} in simulation: {_WORDS[name]}", id=name) for name in AGENTS),
                 *(Option(f"Train {name} on the robot: it moves", id=f"{name}{ON_ROBOT}") for name in AGENTS),
-                Option("Stop and save", id="stop"),
+                Option("Stop and save", id="stop", disabled=not self.session.learning),
                 *self._after(),
                 id="choices",
             )
@@ -223,8 +223,9 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         running = self.session.learning
         if self._finished != (not running):
             self._finished = not running
+            chooser = self.query_one("#choices", Choices)
+            (chooser.enable_option if running else chooser.disable_option)("stop")
             if self._finished:  # there is a run now with which something can be done
-                chooser = self.query_one("#choices", Choices)
                 for option in self._after():
                     if all(option.id != other.id for other in chooser.options):
                         chooser.add_option(option)
