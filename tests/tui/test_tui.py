@@ -6,6 +6,7 @@ import asyncio
 import datetime
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -432,7 +433,7 @@ def test_runs_that_cannot_be_diagnosed_are_refused_in_words(robot: RobotFolder) 
             await pilot.pause()
             assert app.session.diagnosing is None
             await pilot.press("a", "a")
-            assert "0 runs chosen" in screen_text(app)
+            assert "0 of 2 runs chosen" in screen_text(app)
             await pilot.press("a", "d")
             assert app.session.diagnosing is not None
             assert app.session.diagnosing.arguments[:2] == ("gap", "diagnose")
@@ -900,6 +901,7 @@ def test_what_was_learned_is_evaluated_played_compared_and_diagnosed_from_its_sc
             await pilot.press("escape", "d")
             await pilot.pause()
             assert isinstance(app.screen, GapScreen)
+            assert re.search(r"sac-0/b.mcap.*sac-0/a.mcap", screen_text(app), re.DOTALL), "newest first"
 
     asyncio.run(look())
     there = f"--robot {robot.path}"

@@ -83,7 +83,8 @@ improved model, which `w` writes beside the robot's own. The full report with pi
         self._chosen: set[Path] = set()
         self._shown: Path | None = None
         self._was_running = self.session.computing
-        self._runs = runs_of(self.session.folder)
+        self._names = runs_of(self.session.folder)
+        self._runs = list(self._names)
         runs = self.query_one("#runs", Choices)
         for index, path in enumerate(self._runs):
             runs.add_option(Option(self._line(path), id=str(index)))
@@ -95,7 +96,7 @@ improved model, which `w` writes beside the robot's own. The full report with pi
         self.draw_process()
 
     def _line(self, path: Path) -> Text:
-        return Text(f"[{'x' if path in self._chosen else ' '}] {path.name}", no_wrap=True, overflow=overflow())
+        return Text(f"[{'x' if path in self._chosen else ' '}] {self._names[path]}", no_wrap=True, overflow=overflow())
 
     def _list(self) -> None:
         """Read which diagnoses there are."""
@@ -197,7 +198,7 @@ improved model, which `w` writes beside the robot's own. The full report with pi
     def draw_process(self) -> None:
         """What runs, and how far it is."""
         process = self.session.diagnosing
-        text = Text(f"{len(self._chosen)} runs chosen")
+        text = Text(f"{len(self._chosen)} of {len(self._runs)} runs chosen")
         if process is not None:
             if process.running:
                 text = marked("wait", process.last_words or "begun")

@@ -26,12 +26,14 @@ __all__ = ["RecordingsScreen", "runs_of"]
 SUFFIXES = (".mcap", ".parquet", ".csv")
 
 
-def runs_of(folder: RobotFolder | None) -> list[Path]:
-    """All that was recorded of a robot, newest first."""
-    if folder is None or not folder.recordings.is_dir():
-        return []
-    found = [path for path in folder.recordings.rglob("*") if path.suffix in SUFFIXES]
-    return sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)
+def runs_of(folder: RobotFolder | None) -> dict[Path, str]:
+    """All that was recorded of a robot, newest first, by what it is called: a policy's after the run that trained it."""
+    if folder is None:
+        return {}
+    found = {path: path.name for path in folder.recordings.rglob("*")}
+    found |= {path: f"{path.parts[-3]}/{path.name}" for path in folder.runs.glob("*/recordings/*")}
+    made = {path: path.stat().st_mtime for path in found if path.suffix in SUFFIXES}
+    return {path: found[path] for path in sorted(made, key=lambda path: made[path], reverse=True)}
 
 
 class RecordingsScreen(Page):
@@ -57,13 +59,16 @@ that has the columns of docs/recordings.md.
 
     def on_mount(self) -> None:
         super().on_mount()
-        self._files = runs_of(self.session.folder)
+        names = runs_of(self.session.folder)
+        self._files = list(names)
         chooser = self.query_one("#list", Choices)
         for index, path in enumerate(self._files):
             stat = path.stat()
             when = datetime.datetime.fromtimestamp(stat.st_mtime).strftime("%d.%m.%Y %H:%M")
             chooser.add_option(
-                Option(Text(f"{path.name:40.40} {number(stat.st_size / 1e6, decimals=1):>7} MB  {when}"), id=str(index))
+                Option(
+                    Text(f"{names[path]:40.40} {number(stat.st_size / 1e6, decimals=1):>7} MB  {when}"), id=str(index)
+                )
             )
         if self._files:
             chooser.highlighted = 0
