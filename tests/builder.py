@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from openant_tools.bringup.simulated_builder import SimulatedBuilder
 from openant_tools.procedure.finding import Finding
@@ -33,6 +33,21 @@ from openant_tools.virtual.start import assemble
 SMALL_PICTURES = "[camera]\nwidth = 640\nheight = 480\nfps = 15\n"
 #: of a scenario: servos that rub enough for a calibration to be worth it, whatever noise there is
 RUBS = "[motor]\ncoulomb_nm = 0.09\n"
+
+
+T = TypeVar("T")
+
+
+def finished(steps: Generator[Any, Any, T], said: list[str] | None = None) -> T:
+    """The result of something that asks nothing; what it says meanwhile goes to `said`."""
+    while True:
+        try:
+            event = next(steps)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+        if said is not None and isinstance(event, Say):
+            said.append(event.words)
 
 
 class Builder:

@@ -42,11 +42,7 @@ def comms_step(bench: Bench) -> Procedure:
     path = bench.folder.recordings / "comms-soak.mcap"
     path.unlink(missing_ok=True)
     config, text = engine_config(bench), bench.folder.config_file.read_text(encoding="utf-8")
-    soaked = yield from relayed(
-        lambda progress, notice: soak(
-            config, path, 60 * minutes, robot_toml=text, notice=notice, progress=progress,
-        )
-    )  # fmt: skip
+    soaked = yield from soak(config, path, 60 * minutes, robot_toml=text)
     told = yield from relayed(lambda progress, notice: diagnose_dropouts([read_run(path, need=())]))
     moving = dropouts_finding(told, [bench.folder.relative(path)], COMMAND)
     if not soaked.whole:

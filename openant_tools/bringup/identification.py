@@ -36,11 +36,7 @@ def identification(bench: Bench) -> Procedure:
     )
     config = engine_config(bench, imu=None)
     text = bench.folder.config_file.read_text(encoding="utf-8")
-    yield from relayed(
-        lambda progress, notice: record_takes(
-            config, [*wanted, *judge], robot_toml=text, progress=progress, notice=notice
-        )
-    )
+    yield from record_takes(config, [*wanted, *judge], robot_toml=text)
     fitted, held_out = [read_run(take.path) for take in wanted], [read_run(take.path) for take in judge]
     nominal = bench.folder.path / NOMINAL_MODEL
     result = yield from relayed(lambda progress, notice: sysid.fit(fitted, nominal, held_out, progress=progress))

@@ -10,7 +10,7 @@ import click
 
 from openant_tools.cli.hardware import Moving, anyway_option, engine_config, may_move, port_option, robot_of, yes_option
 from openant_tools.cli.options import MINUTES, json_option, rate_option, robot_option
-from openant_tools.cli.progress import progress_bar
+from openant_tools.cli.progress import BarFace, progress_bar
 from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option
 from openant_tools.numbers import number, percent
 
@@ -97,6 +97,7 @@ def _on_the_bus(
     from openant_tools.comms.soak import soak as soak_bus
     from openant_tools.errors import BadInput
     from openant_tools.files import json_text, write_text
+    from openant_tools.procedure.step import drive
     from openant_tools.recording.writer import recording_path
 
     path = recording_path(out)
@@ -117,11 +118,11 @@ def _on_the_bus(
             may_move(yes, remedy="add --yes if it may, or --still")
         shown = stack.enter_context(progress_bar("soaking", console=console))
         try:
-            done = soak_bus(
+            soaking = soak_bus(
                 config, path, seconds, move=not still, resume=resume, thin_s=None if every_cycle else THIN_S,
                 robot_toml=None if folder is None else folder.config_file.read_text(),
-                progress=shown, notice=lambda words: console.print(words, highlight=False),
             )  # fmt: skip
+            done = drive(soaking, BarFace(shown, console))
         except KeyboardInterrupt:
             console.print(f"kept as far as it got: {path}; go on with --resume")
             raise

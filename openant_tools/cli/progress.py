@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import click
 
 from openant_tools.numbers import percent
+from openant_tools.procedure.step import Answer, Event, Progress, Say
 from openant_tools.workers import pass_on
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["progress_bar"]
+__all__ = ["BarFace", "progress_bar"]
 
 #: lines that are said of one piece of work where there is no terminal
 TOLD = 20
@@ -32,14 +34,15 @@ def progress_bar(
         console: of other lines meanwhile.
         lines: whether a line is said for every twentieth where there is no terminal.
     """
+    import rich.progress
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     said = -1
     columns = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
     if remaining:
         columns.append(TimeRemainingColumn())
-    with Progress(*columns, console=console or Console(stderr=True), transient=True) as bar:
+    with rich.progress.Progress(*columns, console=console or Console(stderr=True), transient=True) as bar:
         task = bar.add_task(words, total=1.0)
 
         def tell(share: float, words: str) -> None:
@@ -51,3 +54,23 @@ def progress_bar(
             pass_on(share, words)
 
         yield tell
+
+
+@dataclass(frozen=True)
+class BarFace:
+    """Shows what asks nothing: its progress on a bar, its words above it.
+
+    Attributes:
+        tell: a `progress_bar`'s. console: the bar's.
+    """
+
+    tell: Callable[[float, str], None]
+    console: Console
+
+    def answer(self, event: Event) -> Answer:
+        match event:
+            case Progress(share, words):
+                self.tell(share or 0.0, words)
+            case Say(words):
+                self.console.print(words, highlight=False, markup=False)
+        return None

@@ -20,9 +20,9 @@ from openant_tools.cli.hardware import (
     yes_option,
 )
 from openant_tools.cli.options import Number, rate_option, robot_option, seconds_option
+from openant_tools.cli.progress import BarFace, progress_bar
 from openant_tools.cli.virtual_for_command import placeable, placed, virtual_option
 from openant_tools.numbers import exact, number, span
-from openant_tools.workers import pass_on
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -236,9 +236,8 @@ def _record_here(
     pictures: bool,
 ) -> list[Recorded]:
     """Connect to the robot where it is, and record."""
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-
     from openant_tools.errors import HardwareFault
+    from openant_tools.procedure.step import drive
     from openant_tools.sysid.record import record_takes
 
     floor = wanted[0].protocol.setup == "floor"
@@ -260,23 +259,10 @@ def _record_here(
         + f". All {len(config.servos)} joints move on {config.port}; the robot must be {_where(first)}."
     )
     may_move(yes)
-    columns = TextColumn("{task.description:18}"), BarColumn(), TaskProgressColumn()
-    bar = stack.enter_context(Progress(*columns, TimeElapsedColumn(), console=console, transient=True))
-    task = bar.add_task("connecting", total=1.0)
-
-    def tell(share: float, words: str) -> None:
-        bar.update(task, description=words, completed=share)
-        pass_on(share, words)
-
+    text = None if folder is None else folder.config_file.read_text()
+    shown = stack.enter_context(progress_bar("connecting", console=console))
     try:
-        return record_takes(
-            config,
-            wanted,
-            robot_toml=None if folder is None else folder.config_file.read_text(),
-            progress=tell,
-            notice=lambda text: bar.console.print(text, highlight=False),
-            pictures=pictures,
-        )
+        return drive(record_takes(config, wanted, robot_toml=text, pictures=pictures), BarFace(shown, console))
     except (HardwareFault, KeyboardInterrupt):
         kept = [str(take.path) for take in wanted if take.path.exists()]
         if kept:

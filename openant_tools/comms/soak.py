@@ -9,7 +9,7 @@ it is the losses that are wanted here. A recording that is not written any more 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from openant_tools.comms.messages import EngineConfig
 from openant_tools.comms.restart import Interlock, MotionStopped, Restart, StopCause
 from openant_tools.comms.state import refusal, stopping
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.procedure.step import Progress, Say, Subroutine
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
 from openant_tools.robot.joints import JOINTS
@@ -105,17 +106,14 @@ def soak(
     resume: bool = False,
     thin_s: float | None = THIN_S,
     robot_toml: str | None = None,
-    progress: Callable[[float, str], None] = lambda share, words: None,
-    notice: Callable[[str], None] = lambda words: None,
-) -> BusSoaked:
-    """Soak until the log is `seconds` (s) long.
+) -> Subroutine[BusSoaked]:
+    """Soak until the log is `seconds` (s) long; the words of its progress say what was lost until then.
 
     Args:
         config: the robot, see `comms.setup`.
         move: swing the legs; else the robot stays limp.
         resume: go on with the soak that stands at `out`.
         thin_s: one healthy cycle in so many s is kept; None keeps all.
-        progress: called with the share done, and what was lost until then in words.
 
     Raises:
         HardwareFault: the robot does not answer at the start.
@@ -127,7 +125,7 @@ def soak(
     done = before
     with EngineProcess(config) as engine:
         for event in engine.events():
-            notice(str(event.text) if isinstance(event, messages.Notice) else str(event))
+            yield Say(str(event.text) if isinstance(event, messages.Notice) else str(event))
         wrong = stopping(engine.description["differences"])
         if move and wrong and not config.anyway:
             what, remedy = refusal(wrong)
@@ -158,12 +156,12 @@ def soak(
                     break
                 restart = interlock.stopped(fault.cause, fault.what, done)
                 move, pause_s = restart is not None, PAUSE_S
-                notice(f"{fault}; {_what_follows(restart)}")
+                yield Say(f"{fault}; {_what_follows(restart)}", "warn")
             piece += 1
             done += length
             with contextlib.suppress(HardwareFault):  # a port that is gone has nothing to add
                 statistics = engine.ask(messages.Statistics())
-            progress(min(1.0, done / seconds), _losses(statistics))
+            yield Progress(min(1.0, done / seconds), _losses(statistics))
         if moving:
             engine.ask(messages.Torque(False))
         try:

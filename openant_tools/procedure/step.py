@@ -203,8 +203,8 @@ class Declined(OpenAntError):
     exit_code = 130
 
 
-def drive(procedure: Procedure, face: Face) -> Finding:
-    """Run a procedure to its finding.
+def drive(procedure: Subroutine[T], face: Face) -> T:
+    """Run a procedure, or a part of one, to its result.
 
     Whatever ends it early (an error, Ctrl-C in the face, an intent that is not granted) lets it put the robot into
     order first: torque off, ports closed.
@@ -221,8 +221,8 @@ def drive(procedure: Procedure, face: Face) -> Finding:
             if isinstance(event, Intent) and answer is not True:
                 raise Declined(f"not done: {event.words}", remedy="nothing was changed from there on; run it again")
     except StopIteration as end:
-        finding: Finding = end.value
-        return finding
+        result: T = end.value
+        return result
     finally:
         procedure.close()
 

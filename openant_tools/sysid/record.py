@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.errors import BadInput
+from openant_tools.procedure.step import Progress, Say, Subroutine
 from openant_tools.recording.run import Facts
 from openant_tools.sysid.excitation import CommandSpace, Multisine
 from openant_tools.sysid.plan_file import as_table
@@ -30,6 +31,8 @@ _TEMPERATURE = "present_temperature"  # °C
 #: Work between a cold run and its hot repeat: how long in one go, and the rise (K) at which it is enough.
 WORK_S = 10.0
 HOT_RISE_K = 10
+#: s between two looks at what is played
+LOOK_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -109,17 +112,13 @@ def record_takes(
     wanted: Sequence[Take],
     *,
     robot_toml: str | None = None,
-    progress: Callable[[float, str], None] = lambda share, words: None,
-    notice: Callable[[str], None] = lambda text: None,
     pictures: bool = False,
-) -> list[Recorded]:
+) -> Subroutine[list[Recorded]]:
     """Record one take after another, of a robot that stays where it is.
 
     Args:
         config: the robot, see `comms.setup`.
         robot_toml: the robot's configuration as text, kept inside the recordings.
-        progress: called with what is being done and the share of all that is done.
-        notice: called with what the user should know.
         pictures: record the overhead camera's, too.
 
     Raises:
@@ -131,23 +130,29 @@ def record_takes(
     done: list[Recorded] = []
     past = 0.0
     with EngineProcess(config) as engine:
-        for event in engine.events():
-            notice(_words(event))
+        yield from _notices(engine)
         found = np.asarray(engine.description["position"], float)
         engine.ask(messages.Torque(True))
 
-        def play(protocol: Protocol, seed: int, words: str) -> None:
+        def play(protocol: Protocol, seed: int, words: str) -> Subroutine[None]:
             commands, limp = protocol.commands(space, config.rate_hz, seed), protocol.limp(space, config.rate_hz)
             motion = messages.Play(commands, protocol.name, limp if limp.any() else None)
-            for share in _while_playing(engine, engine.start(motion), len(commands) / config.rate_hz, notice):
-                progress((past + share * protocol.seconds) / total, words)
+            column, number, first = engine.columns.index("t"), engine.start(motion), None
+            while not engine.done(number):  # raises where it was stopped
+                yield from _notices(engine)
+                rows = engine.telemetry()
+                if len(rows):
+                    first = float(rows[0, column]) if first is None else first
+                    played = min(protocol.seconds, float(rows[-1, column]) - first)
+                    yield Progress((past + played) / total, words)
+                time.sleep(LOOK_S)
 
         for take in wanted:
             protocol, extra = take.protocol, dict[str, Any]()
             if take.work_s:
-                extra["work_s"], extra["rise_k"] = _work(engine, take.work_s, play, notice)
+                extra["work_s"], extra["rise_k"] = yield from _work(engine, take.work_s, play)
                 past += take.work_s
-            progress(past / total, "to the home pose")
+            yield Progress(past / total, "to the home pose")
             engine.ask(messages.Ramp(protocol.commands(space, config.rate_hz, take.seed)[0]))
             engine.ask(messages.Hold(SETTLE_S))
             facts = Facts(
@@ -169,7 +174,7 @@ def record_takes(
                 },
             )
             engine.ask(messages.Record(str(take.path), facts, robot_toml, pictures=pictures))
-            play(protocol, take.seed, take.path.stem)
+            yield from play(protocol, take.seed, take.path.stem)
             written, cycles = engine.ask(messages.StopRecording())
             done.append(Recorded(Path(written), cycles))
             past += protocol.seconds
@@ -178,45 +183,30 @@ def record_takes(
             limits = np.array([config.limits_rad.get(joint, (-np.inf, np.inf)) for joint in space.joints])
             engine.ask(messages.Ramp(np.clip(found, limits[:, 0], limits[:, 1])))
         engine.ask(messages.Torque(False))
-        progress(1.0, "done")
+        yield Progress(1.0, "done")
     return done
 
 
 def _work(
     engine: EngineProcess,
     seconds: float,
-    play: Callable[[Protocol, int, str], None],
-    notice: Callable[[str], None],
-) -> tuple[float, int]:
+    play: Callable[[Protocol, int, str], Subroutine[None]],
+) -> Subroutine[tuple[float, int]]:
     """Move for `seconds`, or until a servo is warmer by HOT_RISE_K: (s, K) of what came of it."""
     before = engine.ask(messages.ReadRegister(_TEMPERATURE))
     worked, rise, joint = 0.0, 0, ""
     while worked < seconds and rise < HOT_RISE_K:
         piece = Protocol("work", "", (Multisine(max(1.0, min(WORK_S, seconds - worked))),))
-        play(piece, round(worked), "warming up")
+        yield from play(piece, round(worked), "warming up")
         worked += piece.seconds
         now = engine.ask(messages.ReadRegister(_TEMPERATURE))
         joint, rise = max(((name, now[name] - before[name]) for name in now), key=lambda pair: pair[1])
-    notice(f"{worked:.0f} s of work: {joint} is {rise} K warmer")
+    yield Say(f"{worked:.0f} s of work: {joint} is {rise} K warmer")
     return worked, rise
 
 
-def _while_playing(
-    engine: EngineProcess, number: int, seconds: float, notice: Callable[[str], None]
-) -> Iterator[float]:
-    """Yield the share played until the motion has ended; raises where it was stopped."""
-    column = engine.columns.index("t")
-    first: float | None = None
-    while not engine.done(number):
-        for event in engine.events():
-            if isinstance(event, messages.Notice):
-                notice(event.text)
-        rows = engine.telemetry()
-        if len(rows):
-            first = float(rows[0, column]) if first is None else first
-            yield min(1.0, (float(rows[-1, column]) - first) / seconds)
-        time.sleep(0.05)
-
-
-def _words(event: messages.Event) -> str:
-    return event.text if isinstance(event, messages.Notice) else str(event)
+def _notices(engine: EngineProcess) -> Subroutine[None]:
+    """What the engine has to say."""
+    for event in engine.events():
+        if isinstance(event, messages.Notice):
+            yield Say(event.text)

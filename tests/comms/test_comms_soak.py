@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builder import finished
 from click.testing import CliRunner
 
 from openant_tools.blind.soak_virtual import swinging_soak
@@ -114,7 +115,7 @@ def test_bytes_show_each_fault(cause: str, stepped_robot: Mapping[str, str | Non
     control.ask("fault", cause=cause, on=True, **settings, from_s=now + begins, to_s=now + ends)
     try:
         config = config_of_unknown_robot(bus, control_path, rate_hz=30.0)
-        soaked = soak_bus(config, tmp_path / "soak.mcap", 7.0, thin_s=None)
+        soaked = finished(soak_bus(config, tmp_path / "soak.mcap", 7.0, thin_s=None))
     finally:
         control.ask("fault", cause=cause, on=False, **{key: settings[key] for key in ("where",) if key in settings})
         control.close()

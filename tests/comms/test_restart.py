@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from builder import finished
 from click.testing import CliRunner
 from places import ROOT
 
@@ -142,8 +143,8 @@ def test_a_soak_of_the_bus_ends_for_good_when_the_disk_is_full(
 ) -> None:
     said: list[str] = []
     with disk_of(monkeypatch, 70_000):
-        soaked = soak_bus(
-            config(robot, 100.0), tmp_path / "soak.mcap", 60.0, move=not still, thin_s=None, notice=said.append
+        soaked = finished(
+            soak_bus(config(robot, 100.0), tmp_path / "soak.mcap", 60.0, move=not still, thin_s=None), said
         )
     assert torque(robot) == 0
     assert "the recording stopped" in soaked.ended
@@ -178,8 +179,7 @@ def test_a_soak_of_the_servos_tells_a_full_disk_in_one_line(
     out = tmp_path / "warm.mcap"
     plan = SoakPlan(load="hang", seconds=600.0, cool_down_s=10.0)
     with disk_of(monkeypatch, 60_000), pytest.raises(MotionStopped, match=r"kept, \d+ rows") as stopped:
-        for _ in soak_servos(soak_config(config(robot), 20.0), plan, out):
-            pass
+        finished(soak_servos(soak_config(config(robot), 20.0), plan, out))
     assert stopped.value.cause is StopCause.STORAGE
     assert stopped.value.exit_code == 1
     assert torque(robot) == 0
@@ -192,7 +192,7 @@ def test_recording_an_excitation_ends_with_what_is_kept(
 ) -> None:
     out = tmp_path / "run.mcap"
     with disk_of(monkeypatch, 60_000), pytest.raises(MotionStopped, match=r"kept, \d+ rows") as stopped:
-        record_takes(config(robot, 100.0), [Take(out, protocol("stand", 30.0), 0)])
+        finished(record_takes(config(robot, 100.0), [Take(out, protocol("stand", 30.0), 0)]))
     assert stopped.value.exit_code == 1
     assert torque(robot) == 0
     assert len(read_recording(out).run.t) > 20
@@ -214,7 +214,7 @@ def test_a_place_where_nothing_can_be_recorded_is_refused_and_the_engine_lives(
     }
     for path, words in cases.items():
         with pytest.raises(OpenAntError, match=words) as refused:
-            record_takes(config(robot), [Take(path, protocol("stand", 5.0), 0)])
+            finished(record_takes(config(robot), [Take(path, protocol("stand", 5.0), 0)]))
         assert refused.value.exit_code == 2
         assert torque(robot) == 0
     assert taken.read_bytes() == b"mine"
@@ -235,7 +235,7 @@ def test_a_folder_that_is_removed_under_a_recording_ends_motion(tmp_path: Path) 
 
         hand = threading.Thread(target=remove)
         hand.start()
-        soaked = soak_bus(config(live, 50.0), folder / "soak.mcap", 60.0, thin_s=None)
+        soaked = finished(soak_bus(config(live, 50.0), folder / "soak.mcap", 60.0, thin_s=None))
         hand.join()
         assert torque(live) == 0
     assert "the file was removed while it was written" in soaked.ended
@@ -250,7 +250,7 @@ def test_a_soak_swings_again_after_silence_and_says_which_time_it_is(robot: dict
     now = float(control.ask("now")["t"])
     control.ask("fault", cause="broken_wire", where="knee_fl", on=True, from_s=now + 3.0, to_s=now + 5.0)
     try:
-        soaked = soak_bus(config(robot), tmp_path / "soak.mcap", 12.0, thin_s=None, notice=said.append)
+        soaked = finished(soak_bus(config(robot), tmp_path / "soak.mcap", 12.0, thin_s=None), said)
     finally:
         control.ask("fault", cause="broken_wire", where="knee_fl", on=False)
         control.close()
@@ -268,7 +268,7 @@ def test_a_soak_whose_port_vanished_listens_on_and_moves_no_more(robot: dict[str
     now = float(control.ask("now")["t"])
     control.ask("fault", cause="usb_unplug", on=True, from_s=now + 3.0, to_s=now + 5.0)
     try:
-        soaked = soak_bus(config(robot), tmp_path / "soak.mcap", 12.0, thin_s=None, notice=said.append)
+        soaked = finished(soak_bus(config(robot), tmp_path / "soak.mcap", 12.0, thin_s=None), said)
     finally:
         control.ask("fault", cause="usb_unplug", on=False)
         control.close()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from builder import robot
+from builder import finished, robot
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -371,14 +371,6 @@ def run_soak(plan: SoakPlan, out: Path, robot_: object, *, resume: bool = False,
     bench = robot_.bench  # type: ignore[attr-defined]
     config = soak_config(config_of_unknown_robot(bench.bus, bench.control), rate_hz, plan.margin_k)
     return soak(config, plan, out, resume=resume)
-
-
-def finished(steps):  # type: ignore[no-untyped-def]
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return end.value
 
 
 def test_a_soak_survives_kill_9_and_is_one_recording(tmp_path: Path) -> None:
