@@ -33,8 +33,12 @@ PLACES = {
 }
 
 
-def loop_report(loop: Loop, result: Result) -> Report:
-    """One page: the figure, what the improvement is worth against the control, and the commands that made it."""
+def loop_report(loop: Loop, result: Result, made_by: str = "openant loop") -> Report:
+    """One page: the figure, what the improvement is worth against the control, and the commands that made it.
+
+    Args:
+        made_by: the command as it was typed.
+    """
     means = [what_was_found(result), *_doubts(result)]
     answer = ReportSummary(
         verdict(result),
@@ -53,7 +57,7 @@ def loop_report(loop: Loop, result: Result) -> Report:
         f"{loop.robot.name}, {'the robot itself' if loop.virtual is None else 'a virtual robot'}: {number(loop.steps)} steps of "
         f"training and {number(loop.fine_tune_steps)} more, seed {loop.seed}.",
         answer,
-        made_by="openant loop",
+        made_by=made_by,
         recordings=[loop.diagnosis, loop.result],
     )  # fmt: skip
     rows = [
@@ -159,13 +163,13 @@ def _figures(result: Result) -> list[KeyFigure]:
     promised = result.promised_m_s
     keys = [KeyFigure("on the robot, before", speed(before))]
     if result.improved:
-        keys.append(KeyFigure("after", speed(result.robot_after.mean), f"control {speed(control)}"))
+        keys.append(KeyFigure("on the robot, after", speed(result.robot_after.mean), f"control {speed(control)}"))
     else:
-        keys.append(KeyFigure("after, as the control", speed(control)))
+        keys.append(KeyFigure("on the robot, control", speed(control)))
     keys.append(KeyFigure("simulation less robot, before", speed(promised["before"], sign=True)))
     if result.improved:
         note = f"control {speed(promised['control'], sign=True)}"
-        keys.append(KeyFigure("after", speed(promised["after"], sign=True), note))
+        keys.append(KeyFigure("simulation less robot, after", speed(promised["after"], sign=True), note))
     return keys
 
 
@@ -190,6 +194,6 @@ def _then(loop: Loop, result: Result) -> str:
     if gain.low > 0:
         apply = f"openant gap apply {loop.diagnosis} --robot {loop.robot} --out {loop.robot}/improved.xml"
         return f"Make it the robot's own simulation: `{apply}`."
-    return "Play more starts, or train on for longer, before you believe either." + (
+    return "Play more starts, or train on for longer, before you decide between them." + (
         f" {result.diagnosis.next_experiment}" if result.diagnosis.next_experiment else ""
     )

@@ -69,6 +69,7 @@ def loop(
     from openant_agents.sac import SacSettings
     from openant_tools.bringup.loop import Loop, result_of
     from openant_tools.bringup.loop_report import loop_report, verdict, what_was_found
+    from openant_tools.cli.log import command_line
     from openant_tools.cli.stages import StageLines
     from openant_tools.files import json_text, write_text
     from openant_tools.lock import held
@@ -100,7 +101,7 @@ def loop(
             result = result_of(whole)
             answer = json_text(result.as_json(), indent=2)
             write_text(whole.result, answer)
-            loop_report(whole, result).write(whole.report)
+            loop_report(whole, result, command_line()).write(whole.report)
         lines.say(escape(f"wrote {whole.report}"))
     click.echo(what_was_found(result))
     click.echo(verdict(result))
