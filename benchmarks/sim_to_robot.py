@@ -1,7 +1,7 @@
 """Is it worth improving a simulation by what its own policy recorded? Robots with sealed faults, each through `openant loop`.
 
     python benchmarks/sim_to_robot.py make  --out SET --key-file KEY [--robots 5] [--seed-from COMMIT]
-    python benchmarks/sim_to_robot.py run   --out SET --key-file KEY [--steps 30000 --fine-tune-steps 10000] [--only robot-0]
+    python benchmarks/sim_to_robot.py run   --out SET --key-file KEY [--steps 30000 --fine-tune-steps 10000 --seconds 60]
     python benchmarks/sim_to_robot.py table --out SET [--key-file KEY] [--json FILE]
 
 `make` draws virtual robots with two medium or large effects each, at as many joints as they may belong to, and seals them; beside

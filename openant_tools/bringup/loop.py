@@ -54,7 +54,7 @@ class Loop(StagedFolder):
     steps: int
     fine_tune_steps: int
     seed: int
-    seconds: float = 60.0
+    seconds: float = 12.0
     starts: int = 5
     settings: Path | None = None
 

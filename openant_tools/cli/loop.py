@@ -28,7 +28,10 @@ __all__ = ["loop"]
     help="Training on, in the improved simulation, and of the control in the one as it is.",
 )  # fmt: skip
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-@click.option("--seconds", type=SECONDS, default=60.0, show_default=True, help="Robot time from each start.")
+@click.option(
+    "--seconds", type=SECONDS, default=12.0, show_default=True,
+    help="Robot time from each start. With the five starts a play is a minute, which is enough to diagnose.",
+)  # fmt: skip
 @click.option(
     "--starts", type=click.IntRange(min=1), default=5, show_default=True,
     help="How often each agent starts anew in each place: an interval needs two.",
