@@ -24,13 +24,15 @@ from openant_tools.robot.config import CONFIG_NAME
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.virtual.process import VIRTUAL_DEFAULT, placeable
 from openant_tools.virtual.scenario import load_scenario, read_scenario_file
-from openant_tools.virtual.seal import KEY_VARIABLE, is_sealed
+from openant_tools.virtual.seal import KEY_VARIABLE, is_sealed, read_key
 
 __all__ = ["Loop", "Played", "Result", "result_of"]
 
 SCHEMA = "openant.loop/1"
 #: what was asked for, in the loop's folder
 ASKED = "asked.json"
+#: there: the hash of the robot's model and effects
+SIMULATION = "simulation"
 #: of the robot's engine, for whose settings alone it is looked up here
 RATE_HZ = 100.0
 
@@ -237,18 +239,19 @@ class Loop(StagedFolder):
         simulated.update(repr(config.effects).encode())
         asked = {
             **{key: str(value) if isinstance(value, Path) else value for key, value in asdict(self).items()},
-            "simulation": simulated.hexdigest()[:16],
+            SIMULATION: simulated.hexdigest()[:16],
         }
         del asked["folder"]
         kept = self.folder / ASKED
         if kept.is_file():
             before = read_json(kept, "name a new folder with --out")
             for key, value in asked.items():
-                if before.get(key) != value:
-                    words = f"{key.replace('_', ' ')} {before.get(key)}, not {value}"
-                    raise BadInput(
-                        f"holds a loop with {words}", where=self.folder, remedy="name a new folder with --out"
-                    )
+                if before.get(key) == value:
+                    continue
+                what = f"holds a loop with {key.replace('_', ' ')} {before.get(key)}, not {value}"
+                if key == SIMULATION:
+                    what = "holds a loop that began with another model or other effects of this robot"
+                raise BadInput(what, where=self.folder, remedy="name a new folder with --out")
             return
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise BadInput("holds something that is no loop", where=self.folder, remedy="name a new folder with --out")
@@ -267,6 +270,8 @@ def _check_virtual(source: str) -> None:
         load_scenario(Path(source))
     elif not os.environ.get(KEY_VARIABLE):
         raise BadInput("is sealed", where=source, remedy=f"name its key file: {KEY_VARIABLE}=FILE")
+    else:
+        read_key(Path(os.environ[KEY_VARIABLE]))
     if not placeable(source) and table.get("robot", {}).get("setup") != "floor":
         raise BadInput("this robot does not stand on the floor", where=source, remedy='let its setup be "floor"')
 

@@ -172,6 +172,17 @@ def test_a_loop_that_stands_is_not_done_again_and_another_one_is_refused_its_fol
         Loop(tmp_path, loop.robot, "default", 40, 30, 2).prepare()
 
 
+def test_a_loop_whose_robot_was_calibrated_anew_meanwhile_is_refused(ant: Path, tmp_path: Path) -> None:
+    robot = Path(shutil.copytree(ant, tmp_path / "ant"))
+    loop = Loop(tmp_path / "out", robot, "default", 40, 30, 1)
+    loop.prepare()
+    loop.prepare()
+    with (robot / "nominal.xml").open("a") as model:
+        model.write("<!-- better -->\n")
+    with pytest.raises(BadInput, match="began with another model"):
+        loop.prepare()
+
+
 def quick(found: Diagnosis, ran: list[Command], dies_at: int | None = None) -> Runner:
     """Writes what commands would, at once; killed while it does its nth."""
 
