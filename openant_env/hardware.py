@@ -507,7 +507,7 @@ class AntHardware(AntBase):
                         why = self._turn_back()
                     if why is None:
                         break
-                    self.link.let_down()  # it may wait for long
+                    self._let_down()  # it may wait for long
                 except HardwareFault as fault:
                     why = str(fault)
                     self._reason = why
@@ -563,7 +563,7 @@ class AntHardware(AntBase):
                 return why_unseen
         self._notice(f"turned back in {self.link.now() - began:.0f} s")
         self._take(self.link.stand(self.actions.rest, SETTLE_S))
-        return None
+        return self._unseen()
 
     def _need_word(self) -> None:
         """Where motion has ended for good: have whoever is there asked, or refuse."""
@@ -580,10 +580,17 @@ class AntHardware(AntBase):
         if not self._paused.is_set():
             self.pause(f"{why}; look at the robot, then resume")
 
+    def _let_down(self) -> None:
+        """Have it lie down; a stop on the way is one like any other."""
+        fault = self.link.let_down()
+        if fault is not None:
+            self._reason = str(fault)
+            self._ended_by(_cause(fault), self._reason, fault)
+
     def _in_the_way(self) -> str | None:
         """Why the robot cannot stand up yet; what software can do about it has been done."""
         if self._paused.is_set():
-            self.link.let_down()
+            self._let_down()
             return self._why_paused
         try:
             if not self.link.connected or (self._reason and not self.link.standing):
@@ -642,7 +649,7 @@ class AntHardware(AntBase):
         """What the servos and sensors of a robot have to say against its standing up."""
         hot = self._hot()
         if hot is not None:
-            self.link.let_down()
+            self._let_down()
             return hot
         errors = self.link.errors()
         if errors:
@@ -655,7 +662,7 @@ class AntHardware(AntBase):
             self.link.reboot(list(errors))
             return f"{', '.join(errors)} had shut down, and are started again"
         if self._wound:
-            self.link.let_down()
+            self._let_down()
             why = f"{self._winding}: turn the robot back by hand, in the camera's view"
             self._ended_by(StopCause.CABLE, why)
             return why
@@ -666,7 +673,7 @@ class AntHardware(AntBase):
             return why
         unseen = self._unseen()
         if unseen is not None:
-            self.link.let_down()
+            self._let_down()
         return unseen
 
     def _hot(self) -> str | None:

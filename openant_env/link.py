@@ -243,16 +243,25 @@ class RobotLink:
             engine.wait(number)
         return self._rows(), number
 
-    def let_down(self) -> None:
-        """Slowly back to how the robot was found, then torque off: from standing it would fall."""
+    def let_down(self) -> HardwareFault | None:
+        """Slowly back to how the robot was found, then torque off: from standing it would fall.
+
+        Returns:
+            What stopped it on its way: what cannot lie down is let go where it is.
+        """
         if not self.standing or self._found is None or self._engine is None:
-            return
+            return None
         limits = [self.config.limits_rad.get(s.joint, (-np.inf, np.inf)) for s in self.config.servos]
         low, high = np.array(limits).T
-        with contextlib.suppress(HardwareFault):  # what cannot lie down is let go where it is
-            self._engine.ask(messages.Ramp(np.clip(self._found, low, high)))
-            self._engine.ask(messages.Torque(False))
-        self._standing = False
+        try:
+            with self._noticing_stops():
+                self._engine.ask(messages.Ramp(np.clip(self._found, low, high)))
+                self._engine.ask(messages.Torque(False))
+        except HardwareFault as fault:
+            return fault
+        finally:
+            self._standing = False
+        return None
 
     def release(self) -> None:
         """Torque off now, wherever the robot is: it is no place to lie down slowly from."""

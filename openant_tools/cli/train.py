@@ -10,6 +10,7 @@ import click
 from openant_tools.cli.hardware import Moving
 from openant_tools.cli.learning import settings_of, settings_option
 from openant_tools.cli.options import Number, json_option
+from openant_tools.cli.train_report import report
 from openant_tools.cli.train_sarsa import sarsa
 from openant_tools.cli.training import (
     TrainingPlace,
@@ -123,3 +124,4 @@ def sac(
 
 
 train.add_command(sarsa)
+train.add_command(report)

@@ -21,7 +21,7 @@ from openant_tools.cli.walking import (
     hardware_robot,
     may_walk,
 )
-from openant_tools.errors import BadInput, HardwareFault, StorageFault
+from openant_tools.errors import BadInput, HardwareFault, OpenAntError, StorageFault
 from openant_tools.numbers import exact, number
 
 if TYPE_CHECKING:
@@ -157,23 +157,71 @@ def _place_of(
 @contextlib.contextmanager
 def training(place: TrainingPlace, steps: int, out: Path) -> Iterator[tuple[Any, LearningBar]]:
     """The environment, once a robot may move, and the bar; what ends it early says how to go on."""
-    if place.hardware:
-        may_walk(place.options, place.yes, place.unattended)
-    with environment(place.name, place.options, out / "recordings", unattended=place.unattended) as env:
+    if not place.hardware:
+        with (
+            environment(place.name, place.options, out / "recordings") as env,
+            _going_on(out),
+            LearningBar(steps, out) as bar,
+        ):
+            yield env, bar
+        return
+    from openant_tools.bringup.run_log import add_to_log
+
+    may_walk(place.options, place.yes, place.unattended)
+    said = functools.partial(add_to_log, out)
+    kept = environment(place.name, place.options, out / "recordings", unattended=place.unattended, said=said)
+    with _told_at_its_end(out), kept as env, _going_on(out), LearningBar(steps, out) as bar:
+        said("begun, unattended" if place.unattended else "begun")
+        yield env, bar
+
+
+@contextlib.contextmanager
+def _going_on(out: Path) -> Iterator[None]:
+    """What ends a run early says how to go on."""
+    try:
+        yield
+    except (KeyboardInterrupt, HardwareFault):
+        click.echo(f"saved in {out}; the same command goes on from there", err=True)
+        raise
+
+
+@contextlib.contextmanager
+def _told_at_its_end(out: Path) -> Iterator[None]:
+    """However a run on a robot ends, its log says why; unless somebody wants it gone at once, it has its page."""
+    from openant_tools.bringup.run_log import add_to_log
+
+    why, page = "by a fault of this program", True
+    try:
         try:
-            with LearningBar(steps, out) as bar:
-                yield env, bar
-        except (KeyboardInterrupt, HardwareFault):
-            click.echo(f"saved in {out}; the same command goes on from there", err=True)
-            raise
+            yield
         except OSError as error:
-            if not place.hardware:
-                raise
             raise StorageFault(
                 f"nothing more is saved, and the robot stops: {error.strerror or error}",
                 where=error.filename or out,
                 remedy="make room there; the same command goes on",
             ) from error
+        why = "all steps are done"
+    except KeyboardInterrupt:
+        why, page = "interrupted", False
+        click.echo(f"its page: openant train report {out}", err=True)
+        raise
+    except OpenAntError as error:
+        why = str(error)
+        raise
+    finally:
+        add_to_log(out, f"ended: {why}")
+        if page:
+            _page(out)
+
+
+def _page(out: Path) -> None:
+    """The run's page, as far as there is something to tell."""
+    from openant_tools.bringup.training_report import read_training, training_report
+
+    with contextlib.suppress(OpenAntError, OSError):
+        report = training_report(read_training(out))
+        report.made_by = f"openant train report {out}"
+        click.echo(f"wrote {report.write_folder(out / 'report')}", err=True)
 
 
 def show_result(

@@ -80,13 +80,20 @@ def _notice(words: str) -> None:
 
 @contextlib.contextmanager
 def environment(
-    name: str, options: Mapping[str, Any], recordings: Path, *, unattended: bool = False, **more: Any
+    name: str,
+    options: Mapping[str, Any],
+    recordings: Path,
+    *,
+    unattended: bool = False,
+    said: Callable[[str], None] | None = None,
+    **more: Any,
 ) -> Iterator[Any]:
     """An environment by its id, closed in the end; a robot can be paused meanwhile.
 
     Args:
         options: what a run's `run.json` keeps, to make it again.
-        recordings: where a robot's runs go. unattended: nobody looks after it. more: for the simulated one.
+        recordings: where a robot's runs go. unattended: nobody looks after it. said: also told what the user is.
+        more: for the simulated one.
     """
     import gymnasium
 
@@ -104,10 +111,16 @@ def environment(
         finally:
             env.close()
         return
+
     # With a terminal the space bar is the word that motion may go on where it has ended for good; without one nobody gives it.
+    def notice(words: str) -> None:
+        _notice(words)
+        if said is not None:
+            said(words)
+
     attended = sys.stdin.isatty() and not unattended
     env = gymnasium.make(
-        name, **options, recordings=recordings, notice=_notice, attended=attended, unattended=unattended
+        name, **options, recordings=recordings, notice=notice, attended=attended, unattended=unattended
     )
     try:
         with _pause_key(env.unwrapped):

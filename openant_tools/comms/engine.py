@@ -9,6 +9,7 @@ both die, each servo's Bus Watchdog stops its motion. This is the only way to to
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import sys
 import time
@@ -30,6 +31,7 @@ from openant_tools.comms.following import Behind
 from openant_tools.comms.guardian_process import BEAT_S
 from openant_tools.comms.guards import Trip
 from openant_tools.comms.hardware import Hardware, report_leftovers, take_over
+from openant_tools.comms.lateness import processor_s
 from openant_tools.comms.limp import LimpJoints
 from openant_tools.comms.line import PortGone
 from openant_tools.comms.messages import WATCHDOG_UNIT_S, EngineConfig
@@ -50,6 +52,8 @@ __all__ = ["Engine", "main", "run"]
 
 #: s for which the parent may take its time to hear the last words
 LAST_WORDS_S = 0.5
+#: s between two notes of what a virtual robot takes of this computer
+PROCESSOR_EVERY_S = 10.0
 
 
 def run(config: EngineConfig, parent: Parent, ring: Ring) -> None:
@@ -127,6 +131,8 @@ class Engine:
         self._restless = False
         self._cycles = self._overruns = 0
         self._worst_wake = 0.0
+        #: when it was noted last what a virtual robot takes of this computer, s
+        self._noted_at = -float("inf")
 
     # ---- the loop ------------------------------------------------------------------------------------------------
 
@@ -217,6 +223,19 @@ class Engine:
                         cause=StopCause.BY_HAND,
                     )
                 )
+
+        self._note_virtual_robot(now)
+
+    def _note_virtual_robot(self, now: float) -> None:
+        """Keep with the recording what a virtual robot in real time takes of this computer, from time to time."""
+        pid = self._clock.lateness.robot_pid
+        if pid is None or self._clock.stepped or now - self._noted_at < PROCESSOR_EVERY_S:
+            return
+        self._noted_at = now
+        used = processor_s(pid)
+        if used is not None:
+            with contextlib.suppress(RecordingStopped):  # told by the next cycle's row
+                self._recorder.event("virtual robot", processor_s=used, processors=os.cpu_count())
 
     def _end_looks(self) -> None:
         now = self._clock.now()

@@ -11,13 +11,16 @@ import contextlib
 import os
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.recording.run import Run
 
-__all__ = ["LATE_S", "REMEDY", "Lateness", "Losses", "late_rows", "lateness_words", "losses", "of_wake"]
+__all__ = [
+    "LATE_S", "REMEDY", "Lateness", "Losses", "late_rows", "lateness_words", "losses", "of_wake", "processor_s",
+]  # fmt: skip
 
 #: What a deadline leaves to the operating system (`bus.BusTiming.margin_s`): later than that, answers are missed.
 LATE_S = 4e-3
@@ -185,6 +188,17 @@ def lateness_words(worst_s: float, late: int, cycles: int) -> str:
         return ""
     often = f" in {max(late / cycles, 0.01):.0%} of cycles" if cycles else ""
     return f"this computer was late by up to {worst_s * 1e3:.0f} ms{often}"
+
+
+def processor_s(pid: int) -> float | None:
+    """s that a process and those that it started have had a processor, so far; None where the system does not tell."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+        children = [int(one) for one in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()]
+    except (OSError, ValueError):
+        return None
+    used = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return used + sum(processor_s(child) or 0.0 for child in children)
 
 
 def _pressure_s() -> float | None:

@@ -59,6 +59,7 @@ class Recording:
     Attributes:
         run: the rows of the bus, in SI, with the body's samples at their nearest rows (see `merge_nearest`).
         imu, pose: the body's samples at their own times and rates.
+        pose_known: (n,) s, when each pose of the camera was there to be used: the row before which it came.
         pictures: when the camera's were taken, and their `bytes`; `read_pictures` has them themselves.
         events: what happened, each with `t` (s) and `kind`.
         channels: how counts became SI.
@@ -71,6 +72,7 @@ class Recording:
     run: Run
     imu: Samples
     pose: Samples
+    pose_known: Array
     pictures: Samples
     events: tuple[Mapping[str, Any], ...]
     channels: tuple[ServoChannel, ...]
@@ -202,6 +204,7 @@ def _read(path: Path) -> Recording:
     schemas: dict[int, Schema] = {}
     cycles: list[Any] = []
     body: dict[str, list[Any]] = {"openant.Imu": [], "openant.Pose": []}
+    before: list[int] = []  # rows before each pose
     events: list[Mapping[str, Any]] = []
     pictures: list[tuple[int, int]] = []
     for record in scan:
@@ -224,6 +227,8 @@ def _read(path: Path) -> Recording:
                 pictures.append((record.log_time, len(record.data)))
             elif kind in body:
                 body[kind].append(classes[kind].FromString(record.data))
+                if kind == "openant.Pose":
+                    before.append(len(cycles))
     if content is None:
         raise BadInput(
             "this MCAP file holds no recording of ours"
@@ -259,6 +264,7 @@ def _read(path: Path) -> Recording:
         run=replace(run, columns=columns),
         imu=imu,
         pose=pose,
+        pose_known=_known(before, cycles, body["openant.Pose"]),
         pictures=_pictures(pictures, int(content.get("stamp_offset_ns", 0))),
         events=tuple(events),
         channels=channels,
@@ -390,6 +396,13 @@ def _samples(messages: list[Any], fields: Mapping[str, str]) -> Samples:
         if column is not None:
             columns[name] = column
     return Samples(t[forward], columns)
+
+
+def _known(before: list[int], cycles: list[Any], poses: list[Any]) -> Array:
+    """(n,) s, when the poses that `_samples` keeps were there; those after the last row never were: infinity."""
+    rows = np.array([cycle.t for cycle in cycles] + [np.inf])
+    known: Array = rows[np.array(before, np.intp)]
+    return known[_forward(np.array([pose.t for pose in poses]))]
 
 
 def _pictures(found: list[tuple[int, int]], offset_ns: int) -> Samples:

@@ -24,6 +24,7 @@ import openant_env  # noqa: F401
 from openant_env import hardware, link
 from openant_env.link import engine_rate
 from openant_tools.cli import main
+from openant_tools.comms import messages
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.restart import MotionStopped, StopCause
 from openant_tools.errors import BadInput, HardwareFault
@@ -258,6 +259,10 @@ def test_a_cable_that_winds_up_is_turned_back_before_it_is_too_late(
     walker: Walker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env, turn = walker.env, 2.0 * math.pi
+    env.link.let_down()
+    walker._control.ask("put", position_m=[-0.35, 0.2])  # amid the small picture
+    env.link.look(0.5)
+    env.reset()
     monkeypatch.setattr(hardware, "WINDING_TURNS", 0.4)
     env._wound_rad = -0.52 * turn
     info = walker.until_it_ends(1)
@@ -265,11 +270,11 @@ def test_a_cable_that_winds_up_is_turned_back_before_it_is_too_late(
     assert info["stop_cause"] == "winding"
     before = env._pose[2]
     env.reset()
-    assert 0.0 <= env._wound_rad < 0.4 * turn
+    assert abs(env._wound_rad) < 0.4 * turn
     assert math.remainder(env._pose[2] - before - 0.52 * turn, turn) == pytest.approx(env._wound_rad, abs=0.05)
     assert any(words.startswith("turned back in ") for words in walker.said)
     assert "motion begins again by itself after winding, 1 of 30" in walker.said
-    assert not env.step(STILL)[3]
+    assert env.step(STILL)[4].get("reason") is None
 
     # A robot that is held fast, or whose floor is too slippery, does not turn: that is for a person.
     monkeypatch.setattr(hardware, "TURN_BACK_S", 0.2)
@@ -372,6 +377,25 @@ def test_a_full_disk_ends_walking_until_the_builder_says_otherwise(walker: Walke
     assert len(env.link.recorded) == len(recorded) + 1
     with pytest.raises(BadInput, match="the reset option resume is 1"):
         env.reset(options={"resume": 1})
+
+
+def test_a_stop_while_it_lies_down_is_counted_as_one(walker: Walker, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It once ended motion for good, since torque was to come on again without a reason."""
+    env, ask = walker.env, walker.env.link._engine.ask
+
+    def stopped(command: object, *rest: object) -> object:
+        if isinstance(command, messages.Ramp):
+            ask(messages.Torque(False))
+            raise MotionStopped("knee_fl is silent", cause=StopCause.SILENCE)
+        return ask(command, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(env.link._engine, "ask", stopped)
+        env._let_down()
+    assert env._restart.cause is StopCause.SILENCE
+    assert not env.link.standing
+    env.reset()
+    assert "motion begins again by itself after silence, 1 of 12" in walker.said
 
 
 def test_hands_that_moved_the_robot_after_a_stop_keep_it_down(walker: Walker) -> None:
