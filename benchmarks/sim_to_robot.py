@@ -153,7 +153,9 @@ def _truth(path: Path, key: bytes) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
     parser.add_argument("step", choices=["make", "run", "table"])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--key-file", type=Path)
