@@ -17,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import re
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -520,7 +521,7 @@ class AntHardware(AntBase):
                 self._need_word()
             if waited > self._patience_s:
                 raise HardwareFault(f"the robot cannot go on: {why}", remedy="help it, and start again")
-            kind = why[:24]
+            kind = re.sub(r"\d+", "", why)[:24]  # of a servo that cools each degree is no news
             if kind != said or waited - said_at > REPEAT_S:
                 self._notice(f"waiting: {why}")
                 said, said_at = kind, waited
