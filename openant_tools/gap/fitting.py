@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 
 from openant_tools.gap.descent import END, LEAST_GAIN, Descent
 from openant_tools.gap.features import Floats
-from openant_tools.gap.hypothesis import Part, Refit, bounds_of, quantities, refit_at, scaled, sizes
+from openant_tools.gap.hypothesis import Part, Refit, bounds_of, quantities, refit_at, sizes, without_last
 from openant_tools.gap.nuisance import TILTS
 from openant_tools.gap.prediction import Predictions
 from openant_tools.gap.protocol import Played
@@ -78,6 +78,9 @@ class Fits:
         """Fit within tolerance, and polish sizes: each on all the runs to train on, and without each group of some of them.
 
         All share one linearisation each, at what is found on all of the training runs; and are simulated side by side.
+
+        Args:
+            starts: the first is what the others are asked about beside: each has one cause more.
         """
         fitted = list(training)
         descents = self._no_worse(self._descend(starts, fitted), fitted)
@@ -110,14 +113,12 @@ class Fits:
         return out
 
     def _no_worse(self, descents: list[Descent], fitted: Sequence[int]) -> list[Descent]:
-        """Where a cause leaves more than it does when it is not there, a descent from there in its place."""
-        absent = [scaled(one.start, 0.0) if one.causes else one.start for one in descents]
-        without = [Descent.of(one, len(self.predictions.names), self._learnt) for one in absent]
-        self._look(without, fitted, slopes=False)
-        again = [n for n, (one, other) in enumerate(zip(descents, without, strict=True)) if other.least < one.least]
-        if again:
-            for n, one in zip(again, self._descend([absent[n] for n in again], fitted), strict=True):
-                descents[n] = one
+        """Where a hypothesis leaves more than the first, which lacks its last cause, a descent from there in its place."""
+        first = descents[0]
+        again = [n for n, one in enumerate(descents) if one.least - first.least > 2 * LEAST_GAIN]
+        starts = [without_last(descents[n].start, refit_at(first.start, first.at)) for n in again]
+        for n, one in zip(again, self._descend(starts, fitted) if again else (), strict=True):
+            descents[n] = one
         return descents
 
     def _descend(self, starts: Sequence[Refit], fitted: Sequence[int]) -> list[Descent]:
@@ -175,7 +176,8 @@ class Fits:
                 more, slope = more + own, slope + along
             # What ends at a bound leaves its part to the others: clipped afterwards it would leave it undone.
             root = np.linalg.cholesky(more + descent.damping * np.diag(np.diag(more)))
-            found = np.clip(u + lsq_linear(root.T, -np.linalg.solve(root, slope), bounds=within).x, low, high)
+            step = lsq_linear(root.T, -np.linalg.solve(root, slope), bounds=within, method="bvls").x
+            found = np.clip(u + step, low, high)
         return found
 
     def _bounds(self, descent: Descent) -> tuple[Array, Array]:
@@ -184,12 +186,12 @@ class Fits:
         low, high = np.array([*ends, *[(-END, END)] * len(self.predictions.names)]).T
         return low, high
 
-    def _look(self, descents: Sequence[Descent], fitted: Sequence[int], slopes: bool = True) -> None:
-        """Simulate runs where descents look next, and, for slopes, what varies there."""
+    def _look(self, descents: Sequence[Descent], fitted: Sequence[int]) -> None:
+        """Simulate runs where descents look next, and what varies there."""
         found: list[dict[int, Floats]] = [{} for _ in descents]
         for mine, rollouts in self.predictions.side_by_side(fitted):
             first = mine[0]
-            columns = [self._columns(first, one) if slopes else [] for one in descents]
+            columns = [self._columns(first, one) for one in descents]
             steps = [one.steps_on(self.predictions.protocol.runs[first].plant.setup) for one in descents]
             robots = [
                 self.predictions.robot(refit_at(one.start, u), first)

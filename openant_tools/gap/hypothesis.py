@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.effect import Cause, Quantity
 
-__all__ = ["Hypothesis", "Part", "Refit", "bounds_of", "prior_of", "quantities", "refit_at", "scaled", "sizes"]
+__all__ = ["Hypothesis", "Part", "Refit", "bounds_of", "prior_of", "quantities", "refit_at", "sizes", "without_last"]
 
 Array = NDArray[np.float64]
 
@@ -73,11 +73,11 @@ def prior_of(refit: Refit) -> tuple[Array, Array]:
     return np.array(centre), np.array(deviation)
 
 
-def scaled(refit: Refit, times: float) -> Refit:
-    """The same with so many times the sizes of its last cause."""
-    sized = {q.name for q in refit.hypothesis[-1].definition.quantities if not q.shape}
-    x = {name: value * (times if name in sized else 1.0) for name, value in refit.x[-1].items()}
-    return dataclasses.replace(refit, x=(*refit.x[:-1], x))
+def without_last(start: Refit, found: Refit) -> Refit:
+    """The hypothesis of a start where one that lacks its last cause has come to: of that cause there is nothing."""
+    sized = {q.name for q in start.hypothesis[-1].definition.quantities if not q.shape}
+    x = {name: 0.0 if name in sized else value for name, value in start.x[-1].items()}
+    return Refit(start.hypothesis, (*found.x, x), found.nuisance)
 
 
 def quantities(refit: Refit) -> list[Quantity]:
