@@ -2,13 +2,13 @@
 
     python benchmarks/sim_to_robot.py make  --out SET --key-file KEY [--robots 5] [--seed-from COMMIT]
     python benchmarks/sim_to_robot.py run   --out SET --key-file KEY [--steps 30000 --fine-tune-steps 10000 --seconds 60]
-    python benchmarks/sim_to_robot.py table --out SET [--key-file KEY] [--json FILE]
+    python benchmarks/sim_to_robot.py table --out SET [--opened] [--json FILE]
 
 `make` draws virtual robots with two medium or large effects each, at as many joints as they may belong to, and seals them; beside
 each stands the same robot before it had them. `run` calibrates a simulation of that one on its stand (`sysid record`, `sysid
 fit`), so that what the loop has to find is what came since, and lets `openant loop` go its way with the sealed one. It goes on
-where it was stopped, and prints the table after each robot. `table` reads the summaries that each loop has kept; with the key
-it also says what was true. Hours a robot: nothing of this runs in CI.
+where it was stopped, and prints the table after each robot. `table` reads the summaries that each loop has kept, and once all is
+opened says what was true. Hours a robot: nothing of this runs in CI.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from openant_tools.blind.draw import BUS, Answer, Mix, draw_answers
 from openant_tools.blind.make import seed_of_commit
 from openant_tools.blind.through_bus import scenario_of
 from openant_tools.bringup.stages import openant
-from openant_tools.files import json_text, read_json, read_text, write_text
+from openant_tools.files import json_text, read_json, write_text
 from openant_tools.numbers import number
 from openant_tools.procedure.intervals import Interval
 from openant_tools.robot.config import Provenance
 from openant_tools.robot.folder import create_robot
-from openant_tools.virtual.seal import KEY_VARIABLE, make_key, open_sealed, read_key, seal
+from openant_tools.virtual.seal import KEY_VARIABLE, make_key, read_key, seal
 
 #: One joint at fault of eight changes what a policy earns by as much as chance does (docs/benchmarks.md): whole servo models.
 MIX = Mix(none=0.0, two=1.0, outside=0.0, widest=True)
@@ -41,19 +41,25 @@ MIX = Mix(none=0.0, two=1.0, outside=0.0, widest=True)
 SENSED = {"imu_misalignment", "imu_bias", "tracker_scale"}
 #: robots drawn for each that is wanted: every second one has an effect of sensors
 DRAWN = 8
-HEALTHY, SEALED = "healthy.toml", "sealed.toml"
+HEALTHY, SEALED, SET = "healthy.toml", "sealed.toml", "set.json"
 
 
 def make(out: Path, count: int, commit: str, key: bytes) -> None:
     seed, full = seed_of_commit(commit, Path(__file__).parent)
-    drawn = draw_answers(DRAWN * count, seed, MIX, BUS)
-    answers = [one for one in drawn if not SENSED & {effect.effect for effect in one.effects}][:count]
-    for k, answer in enumerate(answers):
+    drawn = {"commit": full, "seed": seed, "robots": count}
+    if (out / SET).exists() and read_json(out / SET) != drawn:
+        raise SystemExit(f"{out}: holds other robots; name a new folder")
+    for k, answer in enumerate(_answers(seed, count)):
         place = out / f"robot-{k}"
         write_text(place / HEALTHY, _scenario(replace(answer, effects=()), "stand"))
         if not (place / SEALED).exists():
             print(place.name, "commitment", seal(_scenario(answer, "floor"), key, place / SEALED), flush=True)
-    write_text(out / "set.json", json_text({"commit": full, "seed": seed}))
+    write_text(out / SET, json_text(drawn))
+
+
+def _answers(seed: int, count: int) -> list[Answer]:
+    drawn = draw_answers(DRAWN * count, seed, MIX, BUS)
+    return [one for one in drawn if not SENSED & {effect.effect for effect in one.effects}][:count]
 
 
 def _scenario(answer: Answer, setup: str) -> str:
@@ -84,7 +90,7 @@ def run(out: Path, key_file: Path, only: str | None, record_s: float, arguments:
         _must(
             "loop", "--robot", robot, "--virtual", place / SEALED, *arguments, "--out", place / "loop", "--yes",
         )  # fmt: skip
-        table(out, None, None)
+        table(out, False, None)
 
 
 def _must(*words: object, ends: tuple[int, ...] = (0,)) -> None:
@@ -96,14 +102,16 @@ def _must(*words: object, ends: tuple[int, ...] = (0,)) -> None:
 # ------------------------------------------------------------------------------------------------------------- the table
 
 
-def table(out: Path, key: bytes | None, json_file: Path | None) -> None:
+def table(out: Path, opened: bool, json_file: Path | None) -> None:
     found = {file.parents[1].name: read_json(file) for file in sorted(out.glob("robot-*/loop/result.json"))}
     if not found:
         raise SystemExit(f"{out}: no loop has ended yet")
     print("| robot | diagnosed as | simulation less robot, cm/s: before | after | control | reward on the robot, cm/s: before | after"
           " | control | after less control |\n|---|---|---|---|---|---|---|---|---|")  # fmt: skip
+    drawn = read_json(out / SET)
+    true = {f"robot-{k}": answer for k, answer in enumerate(_answers(drawn["seed"], drawn["robots"]))}
     for name, one in found.items():
-        truth = f" (is {_truth(out / name / SEALED, key)})" if key is not None else ""
+        truth = f" (is {', '.join(one.effect for one in true[name].effects)})" if opened else ""
         apart = " | ".join(_span(one["sim_minus_robot"][which]) for which in ("before", "after", "control"))
         rewards = " | ".join(
             _span(one["intervals"][which]) for which in ("robot_before", "robot_after", "control_after")
@@ -112,8 +120,8 @@ def table(out: Path, key: bytes | None, json_file: Path | None) -> None:
         print(f"| {name}{truth} | {one['verdict']} | {apart} | {rewards} | {gained} |")
     answer = summary(list(found.values()))
     print(f"\n{len(found)} robots, {answer['improved']} improved; mean |simulation − robot| "
-          f"{_span(answer['apart_before'])} before, {_span(answer['apart_after'])} after, {_span(answer['apart_control'])} of the "
-          f"control; reward on the robot after less control {_span(answer['gain'])}, risen on {answer['risen']}, "
+          f"{_span(answer['apart_before'], 'cm/s')} before, {_span(answer['apart_after'], 'cm/s')} after, {_span(answer['apart_control'], 'cm/s')} of the "
+          f"control; reward on the robot after less control {_span(answer['gain'], 'cm/s')}, risen on {answer['risen']}, "
           f"surely on {answer['surely_risen']}")  # fmt: skip
     if json_file is not None:
         write_text(json_file, json_text({"robots": found, "summary": answer}, indent=2))
@@ -138,18 +146,9 @@ def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _span(one: Mapping[str, float | None]) -> str:
+def _span(one: Mapping[str, float | None], unit: str = "") -> str:
     value, low, high = (np.nan if (part := one[name]) is None else 100 * part for name in ("value", "low", "high"))
-    return number(value, "", low, high)
-
-
-def _truth(path: Path, key: bytes) -> str:
-    """What is wrong with a robot beside its scatter: the effects that its healthy twin has not."""
-    sealed = tomllib.loads(open_sealed(tomllib.loads(read_text(path)), key, path))["effect"]
-    healthy = tomllib.loads(read_text(path.with_name(HEALTHY)))["effect"]
-    return ", ".join(dict.fromkeys(one["effect"] for one in sealed if one["effect"] not in {h["effect"] for h in healthy})) or (
-        "only what scatters, too"
-    )  # fmt: skip
+    return number(value, unit, low, high)
 
 
 def main() -> None:
@@ -163,21 +162,19 @@ def main() -> None:
     parser.add_argument("--seed-from", default="HEAD")
     parser.add_argument("--only", metavar="ROBOT", help="such as robot-0")
     parser.add_argument("--record-seconds", type=float, default=12.0, help="of each recording for the calibration")
+    parser.add_argument("--opened", action="store_true", help="say what was true, too")
     parser.add_argument("--json", type=Path)
     parser.epilog = "Further options go to `openant loop`."
     chosen, further = parser.parse_known_args()
     if chosen.step != "table" and chosen.key_file is None:
         parser.error("--key-file is missing; `make` makes it where there is none")
-    key = None
-    if chosen.key_file is not None:
-        key = read_key(chosen.key_file) if chosen.key_file.exists() else make_key(chosen.key_file)
     if chosen.step == "make":
-        assert key is not None
+        key = read_key(chosen.key_file) if chosen.key_file.exists() else make_key(chosen.key_file)
         make(chosen.out, chosen.robots, chosen.seed_from, key)
     elif chosen.step == "run":
         run(chosen.out, chosen.key_file, chosen.only, chosen.record_seconds, further)
     else:
-        table(chosen.out, key, chosen.json)
+        table(chosen.out, chosen.opened, chosen.json)
 
 
 if __name__ == "__main__":
