@@ -188,12 +188,11 @@ def _doubts(result: Result) -> list[str]:
 
 
 def _then(loop: Loop, result: Result) -> str:
-    gain = result.gain_m_s
+    found, gain = result.diagnosis, result.gain_m_s
+    open_ = f"To settle what the diagnosis leaves open, {found.next_experiment}." if found.next_experiment else ""
     if gain is None:
-        return what_next(result.diagnosis)
+        return open_ or what_next(found)
     if gain.low > 0:
         apply = f"openant gap apply {loop.diagnosis} --robot {loop.robot} --out {loop.robot}/improved.xml"
         return f"Make it the robot's own simulation: `{apply}`."
-    return "Play more starts, or train on for longer, before you decide between them." + (
-        f" {result.diagnosis.next_experiment}" if result.diagnosis.next_experiment else ""
-    )
+    return f"Play more starts, or train on for longer, before you decide between them. {open_}".strip()

@@ -42,7 +42,7 @@ def diagnosis(verdict: str, selected: tuple[str, ...]) -> Diagnosis:
     found = Found("stiffness_error", "all", {"scale": Span(SOFT, 0.84, 0.86)}, 0.9, 0.8, 0.7, 0.9, True)
     return Diagnosis(
         model="nominal.xml", runs=("walk.mcap",), held_out=(), verdict=verdict, confidence=0.9, effects=(found,),
-        selected=selected, ambiguous_with=(), next_experiment="Record the stand protocol." if not selected else None,
+        selected=selected, ambiguous_with=(), next_experiment="record the stand protocol" if not selected else None,
         gap={"before": 0.02, "after": 0.004, "floor": 0.001}, where=[],
     )  # fmt: skip
 
@@ -279,7 +279,7 @@ def test_where_nothing_is_named_the_control_stands_for_both_and_that_is_said(
     assert "the control stands for both" in what_was_found(result)
     assert "nothing to improve" in verdict(result)
     page = loop_report(loop, result).html(loop.folder)
-    assert "Record the stand protocol" in page
+    assert "To settle what the diagnosis leaves open, record the stand protocol." in page
     assert "improved simulation</td>" not in page
 
 
