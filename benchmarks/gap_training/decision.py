@@ -24,22 +24,24 @@ from openant_tools.files import json_text, read_toml, write_text
 from openant_tools.gap.decide import FILE, OUTSIDE, WEIGHTS, Row, chances
 from openant_tools.gap.diagnosis import NONE
 
-#: where weights begin: evidence as it is, held-out data as a few independent errors a fold; and how far from there costs as much as one
-#: robot's surprise, of those that cannot be negative in logarithms: what should show and does not never speaks for a cause
+#: where weights begin: evidence as it is, held-out data as a few independent errors a fold, a cause's share of the nats as `likelier` has
+#: all of them; and how far from there costs as much as one robot's surprise, of those that cannot be negative in logarithms: what should
+#: show and does not never speaks for a cause
 START = {
     "evidence": 1.0,
     "support": 1.0,
     "shortfall": 0.3,
     "likelier": 0.05,
+    "share": 1.5,
     "none": 0.0,
     "outside": 0.0,
     "outside: support": 0.0,
     "outside: left": 0.0,
 }
 FAR = 1.0
-POSITIVE = ("evidence", "support", "shortfall", "likelier")
+POSITIVE = ("evidence", "support", "shortfall", "likelier", "share")
 #: the weights of what held-out data say
-HELD_OUT = ("support", "shortfall", "likelier", "outside: support", "outside: left")
+HELD_OUT = ("support", "shortfall", "likelier", "share", "outside: support", "outside: left")
 
 
 @dataclass(frozen=True)

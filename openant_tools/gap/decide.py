@@ -20,9 +20,12 @@ from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED
 
 __all__ = ["OUTSIDE", "WEIGHTS", "Decision", "Row", "adds", "chances", "decide", "weights"]
 
-#: the weights by their names: of logarithms of probabilities by the evidence, of what held-out data say of a cause, of how much more
-#: its fit had promised, and of how much likelier it made what it was fitted to; of nothing and of something unknown by themselves, and of this by the most that any cause does, and by the least that any leaves
-WEIGHTS = ("evidence", "support", "shortfall", "likelier", "none", "outside", "outside: support", "outside: left")
+#: the weights by their names: of logarithms of probabilities by the evidence, of what held-out data say of a cause, and of how much more
+#: its fit had promised; of how much likelier any cause made what it was fitted to, for all of them, and of what share of that is each one's;
+#: of nothing and of something unknown by themselves, and of this by the most that any cause does, and by the least that any leaves
+WEIGHTS = (
+    "evidence", "support", "shortfall", "likelier", "share", "none", "outside", "outside: support", "outside: left",
+)  # fmt: skip
 #: where they lie in this package
 FILE = "decision.json"
 #: of what no catalogue has, beside the names of causes
@@ -31,7 +34,8 @@ OUTSIDE = "outside"
 LEAST = 1e-6
 #: nats by which held-out data speak strongly against a cause
 STRONGLY = 3.0
-#: nats beyond which what was fitted says little more: no model of a real robot is true, and a wrong one can be surer than any right one
+#: nats beyond which what was fitted says little more of whether anything is wrong: no model of a real robot is true, and a wrong cause can be
+#: surer than any right one; and that do not tell causes apart, since no likelihood is known better than that
 SURE = 30.0
 #: what it costs to give a wrong name, to say that nothing is wrong where something is, to leave open what is known (an open question is
 #: better than a wrong all-clear), and to name it as one of two
@@ -65,12 +69,11 @@ class Row:
     gain: float | None = None
 
     def held_out(self, weights: Mapping[str, float]) -> float:
-        """What fits say of it, in nats."""
+        """What held-out data say of it, in nats."""
         if self.support is None:
             return 0.0
         short = max(self.foretold - max(self.support, 0.0), 0.0)
-        sure = SURE * math.asinh(self.likelier / SURE)
-        return weights["support"] * self.support - weights["shortfall"] * short + weights["likelier"] * sure
+        return weights["support"] * self.support - weights["shortfall"] * short
 
     @property
     def refuted(self) -> bool:
@@ -101,14 +104,31 @@ def weights() -> Mapping[str, float]:
     return {name: float(text[name]) for name in WEIGHTS}
 
 
+def fitted(rows: Sequence[Row], weights: Mapping[str, float]) -> dict[tuple[str, ...], float]:
+    """Of each hypothesis that was fitted, what that says of it, in nats.
+
+    That some cause makes what was measured likelier says that something is wrong, up to a degree; which it is, causes tell by comparison.
+    """
+    some = [row for row in rows if row.causes and row.support is not None]
+    most = max([0.0, *(row.likelier for row in some)])
+    ill = weights["likelier"] * SURE * math.asinh(most / SURE)
+    return {
+        row.causes: row.held_out(weights)
+        + ill
+        + weights["share"] * math.log((max(row.likelier, 0.0) + SURE) / (most + SURE))
+        for row in some
+    }
+
+
 def chances(rows: Sequence[Row], outside: float, weights: Mapping[str, float]) -> dict[str, float]:
     """NONE, OUTSIDE and the cause of each hypothesis → probability; they come to one."""
     most = max((row.support for row in rows if row.support is not None), default=0.0)
     left = min((row.left for row in rows if row.left is not None), default=0.0)
     fits = weights["outside: support"] * max(most, 0.0) + weights["outside: left"] * left
     logits = {OUTSIDE: weights["outside"] + fits + weights["evidence"] * _log(outside)}
+    said = fitted(rows, weights)
     for row in rows:
-        name, more = (row.causes[0], row.held_out(weights)) if row.causes else (NONE, weights["none"])
+        name, more = (row.causes[0], said.get(row.causes, 0.0)) if row.causes else (NONE, weights["none"])
         logits[name] = weights["evidence"] * _log(row.probability) + more
     # Sorted: sums of the same numbers are the same, in whatever order rows come.
     whole = float(np.logaddexp.reduce(sorted(logits.values())))
@@ -145,10 +165,11 @@ def decide(rows: Sequence[Row], outside: float) -> Decision:
 def adds(rows: Sequence[Row]) -> Row | None:
     """Of hypotheses with one cause more than is selected, the likeliest one whose last cause is likelier there than not."""
     learned = weights()
+    said = fitted(rows, learned)
 
     def probability(row: Row) -> float:
         odds = _log(row.probability) - _log(1 - row.probability)
-        return 1 / (1 + math.exp(-(learned["evidence"] * odds - learned["none"] + row.held_out(learned))))
+        return 1 / (1 + math.exp(-(learned["evidence"] * odds - learned["none"] + said[row.causes])))
 
     likeliest = max((row for row in rows if row.support is not None), key=probability, default=None)
     return likeliest if likeliest is not None and probability(likeliest) > PRESENT else None

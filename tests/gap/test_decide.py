@@ -42,6 +42,18 @@ def test_what_should_leave_less_there_and_does_not_is_less_likely() -> None:
     assert decide([NOTHING, unseen], outside=0.04).verdict == "actuator_lag"
 
 
+def test_causes_that_make_it_likelier_are_told_apart_by_how_much() -> None:
+    """No share of what the best one explains is a second cause; and what some cause explains is not nothing."""
+    best, other = (replace(one, probability=0.3, support=1.0, foretold=1.0) for one in (LAG, DELAY))
+    rows = [replace(NOTHING, probability=0.4), replace(best, likelier=400.0), replace(other, likelier=250.0)]
+    p = chances(rows, 0.04, weights())
+    assert p["actuator_lag"] > 4 * p["action_delay"]
+    assert p[NONE] < chances([rows[0], best, other], 0.04, weights())[NONE]
+    # What nobody knows to a few nats, causes do not share by.
+    p = chances([rows[0], replace(best, likelier=3.0), replace(other, likelier=1.0)], 0.04, weights())
+    assert p["actuator_lag"] < 2 * p["action_delay"]
+
+
 def test_two_that_share_what_is_likely_are_ambiguous() -> None:
     alike = replace(DELAY, probability=0.45, support=LAG.support, foretold=LAG.foretold)
     found = decide([NOTHING, replace(LAG, probability=0.45), alike], outside=0.05)
@@ -62,9 +74,9 @@ def test_a_healthy_robot_has_nothing() -> None:
 
 def test_a_further_cause_comes_in_where_it_is_likelier_there_than_not() -> None:
     pair = ("actuator_lag", "backlash")
-    there = Row(pair, ((0,), (0,)), 0.5, support=2.0, foretold=2.0)
+    there = Row(pair, ((0,), (0,)), 0.5, support=2.0, foretold=2.0, likelier=40.0)
     assert adds([there, replace(there, probability=0.3)]) == there
-    assert adds([replace(there, probability=0.02, support=0.0)]) is None
+    assert adds([replace(there, probability=0.02, support=0.0, likelier=0.0)]) is None
     assert adds([Row(pair, ((0,), (0,)), 0.9)]) is None, "held-out data say nothing of it"
 
 
