@@ -23,6 +23,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -182,6 +183,8 @@ class FlightController:
         self._tick_at = self._grid(t)
         self._tick = t
         self._attitude: Array | None = None
+        #: the body's when it last looked
+        self._quaternion = np.array([1.0, 0.0, 0.0, 0.0])
         self._acc = np.zeros(3)
         self._gyro = np.zeros(3)
         self._calibration: _Calibration | None = None
@@ -279,15 +282,25 @@ class FlightController:
         s, body = self.settings, self._truth()
         noise = self._rng.standard_normal(6)
         acc = (self._mount.T @ body.specific_force) * s.acc_scale + s.acc_bias + s.acc_noise * noise[:3]
-        gyro = (self._mount.T @ body.rate) * s.gyro_scale + s.gyro_bias + s.gyro_noise * noise[3:]
         self._acc = self._board @ acc - self._acc_trim
-        self._gyro = self._board @ gyro
+        self._gyro = self._turning(body.rate, noise[3:])
         if self._calibration is not None:
             self._calibrate(t)
         if self._attitude is None:
-            self._attitude = level_attitude(self._acc)
+            if _is_weight(self._acc):  # let go above the floor, it feels nothing at first
+                self._attitude = level_attitude(self._acc)
         elif dt > 0:
-            self._attitude = mahony(self._attitude, self._gyro, self._acc, dt)
+            # It reads its gyro thousands of times a second: between two looks it turns by what the body did, whatever feet that chatter
+            # do to the rate of an instant.
+            mean = _rotation_vector(self._quaternion, body.quaternion) / dt
+            self._attitude = mahony(self._attitude, self._turning(mean, noise[3:]), self._acc, dt)
+        self._quaternion = np.array(body.quaternion)
+
+    def _turning(self, rate: Array, noise: Array) -> Array:
+        """What the gyro reads of a rate (rad/s, body axes), in the axes of the board."""
+        s = self.settings
+        turning: Array = self._board @ ((self._mount.T @ rate) * s.gyro_scale + s.gyro_bias + s.gyro_noise * noise)
+        return turning
 
     def _calibrate(self, t: float) -> None:
         calibration = self._calibration
@@ -456,6 +469,13 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
     )
 
 
+def _rotation_vector(before: Array, now: Array) -> Array:
+    """(3,) rad in body axes, from one attitude to another (quaternions w x y z)."""
+    turned = np.empty(3)
+    mujoco.mju_subQuat(turned, now, before)
+    return turned
+
+
 def level_attitude(acc: Array) -> Array:
     """Quaternion w x y z with yaw 0 whose roll and pitch put `acc` upright."""
     roll = math.atan2(acc[1], acc[2])
@@ -464,13 +484,18 @@ def level_attitude(acc: Array) -> Array:
     return np.array([cr * cp, sr * cp, cr * sp, -sr * sp])
 
 
+def _is_weight(acc: Array) -> bool:
+    """Whether an acceleration says where up is."""
+    return abs(math.hypot(*acc) / STANDARD_GRAVITY - 1.0) < ATTITUDE_GATE
+
+
 def mahony(q: Array, gyro: Array, acc: Array, dt: float) -> Array:
     """One step of Mahony's complementary filter: rotate by the gyro, lean towards the accelerometer's vertical."""
     w, x, y, z = (float(v) for v in q)
     wx, wy, wz = (float(v) for v in gyro)
     ax, ay, az = (float(v) for v in acc)
-    norm = math.sqrt(ax * ax + ay * ay + az * az)
-    if abs(norm / STANDARD_GRAVITY - 1.0) < ATTITUDE_GATE:
+    if _is_weight(acc):
+        norm = math.sqrt(ax * ax + ay * ay + az * az)
         ax, ay, az = ax / norm, ay / norm, az / norm
         ux, uy, uz = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
         wx += ATTITUDE_GAIN * (ay * uz - az * uy)

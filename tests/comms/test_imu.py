@@ -36,6 +36,11 @@ class Body:
     specific_force: np.ndarray = field(default_factory=lambda: np.array([0.0, 0, GRAVITY]))
 
 
+def turning(rate: float, t: float) -> Body:
+    """A body that turns about its vertical, rad/s."""
+    return Body(np.array([math.cos(rate * t / 2), 0, 0, math.sin(rate * t / 2)]), np.array([0, 0, rate]))
+
+
 class Bench:
     """A flight controller on a table: its clock moves only while somebody waits, its cable is a pair of lists."""
 
@@ -248,8 +253,8 @@ def test_angles_have_our_signs_and_yaw_has_whole_degrees() -> None:
     # A slow turn to the left on the level: yaw grows, in steps of a degree.
     bench.body = Body()
     bench.sleep_until(bench.t + 30)  # the filter levels
-    start = imu.read(bench.t + 1)
-    bench.motion = lambda t: Body(rate=np.array([0, 0, 0.5]))
+    start, begun = imu.read(bench.t + 1), bench.t
+    bench.motion = lambda t: turning(0.5, t - begun)
     samples = collect(bench, imu, 2.0)
     turned = math.remainder(samples[-1].yaw - start.yaw, 2 * math.pi)
     assert turned == pytest.approx(1.0, abs=0.05)
@@ -257,11 +262,31 @@ def test_angles_have_our_signs_and_yaw_has_whole_degrees() -> None:
     assert np.allclose(degrees, np.rint(degrees))
 
 
+def test_a_body_that_is_let_go_in_the_air_is_not_taken_to_lie_on_its_side() -> None:
+    """Nothing but noise pulls at it at first."""
+    bench = Bench()
+    bench.motion = lambda t: Body(specific_force=np.array([0.0, 0, GRAVITY if t > 0.2 else 0.0]))
+    imu = bench.imu()
+    imu.connect()
+    sample = collect(bench, imu, 1.0)[-1]
+    assert sample.roll == pytest.approx(0.0, abs=0.02)
+    assert sample.pitch == pytest.approx(0.0, abs=0.02)
+
+
+def test_feet_that_chatter_do_not_lean_the_body() -> None:
+    """Between two looks it is back where it was, however fast it turns when it is looked at."""
+    bench = Bench()
+    imu = bench.imu()
+    imu.connect()
+    bench.motion = lambda t: Body(rate=np.array([3.0, 0, 0]))
+    assert collect(bench, imu, 2.0)[-1].roll == pytest.approx(0.0, abs=0.05)
+
+
 def test_the_quaternion_of_new_firmware_is_not_rounded() -> None:
     bench = Bench(FlightControllerSettings(api_minor=48))
     imu = bench.imu()
     imu.connect()
-    bench.motion = lambda t: Body(rate=np.array([0, 0, 0.5]))
+    bench.motion = lambda t: turning(0.5, t)
     degrees = np.rad2deg([s.yaw for s in collect(bench, imu, 1.0)])
     assert len(set(degrees)) > 80
 
