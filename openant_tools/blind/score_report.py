@@ -224,7 +224,7 @@ def write_docs(found: Score, path: Path) -> None:
         "# The blind benchmark", "",
         "<!-- Written by `openant gap blind score SET… --docs docs/blind.md`: do not edit. -->", "",
         "Robots that nobody chose, simulated by other code than the diagnosis uses, judged before the answers are opened.", "",
-        "```sh", *_COMMANDS, "```", "", *_drawn(found), "", *_HOW, "", "## Result", "", _origin(found), "", *table_lines(found), "",
+        "```sh long", *_COMMANDS, "```", "", *_drawn(found), "", *_HOW, "", "## Result", "", _origin(found), "", *table_lines(found), "",
     ]  # fmt: skip
     if worst:
         lines += ["Commonest confusions: " + "; ".join(f"{a} taken for {b} ({n})" for a, b, n in worst) + ".", ""]
@@ -278,7 +278,7 @@ def _makers() -> list[str]:
         "## Makers", "",
         "`openant gap blind make --maker COMMAND` lets any program make the robots, so that the diagnosis meets simulators that its",
         "authors did not write. `benchmarks/second_generator` is one, in Drake. For each robot COMMAND is called once, without a shell:",
-        "", "```sh", "COMMAND ANSWER.json FOLDER", "```", "",
+        "", "```sh elsewhere", "COMMAND ANSWER.json FOLDER", "```", "",
         "It leaves run tables in FOLDER, which is empty ([their form](recordings.md#bring-your-own-logs)): at least one `NAME.parquet`",
         "or `NAME.csv` with columns `t`, `cmd.J`, `pos.J`, each with its facts in `NAME.json` (`\"held_out\": true` keeps a run to judge",
         "by; else each is left out in turn). ANSWER.json is what is true of the robot:",

@@ -233,7 +233,7 @@ def write_soak_docs(found: SoakScore, path: Path) -> None:
     lines = [
         "# The blind check of dropout attribution", "",
         "<!-- Written by `openant comms blind score SET --docs docs/comms-blind.md`: do not edit. -->", "",
-        "```sh",
+        "```sh long",
         f"openant comms blind make --out SET --seed-from COMMIT --key-file KEY --soaks {facts['soaks']} "
         f"--healthy {facts['mix']['healthy']:.2g} --virtual {facts['mix']['virtual']:.2g}    # answers sealed",
         "openant comms blind run SET",
