@@ -79,7 +79,7 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
         )
     runners_up = [one for one in found.effects if one.effect not in found.selected][:RUNNERS_UP]
     if runners_up:
-        report.section("Why not something else").table(
+        report.section("Why not something else", open=True).table(
             ["effect", "where", "present", "closes alone", "why not"],
             [
                 [one.effect, where_words(one.joints), percent(one.probability), _percent(one.gap_closed), standing(found, one)]
