@@ -215,9 +215,8 @@ def nudge(bench: Bench, servo: Servo, baud: int, angle_rad: float = NUDGE_RAD) -
         end = start + angle_rad
         if end > config.limits_rad[servo.joint][1]:
             end = start - angle_rad
-        for event in engine.events():
-            if isinstance(event, messages.Notice):
-                yield Say(event.text)
+        for words in engine.notices():
+            yield Say(words)
         engine.ask(messages.Ramp(end))
         engine.ask(messages.Hold(SETTLE_S))
         counts: int = engine.ask(messages.ReadRegister("present_position"))[servo.joint]

@@ -351,9 +351,8 @@ def _nudge_all(bench: Bench, joints: tuple[str, ...]) -> Subroutine[_Nudged]:
     with EngineProcess(engine_config(bench)) as engine:
         names = [servo.joint for servo in engine.config.servos]
         start = np.asarray(engine.description["position"], float)
-        for note in engine.events():
-            if isinstance(note, messages.Notice):
-                yield Say(note.text, "info")
+        for words in engine.notices():
+            yield Say(words)
         engine.ask(messages.Torque(True))
         limits = np.array([engine.config.limits_rad[name] for name in names])
         start = np.clip(start, limits[:, 0], limits[:, 1])

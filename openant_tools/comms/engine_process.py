@@ -148,6 +148,10 @@ class EngineProcess:
         while self._events:
             yield self._events.popleft()
 
+    def notices(self) -> Iterator[str]:
+        """What the engine found worth knowing since the last call; other events are passed over."""
+        return (event.text for event in self.events() if isinstance(event, Notice))
+
     def telemetry(self) -> Any:
         """Rows (n, columns) since the last call, oldest first; see `columns`. What was missed is gone."""
         rows, self._seen = self._ring.since(self._seen)

@@ -124,8 +124,8 @@ def soak(
     stops: list[str] = []
     done = before
     with EngineProcess(config) as engine:
-        for event in engine.events():
-            yield Say(str(event.text) if isinstance(event, messages.Notice) else str(event))
+        for words in engine.notices():
+            yield Say(words)
         wrong = stopping(engine.description["differences"])
         if move and wrong and not config.anyway:
             what, remedy = refusal(wrong)

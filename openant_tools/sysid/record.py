@@ -130,7 +130,8 @@ def record_takes(
     done: list[Recorded] = []
     past = 0.0
     with EngineProcess(config) as engine:
-        yield from _notices(engine)
+        for words in engine.notices():
+            yield Say(words)
         found = np.asarray(engine.description["position"], float)
         engine.ask(messages.Torque(True))
 
@@ -139,7 +140,8 @@ def record_takes(
             motion = messages.Play(commands, protocol.name, limp if limp.any() else None)
             column, number, first = engine.columns.index("t"), engine.start(motion), None
             while not engine.done(number):  # raises where it was stopped
-                yield from _notices(engine)
+                for notice in engine.notices():
+                    yield Say(notice)
                 rows = engine.telemetry()
                 if len(rows):
                     first = float(rows[0, column]) if first is None else first
@@ -203,10 +205,3 @@ def _work(
         joint, rise = max(((name, now[name] - before[name]) for name in now), key=lambda pair: pair[1])
     yield Say(f"{worked:.0f} s of work: {joint} is {rise} K warmer")
     return worked, rise
-
-
-def _notices(engine: EngineProcess) -> Subroutine[None]:
-    """What the engine has to say."""
-    for event in engine.events():
-        if isinstance(event, messages.Notice):
-            yield Say(event.text)

@@ -373,9 +373,8 @@ def _look_around(
             where=engine.config.port,
             remedy=f"let it cool below {limits[k] - BEGIN_K:.0f} °C" + (" and --resume again" if resume else ""),
         )
-    for event in engine.events():
-        if isinstance(event, messages.Notice):
-            yield _sample(log, limits, before.phase, 0.0, 0.0, event.text)
+    for words in engine.notices():
+        yield _sample(log, limits, before.phase, 0.0, 0.0, words)
 
 
 def _under_load(
@@ -418,7 +417,7 @@ def _under_load(
             return _why_stopped(engine, log, limits, at + log.t - begun, stopped)
         log.take(engine.telemetry())
         loaded = at + log.t - begun
-        yield _sample(log, limits, "load", loaded, loaded / total, _notices(engine))
+        yield _sample(log, limits, "load", loaded, loaded / total, "; ".join(engine.notices()))
         near = limits - log.temperature
         k = int(np.nanargmin(near)) if np.isfinite(near).any() else 0
         if plan.margin_k >= 0 and near[k] <= plan.margin_k:
@@ -510,7 +509,7 @@ def _cooling(
         log.take(engine.telemetry())
         cooled = at + max(log.t - begun, 1e-6)
         yield _sample(log, limits, "cool-down", loaded + cooled, min(1.0, (plan.seconds + cooled) / total), words)
-        words = _notices(engine)
+        words = "; ".join(engine.notices())
 
 
 def _sample(log: _Log, limits: Array, phase: Phase, seconds: float, share: float, words: str) -> Sample:
@@ -518,10 +517,6 @@ def _sample(log: _Log, limits: Array, phase: Phase, seconds: float, share: float
         phase, seconds, share, log.joints, log.temperature, limits, log.rate,
         log.newest("cur"), log.newest("load"), log.newest("pwm"), log.newest("volt"), words,
     )  # fmt: skip
-
-
-def _notices(engine: EngineProcess) -> str:
-    return "; ".join(event.text for event in engine.events() if isinstance(event, messages.Notice))
 
 
 def _lie_down(engine: EngineProcess, config: EngineConfig) -> None:
