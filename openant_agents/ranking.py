@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -187,7 +187,21 @@ class Ranking:
     real: Mapping[str, PlaceResult]
     simulated: Mapping[str, Mapping[str, PlaceResult]]
     agreements: Mapping[str, Agreement]
-    flags: tuple[Flag, ...]
+    flags: tuple[Flag, ...] = ()
+
+    def flagged(self, chooser: str, worse: Mapping[str, Mapping[str, PlaceResult]]) -> Ranking:
+        """The same with flags.
+
+        Args:
+            chooser: the simulation that one would choose by.
+            worse: what policies achieve where it is disturbed, by disturbance.
+        """
+        others = {f"the {name} simulation": one for name, one in self.simulated.items() if name != chooser}
+        flags = []
+        for policy, here in self.simulated[chooser].items():
+            otherwise = {words: one[policy].average_reward_m_s for words, one in {**worse, **others}.items()}
+            flags.append(flag(policy, here.average_reward_m_s, otherwise, here.reversals_hz))
+        return replace(self, flags=tuple(one for one in flags if one is not None))
 
     def as_dict(self) -> dict[str, Any]:
         """As it stands in files."""
@@ -205,18 +219,11 @@ class Ranking:
         }  # fmt: skip
 
 
-def rank(
-    real: Mapping[str, PlaceResult],
-    simulated: Mapping[str, Mapping[str, PlaceResult]],
-    chooser: str | None = None,
-    worse: Mapping[str, Mapping[str, PlaceResult]] | None = None,
-) -> Ranking:
+def rank(real: Mapping[str, PlaceResult], simulated: Mapping[str, Mapping[str, PlaceResult]]) -> Ranking:
     """Say which simulation ranks policies as the robot does.
 
     Args:
         real: what was measured on the robot, by policy. simulated: in simulations of it, of these policies and perhaps others.
-        chooser: the simulation that one would choose by, whose exploits are flagged; None leaves that out.
-        worse: what policies achieve where it is disturbed, by disturbance.
 
     Raises:
         BadInput: a simulation lacks a policy, or there are fewer than three.
@@ -228,13 +235,9 @@ def rank(
                     f"{name} has no reward of {policy}", remedy="play it there, or leave it out of --policies"
                 )
     same = {name: {policy: measured[policy] for policy in real} for name, measured in simulated.items()}
-    agreements = {name: agreement([*measured.values()], [*real.values()]) for name, measured in same.items()}
-    others = {f"the {name} simulation": measured for name, measured in same.items() if name != chooser}
-    flags = []
-    for policy, here in same[chooser].items() if chooser is not None else ():
-        otherwise = {words: one[policy].average_reward_m_s for words, one in {**(worse or {}), **others}.items()}
-        flags.append(flag(policy, here.average_reward_m_s, otherwise, here.reversals_hz))
-    return Ranking(real, same, agreements, tuple(one for one in flags if one is not None))
+    return Ranking(
+        real, same, {name: agreement([*measured.values()], [*real.values()]) for name, measured in same.items()}
+    )
 
 
 # ---------------------------------------------------------------------------------------------------------- playing

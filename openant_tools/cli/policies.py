@@ -132,13 +132,15 @@ def rank(
     on_robot = dict(_play(runs, real, seconds, starts, yes))
     runs = {name: path for name, path in runs.items() if name in on_robot}
     simulated = {name: dict(_play(runs, place, seconds, starts, False)) for name, place in places.items()}
-    chooser = None if flag_by == "none" else flag_by or next(iter(places))
-    worse = {}
-    if chooser is not None and not places[chooser].endswith(".json"):
-        few = max(1, (starts or STARTS_IN_SIMULATION) // 5)
-        for words, wrapper in DISTURBANCES.items():
-            worse[words] = dict(_play(runs, places[chooser], seconds, few, False, wrapper=wrapper))
-    found = ranked({name: on_robot[name] for name in runs}, simulated, chooser, worse)
+    found = ranked({name: on_robot[name] for name in runs}, simulated)
+    if flag_by != "none":
+        chooser = flag_by or next(iter(places))
+        worse: dict[str, dict[str, PlaceResult]] = {}
+        if not places[chooser].endswith(".json"):
+            few = max(1, (starts or STARTS_IN_SIMULATION) // 5)
+            for words, wrapper in DISTURBANCES.items():
+                worse[words] = dict(_play(runs, places[chooser], seconds, few, False, wrapper=wrapper))
+        found = found.flagged(chooser, worse)
     _print(found)
     if report is not None:
         write_report(ranking_report(found), report, [folder])
