@@ -104,7 +104,7 @@ def weights() -> Mapping[str, float]:
     return {name: float(text[name]) for name in WEIGHTS}
 
 
-def fitted(rows: Sequence[Row], weights: Mapping[str, float]) -> dict[tuple[str, ...], float]:
+def _fitted(rows: Sequence[Row], weights: Mapping[str, float]) -> dict[tuple[str, ...], float]:
     """Of each hypothesis that was fitted, what that says of it, in nats.
 
     That some cause makes what was measured likelier says that something is wrong, up to a degree; which it is, causes tell by comparison.
@@ -126,7 +126,7 @@ def chances(rows: Sequence[Row], outside: float, weights: Mapping[str, float]) -
     left = min((row.left for row in rows if row.left is not None), default=0.0)
     fits = weights["outside: support"] * max(most, 0.0) + weights["outside: left"] * left
     logits = {OUTSIDE: weights["outside"] + fits + weights["evidence"] * _log(outside)}
-    said = fitted(rows, weights)
+    said = _fitted(rows, weights)
     for row in rows:
         name, more = (row.causes[0], said.get(row.causes, 0.0)) if row.causes else (NONE, weights["none"])
         logits[name] = weights["evidence"] * _log(row.probability) + more
@@ -165,7 +165,7 @@ def decide(rows: Sequence[Row], outside: float) -> Decision:
 def adds(rows: Sequence[Row]) -> Row | None:
     """Of hypotheses with one cause more than is selected, the likeliest one whose last cause is likelier there than not."""
     learned = weights()
-    said = fitted(rows, learned)
+    said = _fitted(rows, learned)
 
     def probability(row: Row) -> float:
         odds = _log(row.probability) - _log(1 - row.probability)

@@ -277,9 +277,10 @@ class FlightController:
         """Read the sensors and carry the attitude filter on."""
         dt = t - self._tick
         self._tick = max(self._tick, t)
+        s, body = self.settings, self._truth()
+        turned, self._quaternion = _rotation_vector(self._quaternion, body.quaternion), np.array(body.quaternion)
         if self.frozen:
             return
-        s, body = self.settings, self._truth()
         noise = self._rng.standard_normal(6)
         acc = (self._mount.T @ body.specific_force) * s.acc_scale + s.acc_bias + s.acc_noise * noise[:3]
         self._acc = self._board @ acc - self._acc_trim
@@ -292,9 +293,7 @@ class FlightController:
         elif dt > 0:
             # It reads its gyro thousands of times a second: between two looks it turns by what the body did, whatever feet that chatter
             # do to the rate of an instant.
-            mean = _rotation_vector(self._quaternion, body.quaternion) / dt
-            self._attitude = mahony(self._attitude, self._turning(mean, noise[3:]), self._acc, dt)
-        self._quaternion = np.array(body.quaternion)
+            self._attitude = mahony(self._attitude, self._turning(turned / dt, noise[3:]), self._acc, dt)
 
     def _turning(self, rate: Array, noise: Array) -> Array:
         """What the gyro reads of a rate (rad/s, body axes), in the axes of the board."""
