@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
+from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.bus import Bus
-from openant_tools.comms.faults import BrokenAnswer, Cause, NoAnswer
+from openant_tools.comms.faults import BrokenAnswer, NoAnswer
 from openant_tools.comms.guards import Trip
 from openant_tools.comms.hardware import Hardware
 from openant_tools.comms.lateness import REMEDY
 from openant_tools.comms.line import PortGone
 from openant_tools.comms.restart import StopCause
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servo
-from openant_tools.comms.silence import diagnose
+from openant_tools.comms.silence import PATIENCE_S, ask, diagnose
 from openant_tools.errors import HardwareFault, OpenAntError
 from openant_tools.recording.writer import RecordingStopped
 
 __all__ = ["cause_of", "examined", "watchdogs_tripped"]
-
-#: how often a servo is asked alone, and again where its answers are not all alike; and the share of them that says what they are
-TRIES, MOSTLY = (3, 6), 2 / 3
 
 
 def cause_of(error: OpenAntError) -> StopCause:
@@ -101,18 +98,15 @@ def _who_is_silent(trip: Trip, hardware: Hardware) -> Trip:
 
 
 def _asked_alone(bus: Bus, servos: Sequence[Servo]) -> tuple[list[Servo], list[Servo]]:
-    """Who is silent, and whose answers are broken; only what is nearly always the same: a busy host meets now this, now that."""
+    """Who is silent, and from whom only broken answers come; waited for so long that a busy host hears a late answer, too."""
     silent, broken = list[Servo](), list[Servo]()
     for servo in servos:
-        causes = Counter[Cause | None]()
-        for tries in TRIES:
-            causes.update(
-                answer.cause for _ in range(tries) for answer in bus.sync_read(BLOCK_ADDRESS, BLOCK_SIZE, [servo.id])
-            )
-            if len(causes) == 1:
+        question, garbage = p2.read(servo.id, BLOCK_ADDRESS, BLOCK_SIZE).encode(), 0
+        for wait_s in PATIENCE_S:
+            heard = ask(bus, question, wait_s, lambda h: h.answer_s is not None, servo.id)
+            if heard.answer_s is not None:
                 break
-        if causes[Cause.CRC] > MOSTLY * causes.total():
-            broken.append(servo)
-        elif set(causes) == {Cause.TIMEOUT}:
-            silent.append(servo)
+            garbage += heard.garbage > 0
+        else:
+            (broken if garbage > len(PATIENCE_S) / 2 else silent).append(servo)
     return silent, broken

@@ -21,7 +21,17 @@ from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.robot.servo import BAUD_CODES, hardware_errors, servo_model
 
-__all__ = ["Heard", "Silence", "ask", "diagnose", "explained", "explaining", "reader_words", "return_level"]
+__all__ = [
+    "PATIENCE_S",
+    "Heard",
+    "Silence",
+    "ask",
+    "diagnose",
+    "explained",
+    "explaining",
+    "reader_words",
+    "return_level",
+]
 
 #: s that a single question waits, again and again: a patient one tells a late answer from none.
 PATIENCE_S = (0.06, 0.12, 0.25)
