@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import io
 import itertools
@@ -9,6 +10,7 @@ import os
 import platform
 import shutil
 import subprocess
+import threading
 import time
 import warnings
 from collections.abc import Sequence
@@ -30,6 +32,8 @@ CIRCLE_RGBA = (0.337, 0.706, 0.914, 1.0)  # Okabe–Ito sky blue
 CIRCLE_SEGMENTS = 48
 #: pictures side by side in a strip
 STRIP_COLUMNS = 4
+#: s that a closed window may take to end its last picture
+CLOSING_S = 5.0
 #: bytes that a video may have: it goes into reports
 VIDEO_BYTES = 3_000_000
 #: of WebP, from 0 to 100, in the order in which they are tried until a video is small enough
@@ -174,6 +178,7 @@ class Window:
             raise NoOpenGL("there is no screen here to open a window on", remedy=instead)
         try:
             viewer = importlib.import_module("mujoco.viewer")
+            before = set(threading.enumerate())
             self._viewer: Any = viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
         except ImportError as error:
             raise NoOpenGL(
@@ -181,6 +186,9 @@ class Window:
             ) from error
         except RuntimeError as error:  # macOS wants its own launcher
             raise NoOpenGL(f"no window can be opened: {error}", remedy=instead) from error
+        # Its thread draws on after it was told to end: a process that ends meanwhile hangs or crashes in the graphics driver.
+        self._threads = [thread for thread in threading.enumerate() if thread not in before]
+        atexit.register(self.close)
         self._dt = dt
         self._next = time.monotonic()
 
@@ -194,8 +202,11 @@ class Window:
         time.sleep(self._next - now)
 
     def close(self) -> None:
-        """Close the window."""
+        """Close the window, and wait until nothing is drawn any more."""
+        atexit.unregister(self.close)
         self._viewer.close()
+        for thread in self._threads:
+            thread.join(CLOSING_S)
 
 
 def write_strip(pictures: Sequence[Image], file: Path, *, seconds_apart: float) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+import threading
+import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -80,8 +82,18 @@ def test_a_window_needs_a_screen_and_one_line_says_so(monkeypatch: pytest.Monkey
 def test_the_window_shows_every_step_and_may_be_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[float] = []
 
+    told_to_close, drawn_to_the_end = threading.Event(), threading.Event()
+
+    def draw() -> None:
+        told_to_close.wait(10)
+        time.sleep(0.05)
+        drawn_to_the_end.set()
+
     def launch_passive(model: Any, data: Any, **how: bool) -> Any:
-        return SimpleNamespace(is_running=lambda: len(seen) < 3, sync=lambda: seen.append(data.time), close=seen.clear)
+        threading.Thread(target=draw, daemon=True).start()
+        return SimpleNamespace(
+            is_running=lambda: len(seen) < 3, sync=lambda: seen.append(data.time), close=told_to_close.set
+        )
 
     monkeypatch.setenv("DISPLAY", ":99")
     monkeypatch.setitem(sys.modules, "mujoco.viewer", SimpleNamespace(launch_passive=launch_passive))
@@ -93,4 +105,4 @@ def test_the_window_shows_every_step_and_may_be_closed(monkeypatch: pytest.Monke
     assert np.allclose(np.diff(seen), 0.02)
     assert env.render() is None
     env.close()
-    assert not seen
+    assert drawn_to_the_end.is_set(), "a process that ends while a window still draws hangs in the graphics driver"
