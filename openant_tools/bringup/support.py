@@ -125,7 +125,8 @@ def _tail(file: Path, name: str) -> dict[str, str]:
     try:
         with file.open("rb") as stream:
             stream.seek(0, io.SEEK_END)
-            stream.seek(max(0, stream.tell() - TAIL))
+            if stream.seek(max(0, stream.tell() - TAIL)):
+                stream.readline()  # half a serial number is none that the mask would know
             return {name: stream.read().decode("utf-8", "replace")}
     except OSError:
         return {}

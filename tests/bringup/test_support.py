@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from openant_tools.bringup.support import Mask
+from openant_tools.bringup.support import TAIL, Mask, gather
 from openant_tools.cli import main
 from openant_tools.robot.folder import RobotFolder, create_robot
 
@@ -68,6 +68,16 @@ def test_a_bundle_has_what_a_report_needs_and_no_secret(
     assert "usb-FTDI_USB__-__Serial_Converter_SERIAL-if00-port0" in texts["robot/robot.toml"]
     assert "~/my-ant/recordings/walk.mcap" in texts["log/openant.log"]
     assert "openant-tools" in texts["versions.txt"]
+
+
+def test_the_end_of_a_long_log_begins_with_a_whole_line(tmp_path: Path) -> None:
+    """Cut anywhere, half a serial number would stand at its beginning, and no pattern knows it."""
+    log = tmp_path / "openant.log"
+    line = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT9HDL4X-if00-port0 answers\n"
+    for extra in range(len(line)):
+        log.write_text(line * (TAIL // len(line) + 2) + "x" * extra)
+        begun = gather(None, [log])["log/openant.log"].splitlines()[0]
+        assert begun == "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_SERIAL-if00-port0 answers"
 
 
 def test_a_name_is_masked_as_a_word_and_not_within_another() -> None:
