@@ -26,6 +26,7 @@ import numpy as np
 STEPS = 250
 CARRIED = 0.2
 POSITION = '<position joint="j" kp="8" kv="0.2" forcerange="-3 3"/>'
+WEAK = '<position joint="j" kp="0.25"/>'  # never beyond the friction: the arm should stay where it is
 MOTOR = '<dcmotor joint="j" input="pos" motorconst="0.6 0.6" resistance="1" controller="8 0 0.5 0 0 3"/>'
 
 
@@ -53,6 +54,10 @@ MODELS: dict[str, tuple[str, str]] = {
     ),
     "motor": (pendulum(MOTOR), pendulum()),
     "damping with the square of speed": (pendulum(joint='damping="0.1 0.3"'), pendulum()),
+    "dry friction that holds": (
+        pendulum(WEAK, joint='damping="0.1" frictionloss="0.5" solimpfriction="0.999 0.999 0.001 0.5 2"'),
+        pendulum(WEAK, joint='damping="0.1" frictionloss="0.5"'),
+    ),
     "adhesion": (pendulum(geom='adhesion="20"'), pendulum()),
     "delayed sensors": (
         pendulum(sensor='<jointpos joint="j" delay="0.03" nsample="20" interp="linear"/>'),

@@ -16,6 +16,8 @@ import mujoco
 import numpy as np
 from lxml import etree
 
+from openant_tools.model.servo import GIVES_WAY
+
 __all__ = ["EFFECTS", "FEATURES", "carries", "elsewhere", "engines", "features_of", "lacking", "sentence", "state"]
 
 MARK = "Engines: "
@@ -30,6 +32,7 @@ FEATURES: Mapping[str, Callable[[mujoco.MjModel], bool]] = {
     "rate-limited setpoint": lambda m: bool((m.actuator_dyntype == _DYN.mjDYN_PID).any()),
     "motor": lambda m: bool((m.actuator_biastype == _BIAS.mjBIAS_DCMOTOR).any()),
     "damping with the square of speed": lambda m: bool(m.dof_dampingpoly.any()),
+    "dry friction that holds": lambda m: bool((m.dof_solimp[:, :2] > GIVES_WAY)[m.dof_frictionloss > 0].any()),
     "adhesion": lambda m: bool(m.geom_adhesion.any()),
     "delayed sensors": lambda m: bool((m.sensor_delay > 0).any()),
 }
@@ -95,6 +98,6 @@ def state(root: etree._Element, model: mujoco.MjModel) -> None:
         first = etree.Comment("")
         first.tail = root.text or "\n  "
         root.insert(0, first)
-    said = str(first.text or "").strip()
+    said = str(first.text or "").strip().rstrip(".")
     text = f" {said}{'. ' if said else ''}{MARK}{'. '.join(sentence(model))} "
     first.text = text.replace("--", "−−")

@@ -36,6 +36,13 @@ def test_the_table_is_of_this_engine_and_every_effect_of_it_is_in_the_catalogue(
     assert set(EFFECTS) <= set(catalogue())
 
 
+def test_the_page_has_the_table_as_it_was_measured() -> None:
+    page = (ROOT / "docs" / "gap.md").read_text()
+    assert f"| written as | {' | '.join(engines())} |" in page
+    for feature in FEATURES:
+        assert f"| {feature} | {' | '.join(table[feature] for table in engines().values())} |" in page
+
+
 def head(path: Path) -> str:
     """The first comment of a model."""
     return path.read_text().partition("<!--")[2].partition("-->")[0]
@@ -80,6 +87,6 @@ def test_a_model_that_is_written_again_says_it_once(tmp_path: Path) -> None:
     source = write(tmp_path / "given.xml", pendulum())
     for name in ("once.xml", "twice.xml"):
         plant = load_plant(source, None, Setup.FLOOR)
-        source = write_model(source, plant.model, tmp_path / name, note="Fitted")
+        source = write_model(source, plant.model, tmp_path / name, note="Fitted.")
     assert (tmp_path / "twice.xml").read_text().count("Engines: ") == 1
-    assert head(tmp_path / "twice.xml").strip().startswith("Fitted")
+    assert head(tmp_path / "twice.xml").strip().startswith("Fitted. Engines: ")
