@@ -15,7 +15,11 @@ SOURCE = os.environ.get("CLEANRL", "https://github.com/vwxyzjn/cleanrl")
 
 with tempfile.TemporaryDirectory() as place:
     cloned = Path(place, "cleanrl")
-    subprocess.run(["git", "clone", "-q", "--depth", "1", SOURCE, str(cloned)], check=True, timeout=120)
+    clone = ["git", "clone", "-q", "--depth", "1", SOURCE, str(cloned)]
+    git = subprocess.run(clone, capture_output=True, text=True, timeout=120, check=False)
+    if git.returncode:
+        print(f"it cannot be cloned: {git.stderr.strip()}")
+        sys.exit(77)
     commit = subprocess.run(
         ["git", "log", "-1", "--format=%h of %cs"], cwd=cloned, check=True, capture_output=True, text=True
     ).stdout.strip()
