@@ -21,6 +21,7 @@ from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_opti
 from openant_tools.numbers import number, percent
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from openant_tools.comms.messages import EngineConfig
@@ -254,24 +255,24 @@ def watch(
     folder = robot_of(robot, needed=False)
     if driver == "sdk":
         with engine_config(folder, port, virtual_source, clock="real") as config:
-            statistics = _watch_by_sdk(config, seconds)
-        if json_file:
-            _write_json(json_file, statistics)
-        return
-    with engine_config(folder, port, virtual_source, clock="real") as config, EngineProcess(config) as engine:
-        end = None if seconds is None else time.monotonic() + seconds
-        with contextlib.suppress(KeyboardInterrupt), Live(console=console, auto_refresh=False) as live:
-            while end is None or time.monotonic() < end:
-                time.sleep(0.2)
-                rows = engine.telemetry()
-                statistics = engine.ask(messages.Statistics())
-                if len(rows):
-                    live.update(_table(engine.columns, rows[-1], statistics), refresh=True)
+            statistics = _watch_by_sdk(console, config, seconds)
+    else:
+        with engine_config(folder, port, virtual_source, clock="real") as config, EngineProcess(config) as engine:
+            end = None if seconds is None else time.monotonic() + seconds
+            with contextlib.suppress(KeyboardInterrupt), Live(console=console, auto_refresh=False) as live:
+                while end is None or time.monotonic() < end:
+                    time.sleep(0.2)
+                    rows = engine.telemetry()
+                    statistics = engine.ask(messages.Statistics())
+                    if len(rows):
+                        live.update(_table(engine.columns, rows[-1], statistics), refresh=True)
+    if not console.is_terminal:
+        console.line()  # in a file the last table ends without its own
     if json_file:
         _write_json(json_file, statistics)
 
 
-def _watch_by_sdk(config: EngineConfig, seconds: float | None) -> dict[str, Any]:
+def _watch_by_sdk(console: Console, config: EngineConfig, seconds: float | None) -> dict[str, Any]:
     """Ask with the vendor's SDK until the time is over or Ctrl-C; what it lost, by servo."""
     from rich.live import Live
     from rich.table import Table
@@ -283,7 +284,7 @@ def _watch_by_sdk(config: EngineConfig, seconds: float | None) -> dict[str, Any]
     end = None if seconds is None else time.monotonic() + seconds
     with (
         VendorSdk(config.port, config.baud) as sdk,
-        Live(auto_refresh=False) as live,
+        Live(console=console, auto_refresh=False) as live,
         contextlib.suppress(KeyboardInterrupt),
     ):
         while end is None or time.monotonic() < end:
