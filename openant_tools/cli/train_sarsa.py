@@ -88,11 +88,12 @@ def sarsa(
             tensorboard=tensorboard,
             report=bar.show,
         )
-    learned = load_checkpoint(out)["agent"] or {"tiles": 0, "shared": 0, "decisions": 0}
+    saved = load_checkpoint(out)["agent"]
+    learned = saved or {"tiles": 0, "shared": 0, "decisions": 0}
     collisions = f"{learned['shared']} look-ups of tiles that share a row" if learned["shared"] else "no collision"
     share = 100 * learned["tiles"] / settings.table
     words = f"{learned['decisions']} decisions; {learned['tiles']} tiles seen, {number(share, decimals=1)} % of the table; {collisions}"
     more = {
         "decisions": learned["decisions"], "tiles": learned["tiles"], "table": settings.table, "collisions": learned["shared"],
     }  # fmt: skip
-    show_result("sarsa", result, out, json_file, words=[words], more=more)
+    show_result("sarsa", result, out, json_file, words=[words], more=more, begun=saved is not None)

@@ -233,12 +233,14 @@ def show_result(
     words: Sequence[str] = (),
     more: Mapping[str, Any] | None = None,
     learning_from_s: float | None = None,
+    begun: bool = True,
 ) -> None:
     """Print how far a run came, draw its curve, and write the JSON that was asked for.
 
     Args:
         words: lines of this agent. more: its part of the JSON.
         learning_from_s: s of robot time at which updates began.
+        begun: whether it has learned something that can be evaluated.
     """
     from openant_agents.curves import plot_curves
     from openant_agents.runs import read_curve
@@ -258,7 +260,9 @@ def show_result(
     for line in words:
         click.echo(line)
     click.echo(f"run: {out}" + (f"   curve: {picture}" if curve else ""))
-    click.echo(f"next: openant eval {out} --seconds 120")
+    click.echo(
+        f"next: openant eval {out} --seconds 120" if begun else "next: the same with more --steps; it only explored"
+    )
     if json_file is not None:
         from openant_tools.files import json_text, write_text
 

@@ -452,6 +452,8 @@ def test_a_full_disk_is_told_and_not_passed_over(tmp_path, monkeypatch):
 def test_train_and_eval_from_the_command_line(tmp_path, capsys):
     out, answer = tmp_path / "run", tmp_path / "train.json"
     arguments = ("train", "sarsa", "--kit", "standard", "--seed", 1, "--out", out)
+    assert run_command(*arguments, "--steps", 30) == 0
+    assert "next: the same with more --steps" in capsys.readouterr().out, "what only explored cannot be evaluated"
     assert run_command(*arguments, "--steps", 1400, "--json", answer) == 0
     result = json.loads(answer.read_text())
     assert result["seconds"] == pytest.approx(70.0)
