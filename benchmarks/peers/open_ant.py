@@ -67,7 +67,7 @@ with tempfile.TemporaryDirectory() as folder:
         ["git", "log", "-1", "--format=%h of %cs"], cwd=cloned, check=True, capture_output=True, text=True
     ).stdout.strip()
     openant = [sys.executable, "-m", "openant_tools"]
-    (place / "floor.toml").write_text('[robot]\nsetup = "floor"\n')
+    (place / "floor.toml").write_text('[robot]\nsetup = "floor"\n[camera]\nfps = 5\n')
     robot = subprocess.Popen(
         [*openant, "virtual", "start", "--scenario", "floor.toml", "--ready-file", "ready.json"], cwd=place
     )
