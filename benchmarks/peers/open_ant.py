@@ -1,8 +1,9 @@
 """The platform's own hardware environment and its SARSA(λ) agent, their files as they are, on the virtual robot.
 
 Its repository is no package: it is cloned from `OPEN_ANT`, a place that git can clone from (default: GitHub). The environment shows its
-camera's picture in a window of its own under Xvfb. One thing is handed to it that it does not ask for: Linux shows no camera of software as
-V4L2's, so `cv2.VideoCapture` opens the virtual robot's stream whatever backend was named.
+camera's picture in a window of its own under Xvfb. Two things are handed to it that it does not ask for: Linux shows no camera of software
+as V4L2's, so `cv2.VideoCapture` opens the virtual robot's stream whatever backend was named; and the SDK waits longer for an answer, since
+on a busy machine a robot of software is late.
 """
 
 import json
@@ -16,7 +17,12 @@ from pathlib import Path
 SOURCE = os.environ.get("OPEN_ANT", "https://github.com/Openmind-Research-Institute/open-ant")
 #: on the virtual robot
 BODY_TAG = 12
-CAMERA = "import cv2; real = cv2.VideoCapture; cv2.VideoCapture = lambda device, *backend: real(device)\n"
+HANDED = """
+import cv2, dynamixel_sdk.port_handler
+real = cv2.VideoCapture
+cv2.VideoCapture = lambda device, *backend: real(device)
+dynamixel_sdk.port_handler.LATENCY_TIMER = 300
+"""
 PLAY = """
 import json, sys
 import numpy as np
@@ -47,8 +53,8 @@ LEARN = "import runpy, sys\nsys.path.insert(0, sys.argv[1]); sys.argv = sys.argv
 
 
 def run(program: str, *words: object, cwd: Path) -> str:
-    """What Python says of a program with the virtual camera, on a screen of Xvfb; Enter is pressed whenever it asks."""
-    command = ["xvfb-run", "-a", sys.executable, "-c", CAMERA + program, *map(str, words)]
+    """What Python says of a program with what is handed to it, on a screen of Xvfb; Enter is pressed whenever it asks."""
+    command = ["xvfb-run", "-a", sys.executable, "-c", HANDED + program, *map(str, words)]
     done = subprocess.run(command, cwd=cwd, input="\n" * 100, capture_output=True, text=True, timeout=150, check=False)
     if done.returncode:
         sys.exit(done.stdout[-1500:] + done.stderr[-1500:])
