@@ -156,7 +156,10 @@ def write_table(run: Run, path: str | Path) -> None:
 def find_run(path: Path) -> Path:
     """The file that a RUN on the command line means: the suffix may be missing, or be that of its facts."""
     if path.is_dir():
-        inside = sorted(file.name for file in path.iterdir() if file.suffix in (".mcap", ".parquet", ".csv"))
+        places = (path, path / "recordings")  # a robot's folder and that of a training run have them there
+        inside = [
+            str(file.relative_to(path)) for place in places for file in sorted(place.glob("*")) if _may_be_run(file)
+        ]
         raise BadInput(
             "this is a folder, not a run", where=path, remedy=f"name one of {_few(inside)}" if inside else None
         )
@@ -175,6 +178,17 @@ def find_run(path: Path) -> Path:
     raise BadInput(
         "there is no such file", where=path, remedy="check the name; `openant rec info FILE` shows what a run holds"
     )
+
+
+def _may_be_run(file: Path) -> bool:
+    """By its name; a CSV by its columns, too: a learning curve is none."""
+    if file.suffix != ".csv":
+        return file.suffix in (".mcap", ".parquet")
+    try:
+        with file.open(encoding="utf-8", errors="replace") as stream:
+            return "t" in stream.readline(10_000).strip().split(",")
+    except OSError:
+        return False
 
 
 def _few(names: Any, count: int = 8) -> str:

@@ -17,7 +17,7 @@ from places import SHARED
 
 from openant_tools.errors import BadInput
 from openant_tools.recording.run import Facts, Run
-from openant_tools.recording.tables import read_run, write_table
+from openant_tools.recording.tables import find_run, read_run, write_table
 
 REALDATA = SHARED / "realdata"
 
@@ -376,3 +376,14 @@ def test_real_recordings_are_read_whole() -> None:
         assert np.isfinite(run.signal("pos")).all()
         assert run.facts.registers[run.joints[0]]["position_p_gain"] > 0
         assert run.model_path is None or run.model_path.exists()
+
+
+def test_a_folder_is_told_which_runs_it_has(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match=r"a folder, not a run$"):
+        find_run(tmp_path)
+    (tmp_path / "learning_curve.csv").write_text("step,seconds,average_reward_m_s\n")
+    (tmp_path / "recordings").mkdir()
+    written(tmp_path)
+    (tmp_path / "recordings" / "walk.mcap").touch()
+    with pytest.raises(BadInput, match=r"→ name one of sway.csv, recordings/walk.mcap$"):
+        find_run(tmp_path)
