@@ -113,7 +113,7 @@ class Servos:
         fields.qfrc_applied[:, self._dof] = view.torque
         changed = {"stiffness": view.stiffness, "velocity_gain": view.velocity_gain, "limit": view.limit}
         for name, value in changed.items():
-            if self._changed[name] or not np.array_equal(value, rest[name]):
+            if self._changed[name] or not (value is rest[name] or np.array_equal(value, rest[name])):
                 self._changed[name] = True
                 self._put(name, value)
 
@@ -133,7 +133,9 @@ class Servos:
             dt: s, of the step. setpoint: (rows, joints) rad. rows: which simulations; the others as in `prepare`.
         """
         rest = self._rest if rows == slice(None) else {name: values[rows] for name, values in self._rest.items()}
-        share = 1.0 if supply is None else supply
+        servo = {name: rest[name] for name in ("stiffness", "velocity_gain", "limit")}
+        if supply is not None:
+            servo = {name: values * supply for name, values in servo.items()}
         friction = rest["friction"].copy()
         return Step(
             dt=dt,
@@ -143,9 +145,7 @@ class Servos:
             load=self._fields.qfrc_bias[rows, self._dof].copy(),
             on=self._on[rows],
             setpoint=setpoint,
-            stiffness=rest["stiffness"] * share,
-            velocity_gain=rest["velocity_gain"] * share,
-            limit=rest["limit"] * share,
+            **servo,
             back_emf=rest["back_emf"],
             damping=rest["damping"],
             friction=friction,
@@ -163,7 +163,7 @@ class Servos:
         with np.errstate(divide="ignore", invalid="ignore"):
             back_emf = np.where(motor, gain[..., MOTOR_CONSTANT] ** 2 / gain[..., RESISTANCE], 0.0)
             stall = gain[..., MOTOR_CONSTANT] * gain[..., VMAX] / gain[..., RESISTANCE]
-        return {
+        rest = {
             "stiffness": np.where(motor, gain[..., KP], -bias[..., 1]),
             "velocity_gain": np.where(motor, gain[..., KD] - back_emf, -bias[..., 2]),
             "limit": np.where(motor, stall, np.where(self._limited, force, np.inf)),
@@ -171,6 +171,9 @@ class Servos:
             "damping": fields.dof_damping[:, self.plant.dof].copy(),
             "friction": fields.dof_frictionloss[:, self.plant.dof].copy(),
         }
+        for values in rest.values():
+            values.flags.writeable = False  # every step begins with these very arrays
+        return rest
 
     def _put(self, name: str, value: Array) -> None:
         """Write one number of every servo, (n, joints), into the models of all simulations."""

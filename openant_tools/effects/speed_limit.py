@@ -34,7 +34,7 @@ def fading(no_load: NDArray[np.float64]) -> Law:
     def act(step: Step) -> None:
         along = step.motor_torque * step.velocity > 0
         left = np.clip(1 - np.abs(step.velocity) / no_load, TINY, 1.0)
-        step.limit *= np.where(along, left, 1.0)
+        step.limit = step.limit * np.where(along, left, 1.0)
 
     return act
 

@@ -39,7 +39,8 @@ class Step:
         load: N·m that gravity and motion ask of each joint's servo (bias force, one step old); read only.
         on: whether torque is on; read only.
         setpoint: rad, where the servo is told to go.
-        stiffness, velocity_gain, limit, back_emf: of the servo: N·m/rad, N·m·s/rad, N·m, N·m·s/rad.
+        stiffness, velocity_gain, limit, back_emf: of the servo: N·m/rad, N·m·s/rad, N·m, N·m·s/rad; a law that changes them
+            puts other arrays in their place.
         damping: N·m·s/rad, of the joint itself, which stays with torque off; read only.
         friction: N·m, the most that dry friction in the joint holds.
         torque: N·m put on the joint beside all this.

@@ -49,9 +49,9 @@ class Heating:
         share = np.minimum(np.abs(step.motor_torque) / np.maximum(step.limit, TINY), 1.0)
         self.state += step.dt / self._seconds * (FULL_HEAT_C * share**2 - self.state)
         left = np.maximum(1 - self._loss * self.state, COLDEST)
-        step.stiffness *= left
-        step.velocity_gain *= left
-        step.limit *= left
+        step.stiffness = step.stiffness * left
+        step.velocity_gain = step.velocity_gain * left
+        step.limit = step.limit * left
 
 
 _warm_it_up = Action("warm it up", "record the same motion cold and after five minutes of work")

@@ -32,9 +32,9 @@ def _law(values: Table) -> Law:
         duty = PLATFORM_PWM_LIMIT * np.minimum(torque / np.maximum(step.limit, 1e-9), 1.0)
         current = (AMPERE_PER_NM * torque * duty).sum(axis=1, keepdims=True)
         share = np.maximum(1.0 - resistance * current / NOMINAL_V, LEAST_SHARE)
-        step.stiffness *= share
-        step.velocity_gain *= share
-        step.limit *= share
+        step.stiffness = step.stiffness * share
+        step.velocity_gain = step.velocity_gain * share
+        step.limit = step.limit * share
         step.supply = step.supply * share
 
     return act
