@@ -85,6 +85,9 @@ class MemoryLine:
     def sleep_until(self, t: float) -> None:
         self._t = max(self._t, t)
 
+    def write_from(self, t: float) -> None:
+        self.sleep_until(t)
+
     def wait_readable(self, line: object, deadline: float) -> bool:
         if self._coming and self._coming[0][0] <= max(deadline, self._t):
             self._t = max(self._t, self._coming[0][0])

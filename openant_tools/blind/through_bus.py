@@ -190,6 +190,9 @@ class _Wire:
         self._t = max(self._t, t)
         self.world.advance(self._t)
 
+    def write_from(self, t: float) -> None:
+        self.sleep_until(t)
+
     def wait_readable(self, line: object, deadline: float) -> bool:
         if self._coming and self._coming[0][0] <= max(deadline, self._t):
             self.sleep_until(self._coming[0][0])

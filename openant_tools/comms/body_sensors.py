@@ -21,7 +21,7 @@ __all__ = ["BodySensors"]
 
 #: rad. No body whose tag is seen from above leans farther.
 STEEP_RAD = np.pi / 4
-#: The IMU's port is left alone for so long before a cycle begins.
+#: The IMU's port is left alone for so long before a cycle begins, where time does not wait for us.
 IMU_SLACK_S = 0.3e-3
 _NAN = float("nan")
 
@@ -37,11 +37,13 @@ class BodySensors:
         self.imu: BodyImu | None = None
         self.camera: BodyCamera | None = None
         self._imu_calibrated = False
+        self._slack_s = IMU_SLACK_S
         #: kind of the reason for which no pose is seen, as the recording was told; empty while poses come
         self._pose_lost = ""
 
     def open(self, config: EngineConfig, clock: Clock, notice: Callable[[str], None]) -> None:
         """Connect to those that the robot has; what does not answer is told, and left out."""
+        self._slack_s = 0.0 if clock.stepped else IMU_SLACK_S
         if config.imu is not None:
             self._imu_calibrated = config.imu.calibrated
             try:
@@ -67,7 +69,7 @@ class BodySensors:
             RecordingStopped: they cannot be recorded.
         """
         if self.imu is not None:
-            for sample in self.imu.until(due - IMU_SLACK_S):
+            for sample in self.imu.until(due - self._slack_s):
                 if recorder.writer is not None:
                     recorder.writer.imu(*sample)
         if self.camera is not None:

@@ -388,7 +388,7 @@ class Bus:
         if self.timing.write_read_gap_s > 0:
             gap = self._quiet_from + self.timing.write_read_gap_s
             if self.clock.now() < gap:
-                self.clock.sleep_until(gap)
+                self.clock.write_from(gap)
         started = self.request_at = self.clock.now()
         self.line.write(packet)
         # Counted from when the system has the bytes: whoever was held up before that must not cut the gap short.

@@ -12,7 +12,7 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -46,6 +46,10 @@ class Clock(Protocol):
 
     def sleep_until(self, t: float) -> None:
         """Return at `t`, at once where that has passed."""
+        ...
+
+    def write_from(self, t: float) -> None:
+        """As `sleep_until`, where the next thing is to write."""
         ...
 
     def wait_readable(self, line: Line, deadline: float) -> bool:
@@ -102,6 +106,9 @@ class RealClock:
         while time.monotonic() < t:
             pass
 
+    def write_from(self, t: float) -> None:
+        self.sleep_until(t)
+
     def wait_readable(self, line: Line, deadline: float) -> bool:
         before = time.monotonic()
         ready, _, _ = select.select([line], [], [], max(0.0, deadline - before))
@@ -116,7 +123,7 @@ class RealClock:
 
 
 class VirtualControl:
-    """The control socket of a virtual robot: one line of JSON out, one back."""
+    """The control socket of a virtual robot: a line of JSON out, one back."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = str(path)
@@ -134,9 +141,13 @@ class VirtualControl:
 
     def ask(self, do: str, **fields: Any) -> dict[str, Any]:
         """Send one request; its answer. Raises HardwareFault where the robot has gone or refuses."""
+        return self.ask_all([{"do": do, **fields}])[0]
+
+    def ask_all(self, requests: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Send requests that are done one after another; their answers. Raises as `ask`."""
         try:
-            self._socket.sendall(json.dumps({"do": do, **fields}).encode() + b"\n")
-            while b"\n" not in self._rest:
+            self._socket.sendall("".join(json.dumps(request) + "\n" for request in requests).encode())
+            while self._rest.count(b"\n") < len(requests):
                 data = self._socket.recv(65536)
                 if not data:
                     raise ConnectionResetError("it closed the connection")
@@ -145,11 +156,12 @@ class VirtualControl:
             raise HardwareFault(
                 f"the virtual robot stopped answering ({error})", where=self.path, remedy="start it again"
             ) from None
-        line, _, self._rest = self._rest.partition(b"\n")
-        answer: dict[str, Any] = json.loads(line)
-        if "error" in answer:
-            raise HardwareFault(f"the virtual robot refuses {do!r}: {answer['error']}", where=self.path)
-        return answer
+        *lines, self._rest = self._rest.split(b"\n", len(requests))
+        answers: list[dict[str, Any]] = [json.loads(line.decode()) for line in lines]
+        for request, answer in zip(requests, answers, strict=True):
+            if "error" in answer:
+                raise HardwareFault(f"the virtual robot refuses {request['do']!r}: {answer['error']}", where=self.path)
+        return answers
 
     @property
     def robot_pid(self) -> int | None:
@@ -183,6 +195,8 @@ class SteppedClock:
         self._marks: dict[str, list[tuple[int, float]]] = {}
         #: s, from when to when the host last stood still
         self._stood = (-math.inf, -math.inf)
+        #: requests that are made together with the next one
+        self._put_off: list[dict[str, Any]] = []
         answer = control.ask("now")
         if not answer["stepped"]:
             raise HardwareFault(
@@ -195,6 +209,8 @@ class SteppedClock:
         """Take these lines, just opened, as the robot's; those attached before stay, and must be idle."""
         given = {"bus": bus, "imu": imu}
         self._lines |= {name: line for name, line in given.items() if line is not None}
+        if self._put_off:
+            self._ask("settle")
         self._t = float(self._control.ask("open")["t"])
         for name, line in self._lines.items():
             self._base[name] = line.written, line.received
@@ -207,6 +223,14 @@ class SteppedClock:
     def sleep_until(self, t: float) -> None:
         if t > self._t or self._unsettled:
             self._ask("advance", to=t)  # once what was written has had its effect
+
+    def write_from(self, t: float) -> None:
+        """The robot hears of it together with what comes next; only where a host stands still the time is not sure before."""
+        if self._stood[1] > -math.inf:
+            self.sleep_until(t)
+        elif t > self._t:
+            self._put_off.append(self._request("advance", to=t))
+            self._t = t
 
     def wait_readable(self, line: Line, deadline: float) -> bool:
         name = self._name(line)
@@ -241,22 +265,27 @@ class SteppedClock:
 
     @property
     def _unsettled(self) -> bool:
-        """Whether something has been written that has not had its effect yet."""
-        return any(line.written != self._settled[name] for name, line in self._lines.items())
+        """Whether something has been written, or put off, that has not had its effect yet."""
+        return bool(self._put_off) or any(line.written != self._settled[name] for name, line in self._lines.items())
 
     def _name(self, line: Line) -> str:
         return next(name for name, known in self._lines.items() if known is line)
 
-    def _ask(self, do: str, **fields: Any) -> None:
-        """Let what was written act, and take in how far time and bytes have come."""
+    def _request(self, do: str, **fields: Any) -> dict[str, Any]:
+        """A request before which all acts that was written so far."""
         self._settled = {name: line.written for name, line in self._lines.items()}
         written = {f"{name}_written": count - self._base[name][0] for name, count in self._settled.items()}
-        answer = self._control.ask(do, **written, **fields)
-        self._take(answer)
-        for name in self._lines:
-            base = self._base[name][1]
-            self._sent[name] = int(answer[f"{name}_sent"]) + base
-            self._marks[name] += [(int(count) + base, float(t)) for count, t in answer.get(f"{name}_arrivals", ())]
+        return {"do": do, **written, **fields}
+
+    def _ask(self, do: str, **fields: Any) -> None:
+        """Let what was written act, and take in how far time and bytes have come."""
+        requests, self._put_off = [*self._put_off, self._request(do, **fields)], []
+        for answer in self._control.ask_all(requests):
+            self._take(answer)
+            for name in self._lines:
+                base = self._base[name][1]
+                self._sent[name] = int(answer[f"{name}_sent"]) + base
+                self._marks[name] += [(int(count) + base, float(t)) for count, t in answer.get(f"{name}_arrivals", ())]
 
     def _take(self, answer: dict[str, Any]) -> None:
         """How far time has come."""

@@ -337,6 +337,7 @@ class Servos:
         self.bus.sync_write(64, 1, dict.fromkeys(self.ids, b"\0"))
         for _ in range(RELEASES):
             self.bus.send(write(BROADCAST, 64, b"\0").encode())
+        self.bus.clock.sleep_until(self.bus.clock.now())  # a robot whose time waits for us hears it before anybody else
 
     def still_on(self, joints: Sequence[str]) -> list[str]:
         """Those of `joints` that do not say that their torque is off: on, or silent. Never raises for a silent one."""

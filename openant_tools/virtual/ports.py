@@ -34,7 +34,9 @@ class ClientPort(Protocol):
 
     def write(self, data: bytes) -> int: ...
 
-    def baud(self, default: int) -> int: ...
+    def baud(self) -> int:
+        """The rate that the client has set, bits/s; 0 where the port has none."""
+        ...
 
     def unplug(self) -> None: ...
 
@@ -105,15 +107,12 @@ class PtyPort:
         except BlockingIOError:
             return 0
 
-    def baud(self, default: int) -> int:
-        """The rate that the client has set on its end, bits/s."""
-        if self._master is None:
-            return default
-        if not _HAS_TERMIOS2:
-            # Elsewhere a pseudo-terminal cannot be set to the rates of servos (macOS): any rate counts as right.
-            return default
+    def baud(self) -> int:
+        # Elsewhere a pseudo-terminal cannot be set to the rates of servos (macOS): any rate counts as right.
+        if self._master is None or not _HAS_TERMIOS2:
+            return 0
         answer = fcntl.ioctl(self._master, _TCGETS2, b"\0" * _TERMIOS2.size)
-        return int(_TERMIOS2.unpack(answer)[-1]) or default
+        return int(_TERMIOS2.unpack(answer)[-1])
 
 
 class TcpPort:
@@ -187,5 +186,5 @@ class TcpPort:
             self._client = None
             return 0
 
-    def baud(self, default: int) -> int:
-        return default
+    def baud(self) -> int:
+        return 0

@@ -3,7 +3,7 @@
 In real time the world is brought to "now" before each packet and every answer leaves when the wire would have
 delivered it. Bytes are stamped when they are read, which on a busy host is later than they were written; how much later
 it may have been is kept with them (`lateness`), and the wire gives the client the benefit of that doubt. In stepped
-time nothing moves but by the control socket.
+time nothing moves but by the control socket, and where requests count bytes these are written when one counts them.
 
 The control socket (Unix stream, one JSON object a line, one line of answer each):
 
@@ -107,7 +107,9 @@ class _Control:
     """One client of the control socket."""
 
     socket: socket.socket
-    buffer: bytearray = field(default_factory=bytearray)
+    rest: bytes = b""
+    #: whether its requests count the bytes that were written
+    counts: bool = False
     received: dict[str, int] = field(default_factory=dict)
     sent: dict[str, int] = field(default_factory=dict)
     #: port → (bytes sent in all, when), since this client's last settle
@@ -171,6 +173,8 @@ class Server:
             self.ports["imu"] = PtyPort(self.folder / "imu")
         self.received = dict.fromkeys(("bus", "imu"), 0)
         self.sent = dict.fromkeys(("bus", "imu"), 0)
+        #: stepped: bytes that were read, and of which no request has said yet that they are written
+        self._waiting = {name: bytearray() for name in self.received}
         #: (when read, how much earlier it may have been written, port, bytes, baud)
         self._held: list[tuple[float, float, str, bytes, int]] = []
         #: waiting for a processor; when nothing was last seen to read; how late what is read now may be
@@ -240,13 +244,17 @@ class Server:
 
     def turn(self) -> None:
         """One turn: wait for bytes or the next thing due, and do it."""
-        self._watch()
-        if self.stepped:
-            for key, _ in self._selector.select(0.05):
-                self._ready(key.data)
-            return
-        sleep_s, until = self._pause()
         ready: Sequence[tuple[selectors.SelectorKey, int]]
+        if self.stepped:
+            # Ports are read when a request counts on their bytes; in pauses, too, so that they do not fill.
+            ready = self._selector.select(0.05)
+            for key, _ in ready:
+                self._ready(key.data)
+            if not ready:
+                self._take_uncounted()
+            return
+        self._watch()
+        sleep_s, until = self._pause()
         if sleep_s > 0:
             before = time.monotonic()
             ready = self._selector.select(0)
@@ -339,16 +347,38 @@ class Server:
         data = port.read()
         if not data:
             return
+        if self.stepped:
+            self._waiting[name] += data
+            return
+        # No wire has the hop through a pseudo-terminal: here and before an answer it is taken off.
+        late_s = self._late_s + time.monotonic() - self._empty_at
+        self._hold(name, data, max(self.now - HOP_S, self.world.now), late_s)
+        self._act()
+
+    def _take(self, name: str, count: int | None = None) -> None:
+        """Stepped: let so many of the bytes that wait, or all, be written now."""
+        waiting = self._waiting[name]
+        data = bytes(waiting[:count])
+        if data:
+            del waiting[: len(data)]
+            self._hold(name, data, self.now)
+
+    def _take_uncounted(self) -> None:
+        """Stepped: read the ports; where nobody counts what is written there, it is written now."""
+        counted = any(control.counts for control in self._controls)
+        for name in self.ports:
+            self._read(name)
+            if not counted:
+                self._take(name)
+
+    def _hold(self, name: str, data: bytes, t: float, late_s: float = 0.0) -> None:
+        """Bytes that were written at `t`, or up to `late_s` (s) earlier, are to act."""
         self.received[name] += len(data)
+        baud = 0
         if name == "bus":
             self._busy_at = self.now
-        baud = port.baud(self.world.line_baud)
-        late_s = 0.0 if self.stepped else self._late_s + time.monotonic() - self._empty_at
-        # No wire has the hop through a pseudo-terminal: here and before an answer it is taken off.
-        sent = self.now if self.stepped else max(self.now - HOP_S, self.world.now)
-        self._held.append((sent, late_s, name, data, baud))
-        if not self.stepped:
-            self._act()
+            baud = self.ports[name].baud() or self.world.line_baud
+        self._held.append((t, late_s, name, data, baud))
 
     def _act(self) -> float:
         """Let held bytes act; when the last of their answers reaches the host, or the wire falls silent, s."""
@@ -440,17 +470,14 @@ class Server:
             control.socket.close()
             self._controls.remove(control)
             return
-        control.buffer += data
-        while (end := control.buffer.find(b"\n")) >= 0:
-            line = bytes(control.buffer[:end])
-            del control.buffer[: end + 1]
-            answer = self._answer(control, line)
-            with contextlib.suppress(OSError):
-                control.socket.sendall(json.dumps(answer).encode() + b"\n")
+        *lines, control.rest = (control.rest + data).split(b"\n")
+        answers = [json.dumps(self._answer(control, line)) + "\n" for line in lines]
+        with contextlib.suppress(OSError):
+            control.socket.sendall("".join(answers).encode())
 
     def _answer(self, control: _Control, line: bytes) -> dict[str, Any]:
         try:
-            request = json.loads(line)
+            request = json.loads(line.decode())
         except ValueError as error:
             return {"error": f"not a request: {error}"}
         try:
@@ -467,7 +494,9 @@ class Server:
         if do == "open":
             for name in self.ports:
                 self._read(name)
+                self._take(name)
             self._restart_counts(control)
+            control.counts = True
             return {"t": self.now}
         if do == "advance":
             return self._advance(control, request)
@@ -524,12 +553,15 @@ class Server:
         )
 
     def _arrive(self, control: _Control, request: dict[str, Any]) -> None:
-        """Wait until all bytes are here that a client says it wrote."""
+        """Wait until all bytes are here that a client says it wrote; in stepped time they are written now."""
         deadline = time.monotonic() + SETTLE_TIMEOUT_S
+        control.counts = True
         for name in self.ports:
-            wanted = int(_number(request, f"{name}_written", 0))
-            while self.received[name] - control.received[name] < wanted:
+            wanted = int(_number(request, f"{name}_written", 0)) + control.received[name]
+            while (missing := wanted - self.received[name]) > len(self._waiting[name]):
                 self._await(name, deadline)
+            if missing > 0:
+                self._take(name, missing)
 
     def _counts(self, control: _Control) -> dict[str, Any]:
         answer: dict[str, Any] = {"t": self.now}
@@ -547,6 +579,8 @@ class Server:
         if writes:
             self._arrive(control, request)
             stood = self._let_act()
+        else:
+            self._take_uncounted()
         if to > self.now or not writes:
             self.advance(to)
             stood |= self._sleep_through()
