@@ -54,6 +54,8 @@ OFF_S = 0.5
 Victim = Literal["command", "engine", "guardian", "guardian+engine"]
 #: s that a command may take to its first torque, on a machine that has much else to do
 BEGIN_S = 120.0
+#: s between two looks at a robot: before the first torque, and where a delay is measured
+SELDOM_S, OFTEN_S = 0.05, 0.005
 
 #: while all stands still, its mechanics leave the processors to those who are watched here
 STAND = "[camera]\npresent = false\n[clock]\ndoze = true\n"
@@ -180,13 +182,14 @@ def torque_after_kill(name: str, victims: tuple[Victim, ...], folder: Path) -> d
 
         def after(done: Callable[[], bool], limit_s: float) -> float:
             begin, late = time.monotonic(), 0.0
+            pause = SELDOM_S if limit_s == BEGIN_S else OFTEN_S  # when it begins is not what is measured
             while not done():
                 before = time.monotonic()
                 if before - begin > limit_s or (limit_s == BEGIN_S and command.poll() is not None):
                     kind = NotBegun if limit_s == BEGIN_S else AssertionError
                     raise kind(f"{name}: not within {limit_s:g} s; " + (folder / "log").read_text()[-800:])
-                time.sleep(0.005)
-                late += max(0.0, time.monotonic() - before - 0.006)
+                time.sleep(pause)
+                late += max(0.0, time.monotonic() - before - pause - 0.001)
             return time.monotonic() - begin - late
 
         def in_time(done: Callable[[], bool], actors: Sequence[int]) -> float:
