@@ -12,7 +12,7 @@ With S_i the average reward of policy i in a simulation and R_i on the robot:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,12 +31,14 @@ from openant_tools.files import json_text, read_json, write_text
 from openant_tools.procedure.intervals import Interval
 
 __all__ = [
-    "Agreement", "PlaceResult", "Ranking", "agreement", "find_policies", "kendall", "play", "rank", "rank_violation",
+    "Agreement", "PlaceResult", "Ranking", "agreement", "check_names", "find_policies", "kendall", "play", "rank", "rank_violation",
     "read_measured", "regret", "spearman", "write_measured",
 ]  # fmt: skip
 
 SCHEMA = "openant.policies/1"
 RESAMPLES = 2_000
+#: what the robot is called among the places of a ranking's file
+ROBOT = "real"
 
 Array = NDArray[np.float64]
 
@@ -205,7 +207,7 @@ class Ranking:
 
     def as_dict(self) -> dict[str, Any]:
         """As it stands in files."""
-        rewards = {"real": self.real, **self.simulated}
+        rewards = {ROBOT: self.real, **self.simulated}
         return {
             "schema": "openant.ranking/1",
             "policies": {
@@ -219,6 +221,12 @@ class Ranking:
         }  # fmt: skip
 
 
+def check_names(simulations: Iterable[str]) -> None:
+    """Raise BadInput where a simulation has the robot's name."""
+    if ROBOT in simulations:
+        raise BadInput(f"a simulation is called {ROBOT}, which is the robot", remedy="give it another name")
+
+
 def rank(real: Mapping[str, PlaceResult], simulated: Mapping[str, Mapping[str, PlaceResult]]) -> Ranking:
     """Say which simulation ranks policies as the robot does.
 
@@ -226,8 +234,9 @@ def rank(real: Mapping[str, PlaceResult], simulated: Mapping[str, Mapping[str, P
         real: what was measured on the robot, by policy. simulated: in simulations of it, of these policies and perhaps others.
 
     Raises:
-        BadInput: a simulation lacks a policy, or there are fewer than three.
+        BadInput: a simulation lacks a policy or is called `real`, or there are fewer than three policies.
     """
+    check_names(simulated)
     for name, measured in simulated.items():
         for policy in real:
             if policy not in measured:

@@ -173,6 +173,8 @@ def _print(ranking: Ranking) -> None:
 
 
 def _simulations(given: tuple[str, ...]) -> dict[str, str]:
+    from openant_agents.ranking import check_names
+
     places: dict[str, str] = {}
     for text in given:
         name, equals, place = text.partition("=")
@@ -181,6 +183,7 @@ def _simulations(given: tuple[str, ...]) -> dict[str, str]:
         if name in places:
             raise BadInput(f"two simulations are called {name}", remedy="give each a name of its own")
         places[name] = place
+    check_names(places)
     return places
 
 

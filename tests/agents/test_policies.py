@@ -280,6 +280,7 @@ def test_what_cannot_be_ranked_is_refused_in_one_line(runs, tmp_path, capsys):
     refused = [
         ((*rank, "--sim", "nominal"), "--sim nominal is not NAME=PLACE"),
         ((*rank, "--sim", "a=nominal", "--sim", "a=nominal"), "two simulations are called a"),
+        ((*rank, "--sim", "real=nominal"), "a simulation is called real, which is the robot"),
         ((*rank, "--sim", f"a={tmp_path}/odd.json"), "it does not say what policies achieved"),
         ((*rank, "--sim", f"a={tmp_path}/nan.json"), "a reward in it is no number"),
         ((*rank, "--sim", f"a={tmp_path}/few.json"), "a has no reward of three"),
