@@ -558,9 +558,9 @@ def _train(
         # Rows of a full ring are overwritten by and by: save them before that, however little time has passed.
         if training.save_is_due or replay.added - saved >= replay.capacity:
             save()
-        training.tell(learning)
+        training.tell(learning, agent.updates)
     save()
-    return training.end(training.step > settings.learning_start)
+    return training.end(training.step > settings.learning_start, agent.updates)
 
 
 def load_policy(folder: Path, env: gymnasium.Env[Any, Any]) -> tuple[Sac, int]:
