@@ -12,16 +12,16 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from openant_tools.bringup.run_log import LogLine, read_log
+from openant_tools.bringup.run_log import LogLine, read_log, whole_rows
 from openant_tools.comms.lateness import LATE_S
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json, read_text, reading
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 __all__ = ["DONE", "JointHeat", "Steps", "TrainingRecord", "read_training", "training_report"]
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 #: s of robot time over which a run's speed is told, and of one point of its curve
 LAST_S, WINDOW_S = 600.0, 120.0
@@ -118,7 +119,7 @@ class TrainingRecord:
         answers, lost: of the servos, and by cause those that did not come.
         processors: of this computer that a virtual robot took, on average; NaN of a real one, and in stepped time.
         of_processors: that this computer has.
-        recordings: that were read. unreadable: those that could not be.
+        recordings: that were read. unreadable: those that could not be, and rows of other files.
     """
 
     run: Path
@@ -252,12 +253,16 @@ def read_training(run: Path, forecast: Path | None = None) -> TrainingRecord:
             used_s += notes[-1]["processor_s"] - notes[0]["processor_s"]
             watched_s += notes[-1]["t"] - notes[0]["t"]
             of_processors = int(notes[-1]["processors"] or 0)
+    curve, torn_curve = _curve(run / "learning_curve.csv")
+    interventions, torn_interventions = _interventions(run / "interventions.csv")
+    log, torn_log = read_log(run)
+    unreadable += [torn for torn in (torn_curve, torn_interventions, torn_log) if torn]
     return TrainingRecord(
         run=run,
         facts=facts,
-        curve=_curve(run / "learning_curve.csv"),
-        interventions=_interventions(run / "interventions.csv"),
-        log=read_log(run),
+        curve=curve,
+        interventions=interventions,
+        log=log,
         steps=Steps.together(steps),
         heat=[
             JointHeat(joint, np.concatenate(times), np.concatenate(values), limit, foreseen.get(joint, ""))
@@ -287,22 +292,28 @@ def _offset(recording: Recording, until: float | None, before: float) -> float:
     return before if begins + before >= until else until - begins
 
 
-def _curve(path: Path) -> Array:
-    if not path.is_file():
-        return np.empty((0, 2))
-    with reading(path, "it is no learning curve", "name the --out of `openant train`"):
-        rows = list(csv.DictReader(io.StringIO(read_text(path))))
-        points = [
-            (float(row["seconds"]), float(row["average_reward_m_s"])) for row in rows if row["average_reward_m_s"]
-        ]
-    return np.array(points).reshape(-1, 2)
+def _curve(path: Path) -> tuple[Array, str]:
+    """(points, 2), and words on rows that are torn."""
+    points, torn = _read_csv(path, lambda row: (float(row["seconds"]), float(row["average_reward_m_s"] or math.nan)))
+    curve = np.array(points).reshape(-1, 2)
+    return curve[np.isfinite(curve[:, 1])], torn
 
 
-def _interventions(path: Path) -> list[tuple[float, str]]:
+def _interventions(path: Path) -> tuple[list[tuple[float, str]], str]:
+    return _read_csv(path, lambda row: (float(row["seconds"]), row["reason"]))
+
+
+def _read_csv(path: Path, make: Callable[[Mapping[str, str]], T]) -> tuple[list[T], str]:
+    """What is made of each row, none where there is no such file; and words on rows that are torn."""
     if not path.is_file():
-        return []
-    with reading(path, "it says nothing of interventions", "name the --out of `openant train`"):
-        return [(float(row["seconds"]), row["reason"]) for row in csv.DictReader(io.StringIO(read_text(path)))]
+        return [], ""
+
+    def whole(row: Mapping[str, str]) -> T:
+        if None in row or None in row.values():
+            raise ValueError
+        return make(row)
+
+    return whole_rows(path, csv.DictReader(io.StringIO(read_text(path))), whole)
 
 
 def _foreseen(path: Path) -> dict[str, str]:
@@ -408,14 +419,16 @@ def training_report(record: TrainingRecord) -> Report:
     """The page of a run."""
     late, lost = record.steps.late_share, sum(record.lost.values()) / max(record.answers, 1)
     hours = f"{number(record.robot_s / 60, 'min', decimals=1)} of robot time"
-    speed = number(100 * record.speed_m_s, "cm/s", decimals=1)
+    measured = math.isfinite(record.speed_m_s)
+    speed = number(100 * record.speed_m_s, "cm/s", decimals=1) if measured else "–"
     helped = f"{len(record.interventions)} intervention{'' if len(record.interventions) == 1 else 's'}"
     rhythm = (
         "in stepped time, which waits for the agent"
         if math.isnan(late)
         else f"{percent(late, decimals=1)} of steps late"
     )
-    verdict = f"{speed} at the end of {hours}, {rhythm}; {helped}, {record.words_given} by somebody's word."
+    reached = f"{speed} at the end of {hours}" if measured else "Ended before its speed was noted"
+    verdict = f"{reached}, {rhythm}; {helped}, {record.words_given} by somebody's word."
     busy = late > LATE_STEPS
     agent, seed = record.facts.get("agent", "agent"), record.facts.get("seed", "unknown")
     answer = ReportSummary(
@@ -428,7 +441,7 @@ def training_report(record: TrainingRecord) -> Report:
         "Find out below who held it up, and close that." if busy else f"`openant eval {record.run} --env hardware`",
         "" if math.isnan(late) else "warn" if busy else "good",
         figures=[
-            KeyFigure("speed", speed, f"last {number(min(LAST_S, record.robot_s) / 60, 'min')}"),
+            KeyFigure("speed", speed, f"last {number(min(LAST_S, record.robot_s) / 60, 'min')}" if measured else "never noted"),
             KeyFigure("steps late", percent(late, decimals=1) if not math.isnan(late) else "–", "" if not math.isnan(late) else "stepped time"),
             KeyFigure("went on by itself", f"{record.alone}×", f"{record.words_given}× by somebody's word"),
             KeyFigure("answers lost", percent(lost, decimals=2)),
@@ -445,9 +458,7 @@ def training_report(record: TrainingRecord) -> Report:
         + (f": {causes}." if causes else ".")
     )
     if record.unreadable:
-        report.section("Recordings that could not be read", open=True).text(
-            "\n".join(f"- {one}" for one in record.unreadable)
-        )
+        report.section("What could not be read", open=True).text("\n".join(f"- {one}" for one in record.unreadable))
     return report
 
 

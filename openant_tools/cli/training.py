@@ -218,10 +218,14 @@ def _page(out: Path) -> None:
     """The run's page, as far as there is something to tell."""
     from openant_tools.bringup.training_report import read_training, training_report
 
-    with contextlib.suppress(OpenAntError, OSError):
+    if not any((out / "recordings").glob("*.mcap")):
+        return
+    try:
         report = training_report(read_training(out))
         report.made_by = f"openant train report {out}"
         click.echo(f"wrote {report.write_folder(out / 'report')}", err=True)
+    except (OpenAntError, OSError) as error:
+        click.echo(f"without a page: {error}", err=True)
 
 
 def show_result(

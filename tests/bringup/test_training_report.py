@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +83,7 @@ def test_what_became_of_a_run_is_read_from_what_it_left(run: Path) -> None:
     assert record.robot_s == 1200.0
     assert record.speed_m_s == pytest.approx(0.08), "the mean of the last five windows of 120 s"
     assert (record.alone, record.words_given) == (2, 1)
-    assert [line.words for line in read_log(run)][2] == "ended: the port is gone"
+    assert [line.words for line in read_log(run)[0]][2] == "ended: the port is gone"
 
     steps = record.steps
     assert len(steps.period) == 2 * (STEPS - 1)
@@ -142,3 +143,34 @@ def test_a_run_in_stepped_time_has_no_deadlines_to_miss(run: Path) -> None:
     page = training_report(type(record)(**{**vars(record), "steps": empty, "interventions": []})).html()
     assert "in stepped time" in page
     assert "The robot never had to be set up again." in page
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+def test_rows_that_a_power_cut_tore_are_left_out_and_told(run: Path, tmp_path: Path, resumed: bool) -> None:
+    whole = read_training(run)
+    folder = shutil.copytree(run, tmp_path / "run")
+    for name, torn in (("log.csv", "2026-11-28T20:1"), ("learning_curve.csv", "11000,13"), ("interventions.csv", "9")):
+        with (folder / name).open("a") as stream:
+            stream.write(torn)
+    if resumed:
+        with (folder / "log.csv").open("a") as stream:  # by the next line, which the torn one takes along
+            stream.write("2026-11-28T20:20:00.000+00:00,begun\n2026-11-28T20:20:01.000+00:00,at it\n")
+    record = read_training(folder)
+    assert [line.words for line in record.log] == [line.words for line in whole.log] + ["at it"] * resumed
+    assert (record.curve == whole.curve).all()
+    assert record.interventions == whole.interventions
+    assert [Path(words.partition(":")[0]).name for words in record.unreadable[1:]] == [
+        "learning_curve.csv", "interventions.csv", "log.csv",
+    ]  # fmt: skip
+    assert "log.csv: row 6 torn, and left out" in html.unescape(training_report(record).html())
+    (folder / "log.csv").write_text("nothing\nof the kind\n")
+    with pytest.raises(BadInput, match=r"log\.csv: no row is what it should be"):
+        read_training(folder)
+
+
+def test_a_run_that_ended_before_its_curve_began_claims_no_speed(run: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(run, tmp_path / "run")
+    (folder / "learning_curve.csv").write_text("step,seconds,average_reward_m_s\n")
+    verdict = training_report(read_training(folder)).answer.verdict
+    assert verdict.startswith("Ended before its speed was noted, 7.7 % of steps late")
+    assert "unknown" not in verdict
