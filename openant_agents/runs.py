@@ -40,6 +40,7 @@ __all__ = [
     "SCHEMA",
     "CurvePoint",
     "TrainingRun",
+    "check_free",
     "has_checkpoint",
     "load_checkpoint",
     "making_sense",
@@ -85,11 +86,7 @@ class TrainingRun:
         self.folder = folder
         # As it will be read back: tuples as lists, keys as texts.
         self.facts: dict[str, Any] = json.loads(json_text({"schema": SCHEMA, **facts}))
-        self._claim = Claim(
-            folder / LOCK,
-            "another process trains in this folder: {}",
-            remedy="wait for it, stop it, or name another --out",
-        )
+        self._claim = _claim(folder)
         path = folder / "run.json"
         try:
             if path.is_file():
@@ -322,6 +319,30 @@ def read_curve(folder: Path) -> list[CurvePoint]:
             if math.isfinite(point.average_reward_m_s):
                 points.append(point)
     return points
+
+
+def check_free(folder: Path, facts: Mapping[str, Any]) -> None:
+    """Refuse a folder that holds another run, or in which another process trains, as far as is known before a robot is asked.
+
+    Args:
+        facts: some of what `run.json` is to say.
+
+    Raises:
+        BadInput: as `TrainingRun`.
+    """
+    path = folder / "run.json"
+    if path.is_file():
+        _claim(folder).release()
+        there, asked = read_facts(folder), json.loads(json_text(facts))
+        _check_same(path, {name: there.get(name) for name in asked}, asked)
+
+
+def _claim(folder: Path) -> Claim:
+    return Claim(
+        folder / LOCK,
+        "another process trains in this folder: {}",
+        remedy="wait for it, stop it, or name another --out",
+    )
 
 
 def _check_same(path: Path, there: Mapping[str, Any], asked: Mapping[str, Any]) -> None:

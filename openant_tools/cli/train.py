@@ -99,12 +99,15 @@ def sac(
         learn = "async" if place.hardware else "sync"
 
     from openant_agents.async_training import train_async
+    from openant_agents.runs import check_free
     from openant_agents.sac import SacSettings
     from openant_agents.sac import train as train_sac
 
     given = {"learning_start": learning_start, "entropy_start": entropy_start, "batch": batch}
     settings = settings_of(SacSettings, settings_file, "sac", given)
     more: dict[str, Any] = {"updates_per_step": updates_per_step} if learn == "async" else {}
+    env_facts = {"id": place.name, "options": place.options}
+    check_free(out, {"agent": "sac", "seed": seed, "settings": settings.as_dict(), "env": env_facts})
     with training(place, steps, out) as (env, bar):
         result = (train_async if learn == "async" else train_sac)(
             env,
@@ -112,7 +115,7 @@ def sac(
             steps=steps,
             seed=seed,
             settings=settings,
-            env_facts={"id": place.name, "options": place.options},
+            env_facts=env_facts,
             source=source,
             device=device,
             tensorboard=tensorboard,

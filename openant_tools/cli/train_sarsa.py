@@ -70,12 +70,14 @@ def sarsa(
     """
     place.options.update(dt=dt, action_range=action_range)
 
-    from openant_agents.runs import load_checkpoint
+    from openant_agents.runs import check_free, load_checkpoint
     from openant_agents.sarsa import SarsaSettings
     from openant_agents.sarsa import train as train_sarsa
 
     given = {"epsilon": epsilon, "step_size": step_size, "reward_scale": reward_scale}
     settings = settings_of(SarsaSettings, settings_file, "sarsa", given)
+    env_facts = {"id": place.name, "options": place.options}
+    check_free(out, {"agent": "sarsa", "seed": seed, "settings": settings.as_dict(), "env": env_facts})
     with training(place, steps, out) as (env, bar):
         result = train_sarsa(
             env,
@@ -83,7 +85,7 @@ def sarsa(
             steps=steps,
             seed=seed,
             settings=settings,
-            env_facts={"id": place.name, "options": place.options},
+            env_facts=env_facts,
             source=source,
             tensorboard=tensorboard,
             report=bar.show,

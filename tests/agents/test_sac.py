@@ -349,6 +349,7 @@ def test_train_and_eval_from_the_command_line(trained, tmp_path, capsys):
     robot, out, result = trained
     assert result["steps"] == 220
     assert result["seconds"] == pytest.approx(4.4)
+    assert result["updates"] == 20
     assert (out / "learning_curve.csv").read_text().splitlines()[0] == "step,seconds,average_reward_m_s"
     assert [point.step for point in read_curve(out)] == [100, 200]
     assert (out / "learning_curve.png").stat().st_size > 5_000
@@ -393,6 +394,7 @@ def test_commands_refuse_in_one_line(trained, tmp_path, capsys, monkeypatch):
         (("train", "sac", "--kit", "lite", "--dt", 0.0005, "--out", "x"), "dt = 0.0005 s is no whole number"),
         (("train", "sac", "--robot", other.path, "--out", "x"), "the effect action_delay does not act as an entry"),
         (("train", "sac", "--robot", robot.path, "--seed", 2, "--out", out), "this folder holds another run"),
+        (("train", "sac", "--robot", robot.path, "--env", "hardware", "--yes", "--out", out), "holds another run"),
         (("train", "sac", "--kit", "lite", "--device", "abacus", "--out", "x"), "torch cannot compute on abacus"),
         (("eval", tmp_path), "there is no training run here"),
         (("eval", out, "--seconds", 0), "Invalid value for '--seconds': 0.0 is not in the range"),
@@ -404,6 +406,7 @@ def test_commands_refuse_in_one_line(trained, tmp_path, capsys, monkeypatch):
         assert words in printed, arguments
         assert "Traceback" not in printed
     assert not (tmp_path / "x").exists()
+    assert not (out / "log.csv").exists(), "what was refused is none of that run's"
     (damaged / "checkpoint.pt").write_bytes((out / "checkpoint.pt").read_bytes()[:1000])
     assert run_command("eval", damaged) == 2
     assert "the checkpoint cannot be read" in capsys.readouterr().err
