@@ -253,9 +253,10 @@ class SteppedClock:
     def arrivals(self, line: Line) -> list[tuple[int, float]]:
         name = self._name(line)
         here = [mark for mark in self._marks[name] if mark[0] <= line.received]
-        self._marks[name] = self._marks[name][len(here) :]
+        rest = self._marks[name] = self._marks[name][len(here) :]
         if not here or here[-1][0] < line.received:
-            here.append((line.received, self._t))
+            # A pseudo-terminal may bring a portion in parts: each came when the whole did, whatever else this computer does.
+            here.append((line.received, rest[0][1] if rest else self._t))
         # Who stood still finds all that came meanwhile when it goes on.
         fell_asleep, woke = self._stood
         return [(count, woke if fell_asleep <= t < woke else t) for count, t in here]

@@ -11,14 +11,15 @@ import threading
 import time
 import tty
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import pytest
 from faulty_line import IDS, FaultyLine, register_bytes
 from places import ROOT
+from wire import MemoryLine
 
 from openant_tools.comms.bus import Bus, BusTiming
-from openant_tools.comms.clock import RealClock, portions
+from openant_tools.comms.clock import RealClock, SteppedClock, portions
 from openant_tools.comms.faults import BrokenAnswer, Cause, NeverSilent, NoAnswer
 from openant_tools.comms.line import PortGone, SerialLine
 from openant_tools.comms.protocol2 import Status
@@ -276,3 +277,26 @@ def test_a_line_whose_other_end_is_gone_is(terminal: tuple[int, SerialLine]) -> 
     os.close(master)
     with pytest.raises(PortGone):
         line.read()
+
+
+class Told:
+    """A robot's control socket: four bytes came at 1.001 s, four more at 1.003 s."""
+
+    path = "control"
+
+    def ask(self, do: str, **fields: object) -> dict[str, object]:
+        return {"t": 1.0, "stepped": True}
+
+    def ask_all(self, requests: Sequence[object]) -> list[dict[str, object]]:
+        said = {"bus_sent": 8, "bus_arrivals": [[4, 1.001], [8, 1.003]], "imu_sent": 0, "imu_arrivals": []}
+        return [{"t": 1.004, **said} for _ in requests]
+
+
+def test_in_stepped_time_bytes_that_a_terminal_brings_in_parts_came_when_the_robot_sent_them() -> None:
+    line = MemoryLine()
+    clock = SteppedClock(Told(), bus=line)  # type: ignore[arg-type]
+    clock.sleep_until(1.004)
+    line.received = 6
+    assert clock.arrivals(line) == [(4, 1.001), (6, 1.003)]
+    line.received = 8
+    assert clock.arrivals(line) == [(8, 1.003)]
