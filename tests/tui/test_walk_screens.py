@@ -307,6 +307,8 @@ def test_the_whole_walk_from_loose_motors_to_the_passport_and_on_to_learning(
     how = [
         "--steps",
         "10",
+        "--learn",
+        "sync",
         "--env",
         "hardware",
         "--virtual",
