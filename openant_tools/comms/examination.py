@@ -47,6 +47,10 @@ def watchdogs_tripped(hardware: Hardware, seconds: float) -> Trip | None:
 
 def examined(trip: Trip, hardware: Hardware) -> Trip:
     """The same stop, said more exactly where it asks for that; everyone is released first."""
+    late = hardware.port.clock.lateness
+    if trip.joint is None and trip.cause is StopCause.SILENCE and late.busy and late.words:
+        # Most servos at once: a computer that comes late loses answers as noise does.
+        return replace(trip, what=f"{trip.what}; {late.words}", remedy=f"{REMEDY}; if it happens again: {trip.remedy}")
     if trip.joint is None or not trip.examine or hardware.port.bus.restless:
         return trip
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import re
@@ -14,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -81,6 +83,21 @@ def answers(robot: dict[str, str]) -> bool:
         return bool(config(robot))
     except HardwareFault:
         return False
+
+
+def again_where_late(test: Callable[..., None]) -> Callable[..., None]:
+    """Three tries for a test in real time, where what it was told blames this computer: then it says nothing of the engine."""
+
+    @functools.wraps(test)
+    def tried(*given: Any, **named: Any) -> None:
+        for left in (2, 1, 0):
+            try:
+                return test(*given, **named)
+            except (AssertionError, HardwareFault) as error:
+                if not left or "this computer was late" not in str(error):
+                    raise
+
+    return tried
 
 
 def wait_until(what: Callable[[], bool]) -> None:
@@ -351,8 +368,9 @@ def test_two_servos_with_one_id_are_told_from_a_cable(live: dict[str, str]) -> N
             control.close()
 
 
+@again_where_late
 def test_unplugging_stops_the_motion_and_plugging_in_goes_on_from_there(live: dict[str, str], tmp_path: Path) -> None:
-    out = tmp_path / "run.mcap"
+    out = tmp_path / f"run-{len(list(tmp_path.iterdir()))}.mcap"
     control = VirtualControl(live["control"])
     with connected(live) as engine:
         engine.ask(messages.Torque(True))
@@ -360,9 +378,11 @@ def test_unplugging_stops_the_motion_and_plugging_in_goes_on_from_there(live: di
         moving = engine.start(messages.Play(np.repeat(HOME[None, :], 3000, axis=0)))
         time.sleep(0.5)
         control.ask("fault", cause="usb_unplug", device="bus", on=True)
-        with pytest.raises(HardwareFault, match=r"the port is gone .* watchdog stops them"):
-            wait_until(lambda: engine.done(moving))
-        control.ask("fault", cause="usb_unplug", device="bus", on=False)
+        try:
+            with pytest.raises(HardwareFault, match=r"the port is gone .* watchdog stops them"):
+                wait_until(lambda: engine.done(moving))
+        finally:
+            control.ask("fault", cause="usb_unplug", device="bus", on=False)
         said: list[str] = []
 
         def back() -> bool:
@@ -407,11 +427,19 @@ def moving(live: dict[str, str], tmp_path: Path) -> Iterator[tuple[subprocess.Po
     """A program that moves the legs: its process, the ids of engine and guardian, and its recording."""
     import pickle
 
-    out = tmp_path / "run.mcap"
+    out, log = tmp_path / "run.mcap", tmp_path / "log"
     payload = pickle.dumps((config(live), HOME, str(out))).hex()
-    parent = subprocess.Popen([sys.executable, "-c", PARENT, payload], stdout=subprocess.PIPE, text=True)
-    assert parent.stdout is not None
-    pids = json.loads(parent.stdout.readline())
+    for left in (2, 1, 0):
+        with log.open("wb") as errors:
+            words = [sys.executable, "-c", PARENT, payload]
+            parent = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=errors, text=True)
+        assert parent.stdout is not None
+        said = parent.stdout.readline()
+        if said:
+            break
+        assert left, log.read_text()
+        assert "this computer was late" in log.read_text()
+    pids = json.loads(said)
     wait_until(lambda: all(torques(live)))
     time.sleep(1.5)  # a second of recording reaches the disk
     yield parent, pids, out
