@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from openant_tools.cli.hardware import Moving, adapter_option, camera_option, imu_option
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import json_option
 from openant_tools.cli.virtual_for_command import virtual_option
 from openant_tools.numbers import number
@@ -81,7 +82,7 @@ def bringup(
         def notice(step: Step, found: Finding | None) -> None:
             place = list(WALK).index(step.name) + 1
             if found is None:
-                click.echo(f"{place}/{len(WALK)} {step.title}", err=True)
+                mention(f"{place}/{len(WALK)} {step.title}")
             else:
                 click.echo(f"{place}/{len(WALK)} {step.title}: ", nl=False)
                 echo_finding(found)

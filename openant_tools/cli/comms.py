@@ -16,6 +16,7 @@ from openant_tools.cli.comms_diagnose import diagnose, timing
 from openant_tools.cli.comms_reboot import reboot
 from openant_tools.cli.comms_soak import soak
 from openant_tools.cli.hardware import engine_config, port_option, robot_of
+from openant_tools.cli.log import aside
 from openant_tools.cli.options import SECONDS, driver_option, json_option, robot_option
 from openant_tools.cli.virtual_for_command import clock_of_its_own, virtual_option, virtual_robot
 from openant_tools.numbers import number, percent
@@ -93,14 +94,13 @@ def scan(
 
     Exit code 1 where something answers garbled, or where others may be missing from the list: the reason is on stderr.
     """
-    from rich.console import Console
 
     from openant_tools.comms.ports import Host
     from openant_tools.comms.silence import LEVELS
     from openant_tools.comms.troubles import SILENCE
     from openant_tools.errors import HardwareFault
 
-    console = Console(stderr=True)
+    console = aside()
     rows: list[dict[str, Any]] = []
     bad = False
     with contextlib.ExitStack() as stack:
@@ -181,7 +181,6 @@ def bench(
     port: str | None, virtual_source: str | None, robot: Path | None, seconds: float, json_file: Path | None
 ) -> None:
     """Measure the rate this bus reaches and the quiet time it needs after a write. Torque is off, nothing moves."""
-    from rich.console import Console
 
     from openant_tools.comms.bench import measure_gap, measure_rate
     from openant_tools.comms.lateness import REMEDY
@@ -189,7 +188,7 @@ def bench(
     from openant_tools.comms.setup import open_bus
     from openant_tools.comms.silence import explaining
 
-    console = Console(stderr=True)
+    console = aside()
     # Stepped, a virtual robot shows its bus and nothing of what else this machine does.
     with engine_config(robot_of(robot, needed=False), port, virtual_source) as config:
         bus = open_bus(config.port, config.baud, config.control)

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from openant_tools.cli import blind_sets as sets
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import Number, json_option, out_option
 from openant_tools.cli.progress import progress_bar
 
@@ -90,6 +91,6 @@ def score(folder: Path, key_file: Path | None, docs: Path | None, so_far: bool, 
         write_text(json_file, json_text(found.as_json()))
     if docs:
         write_soak_docs(found, docs)
-        click.echo(f"wrote {docs}", err=True)
+        mention(f"wrote {docs}")
     if not found.good:
         click.get_current_context().exit(1)

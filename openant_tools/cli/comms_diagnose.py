@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import json_option, report_option, robot_option, write_report
 from openant_tools.numbers import percent
 
@@ -76,7 +77,7 @@ def diagnose(
         folder = robot_of(robot, needed=True)
         assert folder is not None
         finding = dropouts_finding(found, [folder.relative(path) for path in runs])
-        click.echo(f"wrote {keep_finding(finding, folder)}", err=True)
+        mention(f"wrote {keep_finding(finding, folder)}")
     if found.verdict != "none":
         click.get_current_context().exit(1)
 

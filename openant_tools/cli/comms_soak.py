@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from openant_tools.cli.hardware import Moving, anyway_option, engine_config, may_move, port_option, robot_of, yes_option
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import MINUTES, json_option, rate_option, robot_option
 from openant_tools.cli.progress import BarFace, progress_bar
 from openant_tools.cli.virtual_for_command import VIRTUAL_DEFAULT, virtual_option
@@ -138,7 +139,7 @@ def _on_the_bus(
         content = {"run": str(done.path), "seconds": done.seconds, "rows": done.cycles, "stops": list(done.stops),
                    "ended": done.ended, "whole": done.whole, "statistics": done.statistics}  # fmt: skip
         write_text(json_file, json_text(content))
-    click.echo(f"`openant comms diagnose {done.path}` says why", err=True)
+    mention(f"`openant comms diagnose {done.path}` says why")
     if done.ended:
         click.echo(f"openant: {'the soak' if still else 'motion'} has ended for good: {done.ended}", err=True)
     if not done.whole:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import json_option, robot_folder, robot_option
 from openant_tools.errors import BadInput
 from openant_tools.numbers import exact, number, span
@@ -70,7 +71,7 @@ def check(robot: Path | None, json_file: Path | None) -> int:
     from openant_tools.optional import opencv
     from openant_tools.robot.folder import RobotFolder
 
-    click.echo(f"note: {opencv().words}", err=True)  # which is asked for before there is a robot, too
+    mention(f"note: {opencv().words}")  # which is asked for before there is a robot, too
     folder = RobotFolder.at(robot_folder(robot))
     _, located = folder.check()
     errors = [entry for entry in located if entry.problem.severity == "error"]
@@ -144,7 +145,7 @@ def export(robot: Path | None, out: Path | None, grid: bool, kind: str) -> None:
     data = export_platform_config(configuration, imported_object(folder), on_grid=grid)
     text = json_text(data, indent=4)
     for note in export_notes(configuration, out, on_grid=grid):
-        click.echo(f"note: {note}", err=True)
+        mention(f"note: {note}")
     if out is None:
         click.echo(text, nl=False)
     else:

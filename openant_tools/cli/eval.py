@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from openant_tools.cli.hardware import Moving
+from openant_tools.cli.log import aside
 from openant_tools.cli.options import SECONDS, json_option
 from openant_tools.cli.walking import (
     HARDWARE_ID,
@@ -100,7 +101,6 @@ def eval_(
     from openant_tools.cli.learning import need_agents
 
     need_agents()
-    from rich.console import Console
     from rich.progress import Progress
 
     from openant_agents.evaluate import LIKELIEST, SAMPLED, evaluate
@@ -151,7 +151,7 @@ def eval_(
     with environment(name, options, run / "recordings", **more) as env:
         policy = load_policy(run, env)
         found = []
-        with Progress(console=Console(stderr=True), transient=True) as bar:
+        with Progress(console=aside(), transient=True) as bar:
             task = bar.add_task("walking", total=len(ways) * starts * seconds)
             for played, way in enumerate(ways):
 

@@ -10,6 +10,7 @@ from typing import Any, cast
 import click
 
 from openant_tools.cli import blind_sets as sets
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import Number, json_option, out_option, report_option, write_report
 from openant_tools.cli.progress import progress_bar
 from openant_tools.errors import BadInput
@@ -177,6 +178,6 @@ def score(
         write_report(score_report(found), report, folders)
     if docs:
         write_docs(found, docs)
-        click.echo(f"wrote {docs}", err=True)
+        mention(f"wrote {docs}")
     if any(row.reached == "below" for rows in found.makers.values() for row in rows):
         click.get_current_context().exit(1)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import joint_option, json_option, report_option, robot_option, write_report
 from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.runs import checked, model_of, read_runs
@@ -140,9 +141,9 @@ def apply(diagnosis: Path, model: Path | None, out: Path, robot: Path | None, en
     for line in done.carried:
         click.echo(line)
     for line in done.notes:
-        click.echo(line, err=True)
+        mention(line)
     for path in done.written:
-        click.echo(f"wrote {path}", err=True)
+        mention(f"wrote {path}")
 
 
 @click.command("next")

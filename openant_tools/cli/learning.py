@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from openant_tools.cli.log import aside
 from openant_tools.cli.options import robot_folder
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json
@@ -109,7 +110,6 @@ class LearningBar:
     """
 
     def __init__(self, steps: int, folder: Path | None = None) -> None:
-        from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
         from rich.progress import Progress as RichProgress
 
@@ -119,7 +119,7 @@ class LearningBar:
             MofNCompleteColumn(),
             TextColumn("{task.fields[words]}"),
             TimeRemainingColumn(),
-            console=Console(stderr=True),
+            console=aside(),
         )
         self._task = self._bar.add_task("learning", total=steps, words="")
         self._watch: DropWatch | None = None

@@ -11,11 +11,14 @@ import os
 import shlex
 import sys
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
-__all__ = ["FILE", "begin", "command_line", "is_quiet", "log_options", "state_folder"]
+if TYPE_CHECKING:
+    from rich.console import Console
+
+__all__ = ["FILE", "aside", "begin", "command_line", "is_quiet", "log_options", "mention", "state_folder"]
 
 FILE = "openant.log"
 LARGEST, KEPT = 1_000_000, 3
@@ -82,6 +85,19 @@ def command_line() -> str:
 def is_quiet() -> bool:
     """Whether -q was given: nothing but errors on stderr."""
     return _level < 0
+
+
+def mention(words: str) -> None:
+    """Say a line on stderr that is no error: not with -q."""
+    if not is_quiet():
+        click.echo(words, err=True)
+
+
+def aside(**options: Any) -> Console:
+    """A console on stderr for bars and lines that are no errors: silent with -q."""
+    from rich.console import Console
+
+    return Console(stderr=True, quiet=is_quiet(), **options)
 
 
 def log_options() -> list[click.Option]:

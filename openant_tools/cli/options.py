@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from openant_tools.cli.log import mention
 from openant_tools.errors import BadInput
 from openant_tools.numbers import exact
 
@@ -84,7 +85,7 @@ def write_report(report: Report, folder: Path, recordings: Sequence[Path] = ()) 
     made_by = command_line()
     report.made_by = made_by if " " in made_by else report.made_by
     report.recordings = tuple(recordings) or report.recordings
-    click.echo(f"wrote {report.write_folder(folder)}", err=True)
+    mention(f"wrote {report.write_folder(folder)}")
 
 
 out_option = click.option("--out", type=click.Path(path_type=Path), required=True, metavar="PATH", help="What to make.")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import robot_folder, robot_option
 
 __all__ = ["passport"]
@@ -19,4 +20,4 @@ def passport(robot: Path | None) -> None:
     from openant_tools.robot.folder import RobotFolder
 
     for path in write_passport(RobotFolder.at(robot_folder(robot))):
-        click.echo(f"wrote {path}", err=True)
+        mention(f"wrote {path}")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import json_option
 from openant_tools.numbers import number
 
@@ -71,6 +72,6 @@ def plot(runs: tuple[Path, ...], out: Path, singly: bool, json_file: Path | None
                 f"reward drop in {curve.folder} at {number(drop.from_s / 60, 'min', decimals=0)}: {number(100 * drop.best_m_s, decimals=1)} →"
                 f" {number(100 * drop.lowest_m_s, 'cm/s', decimals=1)}, {back}; what preceded it: {path}"
             )
-    click.echo(f"wrote {out}", err=True)
+    mention(f"wrote {out}")
     if json_file is not None:
         write_text(json_file, json_text(answer, indent=None))

@@ -12,6 +12,7 @@ import click
 from openant_tools.cli.eval import STARTS_IN_SIMULATION, STARTS_ON_A_ROBOT
 from openant_tools.cli.hardware import Moving
 from openant_tools.cli.learning import need_agents
+from openant_tools.cli.log import aside
 from openant_tools.cli.options import SECONDS, json_option, report_option, write_report
 from openant_tools.errors import BadInput
 from openant_tools.numbers import number, percent
@@ -199,7 +200,6 @@ def _play(
     wrapper: Callable[[Any], Any] | None = None,
 ) -> Any:
     """(name, what it achieved) of each policy, with progress; from a file where the place is one."""
-    from rich.console import Console
     from rich.progress import Progress
 
     from openant_agents.ranking import play as play_one
@@ -215,7 +215,7 @@ def _play(
     def made(facts: Mapping[str, Any]) -> Any:
         return make(facts) if wrapper is None else wrapper(make(facts))
 
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    with Progress(console=aside(), transient=True) as bar:
         task = bar.add_task(place, total=1.0)
 
         def tell(share: float) -> None:

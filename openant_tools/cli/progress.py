@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import click
-
+from openant_tools.cli.log import aside, mention
 from openant_tools.numbers import percent
 from openant_tools.procedure.step import Answer, Event, Progress, Say
 from openant_tools.workers import pass_on
@@ -35,21 +34,20 @@ def progress_bar(
         lines: whether a line is said for every twentieth where there is no terminal.
     """
     import rich.progress
-    from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     said = -1
     columns = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
     if remaining:
         columns.append(TimeRemainingColumn())
-    with rich.progress.Progress(*columns, console=console or Console(stderr=True), transient=True) as bar:
+    with rich.progress.Progress(*columns, console=console or aside(), transient=True) as bar:
         task = bar.add_task(words, total=1.0)
 
         def tell(share: float, words: str) -> None:
             nonlocal said
             if lines and not bar.console.is_terminal and int(share * TOLD) > said:
                 said = int(share * TOLD)
-                click.echo(f"{percent(share):>5}  {words}", err=True)
+                mention(f"{percent(share):>5}  {words}")
             bar.update(task, description=words, completed=share)
             pass_on(share, words)
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from openant_tools.cli.log import aside, mention
 from openant_tools.cli.options import json_option
 from openant_tools.errors import BadInput
 from openant_tools.numbers import number, percent, span
@@ -242,14 +243,13 @@ def import_(
         return
     if calibration is not None or names or units is not None:
         raise BadInput("--calibration, --joints and --units are of LeRobot's datasets", remedy="add --from lerobot")
-    from rich.console import Console
     from rich.progress import Progress
 
     from openant_tools.recording.convert import import_run
     from openant_tools.recording.tables import read_run
 
     run = read_run(source, need=())
-    console = Console(stderr=True)
+    console = aside()
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(f"importing {run.name}", total=1.0)
         path = import_run(run, out, progress=lambda share: bar.update(task, completed=share))
@@ -272,7 +272,7 @@ def _import_lerobot(root: Path, calibration: Path | None, names: tuple[str, ...]
         )
     conversion = read_conversion(root, calibration, rename, units)
     for remark in conversion.remarks:
-        click.echo(remark, err=True)
+        mention(remark)
     for run in convert(conversion):
         path = out / f"{run.name}.parquet"
         write_table(run, path)

@@ -6,8 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import click
-
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import robot_folder
 
 if TYPE_CHECKING:
@@ -99,4 +98,4 @@ def checked(
 def say(lines: Iterable[str]) -> None:
     """Notes, a line each, on stderr."""
     for line in lines:
-        click.echo(line, err=True)
+        mention(line)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from openant_tools.cli.log import aside
 from openant_tools.numbers import number
 
 if TYPE_CHECKING:
@@ -25,9 +26,8 @@ class StageLines:
     """
 
     def __init__(self, whole: StagedFolder, stages: Sequence[Stage]) -> None:
-        from rich.console import Console
 
-        self.console = Console(stderr=True, highlight=False)
+        self.console = aside(highlight=False)
         self.began = time.monotonic()
         self._whole = whole
         self._name = max(len(stage.name) for stage in stages)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from openant_tools.cli.hardware import Moving, engine_config, port_option, robot_of, yes_option
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import POSITIVE, SECONDS, Number, json_option, report_option, robot_option, write_report
 from openant_tools.cli.virtual_for_command import virtual_option
 
@@ -327,5 +328,5 @@ def _conclude(finding: Finding, folder: RobotFolder | None, json_file: Path | No
 
     echo_numbers(finding)
     if folder is not None:
-        click.echo(f"wrote {keep(finding, folder)}", err=True)
+        mention(f"wrote {keep(finding, folder)}")
     return show_finding(finding, json_file)

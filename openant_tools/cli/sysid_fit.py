@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import model_option, report_option, robot_folder, robot_option, tie_option, write_report
 from openant_tools.cli.progress import progress_bar
 from openant_tools.cli.runs import read_runs, say
@@ -136,7 +137,7 @@ def fit(
     if not accepted:
         click.echo("nothing that was fitted beats the given model on held-out runs; calibrated.xml is the given model")
     for path in written:
-        click.echo(f"wrote {path}", err=True)
+        mention(f"wrote {path}")
     return 0 if accepted else 1
 
 

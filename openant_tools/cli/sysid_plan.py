@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from openant_tools.cli.hardware import robot_of
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import (
     Number,
     json_option,
@@ -153,7 +154,7 @@ def plan(
         write_plan(
             out, made, f"made by `openant sysid plan` for {model.name}; play it with `openant sysid record --plan`"
         )
-        click.echo(f"wrote {out}", err=True)
+        mention(f"wrote {out}")
     if json_file is not None:
         write_text(json_file, json_text(result.as_json()))
     if report is not None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from openant_tools.cli.log import command_line
+from openant_tools.cli.log import command_line, mention
 from openant_tools.cli.options import Number, json_option, report_option, robot_option, write_report
 from openant_tools.numbers import exact, number, percent
 
@@ -95,7 +95,7 @@ def fit(
             then, told, command=command_line(), recording=folder.relative(runs[-1]), held=held,
             rest=rest_advice(then), warning=_warning(folder),
         )  # fmt: skip
-        click.echo(f"wrote {keep(finding, folder, folder.relative(runs[-1]))}", err=True)
+        mention(f"wrote {keep(finding, folder, folder.relative(runs[-1]))}")
     return 1 if held is not None and held.rms_k > BELIEVED_K else 0
 
 
@@ -324,13 +324,13 @@ def _keep_rules(folder: RobotFolder, rules: dict[str, dict[str, float]], run: Pa
     from openant_tools.robot.config import Provenance
 
     if not rules:
-        click.echo("no servo needs derating under this load; robot.toml is left as it is", err=True)
+        mention("no servo needs derating under this load; robot.toml is left as it is")
         return
     now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
     source = Provenance("forecast", command_line(), folder.relative(run), now)
     values = {f"derating.{joint}.{key}": value for joint, rule in rules.items() for key, value in rule.items()}
     folder.update(values, provenance={f"derating.{joint}": source for joint in rules})
-    click.echo(f"wrote {folder.config_file}", err=True)
+    mention(f"wrote {folder.config_file}")
 
 
 def _torques(loads: tuple[str, ...]) -> dict[str, float]:

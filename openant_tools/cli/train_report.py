@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import json_option, write_report
 
 __all__ = ["report"]
@@ -39,7 +40,7 @@ def report(run: Path, forecast: Path | None, out: Path | None, json_file: Path |
     page = training_report(record)
     click.echo(page.answer.verdict)
     for one in record.unreadable:
-        click.echo(f"left out: {one}", err=True)
+        mention(f"left out: {one}")
     write_report(page, out or run / "report")
     if json_file is not None:
         write_text(json_file, json_text(record.as_json(), indent=2))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from openant_tools.cli.learning import LearningBar, kit_option, need_agents, robot_argument
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import robot_option
 from openant_tools.cli.walking import (
     HARDWARE_ID,
@@ -181,7 +182,7 @@ def _going_on(out: Path) -> Iterator[None]:
     try:
         yield
     except (KeyboardInterrupt, HardwareFault):
-        click.echo(f"saved in {out}; the same command goes on from there", err=True)
+        mention(f"saved in {out}; the same command goes on from there")
         raise
 
 
@@ -203,7 +204,7 @@ def _told_at_its_end(out: Path) -> Iterator[None]:
         why = "all steps are done"
     except KeyboardInterrupt:
         why, page = "interrupted", False
-        click.echo(f"its page: openant train report {out}", err=True)
+        mention(f"its page: openant train report {out}")
         raise
     except OpenAntError as error:
         why = str(error)
@@ -223,7 +224,7 @@ def _page(out: Path) -> None:
     try:
         report = training_report(read_training(out))
         report.made_by = f"openant train report {out}"
-        click.echo(f"wrote {report.write_folder(out / 'report')}", err=True)
+        mention(f"wrote {report.write_folder(out / 'report')}")
     except (OpenAntError, OSError) as error:
         click.echo(f"without a page: {error}", err=True)
 

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from openant_tools.cli.learning import LearningBar, kit_option, need_agents, robot_argument
+from openant_tools.cli.log import mention
 from openant_tools.cli.options import json_option, robot_option
 from openant_tools.errors import BadInput
 from openant_tools.numbers import number
@@ -84,14 +85,13 @@ def tune(
 
     def tell(study: Any, trial: Any) -> None:
         if trial.value is None:
-            click.echo(f"trial {trial.number}: {trial.user_attrs.get('failed', trial.state.name.lower())}", err=True)
+            mention(f"trial {trial.number}: {trial.user_attrs.get('failed', trial.state.name.lower())}")
         else:
             each = ", ".join(
                 number(100 * value, sign=True, decimals=1) for value in trial.user_attrs["average_reward_m_s"]
             )
-            click.echo(
+            mention(
                 f"trial {trial.number}: {number(100 * trial.value, 'cm/s', sign=True, decimals=2)} ({each}); best {number(100 * study.best_value, sign=True, decimals=2)}",
-                err=True,
             )
 
     with LearningBar(length) as bar:

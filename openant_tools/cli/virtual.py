@@ -9,6 +9,8 @@ from pathlib import Path
 
 import click
 
+from openant_tools.cli.log import mention
+
 __all__ = ["virtual"]
 
 
@@ -88,7 +90,7 @@ def start(
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
-        click.echo("stopped", err=True)
+        mention("stopped")
 
 
 def _await_eof(ended: threading.Event) -> None:

@@ -94,8 +94,12 @@ def test_every_command_can_say_more_or_less_and_the_log_keeps_all(
     assert run("config", "show", "--robot", tmp_path / "ant", "-v") == 0
     assert run("-q", "config", "show", "--robot", tmp_path / "ant") == 0
     assert capsys.readouterr().err == ""
+    assert run("config", "check", "--robot", tmp_path / "ant") == 0
+    assert "OpenCV" in capsys.readouterr().err, "-q was of the command before"
+    assert run("config", "check", "--robot", tmp_path / "ant", "-q") == 0
+    assert capsys.readouterr().err == ""
     log = (tmp_path / "openant" / "openant.log").read_text()
-    assert log.count(" INFO openant_tools[") == 3
+    assert log.count(" INFO openant_tools[") == 5
     assert f"openant config new --robot {tmp_path / 'ant'}" in log
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "ant" / "robot.toml"))  # a file: nothing can be kept there
     assert run("config", "show", "--robot", tmp_path / "ant") == 0
