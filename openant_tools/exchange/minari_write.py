@@ -200,6 +200,6 @@ def _episodes(rows: Floats, o: int, a: int) -> Iterator[MinariEpisode]:
 
 
 def _folder_of(facts: Mapping[str, Any]) -> RobotFolder | None:
-    named = facts.get("env", {}).get("robot")
+    named = facts.get("env", {}).get("options", {}).get("robot")
     place = Path(str(named)) if named else None
     return RobotFolder.at(place) if place is not None and (place / "robot.toml").is_file() else None

@@ -178,8 +178,10 @@ def test_a_training_run_becomes_episodes_that_end_where_someone_helped(tmp_path:
     pytest.importorskip("pyarrow")
     run = tmp_path / "sac-1"
     run.mkdir()
+    robot = create_robot(tmp_path / "ant", "standard", "lucy").path
     facts = {
-        "schema": "openant.train/1", "agent": "sac", "observations": 2, "actions": 1, "env": {},
+        "schema": "openant.train/1", "agent": "sac", "observations": 2, "actions": 1,
+        "env": {"id": "openant/Ant-v0", "options": {"robot": str(robot)}},
         "trained_on": {"observation_names": ["pos.a", "vel.a"], "action_names": ["a"]},
     }  # fmt: skip
     (run / "run.json").write_text(json.dumps(facts))
@@ -195,3 +197,4 @@ def test_a_training_run_becomes_episodes_that_end_where_someone_helped(tmp_path:
     assert first["truncations"][-1]
     assert second["terminations"][-1]
     assert second["actions"].ravel().tolist() == [-0.5, -0.5]
+    assert "lucy, standard kit" in (tmp_path / "set" / "README.md").read_text()
