@@ -14,6 +14,7 @@ import click
 
 from openant_tools.cli.hardware import may_move, record_pictures_option
 from openant_tools.cli.learning import robot_argument
+from openant_tools.cli.log import mention
 from openant_tools.cli.virtual_for_command import virtual_option
 from openant_tools.errors import BadInput
 
@@ -102,8 +103,8 @@ def environment(
     if name != HARDWARE_ID:
         env = gymnasium.make(name, max_episode_steps=-1, **options, **more)
         if not env.unwrapped.robot.identified:
-            _notice(
-                f"{options['robot']} was never identified: this is the kit's nominal model, not that robot "
+            mention(
+                f"openant: {options['robot']} was never identified: this is the kit's nominal model, not that robot "
                 "(`openant sysid fit … --robot DIR` makes it one)"
             )
         try:
