@@ -15,7 +15,7 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from openant_tools.effects.document import Document, Writer
-from openant_tools.effects.step import DAMPED, TINY, Step
+from openant_tools.effects.step import DAMPED, TINY, Law, Step
 from openant_tools.model.mjcf import in_degrees, number, numbers
 
 __all__ = ["Fields", "Transmission", "hinges"]
@@ -34,30 +34,41 @@ class Fields:
 
     Attributes:
         armature, damping, friction: kg·m², N·m·s/rad, N·m. link: kg·m², inertia of the joint's links without the rotor.
-        damp: gives the joints another damping, (n, joints) N·m·s/rad, from the step on that comes.
+        weigh: gives the joints another armature, (n, joints) kg·m², from the step on that comes.
     """
 
     armature: Array
     damping: Array
     friction: Array
     link: Array
-    damp: Callable[[Array], None]
+    weigh: Callable[[Array], None]
 
 
 class Transmission:
     """A rotor behind play or a spring; the servo's loop closes over both, as the encoder sits on the output, or `before` them.
 
-    The rotor is integrated here, the link by MuJoCo. Both take what passes between them implicitly, as teeth are far too stiff
-    for steps that long: a spring k that is seen where it will be at the step's end is a spring and a damper k·dt.
+    The rotor is integrated here, the link by MuJoCo, both by one implicit step, since teeth are far too stiff for steps that long: how
+    fast the rotor will be is a linear function of how fast the link will be, put into the link's own equation (its Schur complement).
+    What that adds to the link goes with its acceleration, so it is an armature: a contact then meets a link that carries its rotor,
+    as far as teeth are stiff and touch.
 
     Args:
         play: (robots, joints) rad. compliance: the same in rad per N·m. before: (robots, 1).
+        rubbing: makes the law of what else rubs, on rotors here and elsewhere on joints, of what inertia that is, kg·m².
     """
 
-    def __init__(self, play: Array, compliance: Array, fields: Fields, before: NDArray[np.bool_]) -> None:
+    def __init__(
+        self,
+        play: Array,
+        compliance: Array,
+        fields: Fields,
+        before: NDArray[np.bool_],
+        rubbing: Callable[[Array], Law | None] = lambda inertia: None,
+    ) -> None:
         self._mine, self._before, self._fields = (play > 0) | (compliance > 0), before, fields
         output = np.where(self._mine, np.where(before, BARE, OUTPUT), 1.0)
         self._rotor = np.where(self._mine, (1 - output) * fields.armature, 1.0)
+        self._rubbing = rubbing(np.where(self._mine, self._rotor, fields.armature + fields.link))
         self._damping = np.where(self._mine, fields.damping, 0.0)
         fields.armature[:] *= output
         fields.damping[self._mine] = 0.0
@@ -67,6 +78,7 @@ class Transmission:
         self._half = play / 2
         self._angle: Array | None = None
         self._speed, self._link_speed = np.zeros(play.shape), np.zeros(play.shape)
+        self._moved: Callable[[Array], Array] | None = None
 
     def carry(self, position: Array, velocity: Array, load: Array) -> None:
         """Put rotors where they carry a load.
@@ -76,7 +88,7 @@ class Transmission:
         """
         held = np.clip(load, -HELD, HELD)
         self._angle = position + np.where(self._mine, self._half * np.sign(held) + held / self._spring, 0.0)
-        self._speed, self._link_speed = velocity.copy(), velocity.copy()
+        self._speed, self._link_speed, self._moved = velocity.copy(), velocity.copy(), None
 
     def __call__(self, step: Step) -> None:
         h, mine, half, spring, rotor = step.dt, self._mine, self._half, self._spring, self._rotor
@@ -84,31 +96,46 @@ class Transmission:
             # At rest the teeth that carry the load are the ones that touch.
             self.carry(step.position, step.velocity, step.motor_torque)
         assert self._angle is not None
-        angle, speed, position, velocity = self._angle, self._speed, step.position, step.velocity
+        position, velocity = step.position, step.velocity
+        if self._moved is not None:  # now it is known how fast the link has become
+            self._speed = np.where(mine, self._moved(velocity), velocity)
+            self._angle = np.where(mine, self._angle + h * self._speed, position)
+        angle, speed = self._angle, self._speed
+        if self._rubbing is not None:
+            step.velocity = np.where(mine, speed, velocity)
+            self._rubbing(step)
         step.position, step.velocity = np.where(self._before, angle, position), np.where(self._before, speed, velocity)
         driven = step.motor_torque + step.torque
         step.position, step.velocity = position, velocity
-        # The link goes on as it did: what it gets and what the rotor loses are then the same to the second order.
+        friction = step.friction
+        # Which teeth touch, and whether the rotor sticks, is told as if the link went on as it did.
         going = 2 * velocity - self._link_speed
         self._link_speed = velocity.copy()
-        velocity = going
         twist = angle - position
-        ahead = twist + h * (speed - velocity)
+        ahead = twist + h * (speed - going)
         side = np.where(half > 0, np.sign(ahead), 1.0)
         touching = (np.abs(ahead) > half) | (half == 0)
         for _ in range(2):
             k, c = np.where(touching, spring, 0.0), np.where(touching, self._damper, 0.0)
-            heavy = rotor + h * (self._damping + c + h * k)
-            faster = (rotor * speed + h * (driven - k * (twist - h * velocity - side * half) + c * velocity)) / heavy
-            slowed = np.sign(faster) * np.maximum(np.abs(faster) - h * step.friction / heavy, 0.0)
-            pushed = k * (twist + h * (slowed - velocity) - side * half) + c * (slowed - velocity)
+            heavy, stiff = rotor + h * (self._damping + c + h * k), c + h * k
+            free = (rotor * speed + h * (driven - k * (twist - side * half))) / heavy
+
+            def moved(link: Array, free: Array = free, heavy: Array = heavy, stiff: Array = stiff) -> Array:
+                faster = free + h * stiff / heavy * link
+                out: Array = np.sign(faster) * np.maximum(np.abs(faster) - h * friction / heavy, 0.0)
+                return out
+
+            slowed = moved(going)
+            pushed = k * (twist - side * half) + stiff * (slowed - going)
             # Teeth push and never pull.
             touching &= (half == 0) | (pushed * side > 0)
-        self._speed = np.where(mine, slowed, step.velocity)
-        self._angle = np.where(mine, angle + h * self._speed, position)
-        passed = k * (self._angle - position - side * half) + c * self._speed
-        step.torque = np.where(mine, passed, step.torque)
-        self._fields.damp(np.where(mine, c + h * k, self._fields.damping))
+        self._moved = moved
+        # A rotor that sticks gives way to nothing; one that turns follows the link by this share.
+        share = np.where(slowed != 0, h * stiff / heavy, 0.0)
+        along = slowed - share * going
+        held = stiff * (1 - share)
+        step.torque = np.where(mine, k * (twist - side * half) + stiff * along - held * velocity, step.torque)
+        self._fields.weigh(np.where(mine, self._fields.armature + h * held, self._fields.armature))
         step.friction = np.where(mine, 0.0, step.friction)
         step.stiffness = np.where(mine, TINY, step.stiffness)
         step.velocity_gain = np.where(mine, TINY, step.velocity_gain)

@@ -20,6 +20,7 @@ from openant_tools.effects.speed_limit import fading
 from openant_tools.effects.step import DAMPED, HARD, TINY, Law, Step
 from openant_tools.effects.thermal_derating import Heating
 from openant_tools.effects.transmission import Fields, Transmission
+from openant_tools.model.rollout import VELOCITY_SPAN_S
 
 __all__ = ["Fields", "Transmission", "back_emf", "first_laws", "last_laws"]
 
@@ -66,12 +67,16 @@ def last_laws(robots: Sequence[Robot], generated: Array, fields: Fields) -> list
     if smooth.any():
         laws.append(_smoothing(smooth))
     bristle = np.array([[robot.form.bristle if robot.form else 0.0] for robot in robots])
-    if bristle.any():
-        laws.append(_bending(bristle, fields.armature + fields.link))
+
+    def rubbing(inertia: Array) -> Law | None:
+        return _bending(bristle, inertia) if bristle.any() else None
+
     play, compliance = _table(robots, "play"), _table(robots, "compliance")
     if play.any() or compliance.any():
         before = np.array([[robot.form is not None and not robot.form.loop_behind] for robot in robots])
-        laws.append(Transmission(play, compliance, fields, before))
+        laws.append(Transmission(play, compliance, fields, before, rubbing))
+    elif (bending := rubbing(fields.armature + fields.link)) is not None:
+        laws.append(bending)
     return laws
 
 
@@ -115,8 +120,10 @@ def _bending(bristle: Array, inertia: Array) -> Law:
         level = np.maximum(step.friction, TINY)
         stiff = np.minimum(level / np.maximum(bristle, TINY), HARD * inertia / step.dt**2)
         if not bent:
-            # At rest the bristles hold what the motor and gravity push.
-            bent.append(np.clip(step.motor_torque - step.load, -level, level) / stiff)
+            # At rest the bristles hold what the motor and gravity push; sliding they are bent all the way.
+            held = np.clip(step.motor_torque - step.load, -level, level)
+            slides = np.abs(step.velocity) * VELOCITY_SPAN_S > level / stiff
+            bent.append(np.where(slides, np.sign(step.velocity) * level, held) / stiff)
         moved = (bent[0] + step.dt * step.velocity) / (1 + step.dt * stiff * np.abs(step.velocity) / level)
         damper = 2 * DAMPED * np.sqrt(stiff * inertia) * (moved - bent[0]) / step.dt
         step.torque -= np.where(mine, stiff * moved + damper, 0.0)

@@ -69,6 +69,7 @@ def simulate(
     signals: Sequence[str] | None = None,
     warm_c: Sequence[Array] | None = None,
     misread: bool = False,
+    step_s: float | None = None,
 ) -> Log:
     """Let robots do what runs command.
 
@@ -79,6 +80,8 @@ def simulate(
         signals: those wanted; default all that there are.
         warm_c: of each run (joints,) °C, by which servos are known to be warmer than in the coolest one; default none.
         misread: simulations that begin anew begin where noisy sensors say, as those of a real log do.
+        step_s: steps of the simulation that these larger ones stand for. A step's force is that of its beginning and its command the mean
+            over all of it, which so comes early by half a step: by half of what these are longer commands are held back.
     """
     without_words()
     plant, rows = rollouts.plant, rollouts.rows[-1].stop
@@ -102,7 +105,8 @@ def simulate(
             # A run of its own of random numbers to each portion, whatever the others are.
             rng = np.random.default_rng((seed, int(some[0])))
             mine = {name: np.full((len(some), *whole.shape[1:]), np.nan, np.float32) for name, whole in out.items()}
-            _Batch(stepped, [robots[k] for k in some], rng, warm_c, misread=misread).play(mine)
+            later_s = 0.0 if step_s is None else (stepped.plant.timestep - step_s) / 2
+            _Batch(stepped, [robots[k] for k in some], rng, warm_c, misread=misread, later_s=later_s).play(mine)
             for name, values in mine.items():
                 out[name][some] = values
     return Log(out)
@@ -129,7 +133,9 @@ class _Batch:
         warm_c: Sequence[Array] | None,
         *,
         misread: bool = False,
+        later_s: float = 0.0,
     ) -> None:
+        self._later_s = later_s
         self._rollouts, self._robots, self._rng = rollouts, robots, rng
         self._plant, self._segments = rollouts.plant, rollouts.segments
         self._n = len(robots)
@@ -206,17 +212,17 @@ class _Batch:
     def _make_laws(self, warm_c: Array) -> list[Law]:
         plant, copies = self._plant, len(self._segments)
         robots = [robot for _ in range(copies) for robot in self._robots]
-        dampings = self._batch.expand("dof_damping")
+        armatures = self._batch.expand("dof_armature")
 
-        def damp(values: Array) -> None:
-            dampings[:, plant.dof] = values
+        def weigh(values: Array) -> None:
+            armatures[:, plant.dof] = values
 
         fields = Fields(
             armature=_column(self._batch, "dof_armature", plant.dof),
             damping=_column(self._batch, "dof_damping", plant.dof),
             friction=_column(self._batch, "dof_frictionloss", plant.dof),
             link=np.maximum(plant.model.dof_M0[plant.dof] - plant.model.dof_armature[plant.dof], 1e-6)[None].repeat(len(robots), 0),
-            damp=damp,
+            weigh=weigh,
         )  # fmt: skip
         duty = np.array([[robot.form is None or robot.form.tells_duty] for robot in robots])
         self._asked = np.array([[robot.form is not None and robot.form.tells_asked] for robot in robots])
@@ -370,11 +376,11 @@ class _Batch:
     def _control(self, segment: RunStretch, robot: Robot, edges: Array) -> Array:
         plant, h = self._plant, self._plant.timestep
         commands = segment.commands
-        random = _scatters(robot)
-        if not random and not robot.delay.any():
+        random, delay = _scatters(robot), robot.delay + self._later_s
+        if not random and not delay.any():
             mean = np.concatenate([commands.mean(edges[: self._led + 1]), segment.control[:, plant.ctrl]])
-        elif not random and (robot.delay == robot.delay[0]).all():
-            mean = commands.mean(edges - robot.delay[0])
+        elif not random and (delay == delay[0]).all():
+            mean = commands.mean(edges - delay[0])
         else:
             mean = np.empty((len(edges) - 1, len(plant.joints)))
             times = commands.times
@@ -385,13 +391,13 @@ class _Batch:
                 late = packet if packet is not None else self._read_at(robot, times)
                 lost = shared if shared is not None else self._lost(robot, times, j)
                 column = dataclasses.replace(commands, times=late, values=_without(commands.values[:, j : j + 1], lost))
-                mean[:, j] = column.mean(edges - robot.delay[j])[:, 0]
+                mean[:, j] = column.mean(edges - delay[j])[:, 0]
         if robot.lag.any():
             mean = mean.copy()
             # What a servo still follows when a window begins was commanded before it.
             back = edges[0] - h * np.arange(round(REMEMBERS * float(robot.lag.max()) / h), -1, -1)
             for filtered in np.flatnonzero(robot.lag):
-                before = commands.mean(back - robot.delay[filtered])[:, filtered]
+                before = commands.mean(back - delay[filtered])[:, filtered]
                 whole = np.concatenate([before, mean[:, filtered]])
                 mean[:, filtered] = _filtered(whole, h / float(robot.lag[filtered]))[len(before) :]
         return mean

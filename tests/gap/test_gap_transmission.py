@@ -14,9 +14,10 @@ from openant_tools.blind.log import logged
 from openant_tools.blind.robot import true_robot
 from openant_tools.blind.simulate import simulate as simulate_truth
 from openant_tools.effects.catalogue import catalogue, enter
-from openant_tools.effects.robot import Robot
+from openant_tools.effects.robot import Form, Robot
 from openant_tools.gap.features import TAKES_UP_S, around_switching
-from openant_tools.gap.protocol import Players, RunSet
+from openant_tools.gap.protocol import Players, RunSet, rollouts_of
+from openant_tools.gap.simulation import simulate
 from openant_tools.recording.run import Facts, Run
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
@@ -62,6 +63,44 @@ def test_a_knee_that_is_loaded_one_way_does_not_rattle_in_its_play() -> None:
     true, ours = moved_by("backlash", "knee_rr", "floor-1", 8.0, gap_rad=0.02)
     assert np.std(true) < math.radians(0.3)
     assert np.std(ours) < math.radians(0.5)
+
+
+def played(run: str, seconds: float) -> RunSet:
+    """A healthy robot of the other simulator at work, as a diagnosis plays it again."""
+    motion = next(one for one in motions(4242) if one.name == run)
+    rows = round(RATE_HZ * seconds)
+    motion = dataclasses.replace(motion, commands=motion.commands[:rows], limp=motion.limp[:rows])
+    robot = true_robot(Answer("single", (), SEED, "batch", False))
+    (trace,) = simulate_truth([robot], motion, 0)
+    return RunSet.of([logged(robot, motion, 0, trace)], nominal_model_path(), JOINT_NAMES, [None])
+
+
+@pytest.mark.parametrize(("run", "within_rad"), [("stand-1", 1.5e-4), ("floor-1", 4.5e-4)])
+def test_teeth_without_play_carry_a_rotor_as_no_teeth_do(run: str, within_rad: float) -> None:
+    """Else a play is judged by what its simulation does, not by what it does."""
+    protocol = played(run, SECONDS).coarse()
+    option = protocol.runs[0].plant.model.opt
+    form = Form(option.integrator, True, option.impratio, bristle=5e-4)
+    rigid, geared = Robot(8, form=form), Robot(8, form=form)
+    geared.play[:] = 1e-9
+    pos = simulate(rollouts_of(protocol.runs), [rigid, geared], signals=["pos"]).signals["pos"].astype(float)
+    assert float(np.sqrt(np.nanmean((pos[1] - pos[0]) ** 2))) < within_rad
+
+
+@pytest.mark.parametrize("run", ["stand-1", "floor-1"])
+def test_commands_are_as_late_in_large_steps_as_in_small_ones(run: str) -> None:
+    protocol = played(run, SECONDS)
+    coarse, step_s = protocol.coarse(), protocol.runs[0].plant.timestep
+    assert coarse.runs[0].plant.timestep > 2 * step_s
+
+    def off(**late: float) -> float:
+        fine, large = (
+            simulate(rollouts_of(of.runs), [Robot(8)], signals=["pos"], **more).signals["pos"][0].astype(float)
+            for of, more in ((protocol, {}), (coarse, late))
+        )
+        return float(np.sqrt(np.nanmean((large - fine) ** 2)))
+
+    assert off(step_s=step_s) < 0.7 * off()
 
 
 def test_what_follows_a_switch_of_torque_is_unsure_for_a_while() -> None:
