@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.fitting import Fits
 from openant_tools.gap.hypothesis import Refit
-from openant_tools.gap.nuisance import BODY, HEAT_LOSS, LESS
+from openant_tools.gap.nuisance import BODY, HEAT_LOSS, LESS, UNWRITTEN
 from openant_tools.gap.prediction import Predictions
 from openant_tools.model.gap import share_closed
 
@@ -149,7 +149,7 @@ def calibration_of(predictions: Predictions, refit: Refit, judged: Sequence[int]
     joints = predictions.protocol.joints
     for one, u in zip(predictions.names, refit.nuisance, strict=True):
         value = one.value(float(u))
-        if one.of_imu:
+        if one.of_imu or one.name in UNWRITTEN:
             continue
         if one.name == HEAT_LOSS:
             for kind in LESS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -62,6 +63,7 @@ class Fits:
     def __init__(self, predictions: Predictions) -> None:
         self.predictions = predictions
         self._learnt: dict[int, Floats] = {}
+        self._settled = False
         self.found = np.zeros(len(predictions.names))
 
     def nothing(self) -> Refit:
@@ -123,11 +125,11 @@ class Fits:
 
     def _descend(self, starts: Sequence[Refit], fitted: Sequence[int]) -> list[Descent]:
         """Follow each start to where it leaves least on these runs."""
-        # Slopes cost the most: causes begin with what was learnt of tolerances without them.
+        # Slopes cost the most: causes begin with what was learnt of tolerances without them on the floor, where each takes a simulation.
         learnt = {k: known for k, known in self._learnt.items() if k in fitted}
         descents = [Descent.of(start, len(self.predictions.names), learnt) for start in starts]
         begun = descents
-        for _ in range(1 if learnt else MEASURED):
+        for n in range(1 if learnt else MEASURED):
             before = [one.least for one in begun]
             for one in begun if not learnt else ():
                 one.begin()
@@ -139,14 +141,31 @@ class Fits:
                 moving = [one for one in moving if one.goes_on]
                 if not moving:
                     break
+            if n == 0 and not self._settled and self._other_form(descents[0], fitted):
+                continue
             begun = [one for one, cost in zip(begun, before, strict=True) if cost - one.least > 2 * LEAST_GAIN]
             if not begun:
                 break
         return descents
 
+    def _other_form(self, found: Descent, fitted: Sequence[int]) -> bool:
+        """Go on in the form of simulation that leaves least where a descent is; whether that is another one."""
+        before, left = self.predictions.form, []
+        for form in self.predictions.forms:
+            self.predictions.form = form
+            tried = dataclasses.replace(
+                found, u=found.at, least=np.inf, errors={}, blocks={}, slopes=dict(found.slopes)
+            )
+            self._look([tried], fitted)
+            left.append(tried.least)
+        self.predictions.form = self.predictions.forms[int(np.argmin(left))]
+        return self.predictions.form is not before
+
     def _keep(self, found: Descent) -> None:
         """Remember what was learnt of tolerances."""
-        self._learnt = {k: slopes[found.causes :] for k, slopes in found.slopes.items()}
+        on_floor = (k for k in found.slopes if self.predictions.protocol.runs[k].plant.setup is Setup.FLOOR)
+        self._learnt = {k: found.slopes[k][found.causes :] for k in on_floor}
+        self._settled = True
         self.found = found.at[found.causes :]
 
     def _weight(self, k: int) -> Array:

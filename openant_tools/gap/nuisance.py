@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
@@ -9,9 +10,11 @@ import numpy as np
 
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.protocol import RunSet
-from openant_tools.gap.tolerance import FACTORS, FLOOR, tolerance_of, torso_kg
+from openant_tools.gap.tolerance import FACTORS, FLOOR, STAMP_S, tolerance_of, torso_kg
 
-__all__ = ["BODY", "HEAT_LOSS", "LESS", "ONE_SIDED", "TILTS", "Nuisance", "adjust", "nuisances"]
+__all__ = [
+    "BODY", "BRISTLE", "BRISTLE_RAD", "HEAT_LOSS", "LESS", "ONE_SIDED", "TILTS", "UNWRITTEN", "Nuisance", "adjust", "nuisances",
+]  # fmt: skip
 
 #: what tilts a floor along its x and y, rad
 TILTS = ("tilt_x", "tilt_y")
@@ -21,8 +24,15 @@ HEAT_LOSS, WARMED_C, LESS = "heat_loss", 2.0, ("stiffness", "torque_limit")
 BODY = "body"
 #: what an IMU may read at rest, and how it may sit, about its three axes; and how late it may be
 IMU_AXES, IMU_LATE = ("gyro_bias", "acc_bias", "imu_rotation"), "imu_delay"
+#: what part of all servos' damping may be back-EMF, up to the tolerance of the effect of this name
+BACK_EMF = "electrical_damping"
 #: what lies between none and twice its tolerance
-ONE_SIDED = {HEAT_LOSS, IMU_LATE}
+ONE_SIDED = {HEAT_LOSS, IMU_LATE, BACK_EMF}
+#: how far dry friction gives before it slides, rad, and what this may be times as much or as little, where it gives at all: of the form
+#: of a simulation, which no model says
+BRISTLE, BRISTLE_RAD, BRISTLE_TIMES = "bristle", 5e-4, 3.0
+#: what no model of a robot within tolerance is written with: servos of another kind would hold it
+UNWRITTEN = {BACK_EMF, BRISTLE}
 
 
 @dataclass(frozen=True)
@@ -42,7 +52,8 @@ class Nuisance:
         """The factor, or what is added (N·m, rad, s, kg), at so many tolerances; 1/°C of what is lost to heat."""
         if self.name in ONE_SIDED:
             return self.tolerance * (1 + u)
-        return float(np.exp(u * self.tolerance)) if self.name in {*FACTORS, *FLOOR} else float(u * self.tolerance)
+        relative = self.name in FACTORS or self.name in FLOOR or self.name == BRISTLE
+        return float(np.exp(u * self.tolerance)) if relative else float(u * self.tolerance)
 
 
 def adjust(robot: Robot, kind: str, joints: Sequence[int], value: float) -> None:
@@ -67,6 +78,8 @@ def adjust(robot: Robot, kind: str, joints: Sequence[int], value: float) -> None
         setattr(robot, kind, getattr(robot, kind) * value)
     elif kind == "torso_kg":
         robot.torso_kg += value
+    elif kind == BACK_EMF:
+        robot.electrical[at] = np.maximum(robot.electrical[at], value)
     elif kind in TILTS:
         robot.tilt = robot.tilt + value * np.eye(2)[TILTS.index(kind)]
     elif kind == IMU_LATE:
@@ -93,7 +106,10 @@ def nuisances(protocol: RunSet, sensed: Collection[str]) -> list[Nuisance]:
         for j in joints
     ]
     out += [Nuisance("zero_offset", (j,), tolerance_of("zero_offset")) for j in joints]
-    out.append(Nuisance("delay", tuple(joints), tolerance_of("action_delay")))
+    # Rows that are stamped early or late look like commands that act late or early.
+    out.append(Nuisance("delay", tuple(joints), tolerance_of("action_delay") + STAMP_S))
+    out.append(Nuisance(BACK_EMF, tuple(joints), tolerance_of(BACK_EMF) / 2))
+    out.append(Nuisance(BRISTLE, tuple(joints), math.log(BRISTLE_TIMES)))
     if protocol.warmed_c > WARMED_C:
         out.append(Nuisance(HEAT_LOSS, tuple(joints), tolerance_of("thermal_derating")))
     if protocol.reference.floor:

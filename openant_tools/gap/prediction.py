@@ -7,17 +7,19 @@ hardly; and a body that has sunk into a soft floor would be put back where it is
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Collection, Sequence
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.effects.catalogue import enter
-from openant_tools.effects.robot import USUAL_NOISE, Robot
+from openant_tools.effects.robot import USUAL_NOISE, Form, Robot
 from openant_tools.gap.features import COLUMNS, around_switching
 from openant_tools.gap.hypothesis import Refit
-from openant_tools.gap.nuisance import HEAT_LOSS, LESS, ONE_SIDED, adjust, nuisances
+from openant_tools.gap.nuisance import BRISTLE, BRISTLE_RAD, HEAT_LOSS, LESS, ONE_SIDED, UNWRITTEN, adjust, nuisances
 from openant_tools.gap.protocol import Played, RunSet
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.floor import floors
@@ -32,6 +34,8 @@ Array = NDArray[np.float64]
 LOST_RAD = 10.0
 #: rad, the least that a position is known to
 LEAST_SIGMA_RAD = 2e-4
+#: s, steps on the stand, where nothing is gained by larger ones but time: half a milliradian is lost in steps of 2.5 ms
+STAND_STEP_S = 0.001
 #: sensors of the body, and how many columns each has
 SENSED = {name: len(columns) for name, columns in COLUMNS.items()}
 
@@ -47,11 +51,16 @@ class Predictions:
     Attributes:
         names: what of the model may move within tolerance. sensed: signals of the body that any run has, of the others.
         measured: of each run, (rows, channels); NaN where nobody knows what a servo had in mind (`around_switching`).
+        form: what simulations are like in what no model says; forms: what it may be: dry friction holds, or gives before it slides.
         there: of each run, (rows,) which of them are simulated. floor: (joints,) rad; sigma: (channels,) of sensors.
     """
 
     def __init__(self, protocol: RunSet, without: Collection[str] = ()) -> None:
         self.protocol = protocol
+        option = protocol.runs[0].plant.model.opt
+        own = Form(option.integrator, option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC, option.impratio)
+        self.forms = own, dataclasses.replace(own, bristle=BRISTLE_RAD)
+        self.form = own
         self.joints = len(protocol.joints)
         present = {name for one in protocol.runs for name in one.seen} - set(without)
         self.sensed = tuple(name for name in SENSED if name in present)
@@ -63,7 +72,7 @@ class Predictions:
             for one, begun in zip(protocol.runs, self._rollouts, strict=True)
         ]
         self.there = [_rows(one) for one in self._whole]
-        self._coarse = protocol.coarse().runs
+        self._coarse = protocol.coarse(STAND_STEP_S).runs
         self._sets: dict[tuple[int, ...], list[tuple[tuple[int, ...], Rollouts]]] = {}
         self.measured = [self._measured(one) for one in protocol.runs]
         self.floor = floors([one.run for one in protocol.runs], protocol.joints)[0]
@@ -74,29 +83,36 @@ class Predictions:
             ]
         )
 
-    def robot(self, refit: Refit | None, k: int, warm_c: Array | None = None) -> Robot:
+    def robot(self, refit: Refit | None, k: int, warm_c: Array | None = None, *, written: bool = False) -> Robot:
         """As it is on run k; None: the model as it was given.
 
         Args:
             warm_c: (joints,) °C above the coolest run; default as warm as its servos were then.
+            written: as a model of it is written, without what is asked only to tell causes apart.
         """
         reference = self.protocol.reference
         if refit is None:
             return Robot(len(self.protocol.joints), creeps=True)
         robot = Robot(len(self.protocol.joints), reference.low, reference.high)
+        if not written:
+            robot.form = self.form
         enter(robot, reference, [(p.cause, p.joints, x) for p, x in zip(refit.hypothesis, refit.x, strict=True)])
         for one, u in zip(self.names, refit.nuisance, strict=True):
             if one.name == HEAT_LOSS:
                 left = 1 / (1 + one.value(float(u)) * (self.protocol.runs[k].warm_c if warm_c is None else warm_c))
                 for kind in LESS:
                     robot.factor(kind)[:] *= left
+            elif one.name in UNWRITTEN and written:
+                continue
+            elif one.name == BRISTLE:
+                robot.form = dataclasses.replace(self.form, bristle=self.form.bristle * one.value(float(u)))
             elif u or one.name in ONE_SIDED:
                 adjust(robot, one.name, one.joints, one.value(float(u)))
         return robot
 
     def errors(self, k: int, refits: Sequence[Refit | None]) -> Array:
         """(refits, rows, joints) rad, measured minus simulated on run k, begun anew as the gap is defined."""
-        return self._errors([k], [self.robot(refit, k) for refit in refits], self._rollouts[k], ())[0]
+        return self._errors([k], [self.robot(refit, k, written=True) for refit in refits], self._rollouts[k], ())[0]
 
     def over_windows(self, k: int, refits: Sequence[Refit]) -> Array:
         """(refits, rows, channels), measured minus simulated on run k, over whole windows."""
@@ -105,7 +121,10 @@ class Predictions:
     def simulated(self, k: int, refit: Refit, signals: Sequence[str]) -> dict[str, Array]:
         """Signal → (rows, joints), what a re-fitted model does on run k."""
         found = simulate(
-            self._rollouts[k], [self.robot(refit, k)], signals=signals, warm_c=[self.protocol.runs[k].warm_c]
+            self._rollouts[k],
+            [self.robot(refit, k, written=True)],
+            signals=signals,
+            warm_c=[self.protocol.runs[k].warm_c],
         ).signals
         return {name: values[0].astype(np.float64) for name, values in found.items()}
 
@@ -119,7 +138,7 @@ class Predictions:
         """The gap, rad, on these runs of the one model that can be written: its servos are always as warm as on average there."""
         warm = self.warmth(judged)
         errors = np.concatenate(
-            [self._errors([k], [self.robot(refit, k, warm)], self._rollouts[k], ())[0][0] for k in judged]
+            [self._errors([k], [self.robot(refit, k, warm, written=True)], self._rollouts[k], ())[0][0] for k in judged]
         )
         return float(np.sqrt(np.mean(np.square(errors[np.isfinite(errors)]))))
 
@@ -129,11 +148,16 @@ class Predictions:
         return mean
 
     def _errors(
-        self, runs: Sequence[int], robots: Sequence[Robot], rollouts: Rollouts, sensed: Sequence[str]
+        self,
+        runs: Sequence[int],
+        robots: Sequence[Robot],
+        rollouts: Rollouts,
+        sensed: Sequence[str],
+        step_s: float | None = None,
     ) -> list[Array]:
         """Of each run of a rollout (robots, rows, channels), measured minus simulated: of joints, and some sensors of the body."""
         warm_c = [self.protocol.runs[k].warm_c for k in runs]
-        signals = simulate(rollouts, robots, signals=("pos", *sensed), warm_c=warm_c).signals
+        signals = simulate(rollouts, robots, signals=("pos", *sensed), warm_c=warm_c, step_s=step_s).signals
         pos = signals["pos"]
         absent = {name: np.full((*pos.shape[:2], width), np.nan) for name, width in SENSED.items()}
         found = np.concatenate([pos, *(signals.get(name, absent[name]) for name in sensed)], axis=2)
@@ -148,7 +172,7 @@ class Predictions:
 
     def coarse(self, runs: Sequence[int], robots: Sequence[Robot], rollouts: Rollouts) -> list[Array]:
         """Of each run (robots, rows, channels), as `over_windows`, of rollouts of `side_by_side`."""
-        return self._errors(runs, robots, rollouts, self.sensed)
+        return self._errors(runs, robots, rollouts, self.sensed, self.protocol.runs[runs[0]].plant.timestep)
 
     def side_by_side(self, fitted: Sequence[int]) -> list[tuple[tuple[int, ...], Rollouts]]:
         """Runs that one simulation plays, in large steps, where fits follow them: those on one plant, if servos are alike in all."""

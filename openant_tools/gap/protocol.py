@@ -210,18 +210,14 @@ class RunSet:
             groups.setdefault(str(motors.get(joint, alike)), []).append(j)
         return list(groups.values())
 
-    def coarse(self) -> RunSet:
-        """The same, simulated in steps as large as populations allow."""
+    def coarse(self, stand_step_s: float = STAND_STEP_S) -> RunSet:
+        """The same, simulated in steps as large as populations allow, or others on the stand."""
         plants: dict[int, Plant] = {}
         for one in self.runs:
             if id(one.plant) not in plants:
-                largest = FLOOR_STEP_S if one.plant.setup is Setup.FLOOR else STAND_STEP_S
+                largest = FLOOR_STEP_S if one.plant.setup is Setup.FLOOR else stand_step_s
                 model = copy.copy(one.plant.model)
-                model.opt.timestep = (
-                    max(largest, min(one.plant.timestep, largest))
-                    if len(self.joints) > 2
-                    else min(0.002, one.plant.timestep * 2)
-                )
+                model.opt.timestep = largest if len(self.joints) > 2 else min(0.002, one.plant.timestep * 2)
                 model.opt.tolerance = max(model.opt.tolerance, 1e-6)
                 # One robot is one island: sorting what touches costs more than it saves.
                 model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
