@@ -24,7 +24,7 @@ UNLIKE = 0.9
 #: a sample lies outside of both neighbours by more than so many steps of the encoder, or times of what such distances
 #: usually are, to be an error of telemetry
 GLITCH_QUANTA, GLITCH_TIMES = 8, 8.0
-#: what a glitch leaves of itself in the line through its neighbours' own neighbours: a motion leaves far more
+#: what a glitch, as far as it lies beyond its neighbours, leaves in the line through their own neighbours: a motion leaves far more
 GLITCH_ALONE = 0.25
 
 
@@ -83,7 +83,7 @@ def _spikes(t: Array, pos: Array, step: float) -> NDArray[np.int64]:
     beyond = np.maximum(x[inner] - high, low - x[inner])
     limit = max(GLITCH_QUANTA * step, GLITCH_TIMES * 1.4826 * float(np.median(np.abs(alone))))
     left = np.maximum(np.abs(off(inner - 1, 1, 2)), np.abs(off(inner + 1, 2, 1)))
-    spike = (beyond > limit) & (left < GLITCH_ALONE * np.abs(alone) + 2 * step)
+    spike = (beyond > limit) & (left < GLITCH_ALONE * beyond + step)
     found: NDArray[np.int64] = rows[inner[spike]]
     return found
 
