@@ -125,7 +125,7 @@ def _details(report: Report, found: Diagnosis) -> None:
             ["effect", "where", "present", "closes alone", "interval", "parameters", "MuJoCo carries it"],
             [
                 [one.effect, where_words(one.joints), percent(one.probability, decimals=1), _percent(one.gap_closed),
-                 f"{_percent(one.gap_closed_low)} … {_percent(one.gap_closed_high)}", _parameters(one), one.native]
+                 _between(one.gap_closed_low, one.gap_closed_high), _parameters(one), one.native]
                 for one in found.effects
             ],
         ),
@@ -268,6 +268,10 @@ def _joints(words: str | Sequence[str]) -> tuple[str, ...] | str:
 
 def _percent(value: float | None) -> str | None:
     return None if value is None else percent(value)
+
+
+def _between(low: float | None, high: float | None) -> str | None:
+    return None if low is None or high is None else f"{percent(low)} … {percent(high)}"
 
 
 def _parameters(one: Found) -> str:

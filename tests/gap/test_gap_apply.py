@@ -346,7 +346,10 @@ def test_one_page_says_it_all(model: Path, tmp_path: Path) -> None:
     plant = load_plant(model)
     runs = [commanded(plant, sweep(T, 1))]
     diagnosed = diagnosis(model, found("action_delay", "all", delay_s=0.02))
+    unfitted = Found("backlash", "all", {}, 0.02, None, None, None, True)
+    diagnosed = dataclasses.replace(diagnosed, effects=(*diagnosed.effects, unfitted))
     page = diagnosis_report(diagnosed, runs, [], model).html()
+    assert "None" not in page  # a cause that was not fitted closes nothing that anybody knows
     for words in ("action_delay (all)", "confidence 95\u00a0%", "floor", "What to do next", "Where", "improved model"):
         assert words in page
     assert sentence(dataclasses.replace(diagnosed, verdict="none", selected=())).startswith("Nothing beyond the floor")
