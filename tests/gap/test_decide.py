@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openant_tools.gap.decide import OUTSIDE, Row, adds, chances, decide, weights
+from openant_tools.gap.decide import OUTSIDE, SURE, Row, adds, chances, decide, weights
 from openant_tools.gap.diagnosis import NONE
 
 NOTHING = Row((), probability=0.05)
@@ -47,7 +47,10 @@ def test_causes_that_make_it_likelier_are_told_apart_by_how_much() -> None:
     best, other = (replace(one, probability=0.3, support=1.0, foretold=1.0) for one in (LAG, DELAY))
     rows = [replace(NOTHING, probability=0.4), replace(best, likelier=400.0), replace(other, likelier=250.0)]
     p = chances(rows, 0.04, weights())
-    assert p["actuator_lag"] > 2 * p["action_delay"]
+    # All else being equal, by the learned weight of their shares: 400 and 250 nats, each known to SURE.
+    told = ((400.0 + SURE) / (250.0 + SURE)) ** weights()["share"]
+    assert told > 2
+    assert p["actuator_lag"] / p["action_delay"] == pytest.approx(told)
     assert p[NONE] < chances([rows[0], best, other], 0.04, weights())[NONE]
     # What nobody knows to a few nats, causes do not share by.
     p = chances([rows[0], replace(best, likelier=3.0), replace(other, likelier=1.0)], 0.04, weights())
