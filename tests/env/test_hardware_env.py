@@ -296,8 +296,8 @@ def test_unattended_nobody_puts_a_robot_back_and_a_wait_has_an_end(
         assert walker.until_it_ends()["stop_cause"] == "tag"
     env.reset()  # it is seen again: that was announced
     assert "motion begins again by itself after tag, 1 of 20" in walker.said
-    monkeypatch.setattr(hardware, "longest_wait_s", {StopCause.TAG: 1.5}.__getitem__)
-    with walker.fault("camera_stalled"):
+    with walker.fault("camera_stalled"), monkeypatch.context() as patch:
+        patch.setattr(hardware, "longest_wait_s", {StopCause.TAG: 1.5}.__getitem__)
         walker.until_it_ends()
         with pytest.raises(MotionStopped, match=r"the camera does not see the robot: look at light.*nobody is there"):
             env.reset()
