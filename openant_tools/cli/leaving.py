@@ -7,6 +7,7 @@ import select
 import signal
 import sys
 import threading
+import time
 from types import FrameType
 
 import click
@@ -17,6 +18,8 @@ __all__ = ["MOVES", "end_with_the_terminal", "heed_signals"]
 
 #: in a click context's meta: the command has the builder's word that it may move
 MOVES = "openant moves"
+#: s in which a command that was interrupted has laid its robot down
+ENDED_S = 10.0
 
 
 def heed_signals() -> None:
@@ -45,6 +48,9 @@ def end_with_the_terminal() -> None:
         while found := poll.poll():
             if any(what & (select.POLLERR | select.POLLHUP) for _, what in found):
                 os.kill(os.getpid(), gone)
+                # An interrupt can be lost, in a destructor or to whoever catches everything; and nobody is there to give another.
+                time.sleep(ENDED_S)
+                _release()
                 return
             for fd, _ in found:  # it was closed from the beginning
                 poll.unregister(fd)
@@ -62,14 +68,21 @@ def _suspend(number: int, frame: FrameType | None) -> None:
     """Torque off, then stop as Ctrl-Z wants it. What comes back does not go on moving: it ends as after Ctrl-C."""
     context = click.get_current_context(silent=True)
     moves = context is not None and bool(context.meta.get(MOVES))
-    if "openant_tools.comms.engine_process" in sys.modules:
-        from openant_tools.comms.engine_process import EngineProcess
-        from openant_tools.comms.release import release_all
-
-        moves = moves or any(not engine.config.still for engine in EngineProcess.running)
-        release_all()
+    moves = _release() or moves
     signal.signal(number, signal.SIG_DFL)
     os.kill(os.getpid(), number)
     signal.signal(number, _suspend)
     if moves:
         raise KeyboardInterrupt
+
+
+def _release() -> bool:
+    """Torque off at everything that this process has open; whether an engine in it moves something."""
+    if "openant_tools.comms.engine_process" not in sys.modules:
+        return False
+    from openant_tools.comms.engine_process import EngineProcess
+    from openant_tools.comms.release import release_all
+
+    moves = any(not engine.config.still for engine in EngineProcess.running)
+    release_all()
+    return moves

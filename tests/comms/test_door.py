@@ -100,6 +100,23 @@ HOLDING = textwrap.dedent(
     main(["hold"])
     """
 )
+#: the same, where whoever waits is told that it is interrupted and waits on
+DEAF = (
+    HOLDING.replace(
+        """        engine.ask(messages.Torque(True))
+        engine.ask(messages.Hold(300.0))
+""",
+        """        _, held = engine.start(messages.Torque(True)), engine.start(messages.Hold(300.0))
+        while True:
+            try:
+                engine.wait(held)
+            except KeyboardInterrupt:
+                pass
+""",
+    )
+    .replace("import main", "import leaving, main")
+    .replace("main([", "leaving.ENDED_S = 1.0\nmain([")
+)
 
 
 @pytest.mark.slow
@@ -117,10 +134,10 @@ def test_suspension_and_a_lost_terminal_end_motion_first(tmp_path: Path) -> None
         class Busy(Exception):
             """This computer was too busy to tell."""
 
-        def tried(end: Callable[[subprocess.Popen[bytes]], None], codes: tuple[int, ...]) -> None:
+        def tried(end: Callable[[subprocess.Popen[bytes]], None], codes: tuple[int, ...], program: str) -> None:
             """Begin to hold, end it so, and see that torque goes off within two seconds."""
             log = tmp_path / "log"
-            words = [sys.executable, "-c", HOLDING, "hold", str(found["bus"]), str(ready)]
+            words = [sys.executable, "-c", program, "hold", str(found["bus"]), str(ready)]
             with log.open("wb") as err, subprocess.Popen(words, stdout=subprocess.PIPE, stderr=err) as process:
                 try:
                     give_up = time.monotonic() + 60.0
@@ -157,14 +174,15 @@ def test_suspension_and_a_lost_terminal_end_motion_first(tmp_path: Path) -> None
         def suspended(number: int) -> Callable[[subprocess.Popen[bytes]], None]:
             return lambda process: os.kill(process.pid, number)
 
-        for end, codes in (
-            (suspended(signal.SIGTSTP), (130, 1, 2)),  # it does not go on when it comes back
-            (suspended(signal.SIGSTOP), (130, 1, 2)),
-            (unread, (130,)),
+        for end, codes, program in (
+            (suspended(signal.SIGTSTP), (130, 1, 2), HOLDING),  # it does not go on when it comes back
+            (suspended(signal.SIGSTOP), (130, 1, 2), HOLDING),
+            (unread, (130,), HOLDING),
+            (unread, (1,), DEAF),
         ):
             for _ in range(3):
                 try:
-                    tried(end, codes)
+                    tried(end, codes, program)
                     break
                 except Busy:
                     continue
