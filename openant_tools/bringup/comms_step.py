@@ -10,9 +10,11 @@ from openant_tools.comms.dropouts.diagnose import diagnose_dropouts
 from openant_tools.comms.dropouts.outcome import dropouts_finding
 from openant_tools.comms.soak import soak
 from openant_tools.numbers import exact, number
+from openant_tools.procedure.by_time import minutes, noted
 from openant_tools.procedure.finding import together
 from openant_tools.procedure.relay import relayed
-from openant_tools.procedure.step import Ask, Bench, Intent, Procedure
+from openant_tools.procedure.step import Ask, Bench, Intent, Procedure, Say
+from openant_tools.procedure.unfinished import Parts, unfinished
 from openant_tools.recording.tables import read_run
 
 __all__ = ["comms_step"]
@@ -29,24 +31,36 @@ def comms_step(bench: Bench) -> Procedure:
         HardwareFault: not all servos answer.
     """
     still = yield from comms_health(bench)
-    minutes = yield Ask(
-        "Now watch the bus while the legs swing. For how long? (0: not at all; an hour finds what is rare)",
-        unit="min", default=DEFAULT_MIN, low=0.0, high=LONGEST_MIN,
-    )  # fmt: skip
-    minutes = float(minutes) if isinstance(minutes, int | float) else DEFAULT_MIN
-    if minutes == 0.0:
-        return still
-    yield Intent(
-        f"swing all legs gently on the stand for {exact(minutes)} min, and keep what the bus loses", moves=True
-    )
     path = bench.folder.recordings / "comms-soak.mcap"
-    path.unlink(missing_ok=True)
+    left = unfinished(bench.folder, "comms")
+    length = None if left is None or not path.is_file() else next(iter(left.done.values())).get("minutes")
+    resume = length is not None
+    if length is None:
+        asked = yield Ask(
+            "Now watch the bus while the legs swing. For how long? (0: not at all; an hour finds what is rare)",
+            unit="min", default=DEFAULT_MIN, low=0.0, high=LONGEST_MIN,
+        )  # fmt: skip
+        length = float(asked) if isinstance(asked, int | float) else DEFAULT_MIN
+        if length == 0.0:
+            return still
+        path.unlink(missing_ok=True)
+    parts = Parts(bench.folder, "comms", minutes(60 * length))
+    if parts.before:
+        yield Say(parts.words)
+    yield Intent(
+        f"swing all legs gently on the stand until it was {exact(length)} min in all, and keep what the bus loses"
+        if resume
+        else f"swing all legs gently on the stand for {exact(length)} min, and keep what the bus loses",
+        moves=True,
+    )
     config, text = engine_config(bench), bench.folder.config_file.read_text(encoding="utf-8")
-    soaked = yield from soak(config, path, 60 * minutes, robot_toml=text)
+    soaked = yield from noted(soak(config, path, 60 * length, resume=resume, robot_toml=text), parts, minutes=length)
     told = yield from relayed(lambda progress, notice: diagnose_dropouts([read_run(path, need=())]))
     moving = dropouts_finding(told, [bench.folder.relative(path)], COMMAND)
-    if not soaked.whole:
-        why = f"the legs swung for {number(soaked.seconds, 's')} of {number(60 * minutes, 's')}: {soaked.ended or 'motion stopped'}"
+    if soaked.whole:
+        parts.end()
+    else:
+        why = f"the legs swung for {number(soaked.seconds, 's')} of {number(60 * length, 's')}: {soaked.ended or 'motion stopped'}"
         moving = replace(moving, ok=together(moving.ok, None), unsure=(*moving.unsure, f"{why} → run it again"))
     return replace(
         still,

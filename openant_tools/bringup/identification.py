@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import datetime
+from typing import Any
 
 from openant_tools import sysid
 from openant_tools.calib.wires import engine_config
+from openant_tools.comms.state import of_robot_toml
+from openant_tools.files import known
 from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.relay import relayed
-from openant_tools.procedure.step import Bench, Intent, Procedure
+from openant_tools.procedure.step import Bench, Intent, Procedure, Say
+from openant_tools.procedure.unfinished import Parts
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.folder import NOMINAL_MODEL
 from openant_tools.sysid.protocols import protocols
@@ -21,25 +25,43 @@ COMMAND = "openant bringup"
 PROTOCOL = "stand"
 #: s of each recording: a fit takes as long as its data, and this is what tells friction and inertia apart.
 RECORD_S = 16.0
+#: what is recorded, in order; the fit, which asks nobody, follows
+TAKES = ("the motion to fit", "another to judge by", "the same again", "fit")
+TIMES = ("", "once", "twice", "three times")
 
 
 def identification(bench: Bench) -> Procedure:
     """Record, fit, write calibrated.xml; what beats nothing leaves the nominal model where it is."""
+    parts = Parts(bench.folder, "identify", TAKES)
+    robot = _robot(bench)
+    before = {name: facts for name, facts in parts.before.items() if facts["robot"] == robot}
+    if before:
+        yield Say(parts.words)
+    elif parts.before:
+        yield Say("robot.toml is another than when it was left: every motion is recorded again", "warn")
     stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
+    stamp = next((str(facts["stamp"]) for facts in before.values()), stamp)
     out = bench.folder.recordings / f"identify-{stamp}.mcap"
     played = protocols(PROTOCOL, RECORD_S)
     wanted = takes(out, played, 0)
     judge = takes(out.with_name(f"identify-{stamp}-held-out.mcap"), played, 1, repeats=2)
-    yield Intent(
-        f"play `{PROTOCOL}` three times for {number(RECORD_S, 's', decimals=0)} on the stand, legs free, and fit the model to what is seen",
-        moves=True,
-    )
-    config = engine_config(bench, imu=None)
-    text = bench.folder.config_file.read_text(encoding="utf-8")
-    yield from record_takes(config, [*wanted, *judge], robot_toml=text)
+    named = {take.path: name for name, take in zip(TAKES, [*wanted, *judge], strict=False)}
+    missing = [take for take in [*wanted, *judge] if named[take.path] not in before or not take.path.is_file()]
+    for take in missing:
+        take.path.unlink(missing_ok=True)  # cut short
+    if missing:
+        much = f"{TIMES[len(missing)]} for {number(RECORD_S, 's', decimals=0)}"
+        yield Intent(f"play `{PROTOCOL}` {much} on the stand, legs free, and fit the model to what is seen", moves=True)
+        yield from record_takes(
+            engine_config(bench, imu=None),
+            missing,
+            robot_toml=bench.folder.config_file.read_text(encoding="utf-8"),
+            made=lambda take: parts.done(named[take.path], stamp=stamp, robot=robot),
+        )
     fitted, held_out = [read_run(take.path) for take in wanted], [read_run(take.path) for take in judge]
     nominal = bench.folder.path / NOMINAL_MODEL
     result = yield from relayed(lambda progress, notice: sysid.fit(fitted, nominal, held_out, progress=progress))
+    parts.end()
     # Geared servos rub the more the more they bear, which plain MuJoCo cannot do and the environment can.
     richer = result.with_effects
     best = richer or result
@@ -74,3 +96,11 @@ def identification(bench: Bench) -> Procedure:
         unsure=(result.doubt,) if result.doubt else (),
         problems=() if closer else ("no fitted value predicts better than the nominal model → it stays in use",),
     )
+
+
+def _robot(bench: Bench) -> dict[str, Any]:
+    """What a recording is told by: of a robot with other zeros, limits or settings it says nothing any more."""
+    config = bench.folder.config()
+    motors = {joint: vars(motor) for joint, motor in config.motors.items()}
+    content: dict[str, Any] = known({"motors": motors, "registers": of_robot_toml(config)})
+    return content

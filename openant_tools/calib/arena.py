@@ -9,8 +9,10 @@ last it turns to and fro, and the gyro tells how late the camera's heading is.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,7 @@ from openant_tools.numbers import number
 from openant_tools.optional import cv2
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Ask, Bench, Drawing, Hands, Intent, Procedure, Progress, Say, Subroutine
+from openant_tools.procedure.unfinished import Parts
 from openant_tools.recording.reader import Recording, read_recording
 from openant_tools.recording.run import Facts
 from openant_tools.robot.config import CameraSection as CameraFacts
@@ -67,6 +70,8 @@ VIEWS, VIEW_S = 10, 60.0
 NEW_VIEW = 0.03
 #: as `calibrate` calls its source
 BOARD = "ChArUco board"
+#: its parts
+LENS, MOTION, CIRCLE, BACK = "the lens", "standing up and turning", "the circle", "back on its stand"
 FOV_WORDS = "the declared field of view is good to a few mm near the picture's middle, 10 to 20 mm in height"
 
 
@@ -106,6 +111,32 @@ def judge_sizes(lying_m: float, standing_m: float, camera_m: float, tag_m: float
     return Sizes(ratio, step, "origin", setup.origin_tag_size_m * true_camera_m / camera_m)
 
 
+@dataclass(frozen=True)
+class _View:
+    """What the picture told before the robot stood up.
+
+    Attributes:
+        camera_m: its height over the origin's tag. latency_s, latency_source: how late its stamps are, and who says so.
+        problems: what is odd.
+    """
+
+    lens: Intrinsics
+    body_id: int
+    camera_m: float
+    latency_s: float
+    latency_source: str
+    problems: tuple[str, ...]
+
+    @classmethod
+    def of_note(cls, note: Mapping[str, Any]) -> _View:
+        facts = {name: note[name] for name in cls.__dataclass_fields__}
+        return cls(**{**facts, "lens": _lens_of_note(note["lens"]), "problems": tuple(note["problems"])})
+
+
+def _lens_of_note(note: Mapping[str, Any]) -> Intrinsics:
+    return Intrinsics(**{**note, "distortion": tuple(note["distortion"])})
+
+
 def arena(bench: Bench) -> Procedure:
     """Look, measure, judge, write `[camera]` and `[arena]`.
 
@@ -126,48 +157,23 @@ def arena(bench: Bench) -> Procedure:
     # What is worth knowing, what is wrong, and what could not be judged.
     problems, wrong, unsure = list[str](), list[str](), list[str]()
     values = dict[str, object]()
-    yield Progress(0.0, f"looking through {where}")
-    info, lens, seen, words = yield from _look(bench, config, where)
-    problems += words
-    origin_id, body_id = config.camera.origin_tag_id, config.camera.body_tag_id
-    if origin_id not in seen:
-        raise HardwareFault(
-            f"the origin's tag {origin_id} ({config.camera.tag_family}) is not in the picture (seen: {sorted(seen) or 'none'})",
-            where=str(where), remedy="lay it flat into view; is the family right, the light even, the picture sharp?",
-        )  # fmt: skip
-    others = sorted(id for id in seen if id != origin_id)
-    if body_id not in others:
-        if not others:
-            yield Hands("Put the robot on the floor, under the camera.", "place", setup="floor")
-            rest(bench)
-            info, lens, seen, _ = yield from _look(bench, config, where)
-            others = sorted(id for id in seen if id != origin_id)
-        if not others:
-            raise HardwareFault(
-                "the robot's tag is not in the picture", where=str(where), remedy="put the robot under the camera"
-            )
-        answer = yield Ask("What is the number of the robot's tag?", default=float(others[0]))
-        body_id = int(answer) if isinstance(answer, float) else others[0]
-    setup = replace(config.camera, body_tag_id=body_id)
-    origin = tag_pose(seen[origin_id], setup.origin_tag_size_m, lens)
-    if not origin:
-        raise HardwareFault("the corners of the origin's tag make no square", where=str(where), remedy="lay it flat")
-    rotation, position = origin[0]
-    camera_m = abs(float(rotation[:, 2] @ position))
-    if float(np.linalg.norm(position)) > 1.5 * camera_m:
-        problems.append("the camera looks at the floor from the side → hang it straight above, distances get better")
-
-    yield Hands(
-        "Put the robot on its belly at the circle's centre, legs straight out, its nose along the up-direction of the origin's tag.",
-        "place",
-        setup="floor",
-    )
-    rest(bench)
-    yield Intent(
-        "let the robot stand up, turn to and fro for 6 s with its feet in place, and lie down again", moves=True
-    )
-    yield Say(FOV_WORDS if lens.source not in ("robot.toml", BOARD) else "the lens is calibrated")
-    record = yield from _stand_and_wiggle(bench, config, replace(setup, latency_s=None), where, lens)
+    parts = Parts(bench.folder, "arena", (LENS, MOTION, CIRCLE, BACK))
+    if parts.before:
+        yield Say(parts.words)
+    seen = parts.before.get(MOTION, {})
+    if seen.get("where") == where and _path(bench).is_file():
+        view, record = _View.of_note(seen), read_recording(_path(bench))
+    else:
+        if seen:
+            yield Say(f"it was another camera then ({seen['where']}): look and motion are made again", "warn")
+        yield Progress(0.0, f"looking through {where}")
+        view = yield from _view(bench, config, where, parts)
+        setup = replace(config.camera, body_tag_id=view.body_id, latency_s=None)
+        record = yield from _stand_and_wiggle(bench, config, setup, where, view.lens)
+        parts.done(MOTION, where=where, **asdict(view))
+    lens, camera_m, origin_id = view.lens, view.camera_m, config.camera.origin_tag_id
+    setup = replace(config.camera, body_tag_id=view.body_id)
+    problems += view.problems
     lying, standing = _between(record, "lying"), _between(record, "standing")
     sizes = judge_sizes(_height(lying), _height(standing), camera_m, config.camera.body_tag_position_m[2], setup)
     if sizes.wrong:
@@ -191,7 +197,7 @@ def arena(bench: Bench) -> Procedure:
         evidence_of_lens = [Evidence("reprojection error", lens.rms_px, "px", f"{VIEWS} views of a ChArUco board")]
     else:
         evidence_of_lens = []
-    values["camera.body_tag_id"] = body_id
+    values["camera.body_tag_id"] = view.body_id
     values["camera.body_tag_yaw_rad"] = round(config.camera.body_tag_yaw_rad + yaw, 4)
     turning = _between(record, "wiggle")
     evidence = [
@@ -226,9 +232,9 @@ def arena(bench: Bench) -> Procedure:
     except (BadInput, KeyError) as error:
         unsure.append(f"latency: {error} → is the IMU step done? does the robot turn?")
     else:
-        latency_s = info.latency_s + late.latency_s
+        latency_s = view.latency_s + late.latency_s
         evidence += [
-            Evidence("stamps are late by", late.latency_s, "s", f"gyro against tag heading; stamps: {info.latency_source}",
+            Evidence("stamps are late by", late.latency_s, "s", f"gyro against tag heading; stamps: {view.latency_source}",
                      late.latency_s - 2 * late.latency_error_s, late.latency_s + 2 * late.latency_error_s),
             Evidence("camera angle over gyro angle", late.scale, "1", "the same motion",
                      late.scale - 2 * late.scale_error, late.scale + 2 * late.scale_error),
@@ -251,17 +257,21 @@ def arena(bench: Bench) -> Procedure:
             )
         if abs(late.latency_s) > LATE_S and latency_s > 0:
             values["camera.latency_s"] = round(latency_s, 4)
-    radius = yield Ask("Radius of the circle?", unit="m", default=config.arena.radius_m, low=0.1, high=5.0)
+    radius = parts.before.get(CIRCLE, {}).get("radius_m")
+    if radius is None:
+        radius = yield Ask("Radius of the circle?", unit="m", default=config.arena.radius_m, low=0.1, high=5.0)
+        parts.done(CIRCLE, radius_m=radius)
     centre = [round(float(np.median(lying[axis])), 4) for axis in ("x", "y")]
     values |= {"arena.centre_m": centre, "arena.radius_m": radius}
     yield Hands("Put it back on its stand.", "place", setup="stand")
     rest(bench)
+    parts.end()
     bench.folder.update(values, provenance=Provenance("measured", COMMAND, bench.folder.relative(_path(bench))))
     ok = False if wrong else None if unsure else True
     return Finding(
         "arena",
         ok,
-        f"camera at {number(camera_m, 'm', decimals=2)}, tags {origin_id} and {body_id}"
+        f"camera at {number(camera_m, 'm', decimals=2)}, tags {origin_id} and {view.body_id}"
         + ("" if latency_s is None else f", picture stamps {number(1e3 * abs(late.latency_s), 'ms', decimals=0)} off"),
         tuple(evidence),
         "" if ok else "mend what is listed and run it again" if wrong else "see to what is listed and run it again",
@@ -286,15 +296,64 @@ def _clock(bench: Bench) -> Clock:
     return RealClock()
 
 
+def _view(bench: Bench, config: RobotConfig, where: str | int, parts: Parts) -> Subroutine[_View]:
+    """Look until both tags are in the picture, and the robot lies where it is to stand up; what is seen, and that it may.
+
+    Raises:
+        HardwareFault: a tag is not in the picture, or the origin's lies askew.
+    """
+    info, lens, seen, problems = yield from _look(bench, config, where, parts)
+    origin_id, body_id = config.camera.origin_tag_id, config.camera.body_tag_id
+    if origin_id not in seen:
+        raise HardwareFault(
+            f"the origin's tag {origin_id} ({config.camera.tag_family}) is not in the picture (seen: {sorted(seen) or 'none'})",
+            where=str(where), remedy="lay it flat into view; is the family right, the light even, the picture sharp?",
+        )  # fmt: skip
+    others = sorted(id for id in seen if id != origin_id)
+    if body_id not in others:
+        if not others:
+            yield Hands("Put the robot on the floor, under the camera.", "place", setup="floor")
+            rest(bench)
+            info, _, seen, _ = yield from _look(bench, config, where, parts, lens)
+            others = sorted(id for id in seen if id != origin_id)
+        if not others:
+            raise HardwareFault(
+                "the robot's tag is not in the picture", where=str(where), remedy="put the robot under the camera"
+            )
+        answer = yield Ask("What is the number of the robot's tag?", default=float(others[0]))
+        body_id = int(answer) if isinstance(answer, float) else others[0]
+    origin = tag_pose(seen[origin_id], config.camera.origin_tag_size_m, lens)
+    if not origin:
+        raise HardwareFault("the corners of the origin's tag make no square", where=str(where), remedy="lay it flat")
+    rotation, position = origin[0]
+    camera_m = abs(float(rotation[:, 2] @ position))
+    if float(np.linalg.norm(position)) > 1.5 * camera_m:
+        problems.append("the camera looks at the floor from the side → hang it straight above, distances get better")
+    yield Hands(
+        "Put the robot on its belly at the circle's centre, legs straight out, its nose along the up-direction of the origin's tag.",
+        "place",
+        setup="floor",
+    )
+    rest(bench)
+    yield Intent(
+        "let the robot stand up, turn to and fro for 6 s with its feet in place, and lie down again", moves=True
+    )
+    yield Say(FOV_WORDS if lens.source not in ("robot.toml", BOARD) else "the lens is calibrated")
+    return _View(lens, body_id, camera_m, info.latency_s, info.latency_source, tuple(problems))
+
+
 def _look(
-    bench: Bench, config: RobotConfig, where: str | int
+    bench: Bench, config: RobotConfig, where: str | int, parts: Parts, lens: Intrinsics | None = None
 ) -> Subroutine[tuple[CameraInfo, Intrinsics, dict[int, Array], list[str]]]:
-    """What the camera gives, the lens, each tag's corners (4, 2) over a few pictures, and what is odd about the camera."""
+    """What the camera gives, the lens unless it is known, each tag's corners (4, 2) over a few pictures, and what is odd."""
     clock = _clock(bench)
     camera = Camera(CameraSettings(where, exposure=config.camera.exposure, focus=config.camera.focus), clock)
     try:
         info = camera.open()
-        lens, words = yield from _lens(camera, clock, bench, config, where, info)
+        words = list[str]()
+        if lens is None:
+            lens, words = yield from _lens(camera, clock, bench, config, where, info, parts)
+            parts.done(LENS, where=where, **asdict(lens))
         detector, corners = TagDetector(config.camera.tag_family), dict[int, list[Array]]()
         for _ in range(PICTURES):
             frame = camera.wait(clock.now() + 2.0)
@@ -319,10 +378,14 @@ def _look(
 
 
 def _lens(
-    camera: Camera, clock: Clock, bench: Bench, config: RobotConfig, where: str | int, info: CameraInfo
+    camera: Camera, clock: Clock, bench: Bench, config: RobotConfig, where: str | int, info: CameraInfo, parts: Parts
 ) -> Subroutine[tuple[Intrinsics, list[str]]]:
-    """The lens: as robot.toml has it, from views of a board, or from the declared field of view; and what is odd."""
+    """The lens: as it was told before, as robot.toml has it, from views of a board, or from the declared field of view;
+    and what is odd."""
     width, height = info.width, info.height
+    before = dict(parts.before.get(LENS, {}))
+    if before.pop("where", None) == where and (before["width"], before["height"]) == (width, height):
+        return _lens_of_note(before), []
     known = camera_of_robot(
         replace(config, camera=replace(config.camera, body_tag_id=max(config.camera.body_tag_id, 1))), where
     )

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -50,6 +51,9 @@ QUIET_S, LONGEST_S = 1.2, 60.0
 SAMPLE_S = 0.05
 #: Commands keep this far from what hands could reach.
 KEEP_OFF_RAD = 0.03
+#: the parts that are recorded, and where; the one after them
+SWEEP, STAND, FLOOR, BACK = "slow sweep", "motions on the stand", "motions on the floor", "back on its stand"
+RECORDED = {SWEEP: "sweep.mcap", STAND: "bounds-stand.mcap", FLOOR: "bounds-floor.mcap"}
 QUANTILES = (0.001, 0.01, 0.99, 0.999)
 SIGNALS = ("pos", "vel")
 BODY = ("gyro.x", "gyro.y", "gyro.z", "acc.x", "acc.y", "acc.z")
@@ -102,7 +106,11 @@ def bounds(bench: Bench) -> Procedure:
         servos = Servos(bus, robot_servos(config))
         servos.identify()
         servos.set_torque(False)
-        ranges = yield from _by_hand(bench, bus, servos, bench.joints or JOINT_NAMES)
+        joints = bench.joints or JOINT_NAMES
+        parts = Parts(bench.folder, "bounds", (*joints, *RECORDED, BACK), bench.joints)
+        if parts.before:
+            yield Say(parts.words)
+        ranges = yield from _by_hand(bus, servos, joints, parts)
     limits = dict[str, tuple[float, float]]()
     for joint, motor in config.motors.items():
         kit_limit = ANGLE_LIMIT_RAD[JOINTS[joint].kind]
@@ -139,16 +147,21 @@ def bounds(bench: Bench) -> Procedure:
     for kind in ("hip", "knee"):
         ends = (f"{joint} {span(*limits[joint], 'rad', decimals=0)}" for joint in limits if JOINTS[joint].kind == kind)
         yield Say(f"limits of {kind}s: {', '.join(ends)}")
-    yield Intent(
-        "write these limits into robot.toml; then sweep every joint slowly through its range, and play "
-        f"{len(LIBRARY)} motions on the stand",
-        moves=True,
-    )
+    facts = {"limits_rad": {joint: list(ends) for joint, ends in limits.items()}}
+    swept, stood, walked = (_recorded(bench, parts, part, facts) for part in (SWEEP, STAND, FLOOR))
+    intents = ["write these limits into robot.toml"]
+    if swept is None:
+        intents.append("sweep every joint slowly through its range")
+    if stood is None:
+        intents.append(f"play {len(LIBRARY)} motions on the stand")
+    yield Intent("; then ".join(intents), moves=len(intents) > 1)
     values: dict[str, object] = {}
     for joint, (low, high) in limits.items():
         values |= {f"motors.{joint}.min_rad": low, f"motors.{joint}.max_rad": high}
     bench.folder.update(values, provenance=Provenance("measured", COMMAND))
-    swept = yield from sweep(engine_config(bench, imu=None), bench.folder.recordings / "sweep.mcap", "slow sweep")
+    if swept is None:
+        swept = yield from sweep(engine_config(bench, imu=None), _path(bench, SWEEP), "slow sweep")
+        parts.done(SWEEP, **facts)
     sweeps = analyse(swept, limits)
     most = {kind: _most_friction(sweeps, kind) for kind in ("hip", "knee")}
     for one in sweeps.values():
@@ -161,16 +174,23 @@ def bounds(bench: Bench) -> Procedure:
     if missed.words:
         yield Say(f"{missed.words} → {REMEDY}", "warn")
 
-    runs = [(yield from _library(bench, "stand"))]
-    if (
-        yield Ask("Also on the floor? It needs a metre of room around the robot.", ("yes", "no"), default="yes")
-    ) == "yes":
+    if stood is None:
+        stood = yield from _library(bench, STAND)
+        parts.done(STAND, **facts)
+    runs = [stood]
+    question = "Also on the floor? It needs a metre of room around the robot."
+    if walked is not None:
+        runs.append(walked)
+    elif (yield Ask(question, ("yes", "no"), default="yes")) == "yes":
         yield Hands("Put the robot on the floor, on its belly, legs straight out.", "place", setup="floor")
         rest(bench)
         yield Intent("play two of the motions on the floor; the robot stands up, walks about and lies down", moves=True)
-        runs.append((yield from _library(bench, "floor")))
+        runs.append((yield from _library(bench, FLOOR)))
+        parts.done(FLOOR, **facts)
+    if len(runs) > 1:
         yield Hands("Put it back on its stand.", "place", setup="stand")
         rest(bench)
+    parts.end()
     # The sweep is the one motion that takes every joint to its ends: neighbouring legs would meet there in the others.
     found, quantiles = measured_bounds([*runs, swept])
     recording = ", ".join(bench.folder.relative(run.path) for run in runs if run.path)
@@ -207,13 +227,20 @@ def _limit(reached_rad: float, kit_rad: float) -> float:
     return kit_rad if reached_rad > kit_rad - KEEP_OFF_RAD else round(max(0.0, reached_rad - KEEP_OFF_RAD), 5)
 
 
-def _by_hand(bench: Bench, bus: Bus, servos: Servos, joints: Sequence[str]) -> Subroutine[dict[str, Range]]:
+def _path(bench: Bench, part: str) -> Path:
+    return bench.folder.recordings / RECORDED[part]
+
+
+def _recorded(bench: Bench, parts: Parts, part: str, facts: Mapping[str, Any]) -> Run | None:
+    """What was recorded before the step was left, where these are its facts; None where it is to be recorded."""
+    path = _path(bench, part)
+    return read_run(path) if parts.before.get(part) == facts and path.is_file() else None
+
+
+def _by_hand(bus: Bus, servos: Servos, joints: Sequence[str], parts: Parts) -> Subroutine[dict[str, Range]]:
     """joint → its range by hand. Each is led to both stops, twice; the capture ends by itself when nothing new comes."""
     found: dict[str, Range] = {}
     names = list(servos.joints)
-    parts = Parts(bench.folder, "bounds", joints, bench.joints)
-    if parts.before:
-        yield Say(parts.words)
     for k, joint in enumerate(joints):
         # A range is told from the joint's zero: where that is another now, it is no longer known.
         zero = [servos[joint].zero_rad, servos[joint].direction]
@@ -323,10 +350,10 @@ def _sweep_words(sweeps: Mapping[str, JointSweep]) -> list[str]:
     return words
 
 
-def _library(bench: Bench, setup: str) -> Subroutine[Run]:
+def _library(bench: Bench, part: str) -> Subroutine[Run]:
     """Play the motions and record them in one file; the recording."""
-    floor = setup == "floor"
-    path = bench.folder.recordings / f"bounds-{setup}.mcap"
+    floor = part == FLOOR
+    path, setup = _path(bench, part), "floor" if floor else "stand"
     config = engine_config(bench)
     joints = tuple(servo.joint for servo in config.servos)
     with EngineProcess(config) as engine:

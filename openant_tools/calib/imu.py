@@ -25,6 +25,7 @@ from openant_tools.errors import HardwareFault
 from openant_tools.numbers import exact, number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Ask, Bench, Drawing, Hands, Intent, Live, Procedure, Progress, Say, Subroutine
+from openant_tools.procedure.unfinished import Parts
 from openant_tools.robot.config import Provenance
 
 __all__ = ["POSES", "Mounting", "Pose", "imu", "mounting"]
@@ -148,25 +149,42 @@ def imu(bench: Bench) -> Procedure:
             yield Say(note, "warn")
             if "gravity decides" in note.lower() or "Gravity says" in note:
                 problems.append(f"IMU scale: {note} → {number(info.acc_lsb_per_g, 'LSB/g', decimals=0)} is used")
-        yield Drawing("Three poses, each held still for a second.", DRAWING)
+        parts = Parts(bench.folder, "imu", (*(pose.words for pose in POSES), "turns"))
+        # What another board read, or with other scales, says nothing of this one.
+        board = [info.uid, info.acc_lsb_per_g, info.gyro_lsb_per_dps]
+        before = {words: facts["rest"] for words, facts in parts.before.items() if facts["board"] == board}
+        if before:
+            yield Say(parts.words)
+        elif parts.before:
+            yield Say("it is another flight controller than when it was left: every pose is held again", "warn")
+        if len(before) < len(POSES):
+            yield Drawing("Three poses, each held still for a second.", DRAWING)
         for attempt in range(TRIES):
             rests = list[_Rest]()
             for k, pose in enumerate(POSES):
+                if pose.words in before:
+                    rests.append(_Rest(**{name: np.array(value) for name, value in before[pose.words].items()}))
+                    continue
                 yield Progress(0.25 * k, pose.words)
                 rests.append((yield from _pose(driver, clock, pose)))
+                parts.done(pose.words, board=board, rest={name: x.tolist() for name, x in vars(rests[-1]).items()})
+            before = {}
             found = mounting(np.array([rest.acc for rest in rests]), np.array([pose.up for pose in POSES]))
             if found.confidence == "high" or attempt == TRIES - 1:
                 break
             words = f"low confidence: the poses disagree by {number(found.disagreement_rad, 'rad', decimals=0)}"
             if (yield Ask(f"{words}. Once more?", ("yes", "no"), default="yes")) != "yes":
                 break
-        level = rests[0]
         yield Hands("Put it back on its stand, level.", "tilt", path_rad=(0.0, 0.0, 0.0))
         wait(clock, SETTLE_S)
+        # A gyro's bias wanders with its heat: what the turns are told by is read right before them.
+        level = yield from _still(driver, clock)
         imu_now = bench.folder.config().imu
         measured = bench.folder.config().provenance_of("imu.gyro_counts_per_dps") is not None
         turns, gyro = yield from _turns(driver, clock, found.rotation, level, measured)
     turned = turns[0]
+    if found.confidence != "high" or gyro is not None or turned < 0:
+        parts.end()  # else the poses stand, and only the turns are to be made again
     norms = np.array([np.linalg.norm(rest.acc) for rest in rests])
     acc_counts = float(norms.mean() / STANDARD_GRAVITY * info.acc_lsb_per_g)
     nominal = min((*msp.ACC_LSB_PER_G_NEW, msp.ACC_LSB_PER_G_OLD), key=lambda lsb: abs(math.log(acc_counts / lsb)))
@@ -277,20 +295,22 @@ def _pose(driver: Imu, clock: Clock, pose: Pose) -> Subroutine[_Rest]:
     """Hold a pose and read at rest."""
     yield Hands(f"Hold the robot {pose.words} and keep still.", "tilt", path_rad=pose.turn_rad)
     wait(clock, SETTLE_S)
-    for _ in range(TRIES):
-        rest = _rest(driver, clock)
-        if rest.still:
-            break
-        yield Say("it moves; keep still", "warn")
+    rest = yield from _still(driver, clock)
     x, y, z = rest.acc.tolist()
     yield Live({"x": x, "y": y, "z": z}, "m/s²", pose.words)
     return rest
 
 
-def _rest(driver: Imu, clock: Clock) -> _Rest:
-    samples = _samples(driver, clock, REST_S)
-    acc, gyro = samples[:, 1:4], samples[:, 4:7]
-    return _Rest(acc.mean(axis=0), gyro.mean(axis=0), acc.std(axis=0), gyro.std(axis=0))
+def _still(driver: Imu, clock: Clock) -> Subroutine[_Rest]:
+    """Readings at rest; those of the last try where it moves at every one."""
+    for _ in range(TRIES):
+        samples = _samples(driver, clock, REST_S)
+        acc, gyro = samples[:, 1:4], samples[:, 4:7]
+        rest = _Rest(acc.mean(axis=0), gyro.mean(axis=0), acc.std(axis=0), gyro.std(axis=0))
+        if rest.still:
+            break
+        yield Say("it moves; keep still", "warn")
+    return rest
 
 
 def _samples(driver: Imu, clock: Clock, seconds: float) -> Array:

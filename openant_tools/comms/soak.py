@@ -89,12 +89,14 @@ def soak_motion(
 
 
 def soaked_seconds(path: Path) -> float:
-    """How long a soak that stands there lasted so far, s.
+    """How long a soak that stands there lasted so far, s, without the pauses after which it was gone on with.
 
     Raises:
         BadInput: it is no recording, or one torn before its first row.
     """
-    return read_recording(path).run.duration_s
+    recording = read_recording(path)
+    paused = sum(float(event["pause_s"]) for event in recording.events if event["kind"] == "resumed")
+    return recording.run.duration_s - paused
 
 
 def soak(

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 __all__ = ["Parts", "Unfinished", "forget", "unfinished"]
 
 SCHEMA = "openant.unfinished/1"
+#: parts beyond which not each is named
+NAMED = 8
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,12 @@ class Unfinished:
     def words(self) -> str:
         """`4 of 8`."""
         return f"{len(self.done)} of {len(self.of)}"
+
+    @property
+    def done_words(self) -> str:
+        """`hip_rr, knee_rr`; of many parts the first and the last."""
+        names = [part for part in self.of if part in self.done]
+        return ", ".join(names) if len(names) <= NAMED else f"{names[0]} to {names[-1]}"
 
 
 def unfinished(folder: RobotFolder, step: str) -> Unfinished | None:
@@ -76,10 +84,13 @@ class Parts:
     """
 
     def __init__(self, folder: RobotFolder, step: str, of: Sequence[str], named: Sequence[str] = ()) -> None:
-        self._folder, self._step, self._of = folder, step, tuple(of)
+        self._folder, self._step = folder, step
+        #: all of them, in order
+        self.of = tuple(of)
         left = None if named else unfinished(folder, step)
         #: part → what is known of it, of those that were done before
-        self.before: Mapping[str, Mapping[str, Any]] = {} if left is None or left.of != self._of else left.done
+        self.before: Mapping[str, Mapping[str, Any]] = {} if left is None or left.of != self.of else left.done
+        self._left = left if self.before else None
         self._done = dict(self.before)
         self._kept = not named
 
@@ -88,15 +99,20 @@ class Parts:
         self._done[part] = facts
         if self._kept:
             date = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
-            note = {"schema": SCHEMA, "date": date.isoformat(), "of": list(self._of), "done": self._done}
+            note = {"schema": SCHEMA, "date": date.isoformat(), "of": list(self.of), "done": self._done}
             write_text(_file(self._folder, self._step), json_text(note))
+
+    def end(self) -> None:
+        """There is a result: it begins with its first part the next time, whatever the result says."""
+        forget(self._folder, self._step)
 
     @property
     def words(self) -> str:
-        """That it goes on where it was left, in a sentence."""
-        names = ", ".join(self.before)
+        """That it goes on where it was left, in a sentence; "" where it begins with its first part."""
+        if self._left is None:
+            return ""
         verb = "was" if len(self.before) == 1 else "were"
-        return f"it goes on at {len(self.before) + 1} of {len(self._of)}: {names} {verb} done before"
+        return f"it goes on at {len(self.before) + 1} of {len(self.of)}: {self._left.done_words} {verb} done before"
 
 
 def _file(folder: RobotFolder, step: str) -> Path:

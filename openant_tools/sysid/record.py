@@ -113,6 +113,7 @@ def record_takes(
     *,
     robot_toml: str | None = None,
     pictures: bool = False,
+    made: Callable[[Take], None] = lambda take: None,
 ) -> Subroutine[list[Recorded]]:
     """Record one take after another, of a robot that stays where it is.
 
@@ -120,6 +121,7 @@ def record_takes(
         config: the robot, see `comms.setup`.
         robot_toml: the robot's configuration as text, kept inside the recordings.
         pictures: record the overhead camera's, too.
+        made: called with each take whose recording is whole.
 
     Raises:
         HardwareFault: a guard or the stop key stopped it; the recording up to there is kept.
@@ -179,6 +181,7 @@ def record_takes(
             yield from play(protocol, take.seed, take.path.stem)
             written, cycles = engine.ask(messages.StopRecording())
             done.append(Recorded(Path(written), cycles))
+            made(take)
             past += protocol.seconds
         if wanted[-1].protocol.setup == "floor":
             # Standing, it would fall when it is let go: back to how it lay.

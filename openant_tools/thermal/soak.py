@@ -39,6 +39,7 @@ __all__ = [
     "Phase",
     "Sample",
     "SoakPlan",
+    "Soaking",
     "pose_angles",
     "resume_plan",
     "soak",
@@ -337,7 +338,7 @@ def soak(
         except BaseException:
             if not engine.ended:
                 with contextlib.suppress(HardwareFault):  # what ended it says more
-                    engine.ask(messages.Torque(False))
+                    engine.stop()  # which the recording tells from a load that has ended
                     engine.ask(messages.StopRecording())
             raise
         made, cycles = engine.ask(messages.StopRecording())
@@ -577,14 +578,20 @@ PAUSE_S = 10.0
 
 
 def _so_far(path: Path) -> _SoFar:
-    run = read_recording(path).run
+    recording = read_recording(path)
+    run = recording.run
     step = np.diff(run.t, append=run.t[-1])
     step[step > PAUSE_S] = 0.0
     on = run.signal("torque", default=1.0).max(axis=1) > 0
     loaded, cooled = float(step[on].sum()), float(step[~on].sum())
     plan = resume_plan(path)
-    # A shutdown or a margin ends the load for good; Ctrl-C and crashes leave rows under torque at the end.
-    phase: Phase = "load" if not len(on) or on[-1] or loaded == 0.0 else "cool-down"
+    # A servo's shutdown, its margin or a guard of its ends the load for good. A crash leaves rows under torque at the end,
+    # and what no joint caused (the stop key, Ctrl-C, a lost port) is told after the last of them.
+    last = float(run.t[on][-1]) if on.any() else -math.inf
+    cut = any(
+        event["kind"] == "stopped" and event.get("joint") is None and event["t"] >= last for event in recording.events
+    )
+    phase: Phase = "load" if not len(on) or on[-1] or cut or loaded == 0.0 else "cool-down"
     if loaded >= plan.seconds - 1.0:
         phase = "cool-down"
     peak = {joint: float(np.nanmax(clean(run.t, run.column(f"temp.{joint}")).values)) for joint in run.joints}

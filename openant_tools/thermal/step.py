@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 from openant_tools.calib.wires import engine_config
+from openant_tools.errors import BadInput
 from openant_tools.numbers import number
+from openant_tools.procedure.by_time import minutes, noted
 from openant_tools.procedure.finding import Finding
-from openant_tools.procedure.step import Ask, Bench, Intent, Live, Procedure, Progress, Say
+from openant_tools.procedure.step import Ask, Bench, Intent, Live, Procedure, Progress, Say, Subroutine
+from openant_tools.procedure.unfinished import Parts, unfinished
 from openant_tools.recording.tables import read_run
 from openant_tools.robot.kit import kit as kit_by_name
 from openant_tools.thermal.finding import thermal_finding, torque_warning
 from openant_tools.thermal.fit import fit_and_judge
 from openant_tools.thermal.forecast import forecast, rest_advice
 from openant_tools.thermal.inputs import inputs_of
-from openant_tools.thermal.soak import Phase, SoakPlan, soak, soak_config
+from openant_tools.thermal.soak import Phase, Soaking, SoakPlan, resume_plan, soak, soak_config
 
 __all__ = ["thermal_soak"]
 
@@ -30,9 +34,9 @@ PHASES: Mapping[Phase, str] = {"load": "holding the home pose", "cool-down": "co
 TEMPERATURES = "temperature of each servo, up to where it switches off"
 
 
-def _minutes(minutes: float) -> str:
+def _minutes(seconds: float) -> str:
     """A time in words, in seconds where it is short."""
-    return f"{number(minutes)} min" if minutes >= 2.0 else f"{number(60 * minutes, decimals=0)} s"
+    return number(seconds / 60, "min") if seconds >= 120 else number(seconds, "s", decimals=0)
 
 
 def thermal_soak(bench: Bench) -> Procedure:
@@ -43,32 +47,27 @@ def thermal_soak(bench: Bench) -> Procedure:
     warning = torque_warning(knees, kit, supply_v=kit.supply_v, pwm_limit=config.bus.pwm_limit)
     if warning:
         yield Say(warning, "warn")
-    minutes = yield Ask("Soak for how long?", unit="min", default=DEFAULT_MIN, low=SHORTEST_MIN, high=LONGEST_MIN)
-    minutes = float(minutes) if isinstance(minutes, int | float) else DEFAULT_MIN
-    cooling = COOLING_SHARE * minutes
-    yield Intent(
-        f"hold the home pose for {_minutes(minutes)}, then let go and record {_minutes(cooling)} of cooling", moves=True
-    )
     path = bench.folder.recordings / "soak.mcap"
-    path.unlink(missing_ok=True)
-    plan = SoakPlan(load="hang", seconds=60 * minutes, cool_down_s=60 * cooling)
+    plan = _left(bench, path)
+    resume = plan is not None
+    if plan is None:
+        asked = yield Ask("Soak for how long?", unit="min", default=DEFAULT_MIN, low=SHORTEST_MIN, high=LONGEST_MIN)
+        length = float(asked) if isinstance(asked, int | float) else DEFAULT_MIN
+        plan = SoakPlan(load="hang", seconds=60 * length, cool_down_s=60 * COOLING_SHARE * length)
+    parts = Parts(bench.folder, "thermal", minutes(plan.seconds + plan.cool_down_s))
+    if parts.before:
+        yield Say(parts.words)
+    yield Intent(
+        f"hold the home pose for {_minutes(plan.seconds)}, then let go and record {_minutes(plan.cool_down_s)} of cooling"
+        + (", what was left of it" if resume else ""),
+        moves=True,
+    )
+    if not resume:
+        path.unlink(missing_ok=True)
     engine = soak_config(engine_config(bench, imu=None), RATE_HZ)
-    steps = soak(engine, plan, path, robot_toml=bench.folder.config_file.read_text(encoding="utf-8"))
-    try:
-        while True:
-            sample = next(steps)
-            if sample.words:
-                yield Say(sample.words)
-            known = {j: float(v) for j, v in zip(sample.joints, sample.temperature_c, strict=True) if math.isfinite(v)}
-            limits = dict(zip(sample.joints, map(float, sample.limit_c), strict=True))
-            yield Progress(sample.share, PHASES[sample.phase])
-            enough = yield Live(known, "°C", TEMPERATURES, dict.fromkeys(known, 15.0), limits)
-            if enough is True and sample.phase == "cool-down":
-                break
-    except StopIteration:
-        pass
-    finally:
-        steps.close()
+    text = bench.folder.config_file.read_text(encoding="utf-8")
+    yield from noted(_watched(soak(engine, plan, path, robot_toml=text, resume=resume)), parts)
+    parts.end()
     run = inputs_of(read_run(path, need=()))
     # What is forecast is the load, not the cooling after it.
     whole, held = fit_and_judge([run])
@@ -78,3 +77,31 @@ def thermal_soak(bench: Bench) -> Procedure:
         found, told, command=COMMAND, recording=bench.folder.relative(path), held=held, rest=rest_advice(found), warning=warning,
     )  # fmt: skip
     return finding
+
+
+def _left(bench: Bench, path: Path) -> SoakPlan | None:
+    """The plan of the soak that was left in the middle; None where there is none, or none of its recording."""
+    left = unfinished(bench.folder, "thermal")
+    if left is None or not path.is_file():
+        return None
+    try:
+        plan = resume_plan(path)
+    except BadInput:
+        return None
+    return plan if left.of == minutes(plan.seconds + plan.cool_down_s) else None
+
+
+def _watched(steps: Soaking) -> Subroutine[None]:
+    """Show a soak until it ends, or until enough of its cooling was seen."""
+    try:
+        for sample in steps:
+            if sample.words:
+                yield Say(sample.words)
+            known = {j: float(v) for j, v in zip(sample.joints, sample.temperature_c, strict=True) if math.isfinite(v)}
+            limits = dict(zip(sample.joints, map(float, sample.limit_c), strict=True))
+            yield Progress(sample.share, PHASES[sample.phase])
+            enough = yield Live(known, "°C", TEMPERATURES, dict.fromkeys(known, 15.0), limits)
+            if enough is True and sample.phase == "cool-down":
+                return
+    finally:
+        steps.close()

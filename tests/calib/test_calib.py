@@ -39,7 +39,7 @@ from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.procedure.step import Ask, Bench, Declined, Event, Hands, Intent, Live, Progress, drive
-from openant_tools.procedure.unfinished import unfinished
+from openant_tools.procedure.unfinished import Parts, unfinished
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
 from openant_tools.robot.config import CameraSection, Provenance
@@ -268,18 +268,64 @@ def test_zeros_and_ranges_that_were_left_go_on_with_the_next_joint(tmp_path):
         for step, name in ((zeros, "zeros"), (bounds, "bounds")):
             with pytest.raises(KeyboardInterrupt):
                 ant.do(step(ant.bench), ant.builder(before=leave_at(Hands, "Move the front right hip")))
-            assert unfinished(ant.folder, name).words == "2 of 8"
+            assert unfinished(ant.folder, name).words == ("2 of 8" if step is zeros else "2 of 12")
         ant.folder.update({"motors.knee_rr.zero_offset_rad": 3.0}, provenance=Provenance("measured", "a test"))
         moved = {}
         for step in (zeros, bounds):
             builder = ant.builder(before=leave_at(Hands, "Move the front right knee"))
             with pytest.raises(KeyboardInterrupt):
                 ant.do(step(ant.bench), builder)
-            assert "it goes on at 3 of 8: hip_rr, knee_rr were done before" in builder.said
+            of = 8 if step is zeros else 12
+            assert f"it goes on at 3 of {of}: hip_rr, knee_rr were done before" in builder.said
             asked = [event.joint for event in builder.events if isinstance(event, Hands) and event.task == "turn"]
             moved[step.__name__] = list(dict.fromkeys(asked))
         assert moved == {"zeros": ["hip_fr", "knee_fr"], "bounds": ["knee_rr", "hip_fr", "knee_fr"]}
         assert "knee_rr has another zero than when it was moved; it is done again" in builder.said
+
+
+def test_bounds_that_were_left_after_the_sweep_do_not_sweep_again(tmp_path, brisk):
+    with robot(tmp_path / "ant") as ant:
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(bounds(ant.bench), ant.builder(before=leave_at(Progress, "trot")))
+        assert not any(ant.torque())
+        assert unfinished(ant.folder, "bounds").next == "motions on the stand"
+        builder = ant.builder(before=leave_at(Hands, "Put it back"))
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(bounds(ant.bench), builder)
+        assert not [event for event in builder.events if isinstance(event, Hands) and event.task == "turn"]
+        assert "then sweep" not in builder.said
+        assert unfinished(ant.folder, "bounds").next == "back on its stand"
+        finding, builder = ant.do(bounds(ant.bench))
+        assert finding.ok, finding.problems
+        moving = [event.words for event in builder.events if isinstance(event, Intent) and event.moves]
+        assert (moving, [e for e in builder.events if isinstance(e, Ask)]) == ([], [])
+        assert unfinished(ant.folder, "bounds") is None
+
+
+def test_an_imu_whose_poses_were_left_goes_on_with_the_next_and_another_board_begins_anew(tmp_path):
+    with robot(tmp_path / "ant") as ant:
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(imu(ant.bench), ant.builder(before=leave_at(Hands, "left side straight down")))
+        left = unfinished(ant.folder, "imu")
+        assert (left.words, left.next) == ("2 of 4", "left side straight down")
+        builder = ant.builder(before=leave_at(Hands, "Within 3 s"))
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(imu(ant.bench), builder)
+        held = [event.words for event in builder.events if isinstance(event, Hands) and "keep still" in event.words]
+        assert held == ["Hold the robot left side straight down and keep still."]
+        assert unfinished(ant.folder, "imu").next == "turns"
+        note = ant.folder.path / "unfinished" / "imu.json"
+        of_this_board = note.read_text()
+        finding, builder = ant.do(imu(ant.bench))
+        assert finding.ok, finding
+        assert "keep still" not in builder.said
+        assert unfinished(ant.folder, "imu") is None
+        uid = finding.data["uid"]
+        note.write_text(of_this_board.replace(str(uid), "another"))
+        builder = ant.builder(before=leave_at(Hands, "nose straight down"))
+        with pytest.raises(KeyboardInterrupt):
+            ant.do(imu(ant.bench), builder)
+        assert "it is another flight controller than when it was left: every pose is held again" in builder.said
 
 
 class Late(SimulatedBuilder):
@@ -745,13 +791,17 @@ def test_a_board_before_the_camera_gives_the_lens_in_the_arena_step(tmp_path, mo
             return "yes" if isinstance(event, Ask) else True if isinstance(event, Hands) else None
 
     ShownBoard.views = board_views(truth, CharucoBoard(), TILTS)
-    _, lens, _, odd = drive(arena_step._look(bench, bench.folder.config(), "0"), Shower())
+    parts = Parts(bench.folder, "arena", (arena_step.LENS, arena_step.MOTION))
+    _, lens, _, odd = drive(arena_step._look(bench, bench.folder.config(), "0", parts), Shower())
     assert odd == []
+    again = Parts(bench.folder, "arena", (arena_step.LENS, arena_step.MOTION))
+    _, kept, _, _ = drive(arena_step._look(bench, bench.folder.config(), "0", again), Shower())
+    assert kept == lens, "nobody shows the board a second time"
     assert (lens.source, lens.fx) == ("ChArUco board", pytest.approx(780, rel=0.01))
     assert (bench.folder.path / "charuco-board.png").is_file()
     monkeypatch.setattr(arena_step, "VIEW_S", 1.0)
     ShownBoard.views = board_views(truth, CharucoBoard(), [(0.0, 0.0)])
-    _, lens, _, odd = drive(arena_step._look(bench, bench.folder.config(), "0"), Shower())
+    _, lens, _, odd = drive(arena_step._look(bench, bench.folder.config(), "0", parts), Shower())
     assert "only 1 different views of the board were seen; the declared field of view is used" in odd[0]
     assert lens.source != "ChArUco board"
 
@@ -761,9 +811,16 @@ SMALL = {"width": 640, "height": 480, "fps": 15.0}
 
 
 @pytest.mark.slow
-def test_the_arena_is_measured_by_the_robot_itself(tmp_path):
+def test_the_arena_is_measured_by_the_robot_itself_which_moves_once_however_often_it_was_left(tmp_path):
     with robot(tmp_path / "ant", sees=True, camera={**SMALL, "body": {"yaw": 0.3}}, imu=ST) as ant:
-        finding, _ = ant.do(arena(ant.bench))
+        for left_at in (leave_at(Intent, "stand up"), leave_at(Ask, "Radius"), leave_at(Hands, "Put it back")):
+            with pytest.raises(KeyboardInterrupt):
+                ant.do(arena(ant.bench), ant.builder(before=left_at, answers={"Radius": 0.6}))
+        assert unfinished(ant.folder, "arena").words == "3 of 4"
+        finding, builder = ant.do(arena(ant.bench))
+        assert [event.words for event in builder.events if isinstance(event, Hands)] == ["Put it back on its stand."]
+        assert not [event for event in builder.events if isinstance(event, Ask | Intent)]
+        assert ant.folder.config().arena.radius_m == 0.6
         assert finding.ok, finding
         assert finding.data["centre_m"] == pytest.approx([0.75, -0.30], abs=0.02)
         camera = ant.folder.config().camera

@@ -21,9 +21,13 @@ from places import DATA
 from openant_tools.cli import openant as manual
 from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
+from openant_tools.comms.release import release_all
+from openant_tools.comms.restart import MotionStopped
 from openant_tools.comms.setup import config_of_unknown_robot
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
 from openant_tools.procedure.finding import Finding, latest
+from openant_tools.procedure.step import Ask, Event, Progress
+from openant_tools.procedure.unfinished import unfinished
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.resume import continuation
 from openant_tools.recording.run import Facts, Run
@@ -497,6 +501,46 @@ def test_the_walks_step_soaks_fits_and_finds(tmp_path: Path) -> None:
     assert any(one.name == "knee_fl holds for ever" for one in finding.evidence)
     assert "hold the home pose for 2 min" in builder.said
     assert (tmp_path / "ant" / "recordings" / "soak.mcap").is_file()
+
+
+def test_a_soak_that_was_stopped_goes_on_with_its_next_minute(tmp_path: Path) -> None:
+    """By the stop key under load, then by leaving while it cools: each time what was soaked counts, and nobody is asked again."""
+
+    def stop(event: Event) -> None:
+        if isinstance(event, Progress) and event.words.startswith("holding") and (event.share or 0) > 0.4:
+            release_all()
+
+    def leave(event: Event) -> None:
+        if isinstance(event, Progress) and event.words.startswith("cooling") and (event.share or 0) > 0.9:
+            raise KeyboardInterrupt
+
+    def torque_on_s() -> float:
+        run = read_recording(tmp_path / "ant" / "recordings" / "soak.mcap").run
+        step = np.diff(run.t, append=run.t[-1])
+        return float(step[(run.signal("torque").max(axis=1) > 0) & (step < 5)].sum())
+
+    with robot(tmp_path / "ant", **DOZING) as there:
+        with pytest.raises(MotionStopped):
+            there.do(thermal_soak(there.bench), there.builder(answers={"how long": 3.0}, before=stop))
+        assert not any(there.torque())
+        left = unfinished(there.folder, "thermal")
+        assert left is not None
+        assert (left.words, left.next) == ("1 of 4", "minute 2")
+        assert torque_on_s() < 150
+        builder = there.builder(before=leave)
+        with pytest.raises(KeyboardInterrupt):
+            there.do(thermal_soak(there.bench), builder)
+        assert "it goes on at 2 of 4: minute 1 was done before" in builder.said
+        assert not [event for event in builder.events if isinstance(event, Ask)]
+        assert torque_on_s() == pytest.approx(180, abs=3)
+        left = unfinished(there.folder, "thermal")
+        assert left is not None
+        assert left.next == "minute 4"
+        finding, builder = there.do(thermal_soak(there.bench))
+        assert "holding the home pose" not in builder.said
+    assert finding.ok, finding.problems
+    assert torque_on_s() == pytest.approx(180, abs=3)
+    assert unfinished(there.folder, "thermal") is None
 
 
 # ---- gone on with ----

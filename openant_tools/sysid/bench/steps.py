@@ -6,7 +6,8 @@ import math
 
 from openant_tools.calib.wires import engine_config
 from openant_tools.errors import BadInput
-from openant_tools.procedure.step import Ask, Bench, Procedure, Subroutine
+from openant_tools.procedure.step import Ask, Bench, Procedure, Say, Subroutine
+from openant_tools.procedure.unfinished import Parts, unfinished
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import HOME_RAD
 from openant_tools.robot.kit import kit as kit_by_name
@@ -55,10 +56,20 @@ def floor_friction(bench: Bench) -> Procedure:
     Raises:
         BadInput, HardwareFault: as `tilt.floor_friction`.
     """
-    command = "openant sysid tilt"
-    if (yield Ask("What reads the plate's angle?", (IMU, PROTRACTOR), default=IMU)) == IMU:
-        trials = int(_number((yield Ask("How often?", unit="trials", default=float(TRIALS), low=1, high=50)), TRIALS))
-        return (yield from tilt.floor_friction(engine_config(bench), trials, command=command))
+    command, name = "openant sysid tilt", "floor-friction"
+    left = unfinished(bench.folder, name)
+    by = IMU if left else (yield Ask("What reads the plate's angle?", (IMU, PROTRACTOR), default=IMU))
+    if by == IMU:
+        trials = (
+            (yield Ask("How often?", unit="trials", default=float(TRIALS), low=1, high=50)) if left is None else None
+        )
+        of = left.of if left else [f"trial {k + 1}" for k in range(int(_number(trials, TRIALS)))]
+        parts = Parts(bench.folder, name, of)
+        if parts.before:
+            yield Say(parts.words)
+        found = yield from tilt.floor_friction(engine_config(bench), len(of), command=command, parts=parts)
+        parts.end()
+        return found
     slopes = [Slope(angle, "static") for angle in (yield from _angles("it began to slide"))]
     slopes += [Slope(angle, "kinetic") for angle in (yield from _angles("it kept sliding after a tap"))]
     if not slopes:

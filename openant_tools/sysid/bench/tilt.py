@@ -14,6 +14,7 @@ from openant_tools.comms.messages import EngineConfig
 from openant_tools.errors import BadInput
 from openant_tools.numbers import number
 from openant_tools.procedure.step import Hands, Intent, Live, Procedure, Say, Subroutine
+from openant_tools.procedure.unfinished import Parts
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import HOME_RAD
 from openant_tools.sysid.bench.friction import (
@@ -49,6 +50,7 @@ def floor_friction(
     seconds: float = LONGEST_S,
     slid: bool = True,
     resolution_rad: float = math.radians(0.5),
+    parts: Parts | None = None,
 ) -> Procedure:
     """The floor's friction by the angles at which the robot begins to slide; it stands at home with torque on.
 
@@ -58,6 +60,7 @@ def floor_friction(
             counts as the plate's normal, and a trial takes `seconds`.
         seconds: of a trial at most.
         slid, resolution_rad: as `friction_finding` takes them.
+        parts: the trials by name, `trials` of them, for who may leave in the middle.
 
     Raises:
         BadInput: there is no IMU, or it does not read gravity at rest.
@@ -67,7 +70,8 @@ def floor_friction(
         raise BadInput("no flight controller is known", remedy="name it in robot.toml, ports.imu, or type the angles")
     yield Intent("stand up at home on the plate and hold itself there", moves=True)
     pose = np.array([HOME_RAD[JOINTS[servo.joint].kind] for servo in config.servos])
-    slopes: list[Slope] = []
+    before = {} if parts is None else parts.before
+    slopes = [Slope(float(facts["angle_rad"]), "static") for facts in before.values()]
     with EngineProcess(config) as engine:
         yield from heard(engine)
         engine.ask(messages.Torque(True))
@@ -78,7 +82,7 @@ def floor_friction(
             engine.ask(messages.Hold(SETTLE_S))
             engine.telemetry()  # what came before, while it stood up, says nothing of the plate
             up = up_direction(_sample(engine, LEVEL_S)[1])
-        for trial in range(1, trials + 1):
+        for trial in range(len(slopes) + 1, trials + 1):
             if by_hand:
                 again = f"Trial {trial} of {trials}: turn the robot a little, plate level."
                 yield Hands(again, "tilt", path_rad=(0.0, 0.0, 0.0))
@@ -87,6 +91,8 @@ def floor_friction(
                 yield Hands(words, "tilt", path_rad=(SLIDES_RAD, 0.0, 0.0), while_watching=True)
             angle = yield from _trial(engine, up, seconds)
             slopes.append(Slope(checked(angle, "the accelerometer"), "static"))
+            if parts is not None:
+                parts.done(parts.of[trial - 1], angle_rad=angle)
             yield Say(f"trial {trial}: {number(angle, 'rad')}, μ = {number(math.tan(angle))}", "ok")
         engine.ask(messages.Torque(False))
         if by_hand:

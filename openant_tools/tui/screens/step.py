@@ -273,7 +273,7 @@ where the number lies. `l` shows the log of what was said and done instead.
         self.say(
             marked(
                 "warn",
-                f"it was left at {left.words}: {', '.join(left.done)} {'is' if len(left.done) == 1 else 'are'} done",
+                f"it was left at {left.words}: {left.done_words} {'is' if len(left.done) == 1 else 'are'} done",
             )
         )
         onwards = StepChoice(f"Go on at {len(left.done) + 1} of {len(left.of)}: {left.next}", self.begin)

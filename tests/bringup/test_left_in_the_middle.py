@@ -1,0 +1,141 @@
+"""Steps that record: left in the middle, they go on with what is missing, and nobody is asked again what was answered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builder import Builder, Robot, robot
+
+from openant_tools.bringup.comms_step import comms_step
+from openant_tools.bringup.identification import identification
+from openant_tools.bringup.walk import WALK
+from openant_tools.comms.soak import soaked_seconds
+from openant_tools.procedure.step import Answer, Ask, Bench, Event, Intent, Live, Procedure, Progress, Step
+from openant_tools.procedure.unfinished import Unfinished, unfinished
+from openant_tools.recording.reader import read_recording
+from openant_tools.recording.run import Facts
+from openant_tools.recording.telemetry import Cycle, RecordedAnswer, ServoChannel
+from openant_tools.recording.writer import RecordingWriter
+from openant_tools.robot.config import Provenance
+from openant_tools.sysid.bench.steps import floor_friction
+
+#: steps that read or compute only: done again they ask nothing that was answered, and take a minute
+AT_ONCE = ("connect", "estop", "inventory", "gap", "passport")
+
+
+def left(
+    there: Robot, step: Callable[[Bench], Procedure], name: str, leave: Callable[[Event], bool], **answers: float
+) -> Unfinished:
+    """Leave a step once an event is so; how far it is then."""
+
+    def before(event: Event) -> None:
+        if leave(event):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        there.do(step(there.bench), there.builder(before=before, answers=answers))
+    assert not any(there.torque())
+    note = unfinished(there.folder, name)
+    assert note is not None
+    return note
+
+
+def asked(builder: Builder) -> list[str]:
+    return [event.question for event in builder.events if isinstance(event, Ask)]
+
+
+@pytest.mark.parametrize(
+    "step", [step for step in WALK.values() if step.name not in AT_ONCE], ids=lambda step: step.name
+)
+def test_every_step_with_parts_notes_them(step: Step) -> None:
+    """What notes them is seen in each room's own tests; here that no step was forgotten."""
+    module = Path(__file__).parents[2] / (step.procedure.partition(":")[0].replace(".", "/") + ".py")
+    assert f'Parts(bench.folder, "{step.name}"' in module.read_text()
+
+
+def test_a_watch_over_the_bus_goes_on_with_its_next_minute(tmp_path: Path) -> None:
+    soak = tmp_path / "ant" / "recordings" / "comms-soak.mcap"
+    with robot(tmp_path / "ant") as there:
+        note = left(
+            there, comms_step, "comms", lambda event: isinstance(event, Progress) and (event.share or 0) > 0.6 and "lost" in event.words,
+            **{"how long": 1.5},
+        )  # fmt: skip
+        assert (note.words, note.next) == ("1 of 2", "minute 2")
+        before = soaked_seconds(soak)
+        finding, builder = there.do(comms_step(there.bench))
+    assert finding.ok, finding
+    assert not asked(builder)
+    assert "swing all legs gently on the stand until it was 1.5 min in all" in builder.said
+    assert 55 < before < 75
+    assert soaked_seconds(soak) == pytest.approx(90, abs=3)
+    assert unfinished(there.folder, "comms") is None
+
+
+def test_a_pause_does_not_count_as_soaking(tmp_path: Path) -> None:
+    path = tmp_path / "soak.mcap"
+    channel = ServoChannel("knee_fl", "XL430-W250-T", 11, 1, 0.0, {"pos": 0.0015})
+    with RecordingWriter(path, facts=Facts(("knee_fl",)), channels=[channel], clock=lambda: 0.0) as writer:
+        for t in (0.0, 10.0, 3610.0, 3620.0):
+            if t == 3610.0:
+                writer.event("resumed", pause_s=3600.0)
+            writer.cycle(Cycle(t, [None], None, None, [RecordedAnswer({"pos": 1}, True)], [False]))
+    assert read_recording(path).run.duration_s == 3620.0
+    assert soaked_seconds(path) == pytest.approx(20.0)
+
+
+def test_motions_that_were_recorded_are_not_played_again_unless_the_robot_is_another(
+    tmp_path: Path, brisk: None
+) -> None:
+    with robot(tmp_path / "ant", motor={"coulomb_nm": 0.09}) as there:
+        note = left(
+            there, identification, "identify", lambda event: isinstance(event, Progress) and "held-out-2" in event.words
+        )
+        assert (note.words, note.next) == ("2 of 4", "the same again")
+        recorded = {
+            path.name: path.read_bytes() for path in there.folder.recordings.iterdir() if "out-2" not in path.name
+        }
+        limit = there.folder.config().motors["knee_rr"].max_rad
+        there.folder.update({"motors.knee_rr.max_rad": 1.0}, provenance=Provenance("measured", "a test"))
+        intents = list[str]()
+
+        def granted(event: Event) -> bool:
+            intents.extend([event.words] if isinstance(event, Intent) else [])
+            return bool(intents)
+
+        left(
+            there,
+            identification,
+            "identify",
+            granted,
+        )
+        assert intents[0].startswith("play `stand` three times")
+        there.folder.update({"motors.knee_rr.max_rad": limit}, provenance=Provenance("measured", "a test"))
+        finding, builder = there.do(identification(there.bench))
+    assert finding.step == "identify"
+    assert [event.words.split(" for ")[0] for event in builder.events if isinstance(event, Intent)] == [
+        "play `stand` once"
+    ]
+    assert {name: (there.folder.recordings / name).read_bytes() for name in recorded} == recorded
+    assert unfinished(there.folder, "identify") is None
+
+
+def test_slides_that_were_read_stay_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def sliding(builder: Builder, event: Event) -> Answer:
+        return True if isinstance(event, Live) and event.values["plate"] > 0.3 else shown(builder, event)
+
+    shown = Builder.answer
+    monkeypatch.setattr(Builder, "answer", sliding)
+    with robot(tmp_path / "ant") as there:
+        note = left(
+            there, floor_friction, "floor-friction",
+            lambda event: "Trial 2" in getattr(event, "words", ""), **{"How often": 3.0},
+        )  # fmt: skip
+        assert (note.words, note.next) == ("1 of 3", "trial 2")
+        finding, builder = there.do(floor_friction(there.bench))
+    assert not asked(builder)
+    assert "Trial 2 of 3" in builder.said
+    assert "Trial 1 of 3" not in builder.said
+    assert np.isfinite(finding.parameters[0].value or np.nan)
