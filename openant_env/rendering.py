@@ -39,18 +39,21 @@ VIDEO_BYTES = 3_000_000
 #: of WebP, from 0 to 100, in the order in which they are tried until a video is small enough
 VIDEO_QUALITIES = (70, 45, 20, 0)
 
+#: the MUJOCO_GL that a command was given: MuJoCo itself, as it is imported, is told that it draws nothing
+CHOSEN_GL = "OPENANT_MUJOCO_GL"
+
 
 class NoOpenGL(BadInput):
     """This machine has no OpenGL to draw with."""
 
 
 def _backends() -> list[str]:
-    """MuJoCo's OpenGL backends, the likeliest to work first."""
-    chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
-    if chosen in ("glfw", "egl", "osmesa", "cgl"):
-        return [chosen]
-    if chosen in ("disabled", "off", "false", "0"):  # `disable` is what our own commands set, to load faster
+    """MuJoCo's OpenGL backends, the likeliest to work first; one that is named, be it none, is the only one."""
+    chosen = os.environ.get(CHOSEN_GL, os.environ.get("MUJOCO_GL", "")).strip().lower()
+    if chosen in ("disable", "disabled", "off", "false", "0"):
         return []
+    if chosen not in ("", "enable", "enabled", "on", "true", "1", "glx", "wgl"):
+        return [chosen]
     if platform.system() == "Darwin":
         return ["cgl", "glfw"]
     has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -24,7 +24,8 @@ os.environ.setdefault("XDG_STATE_HOME", tempfile.mkdtemp(prefix="openant-state-"
 
 # What the tests start by the hundred compiles our modules once, not each time; and MuJoCo loads no window library.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-os.environ.setdefault("MUJOCO_GL", "disable")
+os.environ.setdefault("OPENANT_MUJOCO_GL", os.environ.get("MUJOCO_GL", ""))
+os.environ["MUJOCO_GL"] = "disable"
 
 # How long an example takes says what else the machine does. `--hypothesis-profile thorough` looks farther.
 settings.register_profile("ours", deadline=None, max_examples=50)

@@ -176,8 +176,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     end_with_who_started_us()
     begin(list(sys.argv[1:] if argv is None else map(str, argv)))
     # MuJoCo loads a window library as it is imported, for a renderer that no command of ours uses (`openant_env.rendering`
-    # chooses its own): a third of its time to load, and a process started besides.
-    os.environ.setdefault("MUJOCO_GL", "disable")
+    # chooses its own, by what was said here): a third of its time to load, and a process started besides. One that it
+    # does not know would end the import.
+    os.environ.setdefault("OPENANT_MUJOCO_GL", os.environ.get("MUJOCO_GL", ""))
+    os.environ["MUJOCO_GL"] = "disable"
     try:
         code = openant.main(args=argv, prog_name="openant", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)

@@ -452,9 +452,9 @@ def test_without_opengl_only_the_picture_fails_and_says_why(monkeypatch):
     assert make().unwrapped.render() is None
 
 
-@pytest.mark.parametrize(("named", "why"), [("glfw", "glfw: "), ("off", "MUJOCO_GL says so")])
+@pytest.mark.parametrize(("named", "why"), [("glfw", "glfw: "), ("off", "MUJOCO_GL says so"), ("mesa", "mesa: ")])
 def test_a_backend_that_has_no_display_or_none_at_all_is_no_opengl(monkeypatch, named, why):
-    monkeypatch.setenv("MUJOCO_GL", named)
+    monkeypatch.setenv(rendering.CHOSEN_GL, named)
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     env = make(render_mode="rgb_array")
