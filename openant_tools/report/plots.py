@@ -171,10 +171,13 @@ def draw_tracking(
 
 
 def legend(axes: Axes, **options: Any) -> None:
-    """A legend above the plot, at the right end of its title's line, where it hides nothing."""
-    handles, _ = axes.get_legend_handles_labels()
+    """A legend above the plot, at its left end, which a phone shows; where the plot has a title, in a line of its own."""
+    handles, labels = axes.get_legend_handles_labels()
     with style():
-        axes.legend(**{"loc": "lower right", "bbox_to_anchor": (1.0, 0.99), "ncols": len(handles) or 1, **options})
+        if axes.get_title("left") and not options:
+            axes.figure.legend(handles, labels, loc="outside upper left", ncols=len(handles) or 1)
+        else:
+            axes.legend(**{"loc": "lower left", "bbox_to_anchor": (0.0, 0.99), "ncols": len(handles) or 1, **options})
 
 
 def as_svg(figure: Figure, key: str = "figure") -> str:

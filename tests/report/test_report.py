@@ -66,6 +66,20 @@ def a_figure(points: int = 50) -> Any:
     return figure
 
 
+def test_a_legend_hides_no_title() -> None:
+    figure, axes = plots.figure(2, 1, height=1.4)
+    with plots.style():
+        for axis in axes:
+            for name in ("read", "95 %", "50 %", "median", "limit"):
+                axis.plot([0, 1], [0, 1], label=name)
+            axis.set_title("hip_rl stays below 80 °C, whatever else is done, and settles at 34 ± 6 °C")
+    plots.legend(axes[0])
+    figure.draw_without_rendering()
+    [legend] = figure.legends
+    boxes = [axis.title.get_window_extent() for axis in axes] + [axis._left_title.get_window_extent() for axis in axes]
+    assert not any(legend.get_window_extent().overlaps(box) for box in boxes if box.width > 0)
+
+
 def a_report() -> Report:
     return (
         Report(

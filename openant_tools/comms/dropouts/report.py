@@ -61,7 +61,7 @@ def dropouts_report(found: DropoutDiagnosis) -> Report:
     lost, asked = int(log.lost.sum()), int(log.answers.sum())
     shows = "What was lost of whom" if lost else "How long the slowest answer took"
     named = found.verdict not in ("none", "unknown")
-    then = f"{best.remedy}.\n\nTo make sure: {found.next_test}." if named else f"{found.next_test}."
+    then = f"{best.remedy}.\n\nTo make sure: {_ended(found.next_test)}" if named else _ended(found.next_test)
     then = then[:1].upper() + then[1:]
     answer = ReportSummary(
         f"{found.what[:1].upper()}{found.what[1:]}.",
@@ -70,7 +70,7 @@ def dropouts_report(found: DropoutDiagnosis) -> Report:
         then if found.next_test else "Nothing. Ask again after cables were moved, and with the legs in motion.",
         "good" if found.healthy_bus else "bad" if named else "warn",
         (
-            KeyFigure("lost", percent(lost / max(1, asked), decimals=2), f"{lost} of {asked} answers"),
+            KeyFigure("lost", number(lost / max(1, asked), "share"), f"{lost} of {asked} answers"),
             KeyFigure("watched", number(log.seconds, "s", decimals=0), f"{len(log.t)} reads"),
         ),
     )
@@ -105,9 +105,13 @@ def _meaning(found: DropoutDiagnosis, lost: int, asked: int) -> str:
     """What it does to the robot."""
     if not lost and asked:
         # Nothing in n trials: the rate lies below 3 / n with 95 % (the rule of three).
-        rare = f"With 95 % certainty fewer than one answer in {max(1, asked // 3)} is lost."
+        rare = f"With 95 % certainty less than {number(3 / asked, 'share')} of all answers are lost."
         return rare if found.healthy_bus else f"{rare} But the times of the loop are not as they should be."
     if found.healthy_bus:
         return "So rare a loss harms nobody: the agent sees a value that is one step old."
-    share = percent(lost / max(1, asked), decimals=2)
-    return f"Of each servo's answers {share} are missing; where one is, the agent acts on an old angle."
+    share = number(lost / max(1, asked), "share")
+    return f"Of all answers {share} are missing; where one is, the agent acts on an old angle."
+
+
+def _ended(words: str) -> str:
+    return words if words.endswith("?") else f"{words}."
