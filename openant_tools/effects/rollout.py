@@ -81,10 +81,10 @@ def rollout(
     laws = laws_of([effects[v] for _ in segments for v in range(nv)], len(plant.joints))
     supply = _Supply(rollouts, nv) if measured_supply else None
     samples = _Samples(rollouts, nv)
-    flips: dict[int, list[int]] = {}
+    flips: dict[int, list[tuple[slice, NDArray[np.bool_]]]] = {}
     for s, segment in enumerate(segments):
-        for step in segment.torque_off:
-            flips.setdefault(step, []).append(s)
+        for step, off in segment.switches(timestep).items():
+            flips.setdefault(step, []).append((slice(s * nv, (s + 1) * nv), off))
     control: Array = np.empty(0)
     before = servos.state
     # Segments come longest first: at each step the first so many go on. None is all of them.
@@ -95,8 +95,8 @@ def rollout(
             ids = np.arange(active * nv, dtype=np.int32)
         if step % CHUNK == 0:
             control = _controls(rollouts, active, nv, step, min(step + CHUNK, longest), delays)
-        for s in flips.get(step, ()):
-            servos.switch(slice(s * nv, (s + 1) * nv), segments[s].torque_off[step])
+        for rows, off in flips.get(step, ()):
+            servos.switch(rows, off)
         ctrl[: active * nv] = control[: active * nv, step % CHUNK]
         servos.prepare(laws, time, before, None if supply is None else supply.share(step))
         batch.step(ids=ids)

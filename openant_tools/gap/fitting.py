@@ -197,6 +197,9 @@ class Fits:
             root = np.linalg.cholesky(more + descent.damping * np.diag(np.diag(more)))
             step = lsq_linear(root.T, -np.linalg.solve(root, slope), bounds=within, method="bvls").x
             found = np.clip(u + step, low, high)
+        # Rounding leaves 1e-16 of what lies on its bound: a delay of that is none.
+        for bound in (low, high):
+            found = np.where(np.abs(found - bound) < 10 * TINY, bound, found)
         return found
 
     def _bounds(self, descent: Descent) -> tuple[Array, Array]:

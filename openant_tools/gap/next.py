@@ -7,8 +7,6 @@ effects apart, the effects know what to do with one's hands (`Effect.told_from`)
 
 from __future__ import annotations
 
-import copy
-import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Sequence
@@ -210,10 +208,8 @@ def _parts(name: str) -> tuple[Protocol, ...]:
 
 def _coarse(plant: Plant) -> Plant:
     """The plant in steps that are fine enough to compare by."""
-    model = copy.copy(plant.model)
     most = FLOOR_STEP_S if plant.setup is Setup.FLOOR else STAND_STEP_S
-    model.opt.timestep = max(model.opt.timestep, most if len(plant.joints) > 2 else STAND_STEP_S / 2)
-    return dataclasses.replace(plant, model=model)
+    return plant.stepped(max(plant.timestep, most if len(plant.joints) > 2 else STAND_STEP_S / 2))
 
 
 def _distances(

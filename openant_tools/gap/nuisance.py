@@ -31,8 +31,10 @@ ONE_SIDED = {HEAT_LOSS, IMU_LATE, BACK_EMF}
 #: how far dry friction gives before it slides, rad, and what this may be times as much or as little, where it gives at all: of the form
 #: of a simulation, which no model says
 BRISTLE, BRISTLE_RAD, BRISTLE_TIMES = "bristle", 5e-4, 3.0
-#: what no model of a robot within tolerance is written with: servos of another kind would hold it
-UNWRITTEN = {BACK_EMF, BRISTLE}
+#: by how many rows' periods torque goes later than rows say: no row says when exactly
+SWITCHING, PERIODS = "switching", 1.0
+#: what no model of a robot within tolerance is written with: servos of another kind would hold it, or it is of the log
+UNWRITTEN = {BACK_EMF, BRISTLE, SWITCHING}
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,8 @@ def adjust(robot: Robot, kind: str, joints: Sequence[int], value: float) -> None
         robot.zero[at] += value
     elif kind == "delay":
         robot.delay[at] += value
+    elif kind == SWITCHING:
+        robot.switching += value
     elif kind in FLOOR:
         setattr(robot, kind, getattr(robot, kind) * value)
     elif kind == "torso_kg":
@@ -110,6 +114,8 @@ def nuisances(protocol: RunSet, sensed: Collection[str]) -> list[Nuisance]:
     out.append(Nuisance("delay", tuple(joints), tolerance_of("action_delay") + STAMP_S))
     out.append(Nuisance(BACK_EMF, tuple(joints), tolerance_of(BACK_EMF) / 2))
     out.append(Nuisance(BRISTLE, tuple(joints), math.log(BRISTLE_TIMES)))
+    if any(one.switches for one in protocol.runs):
+        out.append(Nuisance(SWITCHING, tuple(joints), PERIODS))
     if protocol.warmed_c > WARMED_C:
         out.append(Nuisance(HEAT_LOSS, tuple(joints), tolerance_of("thermal_derating")))
     if protocol.reference.floor:

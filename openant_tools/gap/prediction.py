@@ -153,11 +153,10 @@ class Predictions:
         robots: Sequence[Robot],
         rollouts: Rollouts,
         sensed: Sequence[str],
-        step_s: float | None = None,
     ) -> list[Array]:
         """Of each run of a rollout (robots, rows, channels), measured minus simulated: of joints, and some sensors of the body."""
         warm_c = [self.protocol.runs[k].warm_c for k in runs]
-        signals = simulate(rollouts, robots, signals=("pos", *sensed), warm_c=warm_c, step_s=step_s).signals
+        signals = simulate(rollouts, robots, signals=("pos", *sensed), warm_c=warm_c).signals
         pos = signals["pos"]
         absent = {name: np.full((*pos.shape[:2], width), np.nan) for name, width in SENSED.items()}
         found = np.concatenate([pos, *(signals.get(name, absent[name]) for name in sensed)], axis=2)
@@ -172,7 +171,7 @@ class Predictions:
 
     def coarse(self, runs: Sequence[int], robots: Sequence[Robot], rollouts: Rollouts) -> list[Array]:
         """Of each run (robots, rows, channels), as `over_windows`, of rollouts of `side_by_side`."""
-        return self._errors(runs, robots, rollouts, self.sensed, self.protocol.runs[runs[0]].plant.timestep)
+        return self._errors(runs, robots, rollouts, self.sensed)
 
     def side_by_side(self, fitted: Sequence[int]) -> list[tuple[tuple[int, ...], Rollouts]]:
         """Runs that one simulation plays, in large steps, where fits follow them: those on one plant, if servos are alike in all."""

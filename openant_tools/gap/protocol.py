@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import hashlib
 import json
@@ -92,6 +91,12 @@ class Played:
             warm_c,
             None if windows is None else tuple(windows),
         )
+
+    @property
+    def switches(self) -> bool:
+        """Whether torque goes or comes meanwhile."""
+        off = self.run.signal("torque", self.plant.joints, default=1.0) == 0
+        return bool((off[1:] != off[:-1]).any())
 
     @cached_property
     def layout(self) -> Layout:
@@ -216,12 +221,11 @@ class RunSet:
         for one in self.runs:
             if id(one.plant) not in plants:
                 largest = FLOOR_STEP_S if one.plant.setup is Setup.FLOOR else stand_step_s
-                model = copy.copy(one.plant.model)
-                model.opt.timestep = largest if len(self.joints) > 2 else min(0.002, one.plant.timestep * 2)
-                model.opt.tolerance = max(model.opt.tolerance, 1e-6)
+                plant = one.plant.stepped(largest if len(self.joints) > 2 else min(0.002, one.plant.timestep * 2))
+                plant.model.opt.tolerance = max(plant.model.opt.tolerance, 1e-6)
                 # One robot is one island: sorting what touches costs more than it saves.
-                model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-                plants[id(one.plant)] = dataclasses.replace(one.plant, model=model)
+                plant.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+                plants[id(one.plant)] = plant
         return dataclasses.replace(
             self, runs=tuple(dataclasses.replace(one, plant=plants[id(one.plant)]) for one in self.runs)
         )

@@ -7,6 +7,7 @@ model in everything that `effects.robot` names, so that one batch holds thousand
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from openant_tools.model.rollout import VELOCITY_SPAN_S, Rollouts, RunStretch
 __all__ = ["BASE", "Log", "simulate"]
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 #: bytes of states while a batch runs: with a third of it a robot takes a quarter longer, with three times as much a tenth less
 CHUNK_BYTES = 192 * 2**20
@@ -69,7 +71,6 @@ def simulate(
     signals: Sequence[str] | None = None,
     warm_c: Sequence[Array] | None = None,
     misread: bool = False,
-    step_s: float | None = None,
 ) -> Log:
     """Let robots do what runs command.
 
@@ -80,8 +81,6 @@ def simulate(
         signals: those wanted; default all that there are.
         warm_c: of each run (joints,) °C, by which servos are known to be warmer than in the coolest one; default none.
         misread: simulations that begin anew begin where noisy sensors say, as those of a real log do.
-        step_s: steps of the simulation that these larger ones stand for. A step's force is that of its beginning and its command the mean
-            over all of it, which so comes early by half a step: by half of what these are longer commands are held back.
     """
     without_words()
     plant, rows = rollouts.plant, rollouts.rows[-1].stop
@@ -105,8 +104,7 @@ def simulate(
             # A run of its own of random numbers to each portion, whatever the others are.
             rng = np.random.default_rng((seed, int(some[0])))
             mine = {name: np.full((len(some), *whole.shape[1:]), np.nan, np.float32) for name, whole in out.items()}
-            later_s = 0.0 if step_s is None else (stepped.plant.timestep - step_s) / 2
-            _Batch(stepped, [robots[k] for k in some], rng, warm_c, misread=misread, later_s=later_s).play(mine)
+            _Batch(stepped, [robots[k] for k in some], rng, warm_c, misread=misread).play(mine)
             for name, values in mine.items():
                 out[name][some] = values
     return Log(out)
@@ -133,9 +131,7 @@ class _Batch:
         warm_c: Sequence[Array] | None,
         *,
         misread: bool = False,
-        later_s: float = 0.0,
     ) -> None:
-        self._later_s = later_s
         self._rollouts, self._robots, self._rng = rollouts, robots, rng
         self._plant, self._segments = rollouts.plant, rollouts.segments
         self._n = len(robots)
@@ -154,6 +150,7 @@ class _Batch:
         self._batch.state[:] = state
         self._batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
         hidden = rollouts.horizon is not None and any(_hides(robot) for robot in robots)
+        self._share: Array | None = None
         self._led = round(LED_S / plant.timestep) if hidden else 0
         warm = np.zeros((len(rollouts.runs), len(plant.joints))) if warm_c is None else np.array(warm_c)
         self._laws = self._make_laws(warm[[segment.run for segment in self._segments]][:, None])
@@ -239,7 +236,7 @@ class _Batch:
         for name, values in (("dof_armature", fields.armature), ("dof_damping", fields.damping)):
             self._batch.expand(name)[:, plant.dof] = values
         between = laws_of([robot.laws for robot in robots], len(plant.joints))
-        return [*([self._ask] if self._asked.any() else []), *first, *between, self._note, *last]
+        return [*([self._ask] if self._asked.any() else []), *first, *between, self._partly, self._note, *last]
 
     def _begun(self, warm_c: Array) -> tuple[Array, Array]:
         """As each simulation begins: where setpoints of limited rate are (rad), and how warm its servos are (°C)."""
@@ -288,10 +285,7 @@ class _Batch:
         ctrl, time = self._batch.bind("ctrl"), np.zeros(sims)
         rest = np.repeat([segment.control[0] for segment in segments], n, axis=0)
         ctrl[:] = rest
-        flips: dict[int, list[int]] = {}
-        for s, segment in enumerate(segments):
-            for step in segment.torque_off:
-                flips.setdefault(step, []).append(s)
+        switches = self._switches()
         floor = "gyro" in out or "base" in out or plant.setup is Setup.FLOOR
         states = _States(self._batch, plant, sims, longest, floor)
         cable = self._cable()
@@ -299,8 +293,14 @@ class _Batch:
         before = self._servos.state
         for step in range(longest):
             active = int((lengths > step).sum()) * n
-            for s in flips.get(step, ()):
-                self._servos.switch(slice(s * n, (s + 1) * n), segments[s].torque_off[step])
+            self._share = None
+            for sims, off, share in switches.get(step, ()):
+                self._servos.switch(sims, off)
+                if share is not None:
+                    self._share = (
+                        np.ones((n * len(segments), len(plant.joints))) if self._share is None else self._share
+                    )
+                    self._share[sims] = share
             ctrl[:, plant.ctrl] = control[:, self._led + step]
             self._servos.prepare(self._laws, time, before)
             states.keep(step, before, self._given)
@@ -311,6 +311,33 @@ class _Batch:
             before = self._servos.state
         states.keep(longest, before, None)
         self._sample(states, out)
+
+    def _switches(self) -> dict[int, list[tuple[slice, Bools, Array | None]]]:
+        """Step → of some simulations, joints that are off from there on, and what share of it torque is on where it goes or comes amid it."""
+        out: dict[int, list[tuple[slice, Bools, Array | None]]] = {}
+        h, later = self._plant.timestep, [robot.switching for robot in self._robots]
+        alike = [list(group) for _, group in itertools.groupby(range(self._n), later.__getitem__)]
+        for s, segment in enumerate(self._segments):
+            period = float(np.median(np.diff(self._rollouts.runs[segment.run].t)))
+            last, before = len(segment.control) - 1, segment.torque_off[-np.inf]
+            out.setdefault(0, []).append((slice(s * self._n, (s + 1) * self._n), before, None))
+            for after, off in segment.torque_off.items():
+                for robots in alike if np.isfinite(after) else ():
+                    sims = slice(s * self._n + robots[0], s * self._n + robots[-1] + 1)
+                    at = max(after + later[robots[0]] * period, 0.0) / h
+                    step = min(int(at), last)
+                    went, stays = min(at - step, 1.0), off & before
+                    share = np.where(stays | (off == before), 1.0, np.where(off, went, 1.0 - went))
+                    out.setdefault(step, []).append((sims, stays, share))
+                    out.setdefault(step + 1, []).append((sims, off, None))
+                before = off
+        return out
+
+    def _partly(self, step: Step) -> None:
+        """Torque that goes or comes amid a step is there for a part of it."""
+        if self._share is not None:
+            step.stiffness, step.velocity_gain = step.stiffness * self._share, step.velocity_gain * self._share
+            step.limit = step.limit * self._share
 
     def _lead(self, control: NDArray[np.float32]) -> None:
         """Bring rotors behind play and springs to where they are as a simulation begins: laws act, the joints go as measured."""
@@ -323,7 +350,7 @@ class _Batch:
         ]
         where, speed = (np.stack(of, axis=1).repeat(self._n, axis=1) for of in zip(*paths, strict=True))
         for s, segment in enumerate(self._segments):
-            self._servos.switch(slice(s * self._n, (s + 1) * self._n), segment.torque_off[0])
+            self._servos.switch(slice(s * self._n, (s + 1) * self._n), segment.torque_off[-np.inf])
         for step in range(self._led):
             ctrl[:, self._plant.ctrl] = control[:, step]
             self._servos.prepare(
@@ -376,7 +403,7 @@ class _Batch:
     def _control(self, segment: RunStretch, robot: Robot, edges: Array) -> Array:
         plant, h = self._plant, self._plant.timestep
         commands = segment.commands
-        random, delay = _scatters(robot), robot.delay + self._later_s
+        random, delay = _scatters(robot), robot.delay + plant.lead_s
         if not random and not delay.any():
             mean = np.concatenate([commands.mean(edges[: self._led + 1]), segment.control[:, plant.ctrl]])
         elif not random and (delay == delay[0]).all():

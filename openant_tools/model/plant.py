@@ -12,7 +12,7 @@ import difflib
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -82,6 +82,7 @@ class Plant:
         tree: (joints,) kinematic tree of each joint; joints of different trees do not move each other on the stand.
         path: the file the model was read from.
         form: what was made of its servos.
+        step_s: the model's own time step, where it is simulated in others; see `lead_s`.
     """
 
     model: mujoco.MjModel
@@ -94,10 +95,25 @@ class Plant:
     tree: Ints
     path: Path
     form: Form = Form()
+    step_s: float | None = None
 
     @property
     def timestep(self) -> float:
         return float(self.model.opt.timestep)
+
+    @property
+    def lead_s(self) -> float:
+        """By how much earlier than in the model's own steps commands act.
+
+        A step's force is that of its beginning and its command the mean over all of it, which so acts early by half a step.
+        """
+        return 0.0 if self.step_s is None else (self.timestep - self.step_s) / 2
+
+    def stepped(self, timestep: float) -> Plant:
+        """The same in other steps, which stand for those of the model."""
+        model = copy.copy(self.model)
+        model.opt.timestep = timestep
+        return replace(self, model=model, step_s=self.timestep if self.step_s is None else self.step_s)
 
     @property
     def free_joint(self) -> int | None:

@@ -108,9 +108,14 @@ class RunStretch:
     step: Ints  # (rows,) step before each row
     fraction: Array  # (rows,) of the step after it
     row: Ints  # (rows,) index among the rows of all runs
-    torque_off: dict[int, Bools]  # step → joints off from there on; always has 0
+    torque_off: dict[float, Bools]  # s after its start → joints off from then on; first at -inf, those before it
     start: float  # s, time of its first row
     commands: Staircase
+
+    def switches(self, h: float) -> dict[int, Bools]:
+        """Step, of those of h (s), → joints off from there on."""
+        last = len(self.control) - 1
+        return {round(min(max(after / h, 0.0), last)): off for after, off in self.torque_off.items()}
 
 
 def _allowed_threads() -> int:
@@ -175,13 +180,11 @@ class Rollouts:
 
     def finer(self, parts: int) -> Rollouts:
         """The same with each step cut into so many; as it is where actuators have delay buffers, whose samples count steps."""
-        model = self.plant.model
-        if parts == 1 or (model.actuator_history[:, 0] > 0).any():
+        if parts == 1 or (self.plant.model.actuator_history[:, 0] > 0).any():
             return self
         if parts not in self._finer:
-            fine, model = copy.copy(self), copy.copy(model)
-            model.opt.timestep /= parts
-            fine.plant, fine._batches, fine._finer = replace(self.plant, model=model), {}, {}
+            fine = copy.copy(self)
+            fine.plant, fine._batches, fine._finer = self.plant.stepped(self.plant.timestep / parts), {}, {}
             # Rows lie between steps: what was as long as another may now be a step shorter.
             cut = (self._cut(segment, parts) for segment in self._segments)
             fine._segments = sorted(cut, key=lambda segment: -len(segment.control))
@@ -194,10 +197,7 @@ class Rollouts:
         control = np.repeat(segment.control, parts, axis=0)[: int(step[-1]) + 1]
         edges = segment.start + self.plant.timestep / parts * np.arange(len(control) + 1, dtype=np.float64)
         control[:, self.plant.ctrl] = _setpoints(self.plant, segment.commands, edges)
-        off = {min(first * parts, len(control) - 1): joints for first, joints in segment.torque_off.items()}
-        return replace(
-            segment, control=control, step=step, fraction=np.clip(at - step, 0.0, 1.0), torque_off=off
-        )  # fmt: skip
+        return replace(segment, control=control, step=step, fraction=np.clip(at - step, 0.0, 1.0))
 
     @property
     def steps(self) -> int:
@@ -236,9 +236,10 @@ class Rollouts:
         nj = len(plant.joints)
 
         batch.set_models([model for _ in segments for model in variants])
-        changes = {step for segment in segments for step in segment.torque_off}
+        switches = [segment.switches(plant.timestep) for segment in segments]
+        changes = set().union(*switches)
         limp = {(v, _key(np.zeros(nj, bool))): model for v, model in enumerate(variants)}
-        off = [segment.torque_off[0] for segment in segments]
+        off = [one[0] for one in switches]
         last = [(segment.state[self._qpos], segment.state[self._qvel]) for segment in segments]
         last_pos = np.array([p for p, _ in last])[:, None, :].repeat(nv, axis=1)
         last_vel = np.array([v for _, v in last])[:, None, :].repeat(nv, axis=1)
@@ -250,7 +251,7 @@ class Rollouts:
             active = int((lengths > begin).sum())
             if begin in changes:
                 for s in range(active):
-                    off[s] = segments[s].torque_off.get(begin, off[s])
+                    off[s] = switches[s].get(begin, off[s])
                 batch.set_models(
                     [self._limp(limp, variants[v], v, off[s]) for s in range(len(segments)) for v in range(nv)]
                 )
@@ -407,9 +408,9 @@ def _segments(
         setpoint = _setpoints(plant, commands, edges)
         control = np.tile(rest, (nstep, 1))
         control[:, plant.ctrl] = setpoint
-        off = {0: torque_off[first]}
-        for row in flips[(flips > first) & (flips < stop)]:
-            off[min(nstep - 1, round((t[row] - t[first]) / h))] = torque_off[row]
+        off = {-np.inf: torque_off[max(first - 1, 0)]}
+        for row in flips[(flips >= first) & (flips < stop)]:
+            off[float(t[row] - t[first])] = torque_off[row]
         velocity = initial_velocities(t, pos, first)
         segments.append(
             RunStretch(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -81,9 +80,7 @@ class Dataset:
 
     def stepped(self, times: float) -> Dataset:
         """The same with so many times the time step."""
-        model = copy.copy(self.plant.model)
-        model.opt.timestep *= times
-        return replace(self, plant=replace(self.plant, model=model))
+        return replace(self, plant=self.plant.stepped(self.plant.timestep * times))
 
     @property
     def fitted(self) -> Rollouts:

@@ -99,6 +99,36 @@ def test_a_warm_motor_is_weaker_and_the_refit_says_by_how_much(tmp_path: Path) -
     ]
 
 
+def test_torque_that_goes_a_little_later_than_its_row_is_no_late_sensor(tmp_path: Path) -> None:
+    """A host reads, then tells the servo to let go: the row says so, and the pendulum begins to fall half a row later."""
+    later, text = 0.6, pendulum(joint='damping="0.02" armature="0.004" frictionloss="0.004"')
+    robot = mujoco.MjModel.from_xml_string(text.replace(BENCH, ""))
+    robot.opt.timestep = 0.0002
+    data, runs = mujoco.MjData(robot), []
+    for seed, held in ((1, 0.9), (2, -0.7)):
+        mujoco.mj_resetData(robot, data)
+        row, let_go, pos = 0, 1.1, np.empty(len(T))
+        cmd = held * np.minimum(1.0, (T - T[0]) / 0.6)
+        while row < len(T):
+            if data.time >= T[row] - T[0] - 1e-9:
+                pos[row] = data.qpos[0]
+                row += 1
+            data.ctrl[0] = cmd[row - 1]
+            limp = data.time >= let_go + later * 0.02
+            robot.opt.disableactuator, robot.actuator_group[0] = int(limp), 0
+            mujoco.mj_step(robot, data)
+        noise = 3e-4 * np.random.default_rng(seed).standard_normal(len(T))
+        columns = {"pos.joint": pos + noise, "cmd.joint": cmd, "torque.joint": 1.0 - (T - T[0] > let_go - 1e-6)}
+        runs.append(run_of(columns, T, ["joint"], f"let-go-{seed}"))
+    fits = Fits(predictions := Predictions(RunSet.of(runs, write(tmp_path / "given.xml", text), ["joint"], [None] * 2)))
+    start = catalogue()["sensor_delay"].starts(0.2)[0]
+    plain, late = closures(fits, [fits.nothing(), fits.of([Part("sensor_delay", (0,))], [start])], [(0,), (1,)], [0, 1])
+    u = dict(zip((one.name for one in predictions.names), plain.refit.nuisance, strict=True))
+    assert u["switching"] == pytest.approx(later, abs=0.1)
+    assert late.likelier(plain) < descent.LEAST_GAIN
+    assert "switching" not in calibration_of(predictions, plain.refit, [0]), "it is none of the robot"
+
+
 @pytest.mark.parametrize("name", ["actuator_lag", "action_delay", "load_friction", "backlash"])
 def test_a_cause_that_is_not_there_ends_at_nothing_and_not_beyond(name: str, tmp_path: Path) -> None:
     fits = Fits(Predictions(protocol(tmp_path, kp=8.0, dry=0.03)))

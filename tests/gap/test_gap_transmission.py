@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,6 +22,8 @@ from openant_tools.recording.run import Facts, Run
 from openant_tools.robot.joints import JOINT_NAMES
 from openant_tools.robot.mjcf import nominal_model_path
 
+Array = np.ndarray
+
 SECONDS, SEED = 3.5, 5
 
 
@@ -31,7 +33,7 @@ def moved_by(
     """(rows,) rad, what an effect changes of a joint's motion: as the other simulator has it, and as ours does."""
     motion = next(one for one in motions(4242) if one.name == run)
     rows = round(RATE_HZ * seconds)
-    motion = dataclasses.replace(motion, commands=motion.commands[:rows], limp=motion.limp[:rows])
+    motion = replace(motion, commands=motion.commands[:rows], limp=motion.limp[:rows])
     drawn = Drawn(effect, (joint,), parameters, "medium")
     robots = [
         true_robot(Answer("single", effects, SEED, "batch", False)) for effects in ((), (drawn,))
@@ -69,7 +71,7 @@ def played(run: str, seconds: float) -> RunSet:
     """A healthy robot of the other simulator at work, as a diagnosis plays it again."""
     motion = next(one for one in motions(4242) if one.name == run)
     rows = round(RATE_HZ * seconds)
-    motion = dataclasses.replace(motion, commands=motion.commands[:rows], limp=motion.limp[:rows])
+    motion = replace(motion, commands=motion.commands[:rows], limp=motion.limp[:rows])
     robot = true_robot(Answer("single", (), SEED, "batch", False))
     (trace,) = simulate_truth([robot], motion, 0)
     return RunSet.of([logged(robot, motion, 0, trace)], nominal_model_path(), JOINT_NAMES, [None])
@@ -89,18 +91,29 @@ def test_teeth_without_play_carry_a_rotor_as_no_teeth_do(run: str, within_rad: f
 
 @pytest.mark.parametrize("run", ["stand-1", "floor-1"])
 def test_commands_are_as_late_in_large_steps_as_in_small_ones(run: str) -> None:
-    protocol = played(run, SECONDS)
-    coarse, step_s = protocol.coarse(), protocol.runs[0].plant.timestep
-    assert coarse.runs[0].plant.timestep > 2 * step_s
+    (one,) = played(run, SECONDS).runs
+    (coarse,) = played(run, SECONDS).coarse().runs
+    assert coarse.plant.timestep > 2 * one.plant.timestep
+    early = replace(coarse, plant=replace(coarse.plant, step_s=None))
+    fine, held_back, as_it_is = (
+        simulate(rollouts_of([of]), [Robot(8)], signals=["pos"]).signals["pos"][0].astype(float)
+        for of in (one, coarse, early)
+    )
 
-    def off(**late: float) -> float:
-        fine, large = (
-            simulate(rollouts_of(of.runs), [Robot(8)], signals=["pos"], **more).signals["pos"][0].astype(float)
-            for of, more in ((protocol, {}), (coarse, late))
-        )
+    def off(large: Array) -> float:
         return float(np.sqrt(np.nanmean((large - fine) ** 2)))
 
-    assert off(step_s=step_s) < 0.7 * off()
+    assert off(held_back) < 0.7 * off(as_it_is)
+
+
+def test_torque_goes_amid_a_step_not_with_one() -> None:
+    """So that fits find when: in steps of 2.5 ms a tenth of a row more would else be nothing, or a step."""
+    (coarse,) = played("stand-2", 9.0).coarse().runs
+    assert coarse.switches
+    later = 0.3 + np.arange(6) / 10
+    pos = simulate(rollouts_of([coarse]), [Robot(8, switching=by) for by in later], signals=["pos"]).signals["pos"]
+    moved = np.sqrt(np.nanmean(np.square(pos[1:] - pos[0], dtype=float), axis=(1, 2)))
+    assert moved / moved[0] == pytest.approx(np.arange(1, 6), rel=0.15)
 
 
 def test_what_follows_a_switch_of_torque_is_unsure_for_a_while() -> None:
