@@ -179,7 +179,7 @@ class Robot:
         adhesion_n: force of each foot. tilt: (2,) rad, how far downhill lies along the floor's x and y.
         jitter_s: deviation of when a command acts. dropout: share of commands lost, (joints,); longest_s: at a stretch.
         shared_dropout: all joints lose the same commands.
-        switching: by how many rows' periods torque follows later than rows say.
+        switching: when torque goes or comes, between the earliest (−1) and the latest (1) that a log's rows leave open.
         log_delay: s by which a signal's log lags: "pos", "vel", "imu", "acc" beyond that, "base".
         imu_rotation: (3,) rad. gyro_bias (3,) rad/s, acc_bias (3,) m/s². base_scale, base_yaw: of the tracker.
         noise: signal → deviation of one sample; what else its sensors do by chance.

@@ -31,8 +31,8 @@ ONE_SIDED = {HEAT_LOSS, IMU_LATE, BACK_EMF}
 #: how far dry friction gives before it slides, rad, and what this may be times as much or as little, where it gives at all: of the form
 #: of a simulation, which no model says
 BRISTLE, BRISTLE_RAD, BRISTLE_TIMES = "bristle", 5e-4, 3.0
-#: by how many rows' periods torque goes later than rows say: no row says when exactly
-SWITCHING, PERIODS = "switching", 1.0
+#: when torque goes or comes, of what rows leave open: none says when exactly
+SWITCHING = "switching"
 #: what no model of a robot within tolerance is written with: servos of another kind would hold it, or it is of the log
 UNWRITTEN = {BACK_EMF, BRISTLE, SWITCHING}
 
@@ -115,7 +115,7 @@ def nuisances(protocol: RunSet, sensed: Collection[str]) -> list[Nuisance]:
     out.append(Nuisance(BACK_EMF, tuple(joints), tolerance_of(BACK_EMF) / 2))
     out.append(Nuisance(BRISTLE, tuple(joints), math.log(BRISTLE_TIMES)))
     if any(one.switches for one in protocol.runs):
-        out.append(Nuisance(SWITCHING, tuple(joints), PERIODS))
+        out.append(Nuisance(SWITCHING, tuple(joints), 1.0))
     if protocol.warmed_c > WARMED_C:
         out.append(Nuisance(HEAT_LOSS, tuple(joints), tolerance_of("thermal_derating")))
     if protocol.reference.floor:

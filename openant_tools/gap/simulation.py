@@ -23,9 +23,11 @@ from openant_tools.effects.servos import batch_of
 from openant_tools.effects.step import Law, Step
 from openant_tools.gap.initial_state import heats, setpoints
 from openant_tools.gap.laws import Fields, Transmission, back_emf, first_laws, last_laws
+from openant_tools.gap.tolerance import STAMP_S
 from openant_tools.model.body import torso_body
 from openant_tools.model.plant import Plant, Setup, without_words
 from openant_tools.model.rollout import VELOCITY_SPAN_S, Rollouts, RunStretch
+from openant_tools.recording.run import Run
 
 __all__ = ["BASE", "Log", "simulate"]
 
@@ -108,6 +110,21 @@ def simulate(
             for name, values in mine.items():
                 out[name][some] = values
     return Log(out)
+
+
+def _switching(run: Run) -> tuple[float, float]:
+    """s after the row that says so about which torque goes or comes, and by how much earlier or later at most.
+
+    Between the row and its own command, whichever is first; where a log does not say when that was, up to a row before or after.
+    """
+    sent = run.column("cmd_t")
+    (fresh,) = np.nonzero(
+        np.diff(sent, prepend=-np.inf) > 0
+    )  # rows may be faster than commands, and repeat the one before
+    if not len(fresh):
+        return 0.0, float(np.median(np.diff(run.t)))
+    gap = float(np.median(sent[fresh] - run.t[fresh]))
+    return gap / 2, abs(gap) / 2 + STAMP_S
 
 
 def _scatters(robot: Robot) -> bool:
@@ -318,13 +335,13 @@ class _Batch:
         h, later = self._plant.timestep, [robot.switching for robot in self._robots]
         alike = [list(group) for _, group in itertools.groupby(range(self._n), later.__getitem__)]
         for s, segment in enumerate(self._segments):
-            period = float(np.median(np.diff(self._rollouts.runs[segment.run].t)))
+            centre, half = _switching(self._rollouts.runs[segment.run])
             last, before = len(segment.control) - 1, segment.torque_off[-np.inf]
             out.setdefault(0, []).append((slice(s * self._n, (s + 1) * self._n), before, None))
             for after, off in segment.torque_off.items():
                 for robots in alike if np.isfinite(after) else ():
                     sims = slice(s * self._n + robots[0], s * self._n + robots[-1] + 1)
-                    at = max(after + later[robots[0]] * period, 0.0) / h
+                    at = max(after + centre + later[robots[0]] * half, 0.0) / h
                     step = min(int(at), last)
                     went, stays = min(at - step, 1.0), off & before
                     share = np.where(stays | (off == before), 1.0, np.where(off, went, 1.0 - went))

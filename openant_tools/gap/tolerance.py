@@ -89,7 +89,6 @@ def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width:
     robot.imu_rotation += width * tolerance_of("imu_misalignment") * rng.uniform(-1, 1, 3)
     robot.gyro_bias += width * tolerance_of("imu_bias", "gyro_x") * rng.uniform(-1, 1, 3)
     robot.acc_bias += width * tolerance_of("imu_bias", "acc_x") * rng.uniform(-1, 1, 3)
-    # Torque is off in the row that says so, or goes with the command that follows it.
     robot.switching = float(rng.uniform(-1, 1))
     # A servo's velocity register is a filtered one, and stamps are not exactly those of the samples.
     robot.log_delay["vel"] = robot.log_delay.get("vel", 0.0) + float(

@@ -107,10 +107,10 @@ def test_commands_are_as_late_in_large_steps_as_in_small_ones(run: str) -> None:
 
 
 def test_torque_goes_amid_a_step_not_with_one() -> None:
-    """So that fits find when: in steps of 2.5 ms a tenth of a row more would else be nothing, or a step."""
+    """So that fits find when: in steps of 2.5 ms a third of one would else be nothing, or a whole one."""
     (coarse,) = played("stand-2", 9.0).coarse().runs
     assert coarse.switches
-    later = 0.3 + np.arange(6) / 10
+    later = np.linspace(-1.0, 1.0, 6)
     pos = simulate(rollouts_of([coarse]), [Robot(8, switching=by) for by in later], signals=["pos"]).signals["pos"]
     moved = np.sqrt(np.nanmean(np.square(pos[1:] - pos[0], dtype=float), axis=(1, 2)))
     assert moved / moved[0] == pytest.approx(np.arange(1, 6), rel=0.15)
