@@ -171,7 +171,7 @@ def _portrait(folder: RobotFolder) -> Part | None:
     axes[0, 1].sharex(axes[1, 1])
     axes[0, 1].tick_params(labelbottom=False)
     draw_moment(axes[0, 1], axes[1, 1], moment)
-    plots.legend(axes[0, 1], ncols=2, loc="lower right")
+    plots.legend(axes[0, 1], ncols=2)
     return Figure(
         figure,
         f"The robot's model at its home pose, {how}; and {moment.joint} on a motion that the fit did not see, where the data sheets' "
