@@ -38,7 +38,7 @@ MEASURE, OTHERS, BATCH = 72, 24, 32
 #: that templates are simulated in, beside each other
 PARTS = 4
 #: of simulated robots: raise it where the same recording gives others
-VERSION = 9
+VERSION = 10
 
 
 @dataclass(frozen=True)

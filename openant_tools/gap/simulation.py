@@ -311,13 +311,13 @@ class _Batch:
         for step in range(longest):
             active = int((lengths > step).sum()) * n
             self._share = None
-            for sims, off, share in switches.get(step, ()):
-                self._servos.switch(sims, off)
+            for some, off, share in switches.get(step, ()):
+                self._servos.switch(some, off)
                 if share is not None:
                     self._share = (
                         np.ones((n * len(segments), len(plant.joints))) if self._share is None else self._share
                     )
-                    self._share[sims] = share
+                    self._share[some] = share
             ctrl[:, plant.ctrl] = control[:, self._led + step]
             self._servos.prepare(self._laws, time, before)
             states.keep(step, before, self._given)

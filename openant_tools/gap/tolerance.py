@@ -89,7 +89,6 @@ def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width:
     robot.imu_rotation += width * tolerance_of("imu_misalignment") * rng.uniform(-1, 1, 3)
     robot.gyro_bias += width * tolerance_of("imu_bias", "gyro_x") * rng.uniform(-1, 1, 3)
     robot.acc_bias += width * tolerance_of("imu_bias", "acc_x") * rng.uniform(-1, 1, 3)
-    robot.switching = float(rng.uniform(-1, 1))
     # A servo's velocity register is a filtered one, and stamps are not exactly those of the samples.
     robot.log_delay["vel"] = robot.log_delay.get("vel", 0.0) + float(
         rng.uniform(0, tolerance_of("sensor_delay", "vel"))
@@ -107,6 +106,7 @@ def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width:
     robot.noise["volt_between"] = float(rng.uniform(-VOLT_BETWEEN, VOLT_BETWEEN))
     robot.noise["torque_zero"] = float(TORQUE_ZERO * rng.uniform(0, 1))
     robot.noise["torque_scale"] = float(np.exp(TORQUE_SCALE * rng.normal()))
+    robot.switching = float(rng.uniform(-1, 1))
 
 
 def torso_kg(reference: Reference) -> float:
