@@ -86,10 +86,11 @@ class TorqueSensor:
 
 
 def widened(robot: Robot, rng: np.random.Generator) -> None:
-    """Let a robot's sensors differ, in place, by what is no effect of theirs but how trackers and filters are."""
+    """Let a robot's sensors and its log differ, in place, by what is no effect of theirs but how trackers, filters and hosts are."""
     robot.log_delay["base"] = robot.log_delay.get("base", 0.0) + float(rng.uniform(0, TRACKER_LATE_S))
     robot.log_delay["vel"] = robot.log_delay.get("vel", 0.0) + float(rng.uniform(0, VELOCITY_LATE_S))
     robot.base_scale *= math.exp(float(rng.normal(0, TRACKER_SCALE)))
+    robot.switching = float(rng.uniform(-1, 1))
 
 
 def logged_by(

@@ -244,7 +244,7 @@ class _Batch:
         self._lacks = {
             kind: np.array([robot.lacks.get(kind, whole) for robot in robots]) for kind in ("stiffness", "torque_limit")
         }
-        generated = back_emf(robots, fields)
+        self._generated = generated = back_emf(robots, fields)
         untold = np.where(duty, generated, 0.0)
         self._untold = untold if untold.any() else None
         asked, heat_c = self._begun(warm_c)
@@ -355,6 +355,8 @@ class _Batch:
         if self._share is not None:
             step.stiffness, step.velocity_gain = step.stiffness * self._share, step.velocity_gain * self._share
             step.limit = step.limit * self._share
+            # Back-EMF that a law takes off for the whole step.
+            step.torque = step.torque + (1 - self._share) * self._generated * step.velocity
 
     def _lead(self, control: NDArray[np.float32]) -> None:
         """Bring rotors behind play and springs to where they are as a simulation begins: laws act, the joints go as measured."""

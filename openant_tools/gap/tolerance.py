@@ -106,7 +106,6 @@ def scatter(robot: Robot, reference: Reference, rng: np.random.Generator, width:
     robot.noise["volt_between"] = float(rng.uniform(-VOLT_BETWEEN, VOLT_BETWEEN))
     robot.noise["torque_zero"] = float(TORQUE_ZERO * rng.uniform(0, 1))
     robot.noise["torque_scale"] = float(np.exp(TORQUE_SCALE * rng.normal()))
-    robot.switching = float(rng.uniform(-1, 1))
 
 
 def torso_kg(reference: Reference) -> float:
