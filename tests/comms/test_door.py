@@ -154,7 +154,10 @@ def test_suspension_and_a_lost_terminal_end_motion_first(tmp_path: Path) -> None
                         took = time.monotonic() - begin
                         waited.look()
                         if took > 2.0 + waited.seconds:
-                            raise AssertionError(f"torque is on after {took:.2f} s")
+                            said = log.read_text()
+                            raise AssertionError(
+                                f"torque is on after {took:.2f} s, {waited.seconds:.2f} of them in line: {said}"
+                            )
                         time.sleep(0.01)
                     if time.monotonic() - begin > 2.0:
                         raise Busy
