@@ -83,7 +83,8 @@ def test_a_watchdog_that_would_not_guard_is_refused_where_something_moves(second
 
 HOLDING = textwrap.dedent(
     """
-    import sys
+    import signal, sys
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # tests may run under nohup, which the program heeds
     from openant_tools.cli import main, openant
     from openant_tools.cli.hardware import Moving, engine_config, may_move
     from openant_tools.comms import messages
