@@ -95,8 +95,7 @@ class Played:
     @property
     def switches(self) -> bool:
         """Whether torque goes or comes meanwhile."""
-        off = self.run.signal("torque", self.plant.joints, default=1.0) == 0
-        return bool((off[1:] != off[:-1]).any())
+        return bool(around_switching(self.run, self.plant.joints).any())
 
     @cached_property
     def layout(self) -> Layout:

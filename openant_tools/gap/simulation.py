@@ -118,9 +118,8 @@ def _switching(run: Run) -> tuple[float, float]:
     Between the row and its own command, whichever is first; where a log does not say when that was, up to a row before or after.
     """
     sent = run.column("cmd_t")
-    (fresh,) = np.nonzero(
-        np.diff(sent, prepend=-np.inf) > 0
-    )  # rows may be faster than commands, and repeat the one before
+    # Rows may be faster than commands, and repeat the one before.
+    fresh = 1 + np.flatnonzero(np.diff(sent) > 0)
     if not len(fresh):
         return 0.0, float(np.median(np.diff(run.t)))
     gap = float(np.median(sent[fresh] - run.t[fresh]))
@@ -335,11 +334,13 @@ class _Batch:
         h, later = self._plant.timestep, [robot.switching for robot in self._robots]
         alike = [list(group) for _, group in itertools.groupby(range(self._n), later.__getitem__)]
         for s, segment in enumerate(self._segments):
-            centre, half = _switching(self._rollouts.runs[segment.run])
-            last, before = len(segment.control) - 1, segment.torque_off[-np.inf]
+            last, ((_, before), *changes) = len(segment.control) - 1, segment.torque_off.items()
             out.setdefault(0, []).append((slice(s * self._n, (s + 1) * self._n), before, None))
-            for after, off in segment.torque_off.items():
-                for robots in alike if np.isfinite(after) else ():
+            if not changes:
+                continue
+            centre, half = _switching(self._rollouts.runs[segment.run])
+            for after, off in changes:
+                for robots in alike:
                     sims = slice(s * self._n + robots[0], s * self._n + robots[-1] + 1)
                     at = max(after + centre + later[robots[0]] * half, 0.0) / h
                     step = min(int(at), last)

@@ -91,8 +91,8 @@ def test_teeth_without_play_carry_a_rotor_as_no_teeth_do(run: str, within_rad: f
 
 @pytest.mark.parametrize("run", ["stand-1", "floor-1"])
 def test_commands_are_as_late_in_large_steps_as_in_small_ones(run: str) -> None:
-    (one,) = played(run, SECONDS).runs
-    (coarse,) = played(run, SECONDS).coarse().runs
+    protocol = played(run, SECONDS)
+    (one,), (coarse,) = protocol.runs, protocol.coarse().runs
     assert coarse.plant.timestep > 2 * one.plant.timestep
     early = replace(coarse, plant=replace(coarse.plant, step_s=None))
     fine, held_back, as_it_is = (
