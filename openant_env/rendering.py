@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.files import write_bytes
+from openant_tools.opengl import CHOSEN_GL
 
 __all__ = ["VIDEO_BYTES", "NoOpenGL", "Painter", "write_mp4", "write_strip", "write_video"]
 
@@ -38,9 +39,6 @@ CLOSING_S = 5.0
 VIDEO_BYTES = 3_000_000
 #: of WebP, from 0 to 100, in the order in which they are tried until a video is small enough
 VIDEO_QUALITIES = (70, 45, 20, 0)
-
-#: the MUJOCO_GL that a command was given: MuJoCo itself, as it is imported, is told that it draws nothing
-CHOSEN_GL = "OPENANT_MUJOCO_GL"
 
 
 class NoOpenGL(BadInput):

@@ -11,6 +11,8 @@ from collections.abc import Generator, Iterator
 import pytest
 from hypothesis import settings
 
+from openant_tools.opengl import load_no_window_library
+
 # Each worker has its share of the cores, and so have the processes that it starts: threads of matrix products that wait for
 # one another by spinning cost a fit five times its time where another worker has the other core. Read when numpy is
 # imported, which no plugin does before this. Where its share is one core, joblib works in the worker itself.
@@ -24,8 +26,7 @@ os.environ.setdefault("XDG_STATE_HOME", tempfile.mkdtemp(prefix="openant-state-"
 
 # What the tests start by the hundred compiles our modules once, not each time; and MuJoCo loads no window library.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-os.environ.setdefault("OPENANT_MUJOCO_GL", os.environ.get("MUJOCO_GL", ""))
-os.environ["MUJOCO_GL"] = "disable"
+load_no_window_library()
 
 # How long an example takes says what else the machine does. `--hypothesis-profile thorough` looks farther.
 settings.register_profile("ours", deadline=None, max_examples=50)

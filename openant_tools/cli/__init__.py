@@ -17,6 +17,7 @@ import click
 from openant_tools.cli.leaving import heed_signals
 from openant_tools.cli.log import begin, log_options
 from openant_tools.errors import OpenAntError
+from openant_tools.opengl import load_no_window_library
 from openant_tools.trust import TRUST, trusted
 from openant_tools.workers import end_with_who_started_us
 
@@ -175,11 +176,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     heed_signals()
     end_with_who_started_us()
     begin(list(sys.argv[1:] if argv is None else map(str, argv)))
-    # MuJoCo loads a window library as it is imported, for a renderer that no command of ours uses (`openant_env.rendering`
-    # chooses its own, by what was said here): a third of its time to load, and a process started besides. One that it
-    # does not know would end the import.
-    os.environ.setdefault("OPENANT_MUJOCO_GL", os.environ.get("MUJOCO_GL", ""))
-    os.environ["MUJOCO_GL"] = "disable"
+    load_no_window_library()
     try:
         code = openant.main(args=argv, prog_name="openant", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)

@@ -24,6 +24,7 @@ from openant_env.rendering import NoOpenGL, write_strip
 from openant_env.tasks import BackAndForth
 from openant_env.wrappers import NormaliseByBounds
 from openant_tools.errors import BadInput
+from openant_tools.opengl import CHOSEN_GL
 from openant_tools.robot.config import EffectEntry
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES
@@ -454,7 +455,7 @@ def test_without_opengl_only_the_picture_fails_and_says_why(monkeypatch):
 
 @pytest.mark.parametrize(("named", "why"), [("glfw", "glfw: "), ("off", "MUJOCO_GL says so"), ("mesa", "mesa: ")])
 def test_a_backend_that_has_no_display_or_none_at_all_is_no_opengl(monkeypatch, named, why):
-    monkeypatch.setenv(rendering.CHOSEN_GL, named)
+    monkeypatch.setenv(CHOSEN_GL, named)
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     env = make(render_mode="rgb_array")
