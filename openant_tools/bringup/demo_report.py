@@ -338,9 +338,7 @@ def _overview_figure(
         if picture is not None:
             axes[0].imshow(imread(io.BytesIO(picture)))
         above, below = right.subplots(2, 1, sharex=True)
-        above.set_title("A motion it was not fitted to")
-    draw_moment(above, below, moment)
-    plots.legend(above, loc="upper center", bbox_to_anchor=(0.5, -0.02))
+    draw_moment(above, below, moment, "A motion it was not fitted to")
     return figure
 
 

@@ -61,9 +61,9 @@ def worst_moment(run: Run, nominal: Path, calibrated: Path) -> Moment:
     )  # fmt: skip
 
 
-def draw_moment(above: Any, below: Any, moment: Moment) -> None:
+def draw_moment(above: Any, below: Any, moment: Moment, title: str = "") -> None:
     """Positions into the upper axes, errors of both models into the lower."""
     plots.draw_tracking(
         above, below, moment.joint, moment.t, moment.command, moment.measured, moment.nominal, moment.calibrated,
-        names=("data sheets", "calibrated"),
+        names=("data sheets", "calibrated"), title=title,
     )  # fmt: skip

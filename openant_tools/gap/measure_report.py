@@ -158,9 +158,8 @@ def worst(found: Measurement) -> MatplotlibFigure:
     figure, (above, below) = plots.figure(2, 1, height=1.8, sharex=True)
     plots.draw_tracking(
         above, below, found.joints[j], t[near] - t[0], one.run.signal("cmd", found.joints)[near, j],
-        one.measured["pos"][near, j], one.simulated["pos"][near, j], names=("simulated", ""),
+        one.measured["pos"][near, j], one.simulated["pos"][near, j], names=("simulated", ""), title=one.run.name,
     )  # fmt: skip
-    above.set_title(one.run.name, loc="left", fontsize=10, fontweight="bold")
     return figure
 
 

@@ -256,9 +256,8 @@ def worst(found: Diagnosis, runs: Sequence[Run], model: Path) -> MatplotlibFigur
     improved_too = both[1][near, j] if selected or found.calibration else None
     plots.draw_tracking(
         above, below, joints[j], t[near] - t[0], run.signal("cmd", joints)[near, j], run.signal("pos", joints)[near, j],
-        both[0][near, j], improved_too, names=("given model", "improved model"),
+        both[0][near, j], improved_too, names=("given model", "improved model"), title=run.name,
     )  # fmt: skip
-    above.set_title(run.name, loc="left", fontsize=10, fontweight="bold")
     return figure
 
 

@@ -148,12 +148,13 @@ def draw_tracking(
     better: Array | None = None,
     *,
     names: tuple[str, str] = ("given model", "calibrated"),
+    title: str = "",
 ) -> None:
     """One joint's position into the upper axes, and what each model leaves of it into the lower; alike in every report.
 
     Args:
         t: (rows,) s. command, measured: (rows,) rad. given, better: (rows,) rad as simulated; None for no second model.
-        names: of both models.
+        names: of both models. title: over both axes; the legend stands above it.
     """
     with style():
         above.step(t, DEGREES * command, where="post", color=INK, linewidth=0.8, alpha=0.5, label="command")
@@ -164,6 +165,7 @@ def draw_tracking(
                 above.plot(t, DEGREES * values, line, color=colour, label=name)
                 below.plot(t, 1e3 * (measured - values), line, color=colour)
         below.axhline(0.0, color=INK, linewidth=0.6)
+        above.set_title(title)
         above.set_ylabel(axis_label(joint, "°"))
         below.set_ylabel(axis_label("error", "mrad"))
         below.set_xlabel(axis_label("time in run", "s"))

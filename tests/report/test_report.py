@@ -80,6 +80,17 @@ def test_a_legend_hides_no_title() -> None:
     assert not any(legend.get_window_extent().overlaps(box) for box in boxes if box.width > 0)
 
 
+def test_a_motion_with_a_title_has_one_legend_which_leaves_it_free() -> None:
+    figure, (above, below) = plots.figure(2, 1, height=1.4)
+    t = np.linspace(0.0, 1.0, 9)
+    plots.draw_tracking(
+        above, below, "hip_rl", t, t, t, t, t, title="a run with a name as long as those of held-out recordings"
+    )
+    figure.draw_without_rendering()
+    [legend] = [*figure.legends, *(axes.get_legend() for axes in figure.axes if axes.get_legend())]
+    assert not legend.get_window_extent().overlaps(above._left_title.get_window_extent())
+
+
 def a_report() -> Report:
     return (
         Report(
