@@ -562,6 +562,10 @@ class AntHardware(AntBase):
             why_unseen = self._unseen()
             if why_unseen is not None:
                 return why_unseen
+        # Legs are led back in the air, where no foot sticks, and set down at once: by a ramp's time it has tipped over.
+        for action in (turning_action(self.robot.joints, 0.0, k), np.zeros(len(self.robot.joints))):
+            self._set_command(action)
+            self._take(self.link.go(self._command, half_s)[0])
         self._notice(f"turned back in {self.link.now() - began:.0f} s")
         self._take(self.link.stand(self.actions.rest, SETTLE_S))
         return self._unseen()

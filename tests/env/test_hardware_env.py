@@ -270,6 +270,7 @@ def test_a_cable_that_winds_up_is_turned_back_before_it_is_too_late(
     assert info["stop_cause"] == "winding"
     before = env._pose[2]
     env.reset()
+    assert "the virtual robot is put back where it began" not in walker.said, "it fell over its lifted legs"
     assert abs(env._wound_rad) < 0.4 * turn
     assert math.remainder(env._pose[2] - before - 0.52 * turn, turn) == pytest.approx(env._wound_rad, abs=0.05)
     assert any(words.startswith("turned back in ") for words in walker.said)
