@@ -22,6 +22,8 @@ from openant_tools.recording.writer import RecordingWriter
 from openant_tools.robot.config import Provenance
 from openant_tools.sysid.bench.steps import floor_friction
 
+pytestmark = pytest.mark.usefixtures("half_rate")
+
 #: steps that read or compute only: done again they ask nothing that was answered, and take a minute
 AT_ONCE = ("connect", "estop", "inventory", "gap", "passport")
 

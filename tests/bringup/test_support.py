@@ -72,12 +72,13 @@ def test_a_bundle_has_what_a_report_needs_and_no_secret(
 
 def test_the_end_of_a_long_log_begins_with_a_whole_line(tmp_path: Path) -> None:
     """Cut anywhere, half a serial number would stand at its beginning, and no pattern knows it."""
-    log = tmp_path / "openant.log"
     line = "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_FT9HDL4X-if00-port0 answers\n"
-    for extra in range(len(line)):
+    logs = [tmp_path / f"{extra}.log" for extra in range(len(line))]
+    for extra, log in enumerate(logs):
         log.write_text(line * (TAIL // len(line) + 2) + "x" * extra)
-        begun = gather(None, [log])["log/openant.log"].splitlines()[0]
-        assert begun == "/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_SERIAL-if00-port0 answers"
+    told = gather(None, logs)
+    begun = {told[f"log/{log.name}"].splitlines()[0] for log in logs}
+    assert begun == {"/dev/serial/by-id/usb-FTDI_USB__-__Serial_Converter_SERIAL-if00-port0 answers"}
 
 
 def test_a_name_is_masked_as_a_word_and_not_within_another() -> None:
