@@ -35,7 +35,7 @@ PLATFORM = (
     "matplotlib", "skrl", "tyro", "pandas", "mediapy", "wandb",
 )  # fmt: skip
 #: how a row's command ends that could not be run here, with the reason as its last line
-NOT_RUN = 77
+NOT_RUN = 77  # of benchmarks/peers/their_files.py
 
 
 @dataclass(frozen=True)

@@ -7,34 +7,21 @@ import os
 import re
 import subprocess
 import sys
-import tempfile
-from pathlib import Path
+
+from their_files import cloned
 
 STEPS, LEARNING_STARTS = 300, 100
 SOURCE = os.environ.get("CLEANRL", "https://github.com/vwxyzjn/cleanrl")
 
-with tempfile.TemporaryDirectory() as place:
-    cloned = Path(place, "cleanrl")
-    clone = ["git", "clone", "-q", "--depth", "1", SOURCE, str(cloned)]
-    git = subprocess.run(clone, capture_output=True, text=True, timeout=120, check=False)
-    if git.returncode:
-        print(f"it cannot be cloned: {git.stderr.strip()}")
-        sys.exit(77)
-    commit = subprocess.run(
-        ["git", "log", "-1", "--format=%h of %cs"], cwd=cloned, check=True, capture_output=True, text=True
-    ).stdout.strip()
+with cloned(SOURCE) as (folder, commit):
     # Gymnasium imports what stands before the colon. Without an end to its episodes: the file still looks for what a truncated
     # one leaves behind by its name in Gymnasium 0.29.
     command = [sys.executable, "cleanrl/sac_continuous_action.py", "--env-id", "openant_env:openant/AntContinuing-v0"]
     command += ["--total-timesteps", str(STEPS), "--learning-starts", str(LEARNING_STARTS), "--buffer-size", "1000"]
-    environment = os.environ | {"PYTHONPATH": str(cloned), "OMP_NUM_THREADS": "1"}
-    played = subprocess.run(command, cwd=cloned, env=environment, capture_output=True, text=True, check=False)
+    environment = os.environ | {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
+    played = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     if played.returncode:
         sys.exit(played.stderr)
-    changed = subprocess.run(
-        ["git", "status", "--porcelain", "--untracked-files=no"], cwd=cloned, check=True, capture_output=True, text=True
-    ).stdout
-    assert not changed, changed
     rates = re.findall(r"SPS: (\d+)", played.stdout)
     assert rates, played.stdout
     print(

@@ -14,6 +14,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from their_files import cloned
+
 SOURCE = os.environ.get("OPEN_ANT", "https://github.com/Openmind-Research-Institute/open-ant")
 #: on the virtual robot
 BODY_TAG = 12
@@ -61,17 +63,8 @@ def run(program: str, *words: object, cwd: Path) -> str:
     return done.stdout
 
 
-with tempfile.TemporaryDirectory() as folder:
-    place = Path(folder)
-    cloned = place / "open-ant"
-    clone = ["git", "clone", "-q", "--depth", "1", SOURCE, str(cloned)]
-    git = subprocess.run(clone, capture_output=True, text=True, timeout=120, check=False)
-    if git.returncode:
-        print(f"it cannot be cloned: {git.stderr.strip()}")
-        sys.exit(77)
-    commit = subprocess.run(
-        ["git", "log", "-1", "--format=%h of %cs"], cwd=cloned, check=True, capture_output=True, text=True
-    ).stdout.strip()
+with tempfile.TemporaryDirectory() as temporary, cloned(SOURCE) as (theirs, commit):
+    place = Path(temporary)
     openant = [sys.executable, "-m", "openant_tools"]
     (place / "floor.toml").write_text('[robot]\nsetup = "floor"\n[camera]\nfps = 5\n')
     robot = subprocess.Popen(
@@ -89,8 +82,8 @@ with tempfile.TemporaryDirectory() as folder:
         config |= {"motor_port": ready["bus"], "imu_port": ready["imu"], "camera_id": ready["camera"]}
         config["camera_tag_ids"]["body"] = BODY_TAG
         (place / "ant.json").write_text(json.dumps(config))
-        played = run(PLAY, cloned / "embodied_ant_env", "ant.json", cwd=place).splitlines()[-1]
-        agent = sorted(cloned.glob("agents/*/sarsa_options_tilecoding.py"))[0]
+        played = run(PLAY, theirs / "embodied_ant_env", "ant.json", cwd=place).splitlines()[-1]
+        agent = sorted(theirs.glob("agents/*/sarsa_options_tilecoding.py"))[0]
         words = [
             "--hw_config",
             place / "ant.json",
@@ -106,8 +99,4 @@ with tempfile.TemporaryDirectory() as folder:
     finally:
         robot.terminate()
         robot.wait(30)
-    changed = subprocess.run(
-        ["git", "status", "--porcelain", "--untracked-files=no"], cwd=cloned, check=True, capture_output=True, text=True
-    ).stdout
-    assert not changed, changed
     print(f"{commit}: its environment {played}; its SARSA(λ) took 30 options")
