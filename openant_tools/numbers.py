@@ -11,13 +11,25 @@ import math
 import re
 from collections.abc import Sequence
 
-__all__ = ["UNKNOWN", "column", "decimals_of", "exact", "is_error", "number", "percent", "readable", "span"]
+__all__ = [
+    "UNKNOWN",
+    "chosen",
+    "column",
+    "decimals_of",
+    "exact",
+    "is_error",
+    "number",
+    "percent",
+    "readable",
+    "span",
+    "typed",
+]
 
 UNKNOWN = "unknown"
 #: digits that count, of a number without an interval
 DIGITS = 3
-#: places after the point at most, without an interval: of degrees (an encoder's step is 0.09°) and of milliradians
-FINEST = {"°": 1, "mrad": 2}
+#: places after the point at most, without an interval: of degrees (an encoder's step is 0.09°), milliradians, shares
+FINEST = {"°": 1, "mrad": 2, "%": 2}
 #: unit of files → (the factor below 1 of it, and that unit): short times, small currents and distances
 SMALL = {"s": (1e3, "ms"), "A": (1e3, "mA"), "m": (1e3, "mm")}
 #: below how much of the unit the smaller one is read
@@ -90,7 +102,7 @@ def number(
     if low is not None and high is not None and math.isfinite(low) and math.isfinite(high):
         places = decimals_of(shown, 0.5 * factor * abs(high - low), unit) if decimals is None else decimals
         interval = f" ({_plain(factor * low, places)} to {_plain(factor * high, places)})"
-    elif float(shown).is_integer() and decimals is None:
+    elif _whole(shown) and decimals is None:
         places = 0
     else:
         places = decimals_of(shown, None, unit) if decimals is None else decimals
@@ -104,7 +116,7 @@ def column(values: Sequence[float | None], unit: str = "", *, name: str = "") ->
     known = [value for value in values if value is not None and math.isfinite(value)]
     most = max(map(abs, known), default=0.0)
     factor, read = readable(most, unit, name)
-    whole = all((factor * value).is_integer() for value in map(float, known))
+    whole = all(_whole(factor * value) for value in known)
     places = 0 if whole else decimals_of(factor * most, None, read)
     if unit in SMALL and read != unit:  # each alone might choose the larger unit
         return [number(None if v is None else factor * v, read, decimals=places) for v in values]
@@ -113,7 +125,19 @@ def column(values: Sequence[float | None], unit: str = "", *, name: str = "") ->
 
 def exact(value: float, unit: str = "") -> str:
     """A number that somebody chose, which has the digits that he gave it: `0.5 s`."""
-    return f"{value:g}".replace("-", "−") + _joined(unit)
+    return typed(value).replace("-", "−") + _joined(unit)
+
+
+def chosen(value: float, unit: str = "", *, name: str = "") -> str:
+    """The same, of a limit that files have in another unit than people read: `0.5 %` for a share of 0.005."""
+    factor, unit = readable(value, unit, name)
+    text = _plain(factor * value, decimals_of(factor * value, None, unit))
+    return (text.rstrip("0").rstrip(".") if "." in text else text) + _joined(unit)
+
+
+def typed(value: float, digits: int = 6) -> str:
+    """A number as one types it into a file or a command, `-0.785398`: in the unit of the file, by these digits at most."""
+    return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else f"{value:.{digits}g}"
 
 
 def span(low: float | None, high: float | None, unit: str = "", *, name: str = "", decimals: int | None = None) -> str:
@@ -122,7 +146,7 @@ def span(low: float | None, high: float | None, unit: str = "", *, name: str = "
         return UNKNOWN
     factor, unit = readable(max(abs(low), abs(high)), unit, name)
     ends = [factor * low, factor * high]
-    places = max(0 if float(end).is_integer() else min(2, decimals_of(end, None, unit)) for end in ends)
+    places = max(0 if _whole(end) else min(2, decimals_of(end, None, unit)) for end in ends)
     if places:  # a narrow range, such as that of an inertia, needs more
         places = max(places, min(decimals_of(ends[1], 0.5 * abs(ends[1] - ends[0])), FINEST.get(unit, 6)))
     if decimals is not None:
@@ -138,6 +162,11 @@ def percent(share: float | None, *, decimals: int = 0) -> str:
     if 0.0 < 100 * share < 0.5 * least:
         return f"below {_plain(least, decimals)} %"
     return f"{_plain(100 * share, decimals)} %"
+
+
+def _whole(value: float) -> bool:
+    """Whether it has no fraction but for what a unit's factor rounds."""
+    return math.isclose(value, round(value), rel_tol=1e-12)
 
 
 def _plain(value: float, places: int) -> str:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.reply import STATUS_OVERHEAD
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE
+from openant_tools.numbers import number, percent
 
 __all__ = ["GapTrial", "RateTrial", "bus_limit_hz", "measure_gap", "measure_rate"]
 
@@ -46,12 +47,10 @@ class RateTrial:
     def words(self) -> str:
         """The rate as a sentence; none that the wire does not allow."""
         if self.believable:
-            return f"up to {self.hz:.0f} cycles/s"
+            return f"up to {number(self.hz, decimals=0)} cycles/s"
         if self.lost >= 0.5:
-            return f"no rate, as {self.lost:.0%} of the answers were lost"
-        return (
-            f"no rate, as this port is faster than a wire of its baud rate, which allows {self.limit_hz:.0f} cycles/s"
-        )
+            return f"no rate, as {percent(self.lost)} of the answers were lost"
+        return f"no rate, as this port is faster than a wire of its baud rate, which allows {number(self.limit_hz, decimals=0)} cycles/s"
 
     def as_dict(self) -> dict[str, float]:
         return asdict(self) | {"share": self.share}

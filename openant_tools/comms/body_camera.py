@@ -20,6 +20,7 @@ from openant_tools.comms.clock import Clock
 from openant_tools.comms.intrinsics import Intrinsics
 from openant_tools.comms.tags import BodyLost, BodyPose, BodyTracker, TagSetup
 from openant_tools.errors import HardwareFault, OpenAntError
+from openant_tools.numbers import number
 from openant_tools.optional import cv2
 
 __all__ = ["BodyCamera", "CameraConfig"]
@@ -164,7 +165,9 @@ class BodyCamera:
                 if ": " in self._lost or "; " in self._lost
                 else "look at the picture: light, focus, and both tags in view"
             )
-            fault = HardwareFault(f"no pose of the robot for {now - self._seen_at:.1f} s: {self._lost}", remedy=remedy)
+            fault = HardwareFault(
+                f"no pose of the robot for {number(now - self._seen_at, 's', decimals=1)}: {self._lost}", remedy=remedy
+            )
         if fault is None:
             self._said = ("", -np.inf)
             return None

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from openant_tools.comms.clock import Clock
 from openant_tools.comms.mjpeg import MjpegStream
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.numbers import number
 from openant_tools.optional import cv2
 
 __all__ = ["Camera", "CameraInfo", "CameraSetting", "CameraSettings", "CameraStatistics", "DropCounter", "Frame"]
@@ -336,7 +337,7 @@ class _Frozen:
         if self._same < FROZEN_FRAMES or now - self._since < FROZEN_S:
             return None
         return HardwareFault(
-            f"the camera repeats one picture for {now - self._since:.1f} s",
+            f"the camera repeats one picture for {number(now - self._since, 's', decimals=1)}",
             where=name,
             remedy="its driver hangs: unplug the camera and plug it in again",
         )
@@ -393,7 +394,7 @@ class _Capture:
             notes.append(f"The camera does not do what was asked: {', '.join(refused)}.")
         latency, source = self._latency()
         if source == "guess":
-            notes.append(f"The camera's latency is taken to be {latency * 1e3:.0f} ms until it is measured.")
+            notes.append(f"The camera's latency is taken to be {number(latency, 's')} until it is measured.")
         return CameraInfo(backend, width, height, tuple(settings), latency, source, tuple(notes))
 
     def _latency(self) -> tuple[float, str]:
@@ -428,7 +429,7 @@ class _Capture:
                 )
             if age > max(STALLED_S, STALLED_PERIODS * (self._drops.period or 0.0)):
                 return HardwareFault(
-                    f"the camera has sent no picture for {age:.1f} s",
+                    f"the camera has sent no picture for {number(age, 's', decimals=1)}",
                     where=name,
                     remedy="look at its cable; a dark room makes some webcams slow",
                 )
@@ -633,7 +634,7 @@ class _Snapshots:
         now = self._clock.now()
         self._clock.sleep_until(now)  # what was sent to the robot so far has its effect first
         try:
-            self._http.request("GET", f"/snapshot.jpg?at={now:.9f}")
+            self._http.request("GET", f"/snapshot.jpg?at={now:.9f}")  # for a file
             answer = self._http.getresponse()
             data = answer.read()
         except (OSError, http.client.HTTPException):
@@ -673,7 +674,9 @@ class _Snapshots:
         age = now - self._arrived if self._frame else now - self._began
         if age > STALLED_S:
             return HardwareFault(
-                f"the camera has sent no picture for {age:.1f} s", where=self._settings.name, remedy="look at its cable"
+                f"the camera has sent no picture for {number(age, 's', decimals=1)}",
+                where=self._settings.name,
+                remedy="look at its cable",
             )
         return self._frozen.fault(now, self._settings.name)
 

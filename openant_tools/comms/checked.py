@@ -18,6 +18,7 @@ from openant_tools.comms import messages
 from openant_tools.comms.restart import Restart
 from openant_tools.comms.servos import Servos
 from openant_tools.errors import BadInput
+from openant_tools.numbers import exact, number, span
 from openant_tools.recording.run import Facts
 
 __all__ = ["LONGEST_S", "SLACK_RAD", "checked"]
@@ -191,8 +192,8 @@ def _angles(
         if not math.isfinite(angle):
             raise BadInput(f"{what} is {angle} for {joints[k]}{place}", remedy="give a finite angle, in rad")
         raise BadInput(
-            f"{what}: a command of {angle:.3f} rad for {joints[k]}{place} is outside its limits {low[k]:.3f} to "
-            f"{high[k]:.3f}"
+            f"{what}: a command of {number(angle, 'rad')} for {joints[k]}{place} is outside its limits "
+            f"{span(low[k], high[k], 'rad')}"
         )
     return np.asarray(np.clip(angles, low, high))
 
@@ -212,7 +213,7 @@ def _number(what: str, value: Any) -> float:
 def _seconds(what: str, value: Any) -> float:
     seconds = _number(what, value)
     if not 0.0 <= seconds <= LONGEST_S:
-        raise BadInput(f"{what} is {seconds:g}", remedy=f"give 0 to {LONGEST_S:.0f} s")
+        raise BadInput(f"{what} is {exact(seconds, 's')}", remedy=f"give 0 to {exact(LONGEST_S, 's')}")
     return seconds
 
 

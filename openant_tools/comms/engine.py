@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from openant_tools import numbers
 from openant_tools.comms import messages
 from openant_tools.comms.body_sensors import BodySensors
 from openant_tools.comms.bus import Answer
@@ -198,7 +199,7 @@ class Engine:
         if self._torque and not self._clock.stepped and now - before > port.patience_s:
             self._stopped(
                 Trip(
-                    f"this computer stood still for {now - before:.1f} s, and torque was switched off meanwhile",
+                    f"this computer stood still for {numbers.number(now - before, 's', decimals=1)}, and torque was switched off meanwhile",
                     "close what else keeps it busy, or let it not go to sleep",
                     cause=StopCause.STALL,
                 )

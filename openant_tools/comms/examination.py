@@ -16,6 +16,7 @@ from openant_tools.comms.restart import StopCause
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servo
 from openant_tools.comms.silence import PATIENCE_S, ask, diagnose
 from openant_tools.errors import HardwareFault, OpenAntError
+from openant_tools.numbers import number
 from openant_tools.recording.writer import RecordingStopped
 
 __all__ = ["cause_of", "examined", "watchdogs_tripped"]
@@ -39,7 +40,7 @@ def watchdogs_tripped(hardware: Hardware, seconds: float) -> Trip | None:
     if not tripped:
         return None
     return Trip(
-        f"this computer stood still for {seconds:.2f} s, and the servos' Bus Watchdog stopped the motion",
+        f"this computer stood still for {number(seconds, 's')}, and the servos' Bus Watchdog stopped the motion",
         "close what else keeps it busy, or let it not go to sleep",
         cause=StopCause.STALL,
     )

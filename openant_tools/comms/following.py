@@ -16,6 +16,7 @@ from openant_tools.comms.bus import Answer
 from openant_tools.comms.guards import Trip
 from openant_tools.comms.restart import StopCause
 from openant_tools.comms.servos import Block, Servo
+from openant_tools.numbers import number, percent
 
 __all__ = ["REST_S", "Behind", "Following", "allowance"]
 
@@ -48,8 +49,8 @@ class Behind:
         """Why the motion ends, as far as the joint's angle alone tells."""
         away = abs(self.command_rad - self.angle_rad)
         return Trip(
-            f"{self.servo.called} stands {away:.2f} rad from its command: it was sent to "
-            f"{self.command_rad:.2f} rad, is at {self.angle_rad:.2f} and pushes with {100 * abs(self.duty):.0f} % of full duty",
+            f"{self.servo.called} stands {number(away, 'rad')} from its command: it was sent to "
+            f"{number(self.command_rad, 'rad')}, is at {number(self.angle_rad, 'rad')} and pushes with {percent(abs(self.duty))} of full duty",
             "blocked, overloaded or weak: free the joint, take load off it, and look at its horn and its supply",
             self.servo.joint,
             "behind",

@@ -10,6 +10,7 @@ import time
 
 from openant_tools.comms import guardian
 from openant_tools.errors import HardwareFault
+from openant_tools.numbers import typed
 
 __all__ = ["BEAT_S", "PATIENCE_S", "GuardianProcess"]
 
@@ -46,7 +47,7 @@ class GuardianProcess:
         Raises:
             HardwareFault: this computer lets no process begin.
         """
-        words = [sys.executable, "-I", "-S", guardian.__file__, str(port), self._packet.hex(), f"{self._patience_s:g}"]
+        words = [sys.executable, "-I", "-S", guardian.__file__, str(port), self._packet.hex(), typed(self._patience_s)]
         try:
             self._process = subprocess.Popen(words, stdin=subprocess.PIPE, pass_fds=(port,), start_new_session=True)
         except OSError as error:

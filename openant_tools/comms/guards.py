@@ -11,6 +11,7 @@ from openant_tools.comms.bus import Answer
 from openant_tools.comms.faults import Cause
 from openant_tools.comms.restart import StopCause
 from openant_tools.comms.servos import Block, Servo
+from openant_tools.numbers import number, span
 
 __all__ = ["Guards", "Trip", "Watch"]
 
@@ -112,7 +113,7 @@ class Watch:
         everyone: Counter[Cause] = sum(self._missed.values(), Counter())
         if len(self._missed) > len(self.servos) / 2 and _broken(everyone) > everyone.total() / 25:
             return Trip(
-                f"{len(self._missed)} of {len(self.servos)} servos have not been heard for up to {silent:.2f} s, what "
+                f"{len(self._missed)} of {len(self.servos)} servos have not been heard for up to {number(silent, 's', decimals=2)}, what "
                 f"comes is broken ({_words(everyone)})",
                 "noise on the bus, or a loose connector near the adapter: look at the first cables and the ground",
                 cause=StopCause.SILENCE,
@@ -120,7 +121,7 @@ class Watch:
         causes = _words(missed)
         broken = _broken(missed) > missed.total() / 4
         return Trip(
-            f"{servo.called} has not answered for {silent:.2f} s ({causes})",
+            f"{servo.called} has not answered for {number(silent, 's', decimals=2)} ({causes})",
             "its answers come broken: two servos with one id, a loose connector, or noise"
             if broken
             else "`openant comms scan` asks why",
@@ -139,7 +140,7 @@ class Watch:
             low, high = self.limits_rad[servo.joint]
             if not low - guards.angle_margin_rad <= angle <= high + guards.angle_margin_rad:
                 return Trip(
-                    f"{place} is at {angle:.2f} rad, outside its limits {low:.2f} to {high:.2f}",
+                    f"{place} is at {number(angle, 'rad')}, outside its limits {span(low, high, 'rad')}",
                     "look for a wrong zero, a reversed joint, or something that pushes it",
                     servo.joint,
                     cause=StopCause.LIMITS,
@@ -156,7 +157,7 @@ class Watch:
                 amount = model.effort.to_si(block.effort)
                 unit = " A" if model.has_current_sensor else " of full load"
                 return Trip(
-                    f"{place} pushes with {amount:.2f}{unit} for {t - since:.1f} s",
+                    f"{place} pushes with {number(amount, unit)} for {number(t - since, 's', decimals=1)}",
                     "free the joint: is a leg blocked, or the load too much?",
                     servo.joint,
                     cause=StopCause.OVERLOAD,
@@ -169,7 +170,7 @@ class Watch:
                 self._hot_since.pop(servo.id, None)
             elif t - self._hot_since.setdefault(servo.id, t) >= guards.temperature_s:
                 return Trip(
-                    f"{place} is at {block.temperature} °C, {limit:.0f} °C is its limit",
+                    f"{place} is at {block.temperature} °C, {number(limit, '°C')} is its limit",
                     "let it cool for 20 minutes and take load off this joint",
                     servo.joint,
                     cause=StopCause.HEAT,
@@ -178,7 +179,7 @@ class Watch:
             volts, (low, high) = block.voltage * 0.1, model.supply_range_v
             if not low <= volts <= high + 0.5:
                 return Trip(
-                    f"{place} is supplied with {volts:.1f} V, it needs {low:.1f} to {high:.1f} V",
+                    f"{place} is supplied with {number(volts, 'V', decimals=1)}, it needs {span(low, high, 'V', decimals=1)}",
                     "look at the power connector and the supply under load",
                     servo.joint,
                     cause=StopCause.VOLTAGE,
@@ -191,5 +192,10 @@ def _broken(missed: Counter[Cause]) -> int:
     return missed[Cause.CRC] + missed[Cause.SHORT]
 
 
+_READS = {
+    Cause.TIMEOUT: "no answer", Cause.CRC: "broken", Cause.SHORT: "cut short", Cause.LATE: "too late", Cause.PORT: "port gone",
+}  # fmt: skip
+
+
 def _words(missed: Counter[Cause]) -> str:
-    return ", ".join(f"{cause.value} {count}" for cause, count in missed.most_common())
+    return ", ".join(f"{count} × {_READS.get(cause, cause.value)}" for cause, count in missed.most_common())

@@ -30,6 +30,7 @@ from openant_tools.comms.clock import Clock, portions
 from openant_tools.comms.line import Line, PortGone, SerialLine
 from openant_tools.comms.msp import Command, Direction, Framing, MspParser
 from openant_tools.errors import HardwareFault
+from openant_tools.numbers import number
 
 __all__ = ["Imu", "ImuInfo", "ImuSample", "ImuStatistics", "open_imu"]
 
@@ -229,10 +230,10 @@ class Imu:
             return HardwareFault("the flight controller is unplugged", where=self.where, remedy="look at its USB cable")
         since = self._last.t if self._last else self._sent_at
         if self._silent and now - since > 4 * REPLY_TIMEOUT_S:
-            return self._silence(f"for {now - since:.1f} s")
+            return self._silence(f"for {number(now - since, 's', decimals=1)}")
         if self._raw is not None and now - self._changed_at > FROZEN_S and self._same > 10:
             return HardwareFault(
-                f"the IMU has sent the same reading for {now - self._changed_at:.1f} s",
+                f"the IMU has sent the same reading for {number(now - self._changed_at, 's', decimals=1)}",
                 where=self.where,
                 remedy="its sensor hangs: power the flight controller off and on",
             )
@@ -301,7 +302,7 @@ class Imu:
         scale, gravity, bias = self._scale(api, samples, notes)
         if rate < 0.9 * (100 if multiple else 50):
             notes.append(
-                f"Only {rate:.0f} samples/s arrive; `set serial_update_rate_hz = 1000` in Betaflight's command line "
+                f"Only {number(rate, decimals=0)} samples/s arrive; `set serial_update_rate_hz = 1000` in Betaflight's command line "
                 "lifts its own limit."
             )
         return ImuInfo(
@@ -456,7 +457,7 @@ class Imu:
         if not _at_rest(samples):
             inherited = measured or float(expected[0])
             notes.append(
-                f"The robot moved while connecting, so the accelerometer scale ({inherited:.0f} LSB/g "
+                f"The robot moved while connecting, so the accelerometer scale ({number(inherited, 'LSB/g', decimals=0)} "
                 f"{'as measured' if measured else f'by API {api}'}) is not checked against gravity."
             )
             return inherited, None, None
@@ -466,19 +467,19 @@ class Imu:
         scale: float = min(known, key=lambda lsb: abs(math.log(mean / lsb)))
         if abs(math.log(mean / scale)) > math.log1p(SCALE_TOLERANCE):
             raise HardwareFault(
-                f"the accelerometer reads {mean:.0f} LSB at rest, which is 1 g in no known scale "
+                f"the accelerometer reads {number(mean, 'LSB', decimals=0)} at rest, which is 1 g in no known scale "
                 f"({', '.join(map(str, known))} LSB/g)",
                 where=self.where,
                 remedy="calibrate the accelerometer in Betaflight, board level and still, then connect again",
             )
         if measured:
             notes.append(
-                f"Gravity says {scale:.0f} LSB/g where {measured:.0f} had been measured (other firmware, another board?); "
+                f"Gravity says {number(scale, 'LSB/g', decimals=0)} where {number(measured, decimals=0)} had been measured (other firmware, another board?); "
                 "gravity decides: run `openant calib imu` again."
             )
         elif scale not in expected:
             notes.append(
-                f"Gravity says {scale:.0f} LSB/g where API {api} promises {' or '.join(map(str, expected))}; "
+                f"Gravity says {number(scale, 'LSB/g', decimals=0)} where API {api} promises {' or '.join(map(str, expected))}; "
                 "gravity decides."
             )
         return scale, mean / scale * STANDARD_GRAVITY, bias

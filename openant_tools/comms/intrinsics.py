@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number
 
 __all__ = ["CharucoBoard", "Intrinsics", "calibrate"]
 
@@ -187,12 +188,12 @@ def calibrate(pictures: Sequence[NDArray[np.uint8]], board: CharucoBoard) -> Int
     tilt = max(math.degrees(math.acos(float(np.clip(a @ normals[0], -1, 1)))) for a in normals)
     if tilt < 15.0:
         raise BadInput(
-            f"all views are within {tilt:.0f}° of each other, which leaves focal length and distance mixed up",
+            f"all views are within {number(tilt, '°', decimals=0)} of each other, which leaves focal length and distance mixed up",
             remedy="tilt the board by 30 to 45° in several directions",
         )
     if rms > GOOD_RMS_PX:
         raise BadInput(
-            f"the calibration fits to {rms:.1f} px only",
+            f"the calibration fits to {number(rms, 'px', decimals=1)} only",
             remedy="glue the board to something flat, keep it still, and measure its squares",
         )
     k = [float(v) for v in np.ravel(distortion)[:5]]

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number
 
 __all__ = ["LatencyEstimate", "camera_latency"]
 
@@ -77,8 +78,8 @@ def camera_latency(camera_t: Array, camera_yaw: Array, gyro_t: Array, gyro_z: Ar
     speed = np.interp(tc, tg, rate)
     if np.ptp(speed) < 0.5 or np.ptp(yaw) < math.radians(10):
         raise BadInput(
-            f"the robot turned by {math.degrees(float(np.ptp(yaw))):.0f}° with its speed changing by "
-            f"{float(np.ptp(speed)):.2f} rad/s, which tells no latency",
+            f"the robot turned by {number(float(np.ptp(yaw)), 'rad')} with its speed changing by "
+            f"{number(float(np.ptp(speed)), 'rad/s')}, which tells no latency",
             remedy="turn it to and fro by hand, 30° and more, about once a second",
         )
     middle = tc.mean()

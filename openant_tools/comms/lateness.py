@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.numbers import number, percent
 from openant_tools.recording.run import Run
 
 __all__ = [
@@ -103,7 +104,7 @@ class Lateness:
         """How late it was, as a sentence; empty where it was not."""
         said = lateness_words(self.worst_s, self.late, self.cycles)
         if said and self.pressure > BUSY:
-            said += f" (programs waited for a processor {self.pressure:.0%} of the time)"
+            said += f" (programs waited for a processor {percent(self.pressure)} of the time)"
         return said
 
     def close(self) -> None:
@@ -166,7 +167,7 @@ def losses(run: Run) -> Losses:
     words = ""
     if excused > 0:
         how = of_wake(wake) or "answers came late"
-        words = f"{how}: {excused:.1%} of all answers were missed by that, and say nothing of servos and cables"
+        words = f"{how}: {percent(excused, decimals=1)} of all answers were missed by that, and say nothing of servos and cables"
     enough = int((~late).sum()) >= max(FEWEST, ENOUGH * len(late))
     return Losses(run.joints, lost, ~late, words, enough or not excused)
 
@@ -186,8 +187,8 @@ def lateness_words(worst_s: float, late: int, cycles: int) -> str:
     """How late it was, as a sentence; empty where it was not."""
     if worst_s <= LATE_S or (cycles and late <= SHARE * cycles):
         return ""
-    often = f" in {max(late / cycles, 0.01):.0%} of cycles" if cycles else ""
-    return f"this computer was late by up to {worst_s * 1e3:.0f} ms{often}"
+    often = f" in {percent(late / cycles)} of cycles" if cycles else ""
+    return f"this computer was late by up to {number(worst_s, 's')}{often}"
 
 
 def processor_s(pid: int) -> float | None:

@@ -13,6 +13,7 @@ from openant_tools.comms.guards import Guards
 from openant_tools.comms.restart import Restart, StopCause
 from openant_tools.comms.servos import Servo
 from openant_tools.errors import BadInput
+from openant_tools.numbers import exact
 from openant_tools.recording.run import Facts
 
 if TYPE_CHECKING:
@@ -114,10 +115,10 @@ class EngineConfig:
         seconds = self.watchdog_s
         if self.still or WATCHDOG_UNIT_S <= seconds <= WATCHDOG_LONGEST_S:
             return
-        why = "is off, and the robot is to move" if seconds == 0 else f"cannot be {seconds:g} s"
+        why = "is off, and the robot is to move" if seconds == 0 else f"cannot be {exact(seconds, 's')}"
         raise BadInput(
             f"the servos' Bus Watchdog (watchdog_s) {why}",
-            remedy=f"give it {WATCHDOG_UNIT_S:g} to {WATCHDOG_LONGEST_S:g} s (0.2 is usual): [bus] watchdog_s in robot.toml",
+            remedy=f"give it {exact(WATCHDOG_UNIT_S)} to {exact(WATCHDOG_LONGEST_S, 's')} (0.2 is usual): [bus] watchdog_s in robot.toml",
         )
 
 

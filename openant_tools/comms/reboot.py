@@ -8,6 +8,7 @@ from openant_tools.comms import protocol2 as p2
 from openant_tools.comms.bus import Bus
 from openant_tools.comms.silence import ERROR_STATUS, VOLTAGE, ask, diagnose, patient_ping, read_register
 from openant_tools.errors import HardwareFault
+from openant_tools.numbers import number, span
 from openant_tools.robot.servo import HardwareError, hardware_errors
 
 __all__ = ["Latched", "latched", "reboot"]
@@ -91,7 +92,7 @@ def _cause(bus: Bus, id: int) -> str:
         high, low = int.from_bytes(limits[:2], "little"), int.from_bytes(limits[2:], "little")
         if not low <= now <= high:
             return (
-                f"it is supplied with {now / 10:.1f} V and is set to bear {low / 10:.1f} to {high / 10:.1f} V → look at the "
+                f"it is supplied with {number(now / 10, 'V', decimals=1)} and is set to bear {span(low / 10, high / 10, 'V', decimals=1)} → look at the "
                 "power connector and at the supply under load"
             )
     return ""

@@ -14,6 +14,7 @@ from enum import StrEnum
 from typing import Literal
 
 from openant_tools.errors import HardwareFault
+from openant_tools.numbers import exact
 
 __all__ = [
     "POSE_RAD",
@@ -211,7 +212,7 @@ def _ordinal(n: int) -> str:
 
 
 def _span(seconds: float) -> str:
-    return f"{seconds / 3600:g} h" if seconds >= 3600 else f"{seconds / 60:g} min"
+    return exact(seconds / 3600, "h") if seconds >= 3600 else exact(seconds / 60, "min")
 
 
 def longest_wait_s(cause: StopCause | None) -> float:

@@ -23,6 +23,7 @@ from openant_tools.comms.messages import EngineConfig
 from openant_tools.comms.restart import Interlock, MotionStopped, Restart, StopCause
 from openant_tools.comms.state import refusal, stopping
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.numbers import exact
 from openant_tools.procedure.step import Progress, Say, Subroutine
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts
@@ -186,7 +187,7 @@ def _losses(statistics: Mapping[str, Any]) -> str:
 def _what_follows(restart: Restart | None) -> str:
     if restart is None:
         return "motion has ended for good, and the soak goes on listening, torque off"
-    return f"going on in {PAUSE_S:.0f} s, {restart.count} of {restart.times}"
+    return f"going on in {exact(PAUSE_S, 's')}, {restart.count} of {restart.times}"
 
 
 def _rows_of(path: Path) -> int:

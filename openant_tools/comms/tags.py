@@ -35,6 +35,7 @@ from openant_tools.comms.doubts import View, other_reading
 from openant_tools.comms.intrinsics import Intrinsics
 from openant_tools.comms.tag_family import load_family
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number
 from openant_tools.optional import cv2
 
 __all__ = ["BodyLost", "BodyPose", "BodyTracker", "Sighting", "TagDetector", "TagSetup", "tag_pose"]
@@ -325,7 +326,9 @@ class BodyTracker:
             if gone > JUMP_M + JUMP_M_S * max(0.0, found.t - before):
                 self._jumped = 1
                 self._last = (found.t, found.position)
-                words = f"body tag {self.setup.body_id} was {gone:.2f} m away {found.t - before:.2f} s ago"
+                words = (
+                    f"body tag {self.setup.body_id} was {number(gone, 'm')} away {number(found.t - before, 's')} ago"
+                )
                 self._jump_words = f"{words}: another sheet with its number, or was the robot carried?"
                 return BodyLost(found.t, self._jump_words)
         self._last = (found.t, found.position)
@@ -340,7 +343,7 @@ class BodyTracker:
         doubtful = [s for s in sightings if s.id == tag]
         if doubtful:
             s = max(doubtful, key=lambda s: s.margin)
-            how = f"margin {s.margin:.1f}, {s.hamming} wrong bits"
+            how = f"margin {number(s.margin, decimals=1)}, {s.hamming} wrong bits"
             return f"body tag {tag} is doubtful ({how}): too small, too dark or blurred"
         others = sorted({s.id for s in sightings if s.margin >= self.setup.min_margin and s.hamming == 0})
         others = [i for i in others if i != self.setup.origin_id]
@@ -402,9 +405,9 @@ class BodyTracker:
         turned = math.acos(max(-1.0, min(1.0, max(float(up @ before_up) for up in ups))))
         self._scaled = ""
         if abs(far_m / before_m - 1) > ORIGIN_SAME_SHARE:
-            self._scaled = f"looks {before_m / far_m:.2f} times as large as before"
+            self._scaled = f"looks {number(before_m / far_m)} times as large as before"
         elif turned > ORIGIN_SAME_LEAN_RAD:
-            self._scaled = f"leans by {math.degrees(turned):.0f}° otherwise than before"
+            self._scaled = f"leans by {number(turned, 'rad', decimals=0)} otherwise than before"
         if self._scaled:
             self._scaled = (
                 f"origin tag {self.setup.origin_id} {self._scaled}: the camera zooms, crops, stretches its picture or hangs elsewhere; start "
@@ -431,7 +434,10 @@ class BodyTracker:
             return BodyLost(t, f"the corners of body tag {setup.body_id} make no square")
         fit, *other = sorted(solutions, key=lambda solution: solution.cost)
         if fit.residual_px > MAX_RESIDUAL_PX:
-            return BodyLost(t, f"the corners of body tag {setup.body_id} make no square ({fit.residual_px:.1f} px off)")
+            return BodyLost(
+                t,
+                f"the corners of body tag {setup.body_id} make no square ({number(fit.residual_px, 'px', decimals=1)} off)",
+            )
 
         self._misfits.append(4 * fit.residual_px**2)
 
@@ -450,7 +456,7 @@ class BodyTracker:
         low, high = setup.heights
         if not low <= position[2] <= high:
             return BodyLost(
-                t, f"the body would be {position[2]:.2f} m above the floor: is it carried, or are a tag's size, the lens or the "
+                t, f"the body would be {number(position[2], 'm')} above the floor: is it carried, or are a tag's size, the lens or the "
                 "picture's size other than declared?"
             )  # fmt: skip
         if tilt is not None:
@@ -458,7 +464,7 @@ class BodyTracker:
             apart = math.acos(max(-1.0, min(1.0, float(lean))))
             if apart > LEAN_APART_RAD:
                 return BodyLost(
-                    t, f"the tag leans by {math.degrees(apart):.0f}° otherwise than the IMU says: a stretched picture, or is `openant "
+                    t, f"the tag leans by {number(apart, 'rad', decimals=0)} otherwise than the IMU says: a stretched picture, or is `openant "
                     "calib imu` still to be done?"
                 )  # fmt: skip
         variance = np.zeros(4)

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from openant_tools.errors import BadInput
 from openant_tools.files import read_toml
+from openant_tools.numbers import exact, typed
 from openant_tools.robot import gains
 from openant_tools.robot.config import Provenance
 from openant_tools.robot.control_table import GAIN_MAX
@@ -75,9 +76,9 @@ class Mjcf:
     @property
     def lines(self) -> tuple[str, ...]:
         """As they stand in a model."""
-        joint = (f'<joint damping="{self.damping:.4g}"/>',) if self.damping else ()
-        force = f"{self.force_nm:.4g}"
-        return (*joint, f'<position kp="{self.kp:.4g}" kv="{self.kv:.4g}" forcerange="-{force} {force}"/>')
+        joint = (f'<joint damping="{typed(self.damping, 4)}"/>',) if self.damping else ()
+        force = typed(self.force_nm, 4)
+        return (*joint, f'<position kp="{typed(self.kp, 4)}" kv="{typed(self.kv, 4)}" forcerange="-{force} {force}"/>')
 
 
 @dataclass(frozen=True)
@@ -193,7 +194,7 @@ def registers_for(
     """
     registers, divisor = base or model.factory, p_divisor or model.p_divisor
     stall = gains.stall_torque_nm(model.ratings, supply_v)
-    at = f"{model.name} at {supply_v:g} V"
+    at = f"{model.name} at {exact(supply_v, 'V')}"
     if wanted.kp is not None:
         most = gains.stiffness_nm_rad(GAIN_MAX, divisor, stall)
         p = _count("kp", "N·m/rad", wanted.kp, gains.p_gain_for(wanted.kp, divisor, stall), most, GAIN_MAX, at)
@@ -205,7 +206,7 @@ def registers_for(
         # A kv that was read off four digits may lie a hair below what the motor alone gives.
         if d < -0.5 and wanted.kv < slope * (1 - 1e-3):
             raise BadInput(
-                f"kv {wanted.kv:g} N·m·s/rad is less than the back-EMF of {at}, {slope:.4g}, which no register takes away",
+                f"kv {exact(wanted.kv, 'N·m·s/rad')} is less than the back-EMF of {at}, {typed(slope, 4)}, which no register takes away",
                 remedy="ask for that or more, or, where the model's joint damping holds it, add --back-emf joint",
             )
         d_count = _count("kv", "N·m·s/rad", wanted.kv, max(d, 0.0), most, GAIN_MAX, at, may_be_zero=True)
@@ -218,24 +219,34 @@ def registers_for(
 
 
 def _count(
-    name: str, unit: str, value: float, exact: float, most: float, largest: int, at: str, *, may_be_zero: bool = False
+    name: str,
+    unit: str,
+    value: float,
+    unrounded: float,
+    most: float,
+    largest: int,
+    at: str,
+    *,
+    may_be_zero: bool = False,
 ) -> int:
-    """`exact` as a register's count, or the line that says why it is none."""
-    count = round(exact)
+    """`unrounded` as a register's count, or the line that says why it is none."""
+    count = round(unrounded)
     if count > largest:
-        raise BadInput(f"{name} {value:g} {unit} is more than {at} can give", remedy=f"ask for {_below(most)} or less")
+        raise BadInput(
+            f"{name} {exact(value, unit)} is more than {at} can give", remedy=f"ask for {_below(most)} or less"
+        )
     if count < 1 and not may_be_zero:
         raise BadInput(
-            f"{name} {value:g} {unit} is less than one count of the register gives on {at}",
-            remedy=f"ask for {most / largest:.2g} or more",
+            f"{name} {exact(value, unit)} is less than one count of the register gives on {at}",
+            remedy=f"ask for {typed(most / largest, 2)} or more",
         )
     return count
 
 
 def _below(most: float) -> str:
     """Four digits that are no more than `most`."""
-    text = f"{most:.4g}"
-    return text if float(text) <= most else f"{most * (1 - 5e-4):.4g}"
+    text = typed(most, 4)
+    return text if float(text) <= most else typed(most * (1 - 5e-4), 4)
 
 
 def conversion(
@@ -262,7 +273,7 @@ def conversion(
                     model, Wanted(kp=wanted.kp), supply_v, back_emf, base=base, p_divisor=divisor.value
                 ).position_p
             except BadInput as error:
-                notes.append(f"by a P divisor of {divisor.value:g}: {error.what}")
+                notes.append(f"by a P divisor of {exact(divisor.value)}: {error.what}")
                 continue
         kp = to_mjcf(model, replace(registers, position_p=p), supply_v, back_emf, divisor.value).kp
         by_divisor.append((divisor, p, kp))
@@ -285,14 +296,14 @@ def conversion(
 
 def _supply_notes(model: GainModel, supply_v: float) -> Iterator[str]:
     low, high = model.supply_range_v
-    allowed = f"{low:g} to {high:g} V"
+    allowed = f"{exact(low)} to {exact(high, 'V')}"
     if not low * (1 - SUPPLY_SLACK) <= supply_v <= high * (1 + SUPPLY_SLACK):
         raise BadInput(
-            f"an {model.name} does not run at {supply_v:g} V",
+            f"an {model.name} does not run at {exact(supply_v, 'V')}",
             remedy=f"its maker allows {allowed}; give the volts at the servo",
         )
     if not low <= supply_v <= high:
-        yield f"{supply_v:g} V is beyond what the maker allows, {allowed}: the torque there is extrapolated"
+        yield f"{exact(supply_v, 'V')} is beyond what the maker allows, {allowed}: the torque there is extrapolated"
 
 
 def _check(registers: Registers) -> None:
@@ -320,15 +331,14 @@ def constants(model: GainModel, supply_v: float) -> list[Constant]:
     sheet = f"manual: {model.url}, Specifications"
     pid = f"manual: {model.url}, Position PID Gain(80, 82, 84)"
     ratings, rating = model.ratings, model.rating
-    line, derived = f"at {rating.voltage_v:g} V", f"derived of the line at {rating.voltage_v:g} V"
+    line = f"at {exact(rating.voltage_v, 'V')}"
+    derived = f"derived of the line {line}"
     if any(one.voltage_v == supply_v for one in ratings):
-        stall = f"{sheet}, at {supply_v:g} V"
+        stall = f"{sheet}, at {exact(supply_v, 'V')}"
     else:
-        torques = " / ".join(f"{one.stall_torque_nm:g}" for one in ratings)
-        volts = " / ".join(f"{one.voltage_v:g}" for one in ratings)
-        stall = (
-            f"derived: torque per volt of the nearest lines times {supply_v:g} V; {sheet}, {torques} N·m at {volts} V"
-        )
+        torques = " / ".join(exact(one.stall_torque_nm) for one in ratings)
+        volts = " / ".join(exact(one.voltage_v) for one in ratings)
+        stall = f"derived: torque per volt of the nearest lines times {exact(supply_v, 'V')}; {sheet}, {torques} N·m at {volts} V"
     found = [
         Constant("stall torque", SourcedFigure(gains.stall_torque_nm(ratings, supply_v), "N·m", stall), True),
         Constant("no-load speed", SourcedFigure(rating.no_load_rad_s, "rad/s", f"{sheet}, {line}"), True),
@@ -446,7 +456,7 @@ def beside(result: Conversion, folder: RobotFolder) -> list[Beside]:
                 continue
             origins = {kind: config.provenance_of(f"identified.{kind}.{joint}") for kind in parts}
             single = origins[next(iter(parts))] if len(parts) == 1 else None
-            words = [f"{kind} {value:.4g}, {_origin(origins[kind])}" for kind, value in parts.items()]
+            words = [f"{kind} {typed(value, 4)}, {_origin(origins[kind])}" for kind, value in parts.items()]
             rows.append(
                 Beside(
                     joint, name, sheet[name], sum(parts.values()), single.low if single else None,

@@ -22,6 +22,8 @@ from openant_tools.model.plant import Plant, beside_servos, position_servos
 from openant_tools.model.rollout import Rollouts
 from openant_tools.model.servo import read_stiffness, torque_limit
 from openant_tools.model.stability import NUDGE, growth
+from openant_tools.numbers import exact, number, percent, typed
+from openant_tools.numbers import span as angles
 from openant_tools.recording.run import Run
 from openant_tools.robot.registers import PWM_FULL, RAD_PER_PULSE, RAD_S_PER_COUNT
 from openant_tools.sysid.quality import span, without_errors
@@ -257,8 +259,8 @@ def _time_unit(case: Case) -> Found:
     if furthest > WENT_RAD and fastest < CREEPS_RAD_S:
         unit, factor = ("ms", "0.001") if case.row_s < 500.0 else ("µs", "1e-6") if case.row_s < 5e5 else ("ns", "1e-9")
         yield (
-            f"rows are {case.row_s:.3g} s apart, and what moves over {furthest:.2g} rad is never faster than "
-            f"{fastest:.2g} rad/s: t looks like {unit}",
+            f"rows are {number(case.row_s, 's')} apart, and what moves over {number(furthest, 'rad')} is never faster than "
+            f"{number(fastest, 'rad/s')}: t looks like {unit}",
             f"t is in s ({unit} × {factor})",
         )
 
@@ -276,8 +278,8 @@ def _time_too_short(case: Case) -> Found:
         far = went > WENT_RAD
         if far.any() and (speed := float(np.median(went[far] / took[far]))) > FLIES_RAD_S:
             yield (
-                f"{joint} goes over {span(case.pos[:, j]):.2g} rad in {case.run.duration_s:.2g} s, at {speed:.0f} rad/s: t is "
-                "too small to be in s",
+                f"{joint} goes over {number(span(case.pos[:, j]), 'rad')} in {number(case.run.duration_s, 's')}, at "
+                f"{number(speed, 'rad/s', decimals=0)}: t is too small to be in s",
                 "t is in s, and was divided once too often (by 1000?)",
             )
             return
@@ -292,7 +294,7 @@ def _command_time(case: Case) -> Found:
     last = float(np.nanmax(stamps)) - float(t[0])
     if last > OTHER_UNIT * (case.run.duration_s + 1.0):
         yield (
-            f"cmd_t goes on to {last:.3g} s after the first row, t to {case.run.duration_s:.3g} s",
+            f"cmd_t goes on to {number(last, 's')} after the first row, t to {number(case.run.duration_s, 's')}",
             "give both in s, on one clock (ms × 0.001, µs × 1e-6)",
         )
 
@@ -306,7 +308,7 @@ def _other_units(case: Case) -> Found:
             if not 1 / OTHER_UNIT < ratio < OTHER_UNIT:
                 names = ("pos", "cmd") if ratio > 1 else ("cmd", "pos")
                 yield (
-                    f"{names[0]}.{joint} swings {max(ratio, 1 / ratio):.0f} times as far as {names[1]}.{joint}: they are in "
+                    f"{names[0]}.{joint} swings {number(max(ratio, 1 / ratio), decimals=0)} times as far as {names[1]}.{joint}: they are in "
                     "different units",
                     "give both in rad (1 rad is 57.3 degrees)",
                 )
@@ -318,13 +320,14 @@ def _degrees(case: Case) -> Found:
         for name, values in (("pos", case.pos[:, j]), ("cmd", case.cmd[:, j])):
             if name == "pos" and _degree_steps(case, j):
                 yield (
-                    f"pos.{joint} goes in steps of {case.steps[j]:.3g} to {_furthest(values):.3g}: it looks like degrees",
+                    f"pos.{joint} goes in steps of {number(case.steps[j])} to {number(_furthest(values))}: it looks like degrees",
                     "give it in rad (degrees × π/180)",
                 )
                 break
             if _furthest(values) > MOST_RAD and not math.isfinite(_range(case, j)[1]):
                 yield (
-                    f"{name}.{joint} reaches {_furthest(values):.0f}, which is {_furthest(values) / (2 * math.pi):.0f} turns "
+                    f"{name}.{joint} reaches {number(_furthest(values), decimals=0)}, which is "
+                    f"{number(_furthest(values) / (2 * math.pi), decimals=0)} turns "
                     "in rad",
                     "check its unit (rad); if the joint does turn that far, give it a range in the model",
                 )
@@ -345,7 +348,7 @@ def _wrapped(case: Case) -> Found:
             if len(jumps):
                 ends = "0 … 2π" if np.nanmin(values) > -math.pi / 2 else "±π"
                 yield (
-                    f"{name}.{joint} jumps by a turn {len(jumps)} times, first at t = {case.run.t[jumps[0]]:.6g} s: it is "
+                    f"{name}.{joint} jumps by a turn {len(jumps)} times, first at t = {exact(case.run.t[jumps[0]], 's')}: it is "
                     f"wrapped to {ends}, and goes on as if it were not",
                     "record angles that go on beyond a turn",
                 )
@@ -358,7 +361,7 @@ def _whole_turn(case: Case) -> Found:
         if turns:
             yield (
                 f"pos.{joint} is {'a turn' if abs(turns) == 1 else f'{abs(turns)} turns'} "
-                f"({2 * math.pi * turns:+.2f} rad) from cmd.{joint}, which is taken out",
+                f"({number(2 * math.pi * turns, 'rad', sign=True, decimals=0)}) from cmd.{joint}, which is taken out",
                 "set the joint's zero, or take whole turns out of its positions",
             )
 
@@ -368,7 +371,7 @@ def _whole_turn(case: Case) -> Found:
 
 def _too_short(case: Case) -> Found:
     if case.run.duration_s < SHORTEST_S:
-        yield f"too short to fit: {case.run.duration_s:.2f} s", "record at least a few seconds"
+        yield f"too short to fit: {number(case.run.duration_s, 's', decimals=2)}", "record at least a few seconds"
 
 
 def _nothing_moves(case: Case) -> Found:
@@ -388,8 +391,8 @@ def _by_registers(case: Case) -> Found:
             left = max(0.0, (high - low) * RAD_PER_PULSE)
             if wanted > left:
                 yield (
-                    f"{joint} is commanded over {wanted:.2f} rad, and its registers min_position_limit = {low:.0f} and "
-                    f"max_position_limit = {high:.0f} leave {left:.2f} rad",
+                    f"{joint} is commanded over {number(wanted, 'rad')}, and its registers min_position_limit = {int(low)} and "
+                    f"max_position_limit = {int(high)} leave {number(left, 'rad')}",
                     remedy,
                 )
         speed = table.get("profile_velocity", 0) * RAD_S_PER_COUNT
@@ -400,8 +403,8 @@ def _by_registers(case: Case) -> Found:
                 faster = float(np.mean(moving > speed)) if len(moving) else 0.0
             if faster > TOO_FAST:
                 yield (
-                    f"{joint} is commanded faster than its register profile_velocity = {table['profile_velocity']:.0f} lets it "
-                    f"turn ({speed:.2g} rad/s) in {100 * faster:.0f} % of its motion",
+                    f"{joint} is commanded faster than its register profile_velocity = {int(table['profile_velocity'])} lets it "
+                    f"turn ({number(speed, 'rad/s')}) in {percent(faster)} of its motion",
                     remedy,
                 )
 
@@ -411,7 +414,7 @@ def _does_not_move(case: Case) -> Found:
         if case.commanded(j) > 10 * MOVES_QUANTA * case.steps[j] and not case.moves[j]:
             others = ", ".join(other for other in case.joints if other != joint) or "none"
             yield (
-                f"{joint} is commanded over {case.commanded(j):.2f} rad and does not move",
+                f"{joint} is commanded over {number(case.commanded(j), 'rad')} and does not move",
                 f"check its cable, horn and torque, or leave it out with --joint (all others: {others})",
             )
 
@@ -501,8 +504,8 @@ def _beyond_range(case: Case) -> Found:
         if len(pos) and beyond.mean() > BEYOND:
             furthest = pos[np.argmax(np.maximum(low - pos, pos - high))]
             yield (
-                f"pos.{joint} was measured at {furthest:.2f} rad, beyond the model's range {low:.2f} … {high:.2f}, in "
-                f"{100 * beyond.mean():.0f} % of its rows",
+                f"pos.{joint} was measured at {number(furthest, 'rad')}, beyond the model's range {angles(low, high, 'rad')}, in "
+                f"{percent(beyond.mean())} of its rows",
                 "widen the joint's `range`, or check its unit (rad), its zero, and whether this is the model of this robot",
             )
 
@@ -521,10 +524,9 @@ def _beyond_ctrlrange(case: Case) -> Found:
         cut = (cmd < low - CUT_RAD) | (cmd > high + CUT_RAD)
         if cut.any():
             furthest = cmd[np.argmax(np.maximum(low - cmd, cmd - high))]
-            share = 100 * cut.mean()
             yield (
-                f"cmd.{joint} goes to {furthest:.2f} rad, the model's ctrlrange is {low:.2f} … {high:.2f}: "
-                f"{f'{share:.0f}' if share >= 1 else f'{share:.1g}'} % of its commands are cut",
+                f"cmd.{joint} goes to {number(furthest, 'rad')}, the model's ctrlrange is {angles(low, high, 'rad')}: "
+                f"{percent(cut.mean())} of its commands are cut",
                 "widen `ctrlrange` (or the `range` that it inherits), if the servo itself does not cut them",
             )
 
@@ -539,13 +541,13 @@ def _geared(case: Case) -> Found:
         if math.isclose(gear, 1.0, rel_tol=1e-6):
             continue
         kp, kv = -float(model.actuator_biasprm[i, 1]) * gear**2, -float(model.actuator_biasprm[i, 2]) * gear**2
-        same = f"kp={kp:.4g}" + (f" kv={kv:.4g}" if kv else "")
+        same = f"kp={typed(kp, 4)}" + (f" kv={typed(kv, 4)}" if kv else "")
         if model.actuator_forcelimited[i]:
             low, high = sorted(float(end) * gear for end in model.actuator_forcerange[i])
-            same += f" forcerange={low:.4g} {high:.4g}"
+            same += f" forcerange={typed(low, 4)} {typed(high, 4)}"
         affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
         yield (
-            f"the actuator of {joint} has gear {gear:g}: MuJoCo turns the joint to command / gear, a servo to its command",
+            f"the actuator of {joint} has gear {typed(gear)}: MuJoCo turns the joint to command / gear, a servo to its command",
             f"write the servo at the joint, with gear 1: {same}" if affine and gear > 0 else
             "give it gear 1 and its numbers at the joint; where a servo turns backwards, turn the joint's axis",
         )  # fmt: skip
@@ -655,7 +657,7 @@ def _saturated(case: Case) -> Found:
         share = _share_saturated(case, j)
         if share > SATURATED:
             yield (
-                f"{joint} works at its torque limit in {100 * share:.0f} % of the samples",
+                f"{joint} works at its torque limit in {percent(share)} of the samples",
                 "record smaller or slower motions: a saturated servo shows its limit and nothing else",
             )
 
@@ -688,7 +690,7 @@ def _unstable(case: Case) -> Found:
         restless = [] if apart else _restless(case)
     except BadInput:
         return  # no motion that could be simulated: others say so
-    step = f"steps of {1e3 * case.plant.timestep:.3g} ms"
+    step = f"steps of {number(case.plant.timestep, 's')}"
     if apart:
         what = f"simulated with this run's commands in {step} it falls apart"
         calm = next(
@@ -699,7 +701,7 @@ def _unstable(case: Case) -> Found:
         calm = next((n for n in FINER if not any(_grows(case, pose, n) for pose in restless)), None)
     else:
         return
-    helps = f'timestep="{case.plant.timestep / calm:.3g}" keeps it together' if calm else "shorten its `timestep`"
+    helps = f'timestep="{typed(case.plant.timestep / calm, 3)}" keeps it together' if calm else "shorten its `timestep`"
     yield (
         f"the model is unstable: {what}",
         f'{helps}; or take integrator="implicitfast", or check stiffness, armature and damping',

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number
 from openant_tools.procedure.intervals import Interval
 from openant_tools.thermal.fit import Fit
 from openant_tools.thermal.forecast import forecast, present_load, settled, torque_load
@@ -174,7 +175,9 @@ def against_paper(found: Fit) -> AgainstPaper:
     worst = max((told.joints[k] for k in knees), key=lambda one: (one.probability, one.settles_c.value))
     here = f"here, from a cold start, {worst.words}"
     above = _less(worst.settles_c, paper.limit_c)
-    settles = f"settling {above.value:+.0f} [{above.low:+.0f}, {above.high:+.0f}] K from {paper.limit_c:.0f} °C"
+    settles = (
+        f"settling {number(above.value, 'K', above.low, above.high, sign=True)} from {number(paper.limit_c, '°C')}"
+    )
     when = worst.seconds_to_limit
     if paper.shutdown_s is None or when is None:
         verdict = "" if paper.shutdown_s is None else ": it stays cooler than the paper's"
@@ -186,7 +189,7 @@ def against_paper(found: Fit) -> AgainstPaper:
         verdict = "it gives out sooner than the paper's"
     else:
         verdict = "as the paper's, within the interval"
-    span = f"{later.value / 60:+.0f} [{later.low / 60:+.0f}, {later.high / 60:+.0f}] min"
+    span = number(later.value / 60, "min", later.low / 60, later.high / 60, sign=True)
     return AgainstPaper(
         worst.joint, later, above, f"Paper: {paper.words}. This robot: {here}, {span} from the paper's: {verdict}."
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 
+from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.robot.kit import Kit
 from openant_tools.robot.servo import ServoModel
@@ -55,10 +56,14 @@ def thermal_finding(
             Evidence("telemetry errors", float(sum(glitches.values())), "1", "single readings no heat explains")
         )
     if held is not None:
-        evidence.append(Evidence("error on the later part", held.rms_k, "K", f"fit of the first {held.from_s:.0f} s"))
+        evidence.append(
+            Evidence(
+                "error on the later part", held.rms_k, "K", f"fit of the first {number(held.from_s, 's', decimals=0)}"
+            )
+        )
         if held.rms_k > BELIEVED_K:
             problems.append(
-                f"the model misses the later part by {held.rms_k:.1f} K, most at {held.worst} → soak longer, in a still room"
+                f"the model misses the later part by {number(held.rms_k, 'K', decimals=1)}, most at {held.worst} → soak longer, in a still room"
             )
     if warning:
         problems.append(warning)
@@ -115,7 +120,7 @@ def torque_warning(
     if worst.verdict == "holds":
         return None
     return (
-        f"{worst.servo} knees bear {worst.torque_nm:.2f} N·m on two legs and hold {worst.nominal_nm:.2f} N·m for long: they "
+        f"{worst.servo} knees bear {number(worst.torque_nm, 'N·m', decimals=2)} on two legs and hold {number(worst.nominal_nm, 'N·m', decimals=2)} for long: they "
         "will heat → walk with rests, or stand on four legs (`openant sysid torque` shows the table)"
     )
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.numbers import exact, number, percent, span
 from openant_tools.procedure.intervals import Interval
 from openant_tools.robot.derating import DeratedJoint, Derating
 from openant_tools.thermal.fit import Fit, Variants
@@ -114,27 +115,31 @@ class JointForecast:
     @property
     def words(self) -> str:
         """`knee_fl reaches 72 °C after 31 ± 4 min`."""
-        when = self.seconds_to_limit
+        when, limit = self.seconds_to_limit, number(self.limit_c, "°C")
         if when is None:
-            return f"{self.joint} stays below {self.limit_c:.0f} °C: it settles at {_about(self.settles_c)} °C"
+            return f"{self.joint} stays below {limit}: it settles at {_about(self.settles_c, 1.0, '°C')}"
         if when.high >= HORIZON_S:
             return (
-                f"{self.joint} reaches {self.limit_c:.0f} °C with a probability of {self.probability:.0%}, "
-                f"not before {when.low / 60:.0f} min"
+                f"{self.joint} reaches {limit} with a probability of {percent(self.probability)}, "
+                f"not before {_minutes(when.low)}"
             )
-        half = (when.high - when.low) / 120
         if when.high - when.value > LOPSIDED * (when.value - when.low):
-            span = f"{when.low / 60:.0f} to {when.high / 60:.0f}"
-            return f"{self.joint} reaches {self.limit_c:.0f} °C after {when.value / 60:.0f} min, {span}"
-        return f"{self.joint} reaches {self.limit_c:.0f} °C after {when.value / 60:.0f} ± {half:.0f} min"
+            return f"{self.joint} reaches {limit} after {_minutes(when.value)}, {span(when.low / 60, when.high / 60, decimals=0)}"
+        return f"{self.joint} reaches {limit} after {_about(when, 60.0, 'min')}"
 
 
 #: how many times longer the late side of an interval may be for "±" to be said of it
 LOPSIDED = 2.0
 
 
-def _about(interval: Interval) -> str:
-    return f"{interval.value:.0f} ± {(interval.high - interval.low) / 2:.0f}"
+def _about(interval: Interval, size: float, unit: str) -> str:
+    """`31 ± 4 min`, of a unit of `size`."""
+    half = 0.5 * (interval.high - interval.low)
+    return f"{number(interval.value / size, decimals=0)} ± {number(half / size, unit, decimals=0)}"
+
+
+def _minutes(seconds: float) -> str:
+    return number(seconds / 60, "min", decimals=0)
 
 
 @dataclass(frozen=True)
@@ -259,7 +264,7 @@ def torque_load(found: Fit, torque_nm: Mapping[str, float]) -> Workload:
         # A torque asks for a current, whatever duty that takes as the winding warms.
         current[:, k] = (torque / model.kt_nm_a) ** 2
         push[:, k], keeps[k] = current[:, k] * ohm[k] ** 2, 0.0
-    words = ", ".join(f"{torque:g} N·m at {joint}" for joint, torque in torque_nm.items())
+    words = ", ".join(f"{exact(torque, 'N·m')} at {joint}" for joint, torque in torque_nm.items())
     named = np.array([joint in torque_nm for joint in found.inputs.joints])
     gear = np.where(named, 0.0, load.gear)
     return replace(load, current=current, push=push, by_duty=keeps, gear=gear, words=words)
@@ -456,10 +461,8 @@ class RestPlan:
         if self.work_s is None:
             return "it can go on without rests"
         if self.work_s <= 0:
-            return f"{self.joint} is not cool enough to work: let it rest {self.rest_s / 60:.0f} min first"
-        return (
-            f"work {self.work_s / 60:.0f} min, rest {self.rest_s / 60:.0f} min with torque off ({self.joint} decides)"
-        )
+            return f"{self.joint} is not cool enough to work: let it rest {_minutes(self.rest_s)} first"
+        return f"work {_minutes(self.work_s)}, rest {_minutes(self.rest_s)} with torque off ({self.joint} decides)"
 
 
 def rest_advice(found: Fit, load: Workload | None = None, *, draws: int = 100, seed: int = 0) -> RestPlan:

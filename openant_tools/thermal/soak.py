@@ -23,6 +23,7 @@ from openant_tools.comms.guards import Guards
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.comms.restart import MotionStopped, StopCause
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.numbers import number, percent
 from openant_tools.recording.reader import read_recording
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run
@@ -370,9 +371,10 @@ def _look_around(
     if hot and before.phase == "load":
         k = max(hot, key=lambda k: temperature[k] - limits[k])
         raise HardwareFault(
-            f"{log.joints[k]} is at {temperature[k]:.0f} °C, {limits[k]:.0f} °C is its limit: a soak does not begin there",
+            f"{log.joints[k]} is at {number(temperature[k], '°C', decimals=0)}, {number(limits[k], '°C', decimals=0)} is its limit: a soak does not begin there",
             where=engine.config.port,
-            remedy=f"let it cool below {limits[k] - BEGIN_K:.0f} °C" + (" and --resume again" if resume else ""),
+            remedy=f"let it cool below {number(limits[k] - BEGIN_K, '°C', decimals=0)}"
+            + (" and --resume again" if resume else ""),
         )
     for words in engine.notices():
         yield _sample(log, limits, before.phase, 0.0, 0.0, words)
@@ -392,7 +394,7 @@ def _under_load(
     look = STEPPED_LOOK_S if stepped else LOOK_S
     total = plan.seconds + plan.cool_down_s
     pose, row = -1, 0
-    number: int | None = None
+    playing: int | None = None
     begun, at = log.t, loaded
     while True:
         try:
@@ -409,9 +411,8 @@ def _under_load(
                 engine.ask(messages.Play(played[row : row + rows], "play"))
                 row = row + rows if row + rows < len(played) - 1 else 0
             else:
-                number = (
-                    engine.start(messages.Play(played, "play")) if number is None or engine.done(number) else number
-                )
+                if playing is None or engine.done(playing):
+                    playing = engine.start(messages.Play(played, "play"))
                 time.sleep(look)
         except MotionStopped as stopped:
             log.take(engine.telemetry())
@@ -422,7 +423,7 @@ def _under_load(
         near = limits - log.temperature
         k = int(np.nanargmin(near)) if np.isfinite(near).any() else 0
         if plan.margin_k >= 0 and near[k] <= plan.margin_k:
-            words = f"{log.joints[k]} is at {log.temperature[k]:.0f} °C, {near[k]:.0f} K below its limit"
+            words = f"{log.joints[k]} is at {number(log.temperature[k], '°C', decimals=0)}, {number(near[k], 'K', decimals=0)} below its limit"
             return _End(loaded, "margin", log.joints[k], words)
         if loaded >= plan.seconds - 1.5 / config.rate_hz:
             return _End(loaded)
@@ -435,7 +436,7 @@ def _why_stopped(engine: EngineProcess, log: _Log, limits: Array, loaded: float,
         raise fault
     k = log.joints.index(joint)
     if fault.cause is StopCause.HARDWARE_ERROR and "overheating" in fault.what:
-        words = f"{joint} shut itself down at {log.temperature[k]:.0f} °C, its limit is {limits[k]:.0f} °C"
+        words = f"{joint} shut itself down at {number(log.temperature[k], '°C', decimals=0)}, its limit is {number(limits[k], '°C', decimals=0)}"
         return _End(loaded, "shutdown", joint, words, released=True)
     why: Why = "margin" if fault.cause is StopCause.HEAT else "guard"
     return _End(loaded, why, joint, fault.what, released=True)
@@ -460,7 +461,7 @@ def _press(
         # What the register holds is a whole count.
         if plan.effort > allowed + 0.01:
             raise BadInput(
-                f"{joint} may use {allowed:.0%} of full duty, not {plan.effort:.0%}",
+                f"{joint} may use {percent(allowed)} of full duty, not {percent(plan.effort)}",
                 where=config.port,
                 remedy="give --effort less, or raise bus.pwm_limit in robot.toml",
             )
@@ -483,12 +484,12 @@ def _press(
     for k in knees:
         if duty[k] < STALLED * plan.effort:
             raise BadInput(
-                f"{joints[k]} is not stalled: it presses with {duty[k]:.0%} of full duty, not {plan.effort:.0%}",
+                f"{joints[k]} is not stalled: it presses with {percent(duty[k])} of full duty, not {percent(plan.effort)}",
                 where=config.port,
                 remedy="let the robot lie on its belly, feet on the floor, and put more weight on it: 8 kg for the "
                 "standard robot, 5 kg for the Lite",
             )
-    yield _sample(log, limits, "load", 0.0, 0.0, f"the knees are stalled at {plan.effort:.0%} of full duty")
+    yield _sample(log, limits, "load", 0.0, 0.0, f"the knees are stalled at {percent(plan.effort)} of full duty")
 
 
 def _cooling(

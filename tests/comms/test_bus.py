@@ -133,7 +133,7 @@ def test_a_busy_host_is_no_silent_servo() -> None:
     assert watch.check(0.3, missed) is None, "asked once in 0.3 s"
     trip = watch.check(0.41, missed)
     assert trip is not None
-    assert "hip_rr (id 10) has not answered for 0.41 s (timeout 2)" in trip.what
+    assert "hip_rr (id 10) has not answered for 0.41 s (2 × no answer)" in trip.what
 
 
 def test_one_silent_servo_does_not_hide_those_behind_it() -> None:

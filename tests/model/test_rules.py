@@ -151,7 +151,7 @@ def test_a_joint_of_two_servos_is_refused_and_one_with_a_damper_is_not(tmp_path:
 
 def test_stamps_of_commands_in_milliseconds_are_refused(tmp_path: Path) -> None:
     run = played(tmp_path, cmd_t=1000 * T + 0.5)
-    assert "cmd_t goes on to 3.99e+03 s after the first row, t to 3.99 s" in refused(run, chain(tmp_path))
+    assert "cmd_t goes on to 3990 s after the first row, t to 3.99 s" in refused(run, chain(tmp_path))
 
 
 def test_two_joints_of_eight_and_a_ring_of_three_are_found_exchanged() -> None:
@@ -269,11 +269,11 @@ def test_what_the_model_cuts_is_said_before_the_fit(tmp_path: Path, capsys: pyte
     assert command("gap", "measure", tmp_path / "log", "--model", model) == 0
     heard = capsys.readouterr().err
     assert re.search(
-        r"cmd\.hip goes to -?1\.00 rad, the model's ctrlrange is -0\.50 … 0\.50: \d+ % of its commands", heard
+        r"cmd\.hip goes to −?57\.\d°, the model's ctrlrange is −28\.6 to 28\.6°: \d+ % of its commands", heard
     )
     assert "cmd.knee" not in heard
     assert re.search(
-        r"pos\.knee was measured at -?\d\.\d+ rad, beyond the model's range -0\.50 … 0\.50, in \d+ %", heard
+        r"pos\.knee was measured at −?\d+\.\d°, beyond the model's range −28\.6 to 28\.6°, in \d+ %", heard
     )
 
 
@@ -340,7 +340,7 @@ def test_wrapped_angles_go_on(wrap: Callable[[np.ndarray], np.ndarray], tmp_path
 def test_a_whole_turn_between_command_and_position_is_taken_out(tmp_path: Path) -> None:
     run = played(tmp_path)
     turned = replace(run, columns={**run.columns, "pos.knee": run.columns["pos.knee"] - 2 * np.pi})
-    assert any("pos.knee is a turn (-6.28 rad) from cmd.knee" in line for line in said_of(turned, chain(tmp_path)))
+    assert any("pos.knee is a turn (−360°) from cmd.knee" in line for line in said_of(turned, chain(tmp_path)))
     assert np.allclose(without_turns(turned, run.joints).columns["pos.knee"], run.columns["pos.knee"])
 
 

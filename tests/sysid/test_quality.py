@@ -72,7 +72,7 @@ def test_nothing_moves(plant: Plant) -> None:
 
 def test_a_dead_joint_is_named(plant: Plant) -> None:
     message = refused(with_columns(pos__knee_rr=np.full(300, -0.8)), plant)
-    assert "knee_rr is commanded over 0.60 rad and does not move" in message
+    assert "knee_rr is commanded over 34.4° and does not move" in message
     assert "--joint" in message
 
 
@@ -251,8 +251,8 @@ def test_servos_that_could_not_go_where_they_were_sent_are_named_by_their_regist
         return replace(run, facts=replace(run.facts, registers={"knee_rr": registers}))
 
     words = refused(with_registers(min_position_limit=1900, max_position_limit=2200), plant)
-    assert "knee_rr is commanded over 0.60 rad" in words
-    assert "min_position_limit = 1900 and max_position_limit = 2200 leave 0.46 rad" in words
-    assert "profile_velocity = 1 lets it turn (0.024 rad/s)" in refused(with_registers(profile_velocity=1), plant)
+    assert "knee_rr is commanded over 34.4°" in words
+    assert "min_position_limit = 1900 and max_position_limit = 2200 leave 26.4°" in words
+    assert "profile_velocity = 1 lets it turn (1.37 °/s)" in refused(with_registers(profile_velocity=1), plant)
     check_runs([with_registers(min_position_limit=1900, max_position_limit=2200, operating_mode=4)], [plant])
     check_runs([with_registers(min_position_limit=0, max_position_limit=4095, profile_velocity=0)], [plant])

@@ -16,7 +16,7 @@ from openant_tools.comms.dropouts.causes import CAUSES, OTHERWISE, DropoutCause,
 from openant_tools.comms.dropouts.episodes import cables
 from openant_tools.comms.dropouts.log import read_log
 from openant_tools.comms.dropouts.measures import Measures, measure
-from openant_tools.numbers import percent
+from openant_tools.numbers import number, percent
 from openant_tools.recording.run import Run
 
 __all__ = ["SCHEMA", "DropoutDiagnosis", "Suspect", "Why", "diagnose_dropouts"]
@@ -316,7 +316,11 @@ def _first(measures: Measures) -> int:
 def _sentence(verdict: str, best: Suspect, measures: Measures, tied: Sequence[str]) -> str:
     log = measures.log
     lost, asked, reads = int(log.lost.sum()), int(log.answers.sum()), len(log.t)
-    count = f"{lost} of {asked} answers lost in {log.seconds:.0f} s" if lost else f"no answer lost in {reads} reads"
+    count = (
+        f"{lost} of {asked} answers lost in {number(log.seconds, 's', decimals=0)}"
+        if lost
+        else f"no answer lost in {reads} reads"
+    )
     if verdict == "none":
         return f"{count}: nothing is wrong with the bus"
     if verdict == "unknown":

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from openant_tools.comms.dropouts.episodes import DropoutEpisode, Reach, episodes_of, reach_of
 from openant_tools.comms.dropouts.log import WORDS, Array, BusLog, Flags
+from openant_tools.numbers import number, percent
 
 __all__ = ["Measure", "Measures", "measure"]
 
@@ -122,11 +123,11 @@ def _words(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Loo
     if said < 0.3 * len(codes):
         return
     broken = (counts["crc"] + counts["short"]) / said
-    yield "crc", Measure(broken, f"{broken:.0%} of what was lost came broken"), ()
-    yield "late", Measure(counts["late"] / said, f"{counts['late'] / said:.0%} of what was lost came too late"), ()
+    yield "crc", Measure(broken, f"{percent(broken)} of what was lost came broken"), ()
+    yield "late", Measure(counts["late"] / said, f"{percent(counts['late'] / said)} of what was lost came too late"), ()
     yield (
         "port",
-        Measure(counts["port"] / said, f"the host's port was gone in {counts['port'] / said:.0%} of losses"),
+        Measure(counts["port"] / said, f"the host's port was gone in {percent(counts['port'] / said)} of losses"),
         (),
     )
 
@@ -139,11 +140,11 @@ def _extent(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Lo
     if len(reach.joints) > 1:
         yield (
             "together",
-            Measure(reach.together, f"a read that loses any of {whom} loses {reach.together:.0%} of them"),
+            Measure(reach.together, f"a read that loses any of {whom} loses {percent(reach.together)} of them"),
             reach.joints,
         )
     rate = float(reach.rate[list(reach.joints)].mean())
-    yield "rate", Measure(rate, f"{rate:.2%} of the answers of {whom} are lost"), reach.joints
+    yield "rate", Measure(rate, f"{percent(rate, decimals=2)} of the answers of {whom} are lost"), reach.joints
 
 
 def _rhythm(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
@@ -152,17 +153,21 @@ def _rhythm(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Lo
     runs = _lengths(np.asarray(reach.lost.any(axis=1), bool))
     # By reads, not by losses: a stray one or two must not outnumber an outage of a thousand reads.
     single = float((runs <= 1).sum() / runs.sum())
-    yield "single", Measure(single, f"{single:.0%} of the reads that lose anything stand alone"), ()
+    yield "single", Measure(single, f"{percent(single)} of the reads that lose anything stand alone"), ()
     a_minute = len(episodes) / max(log.seconds / 60, 1e-3)
     often = math.log10(max(a_minute, SELDOM) / SELDOM) / 3
-    yield "often", Measure(often, f"it happens {len(episodes)} times, {a_minute:.2g} times a minute"), ()
+    yield "often", Measure(often, f"it happens {len(episodes)} times, {number(a_minute)} times a minute"), ()
     longest = max(one.to_s - one.from_s for one in episodes) + log.period_s
     rows = int(log.lossy.sum())
     # The length that holds half of all lossy rows, so that one stray loss does not hide an outage.
     lengths = np.sort([one.stop - one.start for one in episodes])
     typical = float(lengths[np.searchsorted(np.cumsum(lengths), rows / 2)]) * log.period_s
     span = math.log(max(typical, 0.02) / 0.02) / math.log(10.0 / 0.02)
-    yield "long", Measure(span, f"it stays silent for {typical:.2g} s at a time, {longest:.2g} s at most"), ()
+    yield (
+        "long",
+        Measure(span, f"it stays silent for {number(typical, 's')} at a time, {number(longest, 's')} at most"),
+        (),
+    )
 
 
 def _lengths(flags: Flags) -> NDArray[np.int64]:
@@ -218,7 +223,7 @@ def _dips(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look
     deep = usual - float(np.min(lowest[known]))
     low = np.isfinite(log.volt) & (log.volt < floor) & near[:, None]
     joints = tuple(np.flatnonzero(low.any(axis=0)).tolist())
-    words = f"the supply dips at {share:.0%} of the losses, by {deep:.1f} V at most (usual {usual:.1f} V)"
+    words = f"the supply dips at {percent(share)} of the losses, by {number(deep, 'V', decimals=1)} at most (usual {number(usual, 'V', decimals=1)})"
     yield "dip", Measure(max(0.0, share - chance), words), joints
 
 
@@ -230,7 +235,11 @@ def _empty(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Loo
         return
     usual = float(np.median(known))
     value = 1 / (1 + math.exp(min((usual - NEEDED_V) / 0.15, 50.0)))
-    yield "empty", Measure(value, f"the supply stands at {usual:.1f} V, servos need {NEEDED_V:.0f} V"), ()
+    yield (
+        "empty",
+        Measure(value, f"the supply stands at {number(usual, 'V', decimals=1)}, servos need {number(NEEDED_V, 'V')}"),
+        (),
+    )
 
 
 def _sag(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
@@ -248,7 +257,14 @@ def _sag(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     slope = float(np.cov(x, v)[0, 1] / x.var())
     r = float(np.corrcoef(x, v)[0, 1])
     drop = max(0.0, -slope) * spread * min(1.0, r * r / 0.25)
-    yield "sag", Measure(drop / SAG_V, f"full load pulls the supply down by {drop:.2f} V (correlation {r:.2f})"), ()
+    yield (
+        "sag",
+        Measure(
+            drop / SAG_V,
+            f"full load pulls the supply down by {number(drop, 'V', decimals=2)} (correlation {number(r, decimals=2)})",
+        ),
+        (),
+    )
 
 
 def _resets(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
@@ -281,7 +297,7 @@ def _resets(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Lo
     by_rows = float((after * rows).sum() / rows.sum())
     joints = tuple(np.flatnonzero(restarts.any(axis=0)).tolist())
     names = "all servos" if len(joints) == len(log.joints) else ", ".join(log.joints[k] for k in joints) or "no servo"
-    words = f"realtime ticks of {names} begin anew at {share:.0%} of the losses"
+    words = f"realtime ticks of {names} begin anew at {percent(share)} of the losses"
     yield "reset", Measure(max(share, by_rows), words), joints
 
 
@@ -310,10 +326,10 @@ def _explained(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) ->
         # Of many lines one fits by chance: all of them are given that chance.
         value, n, edge = _half_lines([sign * log.angle[:, k] for k, sign in lines], weight, shifts, log.weight)
         k, sign = lines[n]
-        side = f"{'above' if sign > 0 else 'below'} {sign * edge:.2f} rad"
+        side = f"{'above' if sign > 0 else 'below'} {number(sign * edge, 'rad')}"
         yield (
             "angle",
-            Measure(value, f"the angle of {log.joints[k]} ({side}) explains {value:.0%} of when it is lost"),
+            Measure(value, f"the angle of {log.joints[k]} ({side}) explains {percent(value)} of when it is lost"),
             (k,),
         )
     volts = _supply(log)
@@ -322,17 +338,27 @@ def _explained(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) ->
         # Of what a lost read would have shown, its neighbours know the most.
         low = -np.minimum(np.interp(log.t, log.t[known], volts[known]), _around(volts))
         value, edge = _half_line(low, starts, shifts, log.weight)
-        yield "low", Measure(value, f"a supply below {-edge:.1f} V explains {value:.0%} of when it is lost"), ()
+        yield (
+            "low",
+            Measure(
+                value, f"a supply below {number(-edge, 'V', decimals=1)} explains {percent(value)} of when it is lost"
+            ),
+            (),
+        )
     if np.isfinite(log.load).all() and np.ptp(log.load) > 1e-6:
         value, _ = _half_line(log.load, starts, shifts, log.weight)
-        yield "load", Measure(value, f"high load of all servos together explains {value:.0%} of when it is lost"), ()
+        yield (
+            "load",
+            Measure(value, f"high load of all servos together explains {percent(value)} of when it is lost"),
+            (),
+        )
     values = []
     for signal in (log.speed, log.shake):
         if np.isfinite(signal).all() and np.ptp(signal) > 1e-6:
             values.append(_half_line(signal, starts, shifts, log.weight)[0])
     if values:
         value = max(values)
-        yield "motion", Measure(value, f"fast motion explains {value:.0%} of when it is lost"), ()
+        yield "motion", Measure(value, f"fast motion explains {percent(value)} of when it is lost"), ()
 
 
 def _around(values: Array) -> Array:
@@ -375,7 +401,7 @@ def _half_lines(
     if total <= 0:
         return 0.0, 0, 0.0
     best, which, at, chance = -1.0, 0, 0.0, np.zeros(len(shifts))
-    for number, values in enumerate(signals):
+    for nth, values in enumerate(signals):
         edges = np.unique(np.quantile(values, np.r_[np.linspace(0.3, 0.9, 16), np.linspace(0.92, 0.995, 12)]))
         bins = np.searchsorted(edges, values, side="right")
         time = np.bincount(bins, duration, minlength=len(edges) + 1)
@@ -391,7 +417,7 @@ def _half_lines(
 
         own = gains(rows)
         if own.max() > best:
-            best, which, at = float(own.max()), number, float(edges[int(own.argmax())])
+            best, which, at = float(own.max()), nth, float(edges[int(own.argmax())])
         for k, shift in enumerate(shifts):
             chance[k] = max(chance[k], float(gains((rows + shift[rows]) % n).max()))
     high = float(np.quantile(chance, 0.9))
@@ -434,7 +460,9 @@ def _host(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look
     a_minute = total / max(minutes, 0.5)
     often = 1 / (1 + (0.12 / max(a_minute, 1e-9)) ** 2) if count >= 3 else 0.0
     once = 1 / (1 + (0.25 / max(longest, 1e-9)) ** 4)
-    words = f"the host's loop stood still {count} times, {longest * 1e3:.0f} ms at most, {a_minute:.2f} s a minute"
+    words = (
+        f"the host's loop stood still {count} times, {number(longest, 's')} at most, {number(a_minute, 's')} a minute"
+    )
     yield "stall", Measure(max(often, once if count else 0.0), words), ()
     if episodes:
         hits = 0
@@ -445,7 +473,7 @@ def _host(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look
         share = hits / len(episodes)
         chance = min(1.0, 3 * count / n)
         value = max(0.0, (share - chance) / max(1 - chance, 1e-3))
-        yield "host", Measure(value, f"{share:.0%} of the losses come when the host's loop stood still"), ()
+        yield "host", Measure(value, f"{percent(share)} of the losses come when the host's loop stood still"), ()
 
 
 # ---- round trips ----
@@ -528,11 +556,11 @@ def _comb(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look
     told = [float(one["latency_timer_ms"]) for one in log.facts if "latency_timer_ms" in one]
     if told and min(told) >= 4 and wait > 0.25e-3 * min(told):
         value = max(value, 0.9)
-    words = f"answers wait {max(wait, 0.0) * 1e3:.1f} ms besides their time on the wire"
+    words = f"answers wait {number(max(wait, 0.0), 's')} besides their time on the wire"
     if best > 0.5:
-        words += f", in a beat of {beat.period_s * 1e3:.0f} ms (strength {best:.2f})"
+        words += f", in a beat of {number(beat.period_s, 's')} (strength {number(best, decimals=2)})"
     if told:
-        words += f"; the adapter's timer is said to be {min(told):.0f} ms"
+        words += f"; the adapter's timer is said to be {number(min(told), 'ms')}"
     yield "comb", Measure(value, words), ()
 
 
@@ -587,9 +615,9 @@ def _staircase(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) ->
     joints = tuple(range(j)) if typical > 0.5 * worst else tuple(np.flatnonzero(np.nan_to_num(excess) > 0.5 * worst))
     value = 1 / (1 + (0.17e-3 / max(worst, 1e-9)) ** 4)
     said = [float(one["return_delay_s"]) for one in log.facts if "return_delay_s" in one]
-    words = f"servos wait up to {worst * 1e3:.2f} ms before they answer (median {typical * 1e3:.2f} ms)"
+    words = f"servos wait up to {number(worst, 's')} before they answer (median {number(typical, 's')})"
     if said:
-        words += f"; the return delay is said to be {max(said) * 1e3:.2f} ms"
+        words += f"; the return delay is said to be {number(max(said), 's')}"
         if max(said) >= 0.2e-3:
             value = max(value, 0.9)
     yield "stairs", Measure(value, words), tuple(int(k) for k in joints)
@@ -632,10 +660,12 @@ def _gap(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look:
     value = max(by_gap, by_write)
     usual = float(np.median(gap[written]))
     if by_gap >= by_write and math.isfinite(edge):
-        words = f"reads within {edge * 1e3:.2f} ms of a write are lost, later ones are not ({by_gap:.0%} explained)"
+        words = (
+            f"reads within {number(edge, 's')} of a write are lost, later ones are not ({percent(by_gap)} explained)"
+        )
     else:
-        words = f"{in_written:.0%} of the reads {usual * 1e3:.2f} ms behind a write are lost"
-        words += f", {in_others:.1%} of the others" if math.isfinite(in_others) else ""
+        words = f"{percent(in_written)} of the reads {number(usual, 's')} behind a write are lost"
+        words += f", {percent(in_others, decimals=1)} of the others" if math.isfinite(in_others) else ""
     if spread <= 0.02e-3 and not math.isfinite(in_others):
         return  # always the same gap, always a write: nothing to compare
     yield "gap", Measure(value, words), ()
@@ -652,5 +682,5 @@ def _baud(log: BusLog, episodes: Sequence[DropoutEpisode], reach: Reach) -> Look
         rows = np.isin(log.run, np.flatnonzero(log.baud == rate))
         share.append((float(crc[rows].sum()) + 0.5) / (float(log.asked[rows].sum()) + 1))
     growth = math.log(share[-1] / share[0]) / math.log(rates[-1] / rates[0])
-    words = f"broken answers go from {share[0]:.2%} at {rates[0]:.0f} baud to {share[-1]:.2%} at {rates[-1]:.0f}"
+    words = f"broken answers go from {percent(share[0], decimals=2)} at {int(rates[0])} baud to {percent(share[-1], decimals=2)} at {int(rates[-1])}"
     yield "baud", Measure(1 / (1 + math.exp(-3 * (growth - 0.4))), words), ()

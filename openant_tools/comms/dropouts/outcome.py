@@ -86,7 +86,7 @@ def dropout_effects(found: DropoutDiagnosis) -> list[dict[str, Any]]:
     entries: dict[tuple[float, float], list[str]] = {}
     for k, joint in enumerate(log.joints):
         lost = reach.lost[:, k]
-        fraction = float(f"{reach.rate[k] * (1.0 if whole else 0.5):.2g}")
+        fraction = float(f"{reach.rate[k] * (1.0 if whole else 0.5):.2g}")  # for a file
         if fraction < WORTH_SIMULATING:
             continue
         edges = np.flatnonzero(np.diff(np.r_[False, lost, False].astype(np.int8)))
@@ -94,7 +94,7 @@ def dropout_effects(found: DropoutDiagnosis) -> list[dict[str, Any]]:
         # One stray outage must not stand for all: the length that 95 of 100 lost reads lie within.
         lengths = np.sort(runs)
         longest = int(lengths[np.searchsorted(np.cumsum(lengths), 0.95 * lengths.sum())])
-        entries.setdefault((fraction, float(f"{longest * log.period_s:.2g}")), []).append(joint)
+        entries.setdefault((fraction, float(f"{longest * log.period_s:.2g}")), []).append(joint)  # for a file
     return [
         {
             "effect": "command_dropout",
