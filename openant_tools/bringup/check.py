@@ -115,7 +115,7 @@ def check(bench: Bench) -> Procedure:
     now: dict[str, JointSweep] = {}
     try:
         run = yield from sweep(
-            engine_config(bench, imu=None), bench.folder.recordings / "check-sweep.mcap", "slow sweep"
+            engine_config(bench, imu=None), bench.folder.recordings / "check-sweep.mcap", "slow sweep", (0.1, 0.6)
         )
     except HardwareFault as fault:
         problems.append(str(fault))
@@ -420,7 +420,7 @@ def _twitch(bench: Bench) -> Subroutine[Run]:
         )
         engine.ask(messages.Record(str(path), facts, overwrite=True))
         motion = messages.Play(commands, "twitch", limp if limp.any() else None)
-        yield from play_watched(engine, motion, len(commands) / config.rate_hz, "twitch")
+        yield from play_watched(engine, motion, len(commands) / config.rate_hz, "twitch", (0.6, 1.0))
         engine.ask(messages.StopRecording())
         engine.ask(messages.Torque(False))
     return read_run(path)

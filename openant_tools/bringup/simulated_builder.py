@@ -44,6 +44,8 @@ class SimulatedBuilder:
             case "turn":
                 self._remote.ask("turn", joint=joint, to=list(hands.path_rad), leg_s=TURN_S)
             case "tilt":
+                if self._remote.ask("state")["setup"] == "floor":  # left there by a step that broke off
+                    self._remote.ask("assemble", setup="stand")
                 self._remote.ask("tilt", rotation_rad=list(hands.path_rad), seconds=TILT_S)
             case "place":
                 self._remote.ask("assemble", setup=hands.setup)

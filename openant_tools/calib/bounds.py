@@ -53,6 +53,9 @@ SAMPLE_S = 0.05
 KEEP_OFF_RAD = 0.03
 #: the parts that are recorded, and where; the one after them
 SWEEP, STAND, FLOOR, BACK = "slow sweep", "motions on the stand", "motions on the floor", "back on its stand"
+#: of the step's progress: ranges by hand up to there, then from where to where each recording is
+BY_HAND = 0.5
+SHARES = {SWEEP: (0.5, 0.6), STAND: (0.6, 0.85), FLOOR: (0.85, 1.0)}
 RECORDED = {SWEEP: "sweep.mcap", STAND: "bounds-stand.mcap", FLOOR: "bounds-floor.mcap"}
 QUANTILES = (0.001, 0.01, 0.99, 0.999)
 SIGNALS = ("pos", "vel")
@@ -160,7 +163,7 @@ def bounds(bench: Bench) -> Procedure:
         values |= {f"motors.{joint}.min_rad": low, f"motors.{joint}.max_rad": high}
     bench.folder.update(values, provenance=Provenance("measured", COMMAND))
     if swept is None:
-        swept = yield from sweep(engine_config(bench, imu=None), _path(bench, SWEEP), "slow sweep")
+        swept = yield from sweep(engine_config(bench, imu=None), _path(bench, SWEEP), "slow sweep", SHARES[SWEEP])
         parts.done(SWEEP, **facts)
     sweeps = analyse(swept, limits)
     most = {kind: _most_friction(sweeps, kind) for kind in ("hip", "knee")}
@@ -249,7 +252,7 @@ def _by_hand(bus: Bus, servos: Servos, joints: Sequence[str], parts: Parts) -> S
                 found[joint] = Range(**parts.before[joint]["range"])
                 continue
             yield Say(f"{joint} has another zero than when it was moved; it is done again", "warn")
-        yield Progress(k / len(joints), f"{joint}: range by hand")
+        yield Progress(BY_HAND * k / len(joints), f"{joint}: range by hand")
         servo, at = servos[joint], names.index(joint)
         far = ANGLE_LIMIT_RAD[JOINTS[joint].kind] + 0.1
         yield Hands(
@@ -360,12 +363,16 @@ def _library(bench: Bench, part: str) -> Subroutine[Run]:
         lying = np.asarray(engine.description["position"], float)
         engine.ask(messages.Torque(True))
         names = ("wander", "trot") if floor else tuple(LIBRARY)
+        start, end = SHARES[part]
         engine.ask(messages.Ramp(motion(names[0], joints, config.limits_rad, config.rate_hz, 0, floor=floor)[0]))
         engine.ask(messages.Record(str(path), Facts(joints=joints, setup=setup, protocol="bounds"), overwrite=True))
         for seed, name in enumerate(names):
             played = motion(name, joints, config.limits_rad, config.rate_hz, seed, floor=floor)
-            yield Progress(seed / len(names), f"{name}: {LIBRARY[name]}")
-            yield from play_watched(engine, messages.Play(played, name), len(played) / config.rate_hz, name)
+            begun, done = (start + (end - start) * k / len(names) for k in (seed, seed + 1))
+            yield Progress(begun, f"{name}: {LIBRARY[name]}")
+            yield from play_watched(
+                engine, messages.Play(played, name), len(played) / config.rate_hz, name, (begun, done)
+            )
         engine.ask(messages.StopRecording())
         if floor:
             low, high = np.array([config.limits_rad[joint] for joint in joints]).T

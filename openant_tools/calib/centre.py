@@ -156,7 +156,7 @@ def _one(bench: Bench, motor: MotorSection) -> Subroutine[tuple[float, str]]:
         [at] = engine.ask(messages.Torque(True))
         engine.ask(messages.WriteRegister(joint, "goal_pwm", round(CENTRE_PWM * PWM_FULL)))
         way = ramp(np.array([at]), np.array([NOMINAL_ZERO_RAD]), config.rate_hz, speed_rad_s=SLOW_RAD_S).commands
-        yield from play_watched(engine, messages.Play(way), len(way) / config.rate_hz, "turning")
+        yield from play_watched(engine, messages.Play(way), len(way) / config.rate_hz, "turning", None)
         engine.ask(messages.Hold(SETTLE_S))
         off = _off(engine, joint)
         if abs(off) > CLOSE_RAD:

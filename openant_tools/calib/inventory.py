@@ -16,7 +16,7 @@ from openant_tools.comms.faults import NoAnswer
 from openant_tools.comms.servos import BLOCK_ADDRESS, BLOCK_SIZE, Servo, Servos
 from openant_tools.comms.setup import find_bus
 from openant_tools.comms.silence import diagnose
-from openant_tools.comms.state import Difference, differences_of_robot, passport_registers, read_state
+from openant_tools.comms.state import Difference, differences_of_robot, in_words, passport_registers, read_state
 from openant_tools.comms.vendor_sdk import VendorSdk
 from openant_tools.errors import BadInput
 from openant_tools.procedure.finding import Evidence, Finding
@@ -307,7 +307,7 @@ def _values(stretch: Sequence[Register], data: bytes) -> dict[str, int]:
 
 def _mend(servos: Servos, odd: Sequence[Difference]) -> Subroutine[list[Difference]]:
     """Ask what to do with them, do it; what was accepted as it is."""
-    for line in _alike(odd):
+    for line in in_words(odd, remedy=False):
         yield Say(line, "warn")
     answer = yield Ask("What to do with them?", (FIX_ALL, FIX_ONE, ACCEPT), default=FIX_ALL)
     chosen = list(odd) if answer == FIX_ALL else []
@@ -321,14 +321,6 @@ def _mend(servos: Servos, odd: Sequence[Difference]) -> Subroutine[list[Differen
         for one in chosen:
             servos.write_counts(one.register, one.joint, one.expected)
     return [one for one in odd if one not in chosen]
-
-
-def _alike(odd: Sequence[Difference]) -> list[str]:
-    """What differs, one line for all servos in which it differs alike."""
-    told: dict[str, list[Difference]] = {}
-    for one in odd:
-        told.setdefault(one.reads, []).append(one)
-    return [found[0].what if len(found) == 1 else f"{len(found)} servos: {reads}" for reads, found in told.items()]
 
 
 def _change(one: Difference) -> RegisterChange:

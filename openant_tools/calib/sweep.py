@@ -37,6 +37,9 @@ from openant_tools.robot.servo import ServoModel, servo_model
 __all__ = ["FOLLOWED", "JointSweep", "analyse", "joint_sweep_of", "play_watched", "sweep"]
 
 Array = NDArray[np.float64]
+#: from which to which share of a step's progress
+Part = tuple[float, float]
+WHOLE: Part = (0.0, 1.0)
 
 #: rad/s; slow enough that nothing but friction and weight counts, and that a hand can stop it
 SPEED_RAD_S = 0.35
@@ -113,8 +116,8 @@ def _there_and_back(reach: float, rate_hz: float) -> Array:
     return np.asarray(np.interp(np.arange(0.0, times[-1], 1 / rate_hz), times, corners), float)
 
 
-def sweep(config: EngineConfig, path: Path, words: str) -> Subroutine[Run]:
-    """Play the sweep on the stand and record it to `path`; the recording.
+def sweep(config: EngineConfig, path: Path, words: str, part: Part = WHOLE) -> Subroutine[Run]:
+    """Play the sweep on the stand and record it to `path`, as such a part of its step; the recording.
 
     Raises:
         HardwareFault: a guard stopped it; its words say which joint and why.
@@ -133,14 +136,20 @@ def sweep(config: EngineConfig, path: Path, words: str) -> Subroutine[Run]:
             joints=joints, setup="stand", protocol="slow sweep", supply_v=float(np.mean(list(volts.values()))) * 0.1
         )
         engine.ask(messages.Record(str(path), facts, overwrite=True))
-        yield from play_watched(engine, messages.Play(played, "slow sweep"), len(played) / config.rate_hz, words)
+        yield from play_watched(engine, messages.Play(played, "slow sweep"), len(played) / config.rate_hz, words, part)
         engine.ask(messages.StopRecording())
         engine.ask(messages.Torque(False))
     return read_run(path)
 
 
-def play_watched(engine: EngineProcess, command: messages.Command, seconds: float, words: str) -> Subroutine[None]:
-    """Start a motion and show joints and progress until it ends; raises HardwareFault where it is stopped."""
+def play_watched(
+    engine: EngineProcess, command: messages.Command, seconds: float, words: str, part: Part | None = WHOLE
+) -> Subroutine[None]:
+    """Start a motion and show joints and progress until it ends; raises HardwareFault where it is stopped.
+
+    Args:
+        part: of its step, that the motion is; None where the step's progress is told otherwise.
+    """
     number = engine.start(command)
     names = [servo.joint for servo in engine.config.servos]
     at = [engine.columns.index(f"pos.{name}") for name in names]
@@ -155,9 +164,9 @@ def play_watched(engine: EngineProcess, command: messages.Command, seconds: floa
             first = float(rows[0, t]) if math.isnan(first) else first
             share = min(1.0, (float(rows[-1, t]) - first) / seconds)
             yield Live({n: float(rows[-1, k]) for n, k in zip(names, at, strict=True)}, "rad", words, low, high)
-            if share - said > 0.2:
+            if part is not None and share - said > 0.2:
                 said = share
-                yield Progress(share, words)
+                yield Progress(part[0] + share * (part[1] - part[0]), words)
         # The motion runs in the engine's process: real time passes here, also where the robot's is stepped.
         time.sleep(0.05)
 

@@ -28,9 +28,9 @@ from openant_tools.comms.messages import WATCHDOG_UNIT_S, EngineConfig
 from openant_tools.comms.servo_settings import ServoSettings
 from openant_tools.comms.servos import Servo, Servos
 from openant_tools.comms.silence import explaining
-from openant_tools.comms.state import EXTENDED_POSITION, POSITION, refusal, stopping
+from openant_tools.comms.state import EXTENDED_POSITION, POSITION, in_words, refusal, stopping
 from openant_tools.errors import HardwareFault
-from openant_tools.numbers import percent
+from openant_tools.numbers import exact, number, percent
 from openant_tools.procedure.journal import EepromWrite, Journal
 from openant_tools.robot.registers import PWM_FULL
 
@@ -134,8 +134,8 @@ class Hardware:
         new = self.settings.read()
         if self.following is not None:
             self.following.take(self.settings.registers)
-        for difference in new:
-            self._notice(str(difference))
+        for words in in_words(new):
+            self._notice(words)
         wrong = stopping(self.settings.differences)
         if wrong and moves and not self.config.anyway:
             what, remedy = refusal(wrong)
@@ -243,8 +243,8 @@ def _set_up(
         notice(words)
     servos = Servos(port.bus, _on_this_turn(config, servos), before_write=servos.before_write)
     settings = ServoSettings(config, port, servos)
-    for difference in settings.differences:
-        notice(str(difference))
+    for words in in_words(settings.differences):
+        notice(words)
     following = None
     if config.guards.behind_rad is not None:
         following = Following(servos.servos, config.guards.behind_rad, settings.registers)
@@ -277,8 +277,8 @@ def _compare_rate(config: EngineConfig, port: EnginePort, servos: Servos, notice
     )  # fmt: skip
     if config.rate_hz > limit:
         notice(
-            f"{config.rate_hz:g} cycles/s are wanted, and {len(config.servos)} servos at {config.baud} baud allow "
-            f"{limit:.0f}: rows come as fast as they can → a higher baud rate, no return delay (`openant calib "
+            f"{exact(config.rate_hz)} cycles/s are wanted, and {len(config.servos)} servos at {config.baud} baud allow "
+            f"{number(limit, decimals=0)}: rows come as fast as they can → a higher baud rate, no return delay (`openant calib "
             "inventory`), or a lower rate"
         )
 

@@ -12,6 +12,7 @@ from openant_tools.comms.messages import EngineConfig
 from openant_tools.comms.servos import Servos
 from openant_tools.comms.state import POSITION, RECORDED, Difference, differences, expected, read_state
 from openant_tools.errors import HardwareFault
+from openant_tools.numbers import number
 
 __all__ = ["ServoSettings"]
 
@@ -48,7 +49,9 @@ class ServoSettings:
         for joint in wanted:  # set when something is to move, whatever stands there now
             if "pwm_limit" not in self.ours.get(joint, {}):
                 wanted[joint].pop("pwm_limit", None)
-        self.differences = differences(servos, self.registers, wanted, config.limits_rad)
+        found = differences(servos, self.registers, wanted, config.limits_rad)
+        # What a gentle motion left of it is raised whenever torque comes on.
+        self.differences = [one for one in found if one.register != "goal_pwm"]
         return [difference for difference in self.differences if difference not in before]
 
     def _at_work(self) -> Iterator[str]:
@@ -81,8 +84,8 @@ class ServoSettings:
                 if outside:
                     end = servo.to_joint(table[name] * scale)
                     raise HardwareFault(
-                        f"{servo.called} would be sent to {outside[0]:.3f} rad, but refuses goals beyond "
-                        f"{end:.3f} rad: its {name} is {table[name]}",
+                        f"{servo.called} would be sent to {number(outside[0], 'rad')}, but refuses goals beyond "
+                        f"{number(end, 'rad')}: its {name} is {table[name]}",
                         where=self._config.port,
                         remedy="widen it by `openant calib inventory`, or narrow this joint's limits in robot.toml",
                     )

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from openant_tools.comms.servos import Servo, Servos
+from openant_tools.numbers import number, percent
 from openant_tools.procedure.finding import latest
 from openant_tools.robot.registers import EEPROM_END, PULSES_PER_TURN, PWM_FULL
 from openant_tools.robot.servo import ServoModel, hardware_errors
@@ -149,7 +150,7 @@ def _weak(seen: SeenRegister) -> bool:
 
 
 def _push(seen: SeenRegister) -> str:
-    return f"it pushes with no more than {100 * abs(seen.found) / PWM_FULL:.0f} % of full duty"
+    return f"it pushes with {percent(abs(seen.found) / PWM_FULL)} of full duty at most"
 
 
 def _soft(seen: SeenRegister) -> bool:
@@ -159,7 +160,7 @@ def _soft(seen: SeenRegister) -> bool:
 
 def _stiffness(seen: SeenRegister) -> str:
     default = seen.servo.model.register("position_p_gain").default or 1
-    return f"it is {seen.found / default:.2g} times as stiff as from the factory"
+    return f"it is {number(seen.found / default)} times as stiff as from the factory"
 
 
 def _shadow(seen: SeenRegister) -> bool:
@@ -185,7 +186,7 @@ def _startup(seen: SeenRegister) -> str:
 
 def _si(seen: SeenRegister, register: str = "profile_velocity") -> str:
     item = seen.servo.model.register(register)
-    return f"{item.to_si(seen.found):.3g} {item.unit}"
+    return number(item.to_si(seen.found), item.unit)
 
 
 #: register → what it does, in the order in which differences are told. All of them are read and recorded.
@@ -212,8 +213,8 @@ SETTINGS: Mapping[str, Setting] = {
     "velocity_i_gain": Setting("without effect on position control"),
     "moving_threshold": Setting("it says `moving` at another speed"),
     "temperature_limit": Setting(lambda seen: f"it shuts down at {seen.found} °C"),
-    "max_voltage_limit": Setting(lambda seen: f"it shuts down above {seen.found / 10:.1f} V"),
-    "min_voltage_limit": Setting(lambda seen: f"it shuts down below {seen.found / 10:.1f} V"),
+    "max_voltage_limit": Setting(lambda seen: f"it shuts down above {number(seen.found / 10, 'V', decimals=1)}"),
+    "min_voltage_limit": Setting(lambda seen: f"it shuts down below {number(seen.found / 10, 'V', decimals=1)}"),
     "shutdown": Setting(_shutdown),
     "startup_configuration": Setting(_startup),
     "status_return_level": Setting("it leaves some instructions unanswered"),
@@ -270,6 +271,17 @@ class Difference:
             "joint": self.joint, "register": self.register, "is": self.found, "expected": self.expected, "by": self.by,
             "stops": self.stops,
         }  # fmt: skip
+
+
+def in_words(found: Sequence[Difference], *, remedy: bool = True) -> list[str]:
+    """What differs and what mends it, one line for all servos in which it differs alike."""
+    told: dict[str, list[Difference]] = {}
+    for one in found:
+        told.setdefault(f"{one.reads} → {one.mended}" if remedy else one.reads, []).append(one)
+    return [
+        f"{f'{len(alike)} servos' if len(alike) > 1 else f'{alike[0].joint} (id {alike[0].id})'}: {words}"
+        for words, alike in told.items()
+    ]
 
 
 def read_state(servos: Servos, registers: Iterable[str] = RECORDED) -> dict[str, dict[str, int]]:

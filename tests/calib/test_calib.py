@@ -34,6 +34,7 @@ from openant_tools.calib.zeros import straight, torso_answer, zeros
 from openant_tools.comms import messages
 from openant_tools.comms.body_imu import rotation
 from openant_tools.comms.camera import CameraInfo
+from openant_tools.comms.clock import VirtualControl
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.intrinsics import CharucoBoard, Intrinsics
 from openant_tools.errors import HardwareFault
@@ -218,8 +219,16 @@ def test_horns_go_on_at_half_a_turn_and_the_drawing_says_which_way(tmp_path):
         finding, builder = ant.do(centre(replace(ant.bench, joints=("hip_rr", "knee_rr"))))
         assert finding.ok, finding
         assert "turn hip_rr slowly from 209° to 180°" in builder.said
+        assert shares(builder.events) == [0.0, 0.5]
         assert not any(ant.torque())
         assert abs(ant.server.world.body.q[0]) < 0.03
+
+
+def shares(events: list[Event]) -> list[float]:
+    """How far the step said to be, which never goes back."""
+    told = [event.share for event in events if isinstance(event, Progress) and event.share is not None]
+    assert told == sorted(told)
+    return told
 
 
 def leave_at(kind: type[Event], words: str):
@@ -294,6 +303,8 @@ def test_bounds_that_were_left_after_the_sweep_do_not_sweep_again(tmp_path, bris
             ant.do(bounds(ant.bench), builder)
         assert not [event for event in builder.events if isinstance(event, Hands) and event.task == "turn"]
         assert "then sweep" not in builder.said
+        assert "goal_pwm" not in builder.said  # which the sweep had lowered
+        assert shares(builder.events)[-1] > 0.6
         assert unfinished(ant.folder, "bounds").next == "back on its stand"
         finding, builder = ant.do(bounds(ant.bench))
         assert finding.ok, finding.problems
@@ -346,6 +357,12 @@ class Late(SimulatedBuilder):
             if self.looks > 100:
                 super().do(self.waiting)
                 self.waiting = None
+
+
+def test_hands_lift_a_robot_that_a_step_left_on_the_floor_before_they_tilt_it(tmp_path):
+    with robot(tmp_path / "ant", robot={"setup": "floor"}) as ant:
+        ant.builder().hands.do(Hands("Hold it level.", "tilt", path_rad=(0.0, 0.0, 0.0)))
+        assert VirtualControl(ant.control).ask("state")["setup"] == "stand"
 
 
 def test_a_leg_is_watched_until_hands_have_moved_it(tmp_path):

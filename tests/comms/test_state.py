@@ -17,7 +17,7 @@ from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.following import allowance
 from openant_tools.comms.servos import Servo
-from openant_tools.comms.state import differences, expected
+from openant_tools.comms.state import differences, expected, in_words
 from openant_tools.errors import HardwareFault
 from openant_tools.procedure.finding import Finding, keep
 from openant_tools.recording.reader import read_recording
@@ -75,6 +75,15 @@ def test_what_makes_a_motion_wrong_stops_it(registers):
 )  # fmt: skip
 def test_what_leaves_a_motion_right_is_told_and_stops_nothing(registers):
     assert found(**registers) == [(next(iter(registers)), False)]
+
+
+def test_what_differs_alike_is_one_line():
+    table = {name: FACTORY | {"position_p_gain": 400} for name in ("knee_fl", "knee_fr", "knee_rl")}
+    servos = [replace(KNEE, joint=name, id=20 + k) for k, name in enumerate(table)]
+    odd = differences(servos, table, {name: expected(KNEE.model) for name in table}, {})
+    [line] = in_words(odd, remedy=False)
+    assert line.startswith("3 servos: position_p_gain is 400,")
+    assert in_words(odd[:1])[0] == str(odd[0])
 
 
 def test_swapped_limits_stop():
@@ -156,7 +165,7 @@ def test_anyway_moves_and_the_recording_says_what_differed(ant: Robot, tmp_path:
         engine.ask(messages.Hold(0.1))
         path, _ = engine.ask(messages.StopRecording())
         said = "\n".join(event.text for event in engine.events() if isinstance(event, messages.Notice))
-    assert "knee_fl (id 31) stands 0." in said
+    assert "knee_fl (id 31) stands " in said
     run = read_recording(path).run
     [fact] = run.facts.extra["differences"]
     assert (fact["joint"], fact["register"], fact["is"], fact["expected"]) == (
@@ -175,7 +184,7 @@ def test_a_joint_that_does_not_arrive_ends_the_motion(tmp_path: Path) -> None:
     with robot(tmp_path / "ant", effect=stuck) as ant, EngineProcess(engine_config(ant.bench, imu=None)) as engine:
         engine.ask(messages.Torque(True))
         with pytest.raises(
-            HardwareFault, match=r"knee_fl \(id 31\) stands 0\.\d+ rad from its command.*blocked, overloaded or weak"
+            HardwareFault, match=r"knee_fl \(id 31\) stands −?\d+\.\d° from its command.*blocked, overloaded or weak"
         ):
             engine.ask(messages.Ramp(HOME))
         assert not any(ant.torque())
@@ -187,7 +196,7 @@ def test_a_register_that_changes_on_the_way_is_named_when_the_joint_does_not_arr
         engine.ask(messages.Ramp(np.zeros(8)))
         with (
             left_behind(ant, min_position_limit=2040),
-            pytest.raises(HardwareFault, match=r"stands 0\.\d+ rad .*; knee_fl \(id 31\): min_position_limit is 2040"),
+            pytest.raises(HardwareFault, match=r"stands −?\d+\.\d° .*; knee_fl \(id 31\): min_position_limit is 2040"),
         ):
             engine.ask(messages.Ramp(HOME))
 
