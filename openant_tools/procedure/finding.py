@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from openant_tools.errors import BadInput
 from openant_tools.files import json_text, known, read_json, write_text
-from openant_tools.numbers import number, span
+from openant_tools.numbers import chosen, number, span
 from openant_tools.procedure.unfinished import forget
 
 if TYPE_CHECKING:  # a manual that lists the steps opens without NumPy
@@ -72,7 +72,7 @@ class Evidence:
     def wanted(self) -> str:
         """Between what it is as it should be, in words; "" where nothing is asked of it."""
         ends = [
-            f"at {word} {number(end, self.unit, name=self.name)}"
+            f"at {word} {chosen(end, self.unit, name=self.name)}"
             for word, end in (("least", self.least), ("most", self.most))
             if end is not None
         ]

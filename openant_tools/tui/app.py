@@ -349,7 +349,8 @@ class OpenAnt(App[int]):
         if isinstance(self.screen, Help):
             self.pop_screen()
             return
-        own = next((words for widget in self._focus_path() if (words := help_of(widget))), "")
+        # What the screen is for comes before how its lists are gone through.
+        own = "\n".join(words for widget in reversed([*self._focus_path()]) if (words := help_of(widget)))
         # A question is about the page below it.
         about = next((screen.about for screen in reversed(self.screen_stack) if isinstance(screen, Page)), "")
         self.push_screen(Help(f"{about}\n{own}\n{GENERAL_HELP}"))

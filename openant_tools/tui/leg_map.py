@@ -171,7 +171,11 @@ Arrow keys choose a joint, here and among the strips.
         for name, (column, row) in feet.items():
             row, column = min(max(row, 0), len(lines) - 1), min(max(column, 0), width - 2)
             lines[row][column : column + 2] = list(name)
-        lines[0][(width - 5) // 2 : (width - 5) // 2 + 5] = list("front")
+        names = [max(column, 0) for column, row in feet.values() if row <= 0]
+        free = [at for at in range(width - 4) if all(at > name + 2 or at + 5 < name for name in names)]
+        if free:
+            at = min(free, key=lambda at: abs(at - (width - 5) // 2))
+            lines[0][at : at + 5] = list("front")
         text = Text("\n".join("".join(cells) for cells in lines) + "\n", no_wrap=True)
         for (row, column), style in styles.items():
             text.stylize(style, row * (width + 1) + column, row * (width + 1) + column + 1)

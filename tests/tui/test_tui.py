@@ -236,6 +236,10 @@ def test_every_widget_that_takes_keys_explains_itself(robot: RobotFolder) -> Non
                 await pilot.pause()
                 assert "STOP" in screen_text(app), name
                 assert len(screen_text(app).split()) > 60, name
+                heading = next(
+                    (line[2:] for line in app.screen_stack[-2].HELP.splitlines() if line.startswith("# ")), ""
+                )
+                assert heading in screen_text(app), f"{name}: what the screen is for comes first"
                 await pilot.press("escape")
 
     asyncio.run(look())

@@ -22,6 +22,9 @@ from openant_tools.tui.prose import Prose
 
 __all__ = ["FindingsScreen"]
 
+#: columns of the list, and those that the chosen one does not have: its margins and a scroll bar
+LIST, MARGINS = 32, 3
+
 NONE_YET = (
     "Nothing found yet.\n\nEach step of the walk leaves a finding here: one sentence, the numbers it rests on, and what "
     "to do next. The same stands in the robot's folder as JSON and Markdown."
@@ -38,6 +41,9 @@ class FindingsScreen(Page):
 A finding is one sentence, the numbers that it rests on with their units and sources, and the next action. They are
 kept in the robot's `findings/`, one a run of a step. The passport is the page that gathers them.
 """
+
+    #: the one that is laid out, where it is no page of prose
+    _shown: Finding | None = None
 
     def body(self) -> ComposeResult:
         with Horizontal():
@@ -69,6 +75,7 @@ kept in the robot's `findings/`, one a run of a step. The passport is the page t
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
         path = self._files[event.option_index]
         prose, finding = self.query_one(Prose), self.query_one("#finding", Static)
+        self._shown = None
         prose.display = path.suffix == ".md"
         finding.display = not prose.display
         try:
@@ -76,16 +83,28 @@ kept in the robot's `findings/`, one a run of a step. The passport is the page t
             if prose.display:
                 prose.show(content)
             else:
-                finding.update(_page(Finding.of_json(parse_json(content, path))))
+                self._shown = Finding.of_json(parse_json(content, path))
+                self._lay_out()
         except (OSError, BadInput, ValueError, KeyError, TypeError, AttributeError) as error:
             prose.display, finding.display = False, True
             finding.update(marked("fail", f"{path} cannot be read: {error}"))
 
+    def on_resize(self) -> None:
+        super().on_resize()
+        self._lay_out()
 
-def _page(finding: Finding) -> Text:
+    def _lay_out(self) -> None:
+        """Show the chosen finding in the columns that there are."""
+        if self._shown is not None:
+            place = self.query_one("#finding", Static)
+            beside = self.query_one("#list").outer_size.width or LIST
+            place.update(_page(self._shown, self.size.width - beside - MARGINS))
+
+
+def _page(finding: Finding, width: int) -> Text:
     title = WALK[finding.step].title if finding.step in WALK else finding.step
     head = Text(f"{title}\n", style="bold")
-    text = Text("\n").join([head, *finding_lines(finding)])
+    text = Text("\n").join([head, *finding_lines(finding, width)])
     return text.append(f"\n\n{finding.date:%Y-%m-%d %H:%M} UTC, {finding.command}")
 
 

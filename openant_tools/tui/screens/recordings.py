@@ -65,11 +65,12 @@ that has the columns of docs/recordings.md.
         for index, path in enumerate(self._files):
             stat = path.stat()
             when = datetime.datetime.fromtimestamp(stat.st_mtime).strftime("%d.%m.%Y %H:%M")
-            chooser.add_option(
-                Option(
-                    Text(f"{names[path]:40.40} {number(stat.st_size / 1e6, decimals=1):>7} MB  {when}"), id=str(index)
-                )
+            size = (
+                number(stat.st_size / 1e6, "MB")
+                if stat.st_size >= 1e6
+                else number(stat.st_size / 1e3, "kB", decimals=0)
             )
+            chooser.add_option(Option(Text(f"{names[path]:40.40} {size:>10}  {when}"), id=str(index)))
         if self._files:
             chooser.highlighted = 0
         else:
