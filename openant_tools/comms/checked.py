@@ -192,8 +192,8 @@ def _angles(
         if not math.isfinite(angle):
             raise BadInput(f"{what} is {angle} for {joints[k]}{place}", remedy="give a finite angle, in rad")
         raise BadInput(
-            f"{what}: a command of {number(angle, 'rad')} for {joints[k]}{place} is outside its limits "
-            f"{span(low[k], high[k], 'rad')}"
+            f"{what}: a command of {number(angle, 'rad', decimals=2)} for {joints[k]}{place} is outside its limits "
+            f"{span(low[k], high[k], 'rad', decimals=2)}"
         )
     return np.asarray(np.clip(angles, low, high))
 

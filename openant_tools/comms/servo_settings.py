@@ -84,8 +84,8 @@ class ServoSettings:
                 if outside:
                     end = servo.to_joint(table[name] * scale)
                     raise HardwareFault(
-                        f"{servo.called} would be sent to {number(outside[0], 'rad')}, but refuses goals beyond "
-                        f"{number(end, 'rad')}: its {name} is {table[name]}",
+                        f"{servo.called} would be sent to {number(outside[0], 'rad', decimals=2)}, but refuses goals beyond "
+                        f"{number(end, 'rad', decimals=2)}: its {name} is {table[name]}",
                         where=self._config.port,
                         remedy="widen it by `openant calib inventory`, or narrow this joint's limits in robot.toml",
                     )

@@ -405,7 +405,7 @@ class BodyTracker:
         turned = math.acos(max(-1.0, min(1.0, max(float(up @ before_up) for up in ups))))
         self._scaled = ""
         if abs(far_m / before_m - 1) > ORIGIN_SAME_SHARE:
-            self._scaled = f"looks {number(before_m / far_m)} times as large as before"
+            self._scaled = f"looks {number(before_m / far_m, decimals=2)} times as large as before"
         elif turned > ORIGIN_SAME_LEAN_RAD:
             self._scaled = f"leans by {number(turned, 'rad', decimals=0)} otherwise than before"
         if self._scaled:

@@ -202,7 +202,7 @@ def test_a_leg_that_was_let_go_is_guarded_too(stepped: dict[str, str]) -> None:
     with EngineProcess(guarded) as engine:
         engine.ask(messages.Torque(True))
         engine.ask(messages.Ramp(commands[0]))
-        with pytest.raises(HardwareFault, match=r"hip_fl .* rad, outside its limits -0.30 to 0.27"):
+        with pytest.raises(HardwareFault, match=r"hip_fl .*°, outside its limits −17\.2 to 15\.5°"):
             engine.ask(messages.Play(commands, "swing", limp))
         assert not any(torques(stepped))
 
@@ -268,7 +268,7 @@ def test_what_cannot_be_is_refused_and_nothing_moves(stepped: dict[str, str]) ->
         with pytest.raises(HardwareFault, match="torque is off"):
             engine.ask(messages.Ramp(HOME))
         engine.ask(messages.Torque(True))
-        with pytest.raises(HardwareFault, match=r"115° for hip_rr is outside its limits −45 to 45°"):
+        with pytest.raises(HardwareFault, match=r"114\.59° for hip_rr is outside its limits −45\.00 to 45\.00°"):
             engine.ask(messages.Ramp(np.full(8, 2.0)))
         with pytest.raises(HardwareFault, match="EEPROM is locked"):
             engine.ask(messages.WriteRegister("hip_rr", "pwm_limit", 400))
@@ -298,7 +298,7 @@ def test_a_joint_out_of_bounds_stops_the_motion(stepped: dict[str, str]) -> None
     settings = config(stepped, guards=Guards(angle_margin_rad=-0.5))
     with EngineProcess(settings) as engine:
         engine.ask(messages.Torque(True))
-        with pytest.raises(HardwareFault, match=r"is at .* rad, outside its limits .* → look for a wrong zero"):
+        with pytest.raises(HardwareFault, match=r"is at .*°, outside its limits .* → look for a wrong zero"):
             engine.ask(messages.Ramp(np.full(8, 0.6)))
         [stopped] = [event for event in engine.events() if isinstance(event, messages.Stopped)]
         assert stopped.joint in JOINT_NAMES

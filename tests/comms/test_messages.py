@@ -71,7 +71,7 @@ def test_what_cannot_be_is_refused_by_name_and_nothing_moves(standing: Standing)
             (make(at_home(1, NAN)), (name, "nan", JOINT_NAMES[1])),
             (make(at_home(2, INF)), (name, "inf", JOINT_NAMES[2])),
             (make(at_home(3, -INF)), (name, "-inf", JOINT_NAMES[3])),
-            (make(at_home(3, 9.0)), (name, "9.000 rad", JOINT_NAMES[3], "outside its limits")),
+            (make(at_home(3, 9.0)), (name, "515.66°", JOINT_NAMES[3], "outside its limits")),
             (make(at_home(0, 0.7854 + 1e-4)), (name, JOINT_NAMES[0], "outside its limits")),
             (make(np.zeros(1)), (name, "shape (1,)", "8 joints")),
             (make(np.float64(0.0)), (name, "shape ()")),
@@ -150,7 +150,7 @@ def test_rounding_at_a_limit_is_no_reason_and_a_refused_goal_leaves_the_one_befo
         assert end[0] == pytest.approx(angle, abs=0.06)
     standing.engine.ask(messages.Goal(HOME.tolist(), 0.6))  # type: ignore[arg-type]
     moving = standing.engine.start(messages.Goal(at_home(0, 0.3), 0.6))
-    standing.refuses(messages.Goal(at_home(0, 2.0), 0.6), "2.000 rad")
+    standing.refuses(messages.Goal(at_home(0, 2.0), 0.6), "114.59°")
     assert standing.engine.wait(moving)[0] == pytest.approx(0.3, abs=0.06)
     standing.engine.ask(messages.Ramp(HOME))
 
