@@ -27,7 +27,7 @@ class Closure:
         before, after, floor: rad, of joints. closed: share of the excess that is gone; low, high: over the folds, 95 %.
         squares: (folds, channels) summed over rows; counts: (folds, channels) of how many errors.
         apart: (folds, channels) squares of how far it is from what it is asked about beside, summed over the same rows.
-        known: (channels,) mean square of sensors. likelihood, std: as of `Fit`.
+        known: (channels,) mean square of sensors. likelihood, within, std: as of `Fit`.
         refit: on all training runs together.
     """
 
@@ -38,6 +38,7 @@ class Closure:
     low: float
     high: float
     likelihood: float
+    within: float
     squares: Array
     apart: Array
     counts: Array
@@ -66,8 +67,8 @@ class Closure:
         return float(each[there].mean()) if there.any() else 0.0
 
     def likelier(self, other: Closure) -> float:
-        """nats by which what it was fitted to is likelier."""
-        return self.likelihood - other.likelihood
+        """nats by which what it was fitted to is likelier than by any robot of one build: a little of its cause is none."""
+        return self.likelihood - max(other.likelihood, self.within)
 
     def _less(self, squares: Array) -> float:
         rows = np.maximum(self.counts, 1.0)  # of a fold without any nothing is left
@@ -107,7 +108,7 @@ def closures(
         low, high = _interval(both[0], both[1], known, floor)
         out.append(
             Closure(
-                before, after, floor, _closed(before, after, floor), low, high, one.likelihood, each[n], apart[n], counts,
+                before, after, floor, _closed(before, after, floor), low, high, one.likelihood, one.within, each[n], apart[n], counts,
                 predictions.sigma**2, one.whole, one.std,
             )
         )  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.gap.features import Floats
-from openant_tools.gap.hypothesis import Refit, prior_of, quantities, sizes
+from openant_tools.gap.hypothesis import Refit, bounds_of, prior_of, quantities, sizes
 from openant_tools.model.plant import Setup
 
 __all__ = ["END", "LEAST_GAIN", "Block", "Descent"]
@@ -81,7 +81,8 @@ class Descent:
     """One hypothesis on its way to where it leaves least.
 
     Attributes:
-        u: where it looks next, sizes of causes, then tolerances. prior, scale: around what, and how far it may go.
+        u: where it looks next, sizes of causes, then tolerances. prior, scale: around what, and how far it may go. low, high: between
+            which it stays.
         at, least, errors: where it was best, what it cost there, and of each run the weighted errors (rows, channels).
         slopes: of each run, weighted, (coordinates, rows, channels); blocks: what each run says where it was best.
         bends: which of them are other ones wherever it comes to. damping: how much steps are held back.
@@ -93,6 +94,8 @@ class Descent:
     u: Array
     prior: Array
     scale: Array
+    low: Array
+    high: Array
     steps: Array
     slopes: dict[int, Floats]
     at: Array
@@ -108,6 +111,7 @@ class Descent:
         """From a start, with what slopes are known of the tolerances alone."""
         at = sizes(start)
         centre, deviations = prior_of(start)
+        low, high = np.array([*map(bounds_of, quantities(start)), *[(-END, END)] * tolerances]).T
         least = [NEARBY_SHAPE if q.share else 0.0 if q.shape else NEARBY_NONE * q.small for q in quantities(start)]
         steps = np.maximum(NEARBY_SIZE * np.abs(at), least)
         u: Array = np.concatenate([at, start.nuisance])
@@ -120,11 +124,28 @@ class Descent:
             u,
             np.concatenate([centre, np.zeros(tolerances)]),
             np.concatenate([deviations, np.full(tolerances, SPREAD)]),
+            low,
+            high,
             np.concatenate([steps, np.ones(tolerances)]),
             slopes,
             u,
             np.array([True] * len(at) + [False] * tolerances),
         )
+
+    @property
+    def inside(self) -> bool:
+        """Whether it is best between its bounds."""
+        return bool(((self.at >= self.low) & (self.at <= self.high)).all())
+
+    def of_one_build(self) -> Descent:
+        """From where it is best, with no more of its last cause than robots of one build differ by."""
+        own = len(self.start.hypothesis[-1].definition.quantities)
+        most = np.full(len(self.u), np.inf)
+        most[self.causes - own : self.causes] = [np.inf if q.shape else q.small for q in quantities(self.start)[-own:]]
+        return dataclasses.replace(
+            self, low=np.maximum(self.low, -most), high=np.minimum(self.high, most), damping=0.0, gained=np.inf,
+            slopes=dict(self.slopes),
+        )  # fmt: skip
 
     def begin(self) -> None:
         """Once more, from where it was best."""

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from openant_tools.gap.descent import END, LEAST_GAIN, Descent
+from openant_tools.gap.descent import LEAST_GAIN, Descent
 from openant_tools.gap.features import Floats
-from openant_tools.gap.hypothesis import Part, Refit, bounds_of, quantities, refit_at, sizes, without_last
+from openant_tools.gap.hypothesis import Part, Refit, refit_at, sizes, without_last
 from openant_tools.gap.nuisance import TILTS
 from openant_tools.gap.prediction import Predictions
 from openant_tools.gap.protocol import Played
@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 INDEPENDENT_S = 0.1
 #: how often slopes are followed at most
 ITERATIONS = 30
+#: and where a cause is held to what robots of one build differ by, from where it was best
+LOOKS = 3
 #: how often slopes of tolerances are measured, each time where those before lead no farther
 MEASURED = 3
 #: how often errors of each joint in each run are taken to be as large as a step leaves them: no model of a real servo is true, and one
@@ -44,13 +46,15 @@ class Fit:
         std: of the coordinates of its causes, in order: by curvature with errors as large as the fit leaves them, or by how much folds
             differ (jackknife), whichever is more.
         likelihood: the logarithm of how likely all is that it was fitted to, where errors of each channel in each run have a size of
-            their own, and that of sizes and tolerances.
+            their own, and that of sizes and tolerances. within: the same, with no more of its last cause than robots of one build
+            differ by.
     """
 
     whole: Refit
     folds: list[Refit]
     std: tuple[Mapping[str, float], ...]
     likelihood: float
+    within: float
 
 
 class Fits:
@@ -90,15 +94,14 @@ class Fits:
             if not one.causes:
                 self._keep(one)
         out = []
-        for one in descents:
+        for one, within in zip(descents, self._within(descents, fitted), strict=True):
             folds = [[k for k in one.blocks if k not in left] for left in leave_out]
             # Where a fold leads otherwise than all of them together, from where these came to; held back it would not leave there.
             one.damping = 0.0
-            low, high = self._bounds(one)
             whole_way = self._solve(one, list(one.blocks))
-            each = [np.clip(one.at + self._solve(one, fold) - whole_way, low, high) for fold in folds]
+            each = [np.clip(one.at + self._solve(one, fold) - whole_way, one.low, one.high) for fold in folds]
             whole, parts = refit_at(one.start, one.at), [refit_at(one.start, u) for u in each]
-            out.append(Fit(whole, parts, refit_at(one.start, self._deviations(one, parts)).x, -0.5 * one.least))
+            out.append(Fit(whole, parts, refit_at(one.start, self._deviations(one, parts)).x, -0.5 * one.least, within))
         return out
 
     def _deviations(self, descent: Descent, folds: Sequence[Refit]) -> Array:
@@ -113,6 +116,15 @@ class Fits:
         spread = np.sqrt((len(each) - 1) / len(each) * np.square(each - each.mean(axis=0)).sum(axis=0))
         out: Array = np.maximum(curvature, spread)
         return out
+
+    def _within(self, descents: Sequence[Descent], fitted: Sequence[int]) -> list[float]:
+        """How likely all is with no more of the last cause of each than robots of one build differ by."""
+        limited = [one.of_one_build() if one.causes else one for one in descents]
+        beyond = [one for one in limited if not one.inside]
+        for one in beyond:
+            one.u, one.least = self._solve(one, list(one.blocks)), np.inf
+        self._follow(beyond, fitted, LOOKS)
+        return [-0.5 * one.least for one in limited]
 
     def _no_worse(self, descents: list[Descent], fitted: Sequence[int]) -> list[Descent]:
         """Where a hypothesis leaves more than the first, which lacks its last cause, a descent from there in its place."""
@@ -133,20 +145,24 @@ class Fits:
             before = [one.least for one in begun]
             for one in begun if not learnt else ():
                 one.begin()
-            moving = begun
-            for _ in range(ITERATIONS):
-                self._look(moving, fitted)
-                for one in moving:
-                    one.u = self._solve(one, list(one.blocks))
-                moving = [one for one in moving if one.goes_on]
-                if not moving:
-                    break
+            self._follow(begun, fitted, ITERATIONS)
             if n == 0 and not self._settled and self._other_form(descents[0], fitted):
                 continue
             begun = [one for one, cost in zip(begun, before, strict=True) if cost - one.least > 2 * LEAST_GAIN]
             if not begun:
                 break
         return descents
+
+    def _follow(self, descents: Sequence[Descent], fitted: Sequence[int], at_most: int) -> None:
+        """Take so many steps, or until none goes on."""
+        moving = list(descents)
+        for _ in range(at_most):
+            if not moving:
+                break
+            self._look(moving, fitted)
+            for one in moving:
+                one.u = self._solve(one, list(one.blocks))
+            moving = [one for one in moving if one.goes_on]
 
     def _other_form(self, found: Descent, fitted: Sequence[int]) -> bool:
         """Go on in the form of simulation that leaves least where a descent is; whether that is another one."""
@@ -185,8 +201,8 @@ class Fits:
     def _solve(self, descent: Descent, runs: Sequence[int]) -> Array:
         """Where the blocks of some runs lead, made where the descent was best."""
         u, prior, scale = descent.at, descent.prior, descent.scale
-        low, high = self._bounds(descent)
-        within = np.minimum(low - u, 0) - TINY, np.maximum(high - u, 0) + TINY
+        low, high = descent.low, descent.high
+        within = low - u - TINY, high - u + TINY
         blocks, found = [descent.blocks[k] for k in runs], u
         for _ in range(INFLATIONS):
             more, slope = np.diag(1 / scale**2), (u - prior) / scale**2
@@ -201,12 +217,6 @@ class Fits:
         for bound in (low, high):
             found = np.where(np.abs(found - bound) < 10 * TINY, bound, found)
         return found
-
-    def _bounds(self, descent: Descent) -> tuple[Array, Array]:
-        """Between which each coordinate may be."""
-        ends = [bounds_of(q) for q in quantities(descent.start)]
-        low, high = np.array([*ends, *[(-END, END)] * len(self.predictions.names)]).T
-        return low, high
 
     def _look(self, descents: Sequence[Descent], fitted: Sequence[int]) -> None:
         """Simulate runs where descents look next, and what varies there."""

@@ -22,7 +22,7 @@ from openant_tools.gap.closure import Closure, calibration_of, closures, heat_lo
 from openant_tools.gap.fitting import Fits
 from openant_tools.gap.hypothesis import Part, Refit
 from openant_tools.gap.prediction import Predictions
-from openant_tools.gap.protocol import Played, RunSet
+from openant_tools.gap.protocol import Played, RunSet, rollouts_of
 from openant_tools.gap.simulation import Log, simulate
 from openant_tools.model.plant import load_plant
 from openant_tools.model.rollout import Rollouts
@@ -139,10 +139,33 @@ def test_a_cause_that_is_not_there_ends_at_nothing_and_not_beyond(name: str, tmp
     assert np.isfinite([found.before, found.floor, found.after, found.low, found.high, found.foretold]).all()
 
 
+@pytest.mark.parametrize(("gap_rad", "beyond"), [(0.005, False), (0.02, True)])
+def test_a_cause_no_larger_than_robots_of_one_build_differ_by_is_none(
+    gap_rad: float, beyond: bool, tmp_path: Path
+) -> None:
+    """A little play is in every gear: it explains what was measured, and says nothing against the robot."""
+    given = protocol(tmp_path, kp=8.0, dry=0.03)
+    robot, rng = Robot(1), np.random.default_rng(0)
+    robot.play[:] = gap_rad
+    runs = []
+    for one in given.runs:
+        log = simulate(rollouts_of([one]), [robot], signals=("pos",)).signals["pos"][0, :, :]
+        pos = np.where(np.isfinite(log[:, 0]), log[:, 0], one.run.columns["pos.joint"])
+        columns = one.run.columns | {"pos.joint": pos + rng.normal(0.0, 3e-4, len(pos))}
+        runs.append(dataclasses.replace(one.run, columns=columns))
+    fits = Fits(Predictions(RunSet.of(runs, tmp_path / "given.xml", ["joint"], [None, None])))
+    start = catalogue()["backlash"].starts(0.2)[0]
+    plain, found = closures(fits, [fits.nothing(), fits.of([Part("backlash", (0,))], [start])], [(0,), (1,)], [0, 1])
+    print(found.refit.x, found.likelihood - plain.likelihood, found.likelier(plain))
+    assert found.refit.x[0]["gap_rad"] == pytest.approx(gap_rad, abs=0.002)
+    assert found.likelihood > plain.likelihood + 10
+    assert (found.likelier(plain) > 10) == beyond
+
+
 def test_what_leaves_nothing_at_all_and_a_fold_without_rows_say_nothing() -> None:
     """Of a log without noise: no sensor has a floor there."""
     none = Closure(
-        before=0, after=0, floor=0, closed=1, low=1, high=1, likelihood=0.0, squares=np.zeros((2, 1)), apart=np.zeros((2, 1)),
+        before=0, after=0, floor=0, closed=1, low=1, high=1, likelihood=0.0, within=0.0, squares=np.zeros((2, 1)), apart=np.zeros((2, 1)),
         counts=np.array([[0.0], [50.0]]), known=np.full(1, 4e-8), refit=Refit((), (), np.zeros(0)), std=(),
     )  # fmt: skip
     some = dataclasses.replace(none, squares=np.array([[0.0], [0.5]]))
