@@ -54,7 +54,8 @@ class Row:
         support: logarithm of how much less it leaves of the gap on held-out folds, mean of them and summed over joints, than what it is asked
             about beside does (no further cause, or the others); None where it was not fitted, or where nothing that was recorded
             tells.
-        foretold: what that would be if it were right; likelier: nats by which what it was fitted to is, its sizes and tolerances with it.
+        foretold: what that would be if it were right; likelier: nats by which what it was fitted to is, its sizes and tolerances with it,
+            than with no more of it than robots of one build differ by.
         left: logarithm of how many times its sensors' errors it leaves on held-out folds; None where it was not fitted.
         gain: share of the excess gap that it closes on held-out folds beyond what is closed without it, for the report.
     """

@@ -156,7 +156,6 @@ def test_a_cause_no_larger_than_robots_of_one_build_differ_by_is_none(
     fits = Fits(Predictions(RunSet.of(runs, tmp_path / "given.xml", ["joint"], [None, None])))
     start = catalogue()["backlash"].starts(0.2)[0]
     plain, found = closures(fits, [fits.nothing(), fits.of([Part("backlash", (0,))], [start])], [(0,), (1,)], [0, 1])
-    print(found.refit.x, found.likelihood - plain.likelihood, found.likelier(plain))
     assert found.refit.x[0]["gap_rad"] == pytest.approx(gap_rad, abs=0.002)
     assert found.likelihood > plain.likelihood + 10
     assert (found.likelier(plain) > 10) == beyond
