@@ -326,9 +326,8 @@ class BodyTracker:
             if gone > JUMP_M + JUMP_M_S * max(0.0, found.t - before):
                 self._jumped = 1
                 self._last = (found.t, found.position)
-                words = (
-                    f"body tag {self.setup.body_id} was {number(gone, 'm')} away {number(found.t - before, 's')} ago"
-                )
+                away, ago = number(gone, "m", decimals=2), number(found.t - before, "s")
+                words = f"body tag {self.setup.body_id} was {away} away {ago} ago"
                 self._jump_words = f"{words}: another sheet with its number, or was the robot carried?"
                 return BodyLost(found.t, self._jump_words)
         self._last = (found.t, found.position)
@@ -456,7 +455,7 @@ class BodyTracker:
         low, high = setup.heights
         if not low <= position[2] <= high:
             return BodyLost(
-                t, f"the body would be {number(position[2], 'm')} above the floor: is it carried, or are a tag's size, the lens or the "
+                t, f"the body would be {number(position[2], 'm', decimals=2)} above the floor: is it carried, or are a tag's size, the lens or the "
                 "picture's size other than declared?"
             )  # fmt: skip
         if tilt is not None:

@@ -75,7 +75,7 @@ def test_two_sheets_with_one_number_give_no_pose_by_turns(tracker: BodyTracker) 
 def test_a_sheet_that_is_seen_only_while_the_robot_is_not_is_no_robot(tracker: BodyTracker) -> None:
     there = with_sheet(photo(CAMERA, AWAY), 12, at=(30, 250), cell=7)
     assert isinstance(tracker.track(photo(CAMERA, HERE), 1.0), BodyPose)
-    assert "m away 0.03 s ago: another sheet with its number" in reason(tracker.track(there, 1.033))
+    assert "m away 33 ms ago: another sheet with its number" in reason(tracker.track(there, 1.033))
     # Who was carried there stays there.
     results = [tracker.track(there, 1.1 + k / 30) for k in range(12)]
     assert isinstance(results[5], BodyLost)
@@ -111,7 +111,7 @@ def test_a_camera_that_was_moved_while_the_origin_was_hidden_is_noticed(tracker:
     assert isinstance(tracker.track(hidden(CAMERA), 1.4), BodyPose)
 
 
-@pytest.mark.parametrize(("declared", "said"), [(0.025, "would be 0.4"), (0.06, "would be -0.1")])
+@pytest.mark.parametrize(("declared", "said"), [(0.025, "would be 0.4"), (0.06, "would be −0.1")])
 def test_a_body_at_an_impossible_height_is_lost(declared: float, said: str) -> None:
     tracker = BodyTracker(TagSetup(body_size=declared), CAMERA.intrinsics)
     settle(tracker, CAMERA)
