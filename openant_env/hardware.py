@@ -549,11 +549,8 @@ class AntHardware(AntBase):
                 why = f"the cable was wound up by {wound_up:.1f} turns, and turning back left {self._turns:.1f}"
                 self._ended_by(StopCause.CABLE, why)
                 return why
-            self._set_command(turning_action(self.robot.joints, way, k))
-            self._derate()
-            rows, _ = self.link.go(self._command, half_s)
+            self._stride(turning_action(self.robot.joints, way, k), half_s)
             k += 1
-            self._take(rows)
             up = self._observation[self.layout.slices["acc"]][2]
             self._fallen_s = self._fallen_s + half_s if up < 0.0 else 0.0
             if self._fallen_s >= FALLEN_S and self._on_fall != "ignore":
@@ -564,11 +561,16 @@ class AntHardware(AntBase):
                 return why_unseen
         # Legs are led back in the air, where no foot sticks, and set down at once: by a ramp's time it has tipped over.
         for action in (turning_action(self.robot.joints, 0.0, k), np.zeros(len(self.robot.joints))):
-            self._set_command(action)
-            self._take(self.link.go(self._command, half_s)[0])
+            self._stride(action, half_s)
         self._notice(f"turned back in {self.link.now() - began:.0f} s")
         self._take(self.link.stand(self.actions.rest, SETTLE_S))
         return self._unseen()
+
+    def _stride(self, action: Array, seconds: float) -> None:
+        """Go so for a while, less far where a servo is warm, and see what came of it."""
+        self._set_command(action)
+        self._derate()
+        self._take(self.link.go(self._command, seconds)[0])
 
     def _need_word(self) -> None:
         """Where motion has ended for good: have whoever is there asked, or refuse."""
