@@ -61,7 +61,7 @@ def estop(bench: Bench) -> Procedure:
         if not all(on.values()):
             raise HardwareFault(f"torque does not come on at {', '.join(j for j, value in on.items() if not value)}")
         yield Say("torque is on: the horn resists your fingers", "info")
-        yield Ask("Press space now, the stop key; on the command line Enter.", ("stop",), default="stop")
+        yield Ask("Stop it now, with the stop key.", ("stop",), default="stop")
         engine.stop()
         off = engine.ask(messages.ReadRegister("torque_enable"))
     stopped = not any(off.values())

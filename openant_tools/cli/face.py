@@ -134,6 +134,9 @@ class CommandFace:
             return ask.default
         need_terminal("it has a question")
         question = escape(ask.question)
+        if len(ask.choices) == 1:
+            Prompt.ask(f"{question} [dim](Enter)[/dim]", console=self.console, default="", show_default=False)
+            return ask.choices[0]
         if ask.choices:
             default = ask.default if isinstance(ask.default, str) else ask.choices[0]
             return Prompt.ask(question, console=self.console, choices=list(ask.choices), default=default)

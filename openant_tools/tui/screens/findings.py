@@ -16,14 +16,14 @@ from openant_tools.files import parse_json, read_text
 from openant_tools.procedure.finding import Finding
 from openant_tools.tui.choices import Choices
 from openant_tools.tui.found import finding_lines
-from openant_tools.tui.marks import mark, marked
+from openant_tools.tui.marks import MARKS, mark, marked
 from openant_tools.tui.page import Page
 from openant_tools.tui.prose import Prose
 
 __all__ = ["FindingsScreen"]
 
 #: columns of the list, and those that the chosen one does not have: its margins and a scroll bar
-LIST, MARGINS = 32, 3
+LIST, MARGINS = 25, 3
 
 NONE_YET = (
     "Nothing found yet.\n\nEach step of the walk leaves a finding here: one sentence, the numbers it rests on, and what "
@@ -57,7 +57,7 @@ kept in the robot's `findings/`, one a run of a step. The passport is the page t
         self._files = self._find()
         chooser = self.query_one("#list", Choices)
         for number, path in enumerate(self._files):
-            chooser.add_option(Option(_title(path), id=str(number)))
+            chooser.add_option(Option(_option(path), id=str(number)))
         if self._files:
             chooser.highlighted = 0
         else:
@@ -102,15 +102,18 @@ kept in the robot's `findings/`, one a run of a step. The passport is the page t
 
 
 def _page(finding: Finding, width: int) -> Text:
-    title = WALK[finding.step].title if finding.step in WALK else finding.step
-    head = Text(f"{title}\n", style="bold")
+    head = Text(f"{_title(finding.step)}\n", style="bold")
     text = Text("\n").join([head, *finding_lines(finding, width)])
     return text.append(f"\n\n{finding.date:%Y-%m-%d %H:%M} UTC, {finding.command}")
 
 
-def _title(path: Path) -> Text:
+def _title(step: str) -> str:
+    return WALK[step].title if step in WALK else step
+
+
+def _option(path: Path) -> Text:
     if path.stem == "passport":
         return Text(f"{mark('info')} Passport", style="bold")
     step, _, stamp = path.stem.rpartition("-")
     day = f"{stamp[6:8]}.{stamp[4:6]}. {stamp[9:11]}:{stamp[11:13]}" if len(stamp) >= 13 else stamp
-    return Text(f"{step:14.14} {day}")
+    return Text(_title(step)).append(f"\n{day}", MARKS["todo"].colour)
