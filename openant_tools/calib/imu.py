@@ -206,7 +206,7 @@ def imu(bench: Bench) -> Procedure:
             f"integral of the gyro about the body's vertical, {number(info.gyro_lsb_per_dps)} counts for 1 °/s",
         ),
         *([] if gyro is None else [
-            Evidence("gyro counts for 1 °/s", gyro.counts_per_dps, "1", f"{len(turns)} turns by hand", gyro.low, gyro.high)
+            Evidence("gyro counts for 1 °/s", gyro.counts_per_dps, "1", f"turns by hand: {len(turns)}", gyro.low, gyro.high)
         ]),
     )  # fmt: skip
     unsure = list[str]()

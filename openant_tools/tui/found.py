@@ -175,18 +175,24 @@ def _list(evidence: Sequence[Evidence], width: int) -> list[Text]:
     if not evidence:
         return []
     names = max(len(spelled(one.name)) for one in evidence)
-    values = max(len(spelled(one.words)) for one in evidence)
+    parts = [spelled(one.words).replace(" (", "| (").partition("|")[::2] for one in evidence]
+    values = max(len(value) for value, _ in parts)
+    intervals = max(len(interval) for _, interval in parts)
     bar = BAR if any(one.wanted for one in evidence) else 0
-    before = 2 + names + 2 + values + bar + 2
+    before = 2 + names + 2 + values + intervals + bar + 2
     beside = width - before >= 16  # else the source stands below its number
     lines = []
-    for one in evidence:
-        line = Text(f"  {spelled(one.name):{names}}  ").append(f"{spelled(one.words):>{values}}", "bold")
+    for one, (value, interval) in zip(evidence, parts, strict=True):
+        line = Text(f"  {spelled(one.name):{names}}  ").append(f"{value:>{values}}", "bold")
+        source = f"{one.source}; as it should be: {one.wanted}" if one.wanted else one.source
+        if before - 2 <= width:
+            line.append(f"{interval:{intervals}}", "bold")
+        elif interval:  # below, too
+            source = f"{interval.strip()} {source}"
         if one.wanted:
             line.append(" ").append_text(allowed_bar(one, BAR - 1))
         else:
             line.append(" " * bar)
-        source = f"{one.source}; as it should be: {one.wanted}" if one.wanted else one.source
         if beside:
             first, *rest = textwrap.wrap(spelled(source), width - before, break_on_hyphens=False) or [""]
             line.append(f"  {first}", GREY)

@@ -347,3 +347,15 @@ def test_of_numbers_that_read_alike_none_is_marked_as_the_worst() -> None:
     for evidence, marked in ((alike, False), (other, True)):
         lines = numbers_lines(Finding("zeros", True, "zeros", evidence, "", "zeros"))
         assert any("the largest of its column" in line.plain for line in lines) == marked
+
+
+@pytest.mark.parametrize("width", [52, 76, 92])
+def test_an_interval_widens_no_row_beyond_the_page(width: int) -> None:
+    evidence = (
+        Evidence("distance by size over distance by height", 1.0, "1", "robot lying on the floor"),
+        Evidence("camera angle over gyro angle", 0.9959, "1", "the same motion", 0.9945, 0.9973),
+    )
+    lines = [line.plain for line in numbers_lines(Finding("arena", True, "arena", evidence, "", "arena"), width)]
+    assert max(map(len, lines)) <= width
+    assert "(0.9945 to 0.9973)" in " ".join(lines)
+    assert next(line for line in lines if "distance by size" in line).split()[-1] != "height"
