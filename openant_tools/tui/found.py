@@ -171,24 +171,21 @@ def _worst_mark() -> str:
 
 
 def _list(evidence: Sequence[Evidence], width: int) -> list[Text]:
-    """One number a line: its name, the number, its bar where it has one, and where it comes from."""
+    """One number a line: its name, the number, its bar where it has one, its interval, and where it comes from."""
     if not evidence:
         return []
     names = max(len(spelled(one.name)) for one in evidence)
     parts = [spelled(one.words).replace(" (", "| (").partition("|")[::2] for one in evidence]
     values = max(len(value) for value, _ in parts)
-    intervals = max(len(interval) for _, interval in parts)
     bar = BAR if any(one.wanted for one in evidence) else 0
-    before = 2 + names + 2 + values + intervals + bar + 2
-    beside = width - before >= 16  # else the source stands below its number
+    before = 2 + names + 2 + values + bar + 2
+    longest = max((len(word) for one in evidence for word in one.source.split()), default=0)
+    beside = width - before >= max(16, longest)  # else the source stands below its number
     lines = []
     for one, (value, interval) in zip(evidence, parts, strict=True):
         line = Text(f"  {spelled(one.name):{names}}  ").append(f"{value:>{values}}", "bold")
-        source = f"{one.source}; as it should be: {one.wanted}" if one.wanted else one.source
-        if before - 2 <= width:
-            line.append(f"{interval:{intervals}}", "bold")
-        elif interval:  # below, too
-            source = f"{interval.strip()} {source}"
+        wanted = f"; as it should be: {one.wanted}" if one.wanted else ""
+        source = f"{interval} {one.source}{wanted}".strip()
         if one.wanted:
             line.append(" ").append_text(allowed_bar(one, BAR - 1))
         else:
