@@ -70,7 +70,10 @@ kept in the robot's `findings/`, one a run of a step. The passport is the page t
             return []
         passport = folder.passport.with_suffix(".md")
         found = sorted(folder.findings.glob("*-2*.json"), key=lambda path: path.stem.rpartition("-")[2], reverse=True)
-        return [passport, *found] if passport.is_file() else found
+        if not passport.is_file():
+            return found
+        # The page says what each finding of its making said.
+        return [passport, *(path for path in found if not path.name.startswith("passport-"))]
 
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
         path = self._files[event.option_index]
