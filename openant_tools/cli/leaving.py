@@ -12,7 +12,7 @@ from types import FrameType
 
 import click
 
-from openant_tools.signals import SUSPENDED, TERMINAL_GONE, TOLD_TO_GO
+from openant_tools.signals import SUSPENDED, TERMINAL_GONE, TOLD_TO_GO, heard
 
 __all__ = ["MOVES", "end_with_the_terminal", "heed_signals"]
 
@@ -59,8 +59,7 @@ def end_with_the_terminal() -> None:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    if number == TERMINAL_GONE:  # the kernel, the shell and the watch above may all say so: once is enough
-        signal.signal(number, signal.SIG_IGN)
+    heard(number)
     raise KeyboardInterrupt
 
 

@@ -25,7 +25,7 @@ from openant_tools.bringup.walk import BENCH, BESIDE, WALK
 from openant_tools.errors import OpenAntError
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.kit import KITS
-from openant_tools.signals import SUSPENDED
+from openant_tools.signals import SUSPENDED, TOLD_TO_GO, heard
 from openant_tools.tui.dialogs import Help, Question
 from openant_tools.tui.feeds import ReplayFeed
 from openant_tools.tui.jump import Jump
@@ -154,6 +154,7 @@ class OpenAnt(App[int]):
         if self._ticking:
             self.set_interval(TICK_S, self.tick)
         self._stop_before_suspension()
+        self._go_when_told()
         if self.session.folder is None and self.session.robots_here():
             self.call_after_refresh(self.need_folder, lambda: None)
         if self._virtual is not None:
@@ -209,6 +210,20 @@ class OpenAnt(App[int]):
             suspend(number, frame)
 
         signal.signal(SUSPENDED, stop)
+
+    def _go_when_told(self) -> None:
+        """Being told to go, and a terminal that is gone, are as good as Ctrl-C. An exception amid what draws would leave its
+        threads behind, and with them this program."""
+        loop = asyncio.get_running_loop()
+
+        def go(number: int, frame: FrameType | None) -> None:
+            heard(number)
+            self.session.release()
+            loop.call_soon_threadsafe(self.action_interrupt)
+
+        for number in TOLD_TO_GO:
+            if callable(signal.getsignal(number)):  # else it is ignored, as under nohup, or this is a test
+                signal.signal(number, go)
 
     def _fatal_error(self) -> None:
         """Textual's end for a fault of the program: torque goes off, the log has the traceback, the terminal one line."""
