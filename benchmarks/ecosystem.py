@@ -10,18 +10,20 @@ on the path it installs, in a third of pip's time; ECOSYSTEM_INSTALL holds furth
 
 from __future__ import annotations
 
+import argparse
 import datetime
 import os
 import platform
 import shlex
 import shutil
 import subprocess
-import sys
 import time
 import venv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from peers.their_files import NOT_RUN
 
 ROOT = Path(__file__).parents[1]
 BUILD = ROOT / "build" / "ecosystem"
@@ -34,8 +36,6 @@ PLATFORM = (
     "dynamixel-sdk", "pyserial", "numpy", "opencv-python", "pyapriltags", "gymnasium", "mujoco", "imageio", "scipy", "torch",
     "matplotlib", "skrl", "tyro", "pandas", "mediapy", "wandb",
 )  # fmt: skip
-#: how a row's command ends that could not be run here, with the reason as its last line
-NOT_RUN = 77  # of benchmarks/peers/their_files.py
 
 
 @dataclass(frozen=True)
@@ -227,10 +227,15 @@ def kept() -> dict[str, str]:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("rows", nargs="*", help=f"of {', '.join(ROWS)}; default: all that were not made today")
+    asked = parser.parse_args().rows
+    if unknown := [name for name in asked if name not in ROWS]:
+        parser.error(f"no such row: {', '.join(unknown)}")
     BUILD.mkdir(parents=True, exist_ok=True)
     told = kept()
     today = datetime.date.today().isoformat()
-    for name in sys.argv[1:] or [name for name in ROWS if not told.get(name, "").endswith(f"| {today} |")]:
+    for name in asked or [name for name in ROWS if not told.get(name, "").endswith(f"| {today} |")]:
         found = run(name)
         print(name, found, flush=True)
         told[name] = (
