@@ -22,6 +22,7 @@ __all__ = [
     "percent",
     "readable",
     "span",
+    "stored",
     "typed",
 ]
 
@@ -138,6 +139,11 @@ def chosen(value: float, unit: str = "", *, name: str = "") -> str:
 def typed(value: float, digits: int = 6) -> str:
     """A number as one types it into a file or a command, `-0.785398`: in the unit of the file, by these digits at most."""
     return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else f"{value:.{digits}g}"
+
+
+def stored(value: float) -> float:
+    """A number as files keep it: six digits, more than any interval leaves meaning to, and fit for reading."""
+    return float(f"{value:.6g}")  # for a file
 
 
 def span(low: float | None, high: float | None, unit: str = "", *, name: str = "", decimals: int | None = None) -> str:

@@ -17,6 +17,7 @@ from openant_tools.effects.rollout import EffectValues
 from openant_tools.effects.sensing import SensingEffects
 from openant_tools.errors import BadInput
 from openant_tools.files import read_toml
+from openant_tools.numbers import stored
 from openant_tools.robot.config import ConfigProblem, parse_effects
 from openant_tools.robot.config import EffectEntry as Entry
 from openant_tools.robot.pair import OTHER_REMEDY, PLAIN, mark_of, stranger_words, strangers
@@ -213,7 +214,7 @@ def entries_of(values: EffectValues, joints: Sequence[str]) -> list[Entry]:
         groups: dict[tuple[tuple[str, float], ...], list[str]] = {}
         for j, joint in enumerate(joints):
             # Six digits: more than any interval leaves meaning to.
-            sizes = tuple((parameter, float(f"{value[j]:.6g}")) for parameter, value in mine.items() if value[j])
+            sizes = tuple((parameter, stored(value[j])) for parameter, value in mine.items() if value[j])
             if sizes:
                 groups.setdefault(sizes, []).append(joint)
         entries += [Entry(name, tuple(where), dict(sizes)) for sizes, where in groups.items()]

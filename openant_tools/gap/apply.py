@@ -28,6 +28,7 @@ from openant_tools.model.body import floor_contacts
 from openant_tools.model.engines import carries, elsewhere, state
 from openant_tools.model.mjcf import document_text, write_model
 from openant_tools.model.plant import Plant, Setup, load_plant
+from openant_tools.numbers import stored
 from openant_tools.robot.config import EffectEntry, Provenance
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.pair import PLAIN, mark_of
@@ -229,9 +230,7 @@ def _entries(plant: Plant, selected: list[Found], robot: Robot) -> list[EffectEn
 
 
 def _entry(one: Found) -> EffectEntry:
-    return EffectEntry(
-        one.effect, one.joints, {name: float(f"{span.value:.6g}") for name, span in one.parameters.items()}
-    )
+    return EffectEntry(one.effect, one.joints, {name: stored(span.value) for name, span in one.parameters.items()})
 
 
 def _others(folder: RobotFolder, found: Diagnosis, given: str | None) -> list[EffectEntry]:

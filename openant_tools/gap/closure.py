@@ -13,6 +13,7 @@ from openant_tools.gap.hypothesis import Refit
 from openant_tools.gap.nuisance import BODY, HEAT_LOSS, LESS, UNWRITTEN
 from openant_tools.gap.prediction import Predictions
 from openant_tools.model.gap import share_closed
+from openant_tools.numbers import stored
 
 __all__ = ["Closure", "calibration_of", "closures", "heat_loss_of"]
 
@@ -160,7 +161,7 @@ def calibration_of(predictions: Predictions, refit: Refit, judged: Sequence[int]
             continue
         for name in [joints[j] for j in one.joints] or [BODY]:
             out.setdefault(one.name, {})[name] = value
-    return {kind: {name: float(f"{value:.6g}") for name, value in values.items()} for kind, values in out.items()}
+    return {kind: {name: stored(value) for name, value in values.items()} for kind, values in out.items()}
 
 
 def heat_loss_of(predictions: Predictions, refit: Refit) -> float | None:

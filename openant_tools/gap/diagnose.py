@@ -22,6 +22,7 @@ from openant_tools.gap.diagnosis import AMBIGUOUS, Diagnosis
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.finding import Given, finding
 from openant_tools.gap.trials import Trials
+from openant_tools.numbers import number
 from openant_tools.recording.run import Run
 from openant_tools.sysid.identify import joints_in_common
 
@@ -161,6 +162,6 @@ def _check_motion(runs: Sequence[Run], joints: Sequence[str]) -> None:
         moved = max(moved, float(np.nanmax(np.nanmax(pos, axis=0) - np.nanmin(pos, axis=0))))
     if moved < math.radians(1):
         raise BadInput(
-            f"nothing moves: no joint goes farther than {math.degrees(moved):.2f}°", where=runs[0].path or runs[0].name,
+            f"nothing moves: no joint goes farther than {number(moved, 'rad')}", where=runs[0].path or runs[0].name,
             remedy="record a protocol that moves the joints, see `openant sysid record --list`; angles are in rad",
         )  # fmt: skip

@@ -10,6 +10,7 @@ from typing import Any
 
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json
+from openant_tools.numbers import number, stored
 
 __all__ = ["AMBIGUOUS", "NONE", "SCHEMA", "UNEXPLAINED", "Diagnosis", "Found", "Span", "read_diagnosis"]
 
@@ -26,8 +27,7 @@ class Span:
     high: float
 
     def __str__(self) -> str:
-        known = math.isfinite(self.low) and math.isfinite(self.high)
-        return f"{self.value:.3g} [{self.low:.3g}, {self.high:.3g}]" if known else f"{self.value:.3g}"
+        return number(self.value, low=self.low, high=self.high)
 
 
 @dataclass(frozen=True)
@@ -184,4 +184,4 @@ def _told(value: float | None, unknown: float = math.inf) -> float:
 
 def _number(value: float | None) -> float | None:
     """A JSON number; what is infinite or unknown has none."""
-    return float(f"{value:.6g}") if value is not None and math.isfinite(value) else None
+    return stored(value) if value is not None and math.isfinite(value) else None

@@ -19,6 +19,7 @@ from openant_tools.gap.next import suggestion
 from openant_tools.gap.residual import residual_after
 from openant_tools.gap.trials import Trials
 from openant_tools.gap.velocity_delay import velocity_delay
+from openant_tools.numbers import number, percent
 from openant_tools.recording.run import Run
 from openant_tools.sysid.intervals import TWO_SIDED_95
 
@@ -63,8 +64,8 @@ def finding(
         calibration = calibration_of(predictions, best.refit, judged)
         if (loss := heat_loss_of(predictions, best.refit)) is not None:
             notes.append(
-                f"servos lose {100 * loss:.2f} % of their torque per °C; a written model is always as warm as on average here, and "
-                f"leaves {1e3 * predictions.written(best.refit, judged):.2f} mrad"
+                f"servos lose {number(loss, 'share')} of their torque per °C; a written model is always as warm as on average here, and "
+                f"leaves {number(predictions.written(best.refit, judged), 'rad', name='gap')}"
             )
     effects = sorted(
         (_found(trials, row, best) for row in rows if row.causes), key=lambda one: -_rank(one, rows, chosen)
@@ -112,8 +113,8 @@ def _rank(one: Found, rows: Sequence[Row], chosen: Sequence[str]) -> float:
 
 def _why_not(row: Row, plain: Closure) -> str:
     assert row.gain is not None
-    words = "closes no more" if row.gain < 0.005 else f"closes {100 * row.gain:.0f} % more"
-    return f"on held-out data it {words} than a re-fit within tolerance, which closes {100 * plain.closed:.0f} %"
+    words = "closes no more" if row.gain < 0.005 else f"closes {percent(row.gain)} more"
+    return f"on held-out data it {words} than a re-fit within tolerance, which closes {percent(plain.closed)}"
 
 
 def _found(trials: Trials, row: Row, best: Closure | None) -> Found:
@@ -167,7 +168,7 @@ def _notes(trials: Trials, given: Given, decision: Decision) -> list[str]:
     ]
     for signal, times in trials.assessment.set_aside.items():
         notes.append(
-            f"the {COLUMNS.get(signal, signal)} column behaves like none that is known ({times:.1f} times the farthest healthy robot): "
+            f"the {COLUMNS.get(signal, signal)} column behaves like none that is known ({number(times)} times the farthest healthy robot): "
             "judged without it"
         )
     if decision.verdict in given.prior:

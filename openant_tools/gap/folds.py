@@ -12,6 +12,7 @@ import numpy as np
 
 from openant_tools.errors import BadInput
 from openant_tools.gap.usable import LEAST_S, Usable
+from openant_tools.numbers import exact, number
 
 __all__ = ["FOLDS", "Part", "folds"]
 
@@ -77,9 +78,9 @@ def folds(usable: Sequence[Usable]) -> tuple[tuple[int, Part], ...]:
     if len(found) == 1:
         (one,) = (usable[k] for k in there)
         raise BadInput(
-            f"{one.usable_s:.1f} s of the one run can be simulated, too little to hold parts of it out",
+            f"{number(one.usable_s, 's')} of the one run can be simulated, too little to hold parts of it out",
             where=one.run,
-            remedy=f"record {FOLDS * LEAST_S + (FOLDS - 1) * APART_S + 1:g} s or more in one piece, or a second run",
+            remedy=f"record {exact(FOLDS * LEAST_S + (FOLDS - 1) * APART_S + 1, 's')} or more in one piece, or a second run",
         )
     return tuple(found)
 
@@ -119,5 +120,5 @@ def _until(stretches: Sequence[tuple[float, float]], t: float) -> float:
 
 
 def _seconds(value: float) -> str:
-    text = f"{value:.3f}".rstrip("0")
+    text = f"{value:.3f}".rstrip("0")  # for a file
     return text + "0" if text.endswith(".") else text

@@ -27,6 +27,7 @@ from openant_tools.gap.simulation import simulate
 from openant_tools.gap.tolerance import scatter
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.model.rollout import Rollouts
+from openant_tools.numbers import number
 from openant_tools.recording.run import Facts, Run
 from openant_tools.robot.joints import JOINTS
 from openant_tools.sysid.protocols import FULL, PROTOCOLS, CommandSpace, Protocol, protocols
@@ -110,7 +111,7 @@ def experiments(
     if listed and (listed[0].apart or 0.0) >= 1.0:
         best = listed[0]
         said = (
-            f"Record `{best.name}`: even {best.pair[0]} and {best.pair[1]} differ there by {best.apart:.1f} standard "
+            f"Record `{best.name}`: even {best.pair[0]} and {best.pair[1]} differ there by {number(best.apart)} standard "
             "deviations of robots of one build."
         )
     elif by_hand:

@@ -274,4 +274,4 @@ def _between(low: float | None, high: float | None) -> str | None:
 
 
 def _parameters(one: Found) -> str:
-    return ", ".join(f"{name} {span}".replace("-", "−") for name, span in one.parameters.items())
+    return ", ".join(f"{name} {span}" for name, span in one.parameters.items())

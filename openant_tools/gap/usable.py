@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from openant_tools.gap.handling import lifted, lying, pushed
 from openant_tools.gap.ramps import ramps
 from openant_tools.model.plant import Plant, Setup
+from openant_tools.numbers import exact, number, percent
 from openant_tools.recording.run import Run
 
 __all__ = ["LEAST_S", "Excluded", "Reason", "Usable", "usable"]
@@ -52,7 +53,7 @@ class Reason(StrEnum):
     RAMP = "a ramp to a pose"
     PUSHED = "joints moved by hand"
     BEGUN = "what was commanded before it began"
-    SHORT = f"under {LEAST_S:g} s between two others"
+    SHORT = f"under {exact(LEAST_S, 's')} between two others"
 
 
 @dataclass(frozen=True)
@@ -95,11 +96,13 @@ class Usable:
 
     def __str__(self) -> str:
         """One line for a report."""
-        line = f"{self.run}: {self.usable_s:.1f} of {self.seconds:.1f} s can be simulated ({100 * self.share:.0f} %)"
+        line = f"{self.run}: {number(self.usable_s, 's')} of {number(self.seconds, 's')} can be simulated ({percent(self.share)})"
         lost: dict[Reason, float] = {}
         for one in self.excluded:
             lost[one.reason] = lost.get(one.reason, 0.0) + one.seconds
-        why = ", ".join(f"{reason.value} {s:.1f} s" for reason, s in sorted(lost.items(), key=lambda item: -item[1]))
+        why = ", ".join(
+            f"{reason.value} {number(s, 's')}" for reason, s in sorted(lost.items(), key=lambda item: -item[1])
+        )
         return f"{line}; left out: {why}" if why else line
 
 

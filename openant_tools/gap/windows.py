@@ -19,6 +19,7 @@ from openant_tools.gap.folds import Part, folds
 from openant_tools.gap.regime import slope
 from openant_tools.gap.usable import LEAST_S, Usable, usable
 from openant_tools.model.plant import Plant, Setup
+from openant_tools.numbers import number
 from openant_tools.recording.run import Run
 
 __all__ = ["AT_MOST_S", "Selection", "cut", "select", "window_s"]
@@ -66,9 +67,10 @@ class Selection:
 
     def __str__(self) -> str:
         """One line for a report."""
-        able, whole = sum(one.usable_s for one in self.usable), sum(one.seconds for one in self.usable)
+        able = number(sum(one.usable_s for one in self.usable), "s")
+        whole = number(sum(one.seconds for one in self.usable), "s")
         lines = "; ".join(str(one) for one in self.usable if one.excluded)
-        line = f"{self.seconds:.1f} s simulated, of {able:.1f} s that can be and {whole:.1f} s recorded"
+        line = f"{number(self.seconds, 's')} simulated, of {able} that can be and {whole} recorded"
         return f"{line} ({lines})" if lines else line
 
 

@@ -7,13 +7,14 @@ import math
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
 from openant_tools.model.gap import share_closed
+from openant_tools.numbers import number, percent, span
 
 __all__ = ["closed", "rest_words", "sentence", "standing", "what_next", "where_words"]
 
 
 def sentence(found: Diagnosis) -> str:
     """The verdict, with its confidence."""
-    sure = f"confidence {100 * found.confidence:.0f} %"
+    sure = f"confidence {percent(found.confidence)}"
     if found.verdict == NONE:
         return f"Nothing beyond the floor and the tolerance of robots of one build ({sure})."
     by_name = {one.effect: one for one in reversed(found.effects)}
@@ -21,35 +22,31 @@ def sentence(found: Diagnosis) -> str:
         sets = "; ".join(" or ".join(group) for group in found.ambiguous_with)
         candidates = sets or " or ".join(one.effect for one in found.effects[:2])
         words = f"The gap is real, but these runs cannot tell its causes apart: {candidates} ({sure})."
-        share = 100 * closed(found)
-        return (
-            f"{words} With {found.selected[0]} {share:.0f} % of it closes on held-out runs."
-            if found.selected
-            else words
-        )
+        if not found.selected:
+            return words
+        return f"{words} With {found.selected[0]} {percent(closed(found))} of it closes on held-out runs."
     if found.verdict == UNEXPLAINED:
         best = _closest(found)
         closest = "" if best is None else f"; closest is {best.effect}" + (
-            "" if best.gap_closed is None else f", which closes {100 * best.gap_closed:.0f} % of it"
+            "" if best.gap_closed is None else f", which closes {percent(best.gap_closed)} of it"
         )  # fmt: skip
         left = f" {rest_words(found)}" if found.rest else ""
         return f"The gap is real, and nothing known here explains it{closest} ({sure}).{left}"
     one = by_name[found.verdict]
     words = f"{one.effect} ({where_words(one.joints)}): {catalogue()[one.effect].words}"
-    share = closed(found)
     beside = [name for name in found.selected if name != found.verdict]
     more = f", with {' and '.join(beside)} beside it" if beside else ""
-    return f"{words}{more}; the improved model closes {100 * share:.0f} % of the gap on held-out runs ({sure})."
+    return f"{words}{more}; the improved model closes {percent(closed(found))} of the gap on held-out runs ({sure})."
 
 
 def rest_words(found: Diagnosis) -> str:
     """What is left once the improved model has done what it can, and what that follows."""
     rest = found.rest
-    low, high = rest["band_hz"]
-    text = f"What is left is largest at {rest['joint']}, {100 * rest['share']:.0f} % of it between {low:.1f} and {high:.1f} Hz"
+    band = span(*rest["band_hz"], "Hz", decimals=1)
+    text = f"What is left is largest at {rest['joint']}, {percent(rest['share'])} of it from {band}"
     if rest["regressor"] is None:
         return f"{text}, where it follows nothing that was looked at."
-    return f"{text}, where it follows {rest['regressor']} (coherence {rest['coherence']:.2f})."
+    return f"{text}, where it follows {rest['regressor']} (coherence {number(rest['coherence'], decimals=2)})."
 
 
 def where_words(joints: tuple[str, ...] | str) -> str:
@@ -71,15 +68,15 @@ def standing(found: Diagnosis, one: Found) -> str:
         return "closest, and not enough"
     if one.effect in found.selected:
         lost = found.removal.get(one.effect)
-        return "selected" + (f"; without it {100 * lost:.0f} % less closes" if lost is not None else "")
+        return "selected" + (f"; without it {percent(lost)} less closes" if lost is not None else "")
     if any(one.effect in group for group in found.ambiguous_with):
         return "these runs cannot tell"
     leads = next((other for other in found.effects if other.effect == found.verdict), None)
     if one.gap_closed is not None and leads is not None and leads.gap_closed is not None:
-        return f"by itself it closes {100 * one.gap_closed:.0f} %, {leads.effect} {100 * leads.gap_closed:.0f} %"
+        return f"by itself it closes {percent(one.gap_closed)}, {leads.effect} {percent(leads.gap_closed)}"
     if one.gap_closed is not None:
-        return f"by itself it closes {100 * one.gap_closed:.0f} %, which is not enough"
-    return f"the recording looks as with it in {100 * one.probability:.0f} of 100 cases"
+        return f"by itself it closes {percent(one.gap_closed)}, which is not enough"
+    return f"the recording looks as with it in {percent(one.probability)} of cases"
 
 
 def _closest(found: Diagnosis) -> Found | None:

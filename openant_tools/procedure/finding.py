@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from openant_tools.errors import BadInput
 from openant_tools.files import json_text, known, read_json, write_text
-from openant_tools.numbers import chosen, number, span
+from openant_tools.numbers import chosen, number, span, stored
 from openant_tools.procedure.unfinished import forget
 
 if TYPE_CHECKING:  # a manual that lists the steps opens without NumPy
@@ -257,19 +257,15 @@ def keep(finding: Finding, folder: RobotFolder, recording: str | None = None) ->
         if p.value is None:
             continue
         name = f"bench.{p.name}"
-        values[name] = _short(p.value)
+        values[name] = stored(p.value)
         provenance[name] = Provenance(
             "measured",
             finding.command,
             recording or folder.relative(path),
             finding.date,
-            None if p.low is None else _short(p.low),
-            None if p.high is None else _short(p.high),
+            None if p.low is None else stored(p.low),
+            None if p.high is None else stored(p.high),
         )
     if values:
         folder.update(values, provenance=provenance)
     return path
-
-
-def _short(value: float) -> float:
-    return float(f"{value:.6g}")  # for a file

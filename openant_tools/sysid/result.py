@@ -21,7 +21,7 @@ from openant_tools.errors import BadInput
 from openant_tools.files import json_text, read_json, write_text
 from openant_tools.model.gap import HORIZON_S
 from openant_tools.model.mjcf import write_model
-from openant_tools.numbers import number
+from openant_tools.numbers import number, stored
 from openant_tools.robot.config import EffectEntry, Provenance
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.pair import PLAIN, mark_of
@@ -211,9 +211,9 @@ def write_robot(result: Identification, folder: RobotFolder) -> None:
         for joint in value.joints or (label,):
             # What stayed at its prior is written too: it must not be an older fit's value that is read beside this model.
             path = f"identified.{kind}.{joint}"
-            values[path] = _rounded(value.value)
+            values[path] = stored(value.value)
             provenance[path] = (
-                source("fitted", value.low and _rounded(value.low), value.high and _rounded(value.high))
+                source("fitted", value.low and stored(value.low), value.high and stored(value.high))
                 if value.accepted
                 else source("not in the data" if value.verdict == "not in the data" else "as given")
             )
@@ -249,8 +249,3 @@ def effects_beside(result: Identification, folder: RobotFolder) -> list[EffectEn
         elif entry.pair == given:
             beside.append(replace(entry, pair=pair_of(result)))
     return beside
-
-
-def _rounded(value: float) -> float:
-    """Six digits: more than any interval leaves meaning to, and fit for reading."""
-    return float(f"{value:.6g}")
