@@ -309,7 +309,9 @@ def _mend(servos: Servos, odd: Sequence[Difference]) -> Subroutine[list[Differen
     """Ask what to do with them, do it; what was accepted as it is."""
     for line in in_words(odd, remedy=False):
         yield Say(line, "warn")
-    answer = yield Ask("What to do with them? What you accept is expected from now on.", (FIX_ALL, FIX_ONE, ACCEPT), default=FIX_ALL)
+    answer = yield Ask(
+        "What to do with them? What you accept is expected from now on.", (FIX_ALL, FIX_ONE, ACCEPT), default=FIX_ALL
+    )
     chosen = list(odd) if answer == FIX_ALL else []
     if answer == FIX_ONE:
         for one in odd:
