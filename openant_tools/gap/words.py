@@ -42,7 +42,8 @@ def sentence(found: Diagnosis) -> str:
 def rest_words(found: Diagnosis) -> str:
     """What is left once the improved model has done what it can, and what that follows."""
     rest = found.rest
-    band = span(*rest["band_hz"], "Hz", decimals=1)
+    low, high = rest["band_hz"]
+    band = span(low, high, "Hz", decimals=1)
     text = f"What is left is largest at {rest['joint']}, {percent(rest['share'])} of it from {band}"
     if rest["regressor"] is None:
         return f"{text}, where it follows nothing that was looked at."

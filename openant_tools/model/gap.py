@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.numbers import typed
+
 __all__ = ["HORIZON_S", "Gap", "excess", "gap", "share_closed"]
 
 Array = NDArray[np.float64]
@@ -22,6 +24,9 @@ class Gap:
 
     horizon: float
     full: float
+
+    def as_json(self) -> dict[str, float]:
+        return {f"gap_{typed(HORIZON_S)}_s_rad": self.horizon, "gap_full_rad": self.full}
 
 
 def gap(measured: Array, simulated: Array) -> float:

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from openant_tools.errors import BadInput
+from openant_tools.numbers import exact, number
 from openant_tools.sysid.intervals import TWO_SIDED_95
 
 __all__ = ["FAMILY_ERROR", "Change", "Comparison", "Estimate", "Snapshot", "compare", "holm"]
@@ -176,8 +177,8 @@ def _finite(value: float) -> float | None:
 
 def _percent(change: Change) -> str:
     if not change.a.value:
-        return f"{change.difference:+.3g} {change.unit}"
-    return f"{100 * change.difference / abs(change.a.value):+.0f} %"
+        return number(change.difference, change.unit, sign=True)
+    return number(change.difference / abs(change.a.value), "share", sign=True, decimals=0)
 
 
 def compare(a: Snapshot, b: Snapshot) -> Comparison:
@@ -287,7 +288,7 @@ def _notes(a: Snapshot, b: Snapshot, changes: Sequence[Change]) -> tuple[str, ..
     tempting = [c.name for c in changes if c.status == "same" and c.p < FAMILY_ERROR]
     if tempting:
         notes.append(
-            f"{', '.join(tempting)} would differ if looked at alone (p < {FAMILY_ERROR:g}); among so many parameters that is "
+            f"{', '.join(tempting)} would differ if looked at alone (p < {exact(FAMILY_ERROR)}); among so many parameters that is "
             "expected. Record again to decide."
         )
     if all(change.status == "not comparable" for change in changes):

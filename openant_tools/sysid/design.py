@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.model.plant import Plant, Setup, load_plant
-from openant_tools.numbers import percent
+from openant_tools.numbers import exact, percent
 from openant_tools.sysid.excitation import (
     Around,
     Chirp,
@@ -77,7 +77,9 @@ def design(asked: Planned, seconds: float, progress: Progress | None = None) -> 
     """
     slots = int((seconds - Protocol("", "", ()).seconds) / SLOT_S + 1e-9)
     if slots < 2:
-        raise BadInput(f"{seconds:g} s hold no two motions", remedy=f"give it {2 * SLOT_S + 3:.0f} s or more")
+        raise BadInput(
+            f"{exact(seconds, 's')} hold no two motions", remedy=f"give it {exact(2 * SLOT_S + 3, 's')} or more"
+        )
     plant = load_plant(asked.model, asked.space.joints, Setup.STAND, electrical=True)
     plant.model.opt.timestep = max(plant.timestep, STEP_S)
     drawn = _candidates(asked.space, np.random.default_rng(asked.seed))

@@ -17,6 +17,7 @@ from openant_tools.comms.motion import catch
 from openant_tools.model.plant import Plant, Setup
 from openant_tools.model.rollout import fill_setpoints
 from openant_tools.model.servo import read_damping, read_electrical, read_velocity_gain, torque_limit
+from openant_tools.numbers import number
 from openant_tools.recording.run import Facts, Run
 from openant_tools.sysid.excitation import CommandSpace
 from openant_tools.sysid.protocols import Protocol
@@ -100,7 +101,7 @@ class Forecast:
         if self.astray:
             out.append(f"{where} {', '.join(self.astray)} goes farther than a guard allows")
         if self.lean_rad > FALLEN_RAD:
-            out.append(f"{where} the body leans by {np.degrees(self.lean_rad):.0f}°")
+            out.append(f"{where} the body leans by {number(self.lean_rad, 'rad', decimals=0)}")
         if self.torso_down:
             out.append(f"{where} the torso touches the floor")
         return out

@@ -27,6 +27,7 @@ from openant_tools.model.floor import disagreement, floors
 from openant_tools.model.gap import HORIZON_S, Gap, share_closed
 from openant_tools.model.of_run import own_model, plants_of
 from openant_tools.model.plant import Plant, Setup, load_plant, setup_of
+from openant_tools.numbers import column, exact, number, percent, span
 from openant_tools.recording.run import Run
 from openant_tools.robot.config import EffectEntry as Entry
 from openant_tools.sysid.choice import Choice, Fold, Settled, by_gain, by_motion, pays, pooled, settle
@@ -91,8 +92,8 @@ FOLLOWED = (
 )
 #: and where held-out runs sent back what was chosen
 SENT_BACK = (
-    "Held-out runs are not followed better by what was chosen ({:.1f} → {:.1f} mrad over full runs, {:.1f} → {:.1f} mrad at "
-    + f"{HORIZON_S:g} s), so all of it goes back: they differ from the fitted runs in what these do not tell."
+    "Held-out runs are not followed better by what was chosen ({} → {} over full runs, {} → {} at "
+    + f"{exact(HORIZON_S, 's')}), so all of it goes back: they differ from the fitted runs in what these do not tell."
 )
 #: share by which a supply falls before it is worth a word: a servo measures it in steps of 0.1 V
 SAG = 0.03
@@ -141,15 +142,10 @@ class Value:
         return self.verdict not in SILENT
 
     @property
-    def interval(self) -> str:
-        """For reading; empty where there is none."""
-        return "" if self.low is None or self.high is None else f"[{self.low:.4g}, {self.high:.4g}]"
-
-    @property
     def words(self) -> str:
         """The verdict for reading."""
         if self.verdict == "conflict":
-            return f"conflict: the prior says {self.prior_low:.4g} to {self.prior_high:.4g}"
+            return f"conflict: the prior says {span(self.prior_low, self.prior_high, self.unit)}"
         return f"tied to {self.tied_to}" if self.tied_to else self.verdict
 
 
@@ -244,10 +240,6 @@ class Identification:
 
     def as_json(self) -> dict[str, Any]:
         """`fit.json` (formats, section 6)."""
-
-        def figures(figure: Gap) -> dict[str, float]:
-            return {f"gap_{HORIZON_S:g}_s_rad": figure.horizon, "gap_full_rad": figure.full}
-
         return {
             "schema": "openant.fit/1",
             "model": str(self.model),
@@ -274,16 +266,16 @@ class Identification:
                 "runs": list(self.judged_on),
                 "in_turn": self.in_turn,
                 "nested": self.in_turn,
-                "before": figures(self.before),
-                "after": figures(self.after),
+                "before": self.before.as_json(),
+                "after": self.after.as_json(),
                 "floor_rad": self.floor,
                 "doubt": self.doubt,
                 "share_closed": share_closed(self.before.full, self.after.full, self.floor),
             },
             "chosen": {
                 "folds": [list(names) for names in self.folds],
-                "before": figures(self.choice.before),
-                "after": figures(self.choice.after),
+                "before": self.choice.before.as_json(),
+                "after": self.choice.after.as_json(),
                 "measured_supply": self.datasets[0].measured_supply,
             },
             "accepted": list(self.accepted),
@@ -427,9 +419,8 @@ def identify(
         judged = judged if data[0].measured_supply == supplies[0] else datasets(hold_out, True)
         before, after = gaps(judged, chosen, [np.zeros(len(chosen)), u])
         if not (after.horizon < before.horizon and after.full < before.full):
-            sent_back.append(
-                SENT_BACK.format(1e3 * before.full, 1e3 * after.full, 1e3 * before.horizon, 1e3 * after.horizon)
-            )
+            left = (before.full, after.full, before.horizon, after.horizon)
+            sent_back.append(SENT_BACK.format(*(number(rad, "rad", name="error") for rad in left)))
             kept, u, after = np.zeros(len(chosen), bool), np.zeros(len(chosen)), before
     found = verdicts(estimate, kept)
     values = tuple(
@@ -635,7 +626,7 @@ def _telemetry_notes(runs: Sequence[Run], telemetry: Sequence[Telemetry]) -> Ite
     if spiked:
         yield f"Samples that stand alone far from their neighbours are errors of telemetry and left out: {', '.join(spiked)}."
     lost = [
-        f"{100 * n / len(run.t):.0f} % of pos.{joint} in {run.name}"
+        f"{percent(n / len(run.t))} of pos.{joint} in {run.name}"
         for run, found in zip(runs, telemetry, strict=True)
         for joint, n in found.missing.items()
         if n > MISSING * len(run.t)
@@ -660,7 +651,7 @@ def _supply_notes(runs: Sequence[Run], joints: Sequence[str]) -> Iterator[str]:
         if run.facts.supply_v and run.has("volt", joints):
             volts = float(np.nanquantile(run.signal("volt", joints), 0.05))
             if volts < (1 - SAG) * run.facts.supply_v:
-                low[run.name] = f"{volts:.1f} of {run.facts.supply_v:g} V in {run.name}"
+                low[run.name] = f"{number(volts, decimals=1)} of {exact(run.facts.supply_v, 'V')} in {run.name}"
     if low:
         yield (
             f"The supply fell to {', '.join(low.values())}, and gains and torque limits with it: `--measured-supply` lets them "
@@ -670,11 +661,7 @@ def _supply_notes(runs: Sequence[Run], joints: Sequence[str]) -> Iterator[str]:
 
 def _notes(estimate: Estimate, joints: Sequence[str], runs: Sequence[Run], values: Sequence[Value]) -> tuple[str, ...]:
     notes = []
-    torn = [
-        f"{value.name} ({value.halves[0]:.4g} and {value.halves[1]:.4g} {value.unit})"
-        for value in values
-        if value.halves
-    ]
+    torn = [f"{value.name} ({' and '.join(column(value.halves, value.unit))})" for value in values if value.halves]
     if torn:
         notes.append(
             f"Two halves of the data contradict each other about {', '.join(torn)}: the robot changed between them, or the "
@@ -683,7 +670,7 @@ def _notes(estimate: Estimate, joints: Sequence[str], runs: Sequence[Run], value
         )
     if estimate.stamp_error_s > STAMP_ERROR_S:
         notes.append(
-            f"Time stamps miss the moments of sampling by {1e3 * estimate.stamp_error_s:.1f} ms (standard deviation, row by "
+            f"Time stamps miss the moments of sampling by {number(estimate.stamp_error_s, 's')} (standard deviation, row by "
             "row). Fast motion counts for less because of it."
         )
     if not estimate.converged:

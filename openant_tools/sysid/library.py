@@ -22,6 +22,7 @@ from openant_tools.model.floor import disagreement, floors
 from openant_tools.model.gap import HORIZON_S, Gap, gap
 from openant_tools.model.of_run import models_of, own_model, plants_of, with_model
 from openant_tools.model.plant import Plant, load_plant, setup_of
+from openant_tools.numbers import exact, number
 from openant_tools.recording.facts import with_facts
 from openant_tools.recording.plausibility import check_run
 from openant_tools.recording.run import Run
@@ -226,8 +227,8 @@ class Judgement:
 
     def __repr__(self) -> str:
         return (
-            f"{self.model}: full run {1e3 * self.gap.full:.2f} mrad, {HORIZON_S:g} s {1e3 * self.gap.horizon:.2f} mrad, "
-            f"floor {1e3 * self.floor:.2f} mrad"
+            f"{self.model}: full run {_error(self.gap.full)}, {exact(HORIZON_S, 's')} {_error(self.gap.horizon)}, "
+            f"floor {_error(self.floor)}"
         )
 
 
@@ -361,19 +362,20 @@ def report(found: Identification, folder: File, *, robot: File | None = None) ->
 
 def summary(found: Identification) -> str:
     """What a fit found, for reading: each value with its 95 % interval, unit and verdict, the gap on held-out runs, the notes."""
-    width = max(len(value.name) for value in found.values)
-    wide = max(len(value.interval) for value in found.values)
-    lines = [
-        f"{value.name:{width}}  {value.value:10.5g}  {value.interval:{wide}}  {value.unit:10} {value.words}"
-        for value in found.values
-    ]
+    shown = {value.name: number(value.value, value.unit, value.low, value.high) for value in found.values}
+    width, wide = (max(map(len, words)) for words in (shown.keys(), shown.values()))
+    lines = [f"{value.name:{width}}  {shown[value.name]:{wide}}  {value.words}" for value in found.values]
     judged = "runs left out in turn, each with all choices made anew" if found.in_turn else "held-out runs"
     lines.append(
-        f"error on {judged}, full run: {1e3 * found.before.full:.2f} → {1e3 * found.after.full:.2f} mrad; "
-        f"{HORIZON_S:g} s: {1e3 * found.before.horizon:.2f} → {1e3 * found.after.horizon:.2f} mrad; "
-        f"floor {1e3 * found.floor:.2f} mrad"
+        f"error on {judged}, full run: {_error(found.before.full)} → {_error(found.after.full)}; "
+        f"{exact(HORIZON_S, 's')}: {_error(found.before.horizon)} → {_error(found.after.horizon)}; "
+        f"floor {_error(found.floor)}"
     )
     return "\n".join([*lines, *found.notes])
+
+
+def _error(rad: float) -> str:
+    return number(rad, "rad", name="error")
 
 
 def _listed(runs: Run | Sequence[Run]) -> list[Run]:

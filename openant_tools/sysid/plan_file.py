@@ -13,6 +13,7 @@ import tomlkit
 
 from openant_tools.errors import BadInput
 from openant_tools.files import read_toml, write_text
+from openant_tools.numbers import exact, number, typed
 from openant_tools.sysid import excitation, floor_motion
 from openant_tools.sysid.excitation import Segment
 from openant_tools.sysid.protocols import LONGEST_S, Protocol
@@ -95,7 +96,9 @@ def _recording(entry: Any, where: str, name: str, words: str) -> Protocol:
         raise BadInput("lets go of legs that carry the robot", where=where, remedy='write setup = "stand"')
     made = Protocol(name, words, read, setup, heading)
     if made.seconds > LONGEST_S:
-        raise BadInput(f"takes {made.seconds:.0f} s", where=where, remedy=f"keep it below {LONGEST_S:.0f} s")
+        raise BadInput(
+            f"takes {number(made.seconds, 's')}", where=where, remedy=f"keep it below {exact(LONGEST_S, 's')}"
+        )
     return made
 
 
@@ -148,12 +151,12 @@ def _value(kind: Any, key: str, value: Any, where: str) -> Any:
         if not items or any(abs(item) >= 1 for item in items):
             raise BadInput(f"`{key}` are not shares between -1 and 1", where=where, remedy="correct them")
         return items
-    number = _number(value, key, where)
-    if key.endswith("share") and not 0 < number <= 1:
-        raise BadInput(f"`{key}` is {number:g}, not a share between 0 and 1", where=where, remedy="correct it")
-    if number <= 0:
-        raise BadInput(f"`{key}` is {number:g}, it must be more than 0", where=where, remedy="correct it")
-    return number
+    given = _number(value, key, where)
+    if key.endswith("share") and not 0 < given <= 1:
+        raise BadInput(f"`{key}` is {typed(given)}, not a share between 0 and 1", where=where, remedy="correct it")
+    if given <= 0:
+        raise BadInput(f"`{key}` is {typed(given)}, it must be more than 0", where=where, remedy="correct it")
+    return given
 
 
 def _number(value: Any, key: str, where: str) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.numbers import exact
 from openant_tools.sysid.excitation import (
     Around,
     Chirp,
@@ -260,10 +261,13 @@ def _filled(name: str, words: str, parts: tuple[Part, ...], seconds: float | Non
     # In a row of recordings the shortest must still hold its motion.
     shortest = SHORTEST_S if len(parts) == 1 else max(SHORTEST_S, default / 2)
     if not total >= shortest:
-        raise BadInput(f"{total} s is too short for {name}", remedy=f"give it {shortest:.0f} s or more")
+        raise BadInput(
+            f"{exact(total, 's')} is too short for {name}", remedy=f"give it {exact(math.ceil(shortest), 's')} or more"
+        )
     if total > LONGEST_S * len(parts):
         raise BadInput(
-            f"{total:g} s is too long for {name}", remedy=f"record for {LONGEST_S:.0f} s at most, and repeat"
+            f"{exact(total, 's')} is too long for {name}",
+            remedy=f"record for {exact(LONGEST_S, 's')} at most, and repeat",
         )
     played = []
     for part in parts:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from openant_tools.errors import BadInput
 from openant_tools.model.floor import resolution
 from openant_tools.model.plant import Plant
+from openant_tools.numbers import number
 from openant_tools.recording.run import Run
 
 __all__ = ["Telemetry", "check_model", "span", "without_errors"]
@@ -115,8 +116,8 @@ def check_model(run: Run, plant: Plant, simulated: Array) -> None:
         varies, left = float(np.std(pos[on, j])), float(np.std(pos[on, j] - simulated[on, j]))
         if left > UNLIKE * varies:
             raise BadInput(
-                f"{joint} moves otherwise than in the model altogether: it varies by {varies:.2f} rad, the model's error by "
-                f"{left:.2f} rad",
+                f"{joint} moves otherwise than in the model altogether: it varies by {number(varies, 'rad')}, the model's error by "
+                f"{number(left, 'rad')}",
                 where=where,
                 remedy="check whether this is the model of this robot: its masses, gains, axes and zeros; if it is, "
                 "`openant gap diagnose` says what else may move it so",

@@ -16,6 +16,7 @@ from openant_tools.comms import messages
 from openant_tools.comms.engine_process import EngineProcess
 from openant_tools.comms.messages import EngineConfig
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number
 from openant_tools.procedure.step import Progress, Say, Subroutine
 from openant_tools.recording.run import Facts
 from openant_tools.sysid.excitation import CommandSpace, Multisine
@@ -90,7 +91,7 @@ def takes(
         if k:
             place = f"-{protocol.setup}"
             if protocol.heading_rad:
-                place += f"-{math.degrees(protocol.heading_rad):.0f}"
+                place += f"-{round(math.degrees(protocol.heading_rad))}"
 
         def path(what: str, place: str = place) -> Path:
             return out.with_name(f"{out.stem}{place}{what}{out.suffix}")
@@ -206,5 +207,5 @@ def _work(
         worked += piece.seconds
         now = engine.ask(messages.ReadRegister(_TEMPERATURE))
         joint, rise = max(((name, now[name] - before[name]) for name in now), key=lambda pair: pair[1])
-    yield Say(f"{worked:.0f} s of work: {joint} is {rise} K warmer")
+    yield Say(f"{number(worked, 's')} of work: {joint} is {rise} K warmer")
     return worked, rise

@@ -21,7 +21,7 @@ from openant_tools.errors import BadInput
 from openant_tools.files import json_text, read_json, write_text
 from openant_tools.model.gap import HORIZON_S
 from openant_tools.model.mjcf import write_model
-from openant_tools.numbers import number, stored
+from openant_tools.numbers import exact, number, stored
 from openant_tools.robot.config import EffectEntry, Provenance
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.pair import PLAIN, mark_of
@@ -93,11 +93,11 @@ def stating_both(plain: Identification, tried: Identification) -> Identification
         for one, other in ((plain.after.full, tried.after.full), (plain.after.horizon, tried.after.horizon))
     )
     judged = "runs left out in turn" if plain.in_turn else "held-out runs"
-    errors = f"Error on {judged}: {full} over full runs; {short} at {HORIZON_S:g} s."
+    errors = f"Error on {judged}: {full} over full runs; {short} at {exact(HORIZON_S, 's')}."
     if both := chosen_in_turn(tried, plain):
         errors += f" Chosen between the two anew without each: {number(both.full, 'rad', name='gap')} and {number(both.horizon, 'rad', name='gap')}."
     found = [
-        f"{value.name} = {value.value:.3g} {value.unit}"
+        f"{value.name} = {number(value.value, value.unit)}"
         for value in tried.values
         if value.accepted and value.value and value.name.partition(".")[0] in TRIED
     ]
@@ -137,7 +137,7 @@ def pairs(plain: Identification, richer: Identification) -> dict[str, Any]:
     both = chosen_in_turn(richer, plain)
     return {
         "wins": "with_effects",
-        "chosen_in_turn": both and {f"gap_{HORIZON_S:g}_s_rad": both.horizon, "gap_full_rad": both.full},
+        "chosen_in_turn": both and both.as_json(),
         "plain": one(plain, ""),
         "with_effects": one(richer, f"{WITH_EFFECTS}/"),
     }

@@ -85,7 +85,7 @@ def test_the_same_seed_plays_the_same() -> None:
 def test_what_cannot_be_played_is_refused() -> None:
     with pytest.raises(BadInput, match=r"no protocol 'chrip' → use one of full, stand, chirp"):
         protocol("chrip")
-    with pytest.raises(BadInput, match=r"2\.0 s is too short"):
+    with pytest.raises(BadInput, match=r"2 s is too short"):
         protocol("stand", 2.0)
     with pytest.raises(BadInput, match="limits of knee_fl leave no room around the home pose"):
         CommandSpace.around_home({"knee_fl": (-0.5, 0.5)})
@@ -363,8 +363,8 @@ def test_the_list_says_what_is_played_where() -> None:
             "with seed 4 the recording to hold out would play the same",
         ),
         (["--out", "a.mcap", "--rate", "nan"], "--rate is nan → give it a number"),
-        (["--out", "a.mcap", "--seconds", "1e9"], "1e+09 s is too long for full → record for 600 s at most"),
-        (["--out", "a.mcap", "--seconds", "9"], "9.0 s is too short for full → give it 20 s or more"),
+        (["--out", "a.mcap", "--seconds", "1e9"], "1000000000 s is too long for full → record for 600 s at most"),
+        (["--out", "a.mcap", "--seconds", "9"], "9 s is too short for full → give it 20 s or more"),
     ],
 )
 def test_what_cannot_be_recorded_is_refused(arguments: list[str], words: str) -> None:

@@ -125,7 +125,7 @@ def test_a_model_of_another_robot_is_named(tmp_path: Path) -> None:
     run = plants.run_of(columns, t, ["joint"], "swing")
     check_model(run, own, Rollouts(own, [run])().pos[0])
     with pytest.raises(
-        BadInput, match=r"swing: joint moves otherwise than in the model altogether: it varies by 0\.\d+ rad"
+        BadInput, match=r"swing: joint moves otherwise than in the model altogether: it varies by \d+\.\d°"
     ):
         check_model(run, other, Rollouts(other, [run])().pos[0])
     with pytest.raises(
