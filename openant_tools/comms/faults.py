@@ -8,6 +8,7 @@ from enum import StrEnum
 from openant_tools.comms.protocol2 import Error
 from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import HardwareFault
+from openant_tools.numbers import number
 
 __all__ = [
     "REFUSALS", "BrokenAnswer", "Cause", "NeverSilent", "NoAnswer", "Refused", "missing_answers", "refusal_words",
@@ -54,7 +55,7 @@ class NeverSilent(BrokenAnswer):
 
     def __init__(self, path: str, baud: int, count: int, seconds: float) -> None:
         super().__init__(
-            SILENCE["flood"].says.format(count=count, seconds=seconds, baud=baud),
+            SILENCE["flood"].says.format(count=count, seconds=number(seconds, "s"), baud=baud),
             where=path,
             remedy=SILENCE["flood"].do,
         )

@@ -25,6 +25,7 @@ from openant_tools.comms.silence import (
 )
 from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.servo import BAUD_CODES, servo_model
 
@@ -164,7 +165,7 @@ class _Rate:
         if noise:
             self.doubts.append(_words("garbled_list", count=noise, baud=bus.line.baud))
         if wait_s == PATIENT_S and bus.clock.now() - began > wait_s + QUIET_S / 2:
-            self.doubts.append(_words("still_coming", baud=bus.line.baud, seconds=wait_s))
+            self.doubts.append(_words("still_coming", baud=bus.line.baud, seconds=number(wait_s, "s")))
         return found
 
     def _alone(self, id: int) -> FoundServo | None:

@@ -19,6 +19,7 @@ from openant_tools.comms.faults import BrokenAnswer, NoAnswer
 from openant_tools.comms.ports import Host, PortHolder
 from openant_tools.comms.troubles import SILENCE
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.numbers import number, span
 from openant_tools.robot.servo import BAUD_CODES, hardware_errors, servo_model
 
 __all__ = [
@@ -297,7 +298,7 @@ class _Questions:
         if self._lateness.busy:
             return self._late((id,))
         if after > usual:
-            return self._say("late_answers", (id,), after_ms=after * 1e3)
+            return self._say("late_answers", (id,), after=number(after, "s"))
         return self._say("intermittent", (id,))
 
     def _error(self, id: int) -> Silence:
@@ -330,7 +331,8 @@ class _Questions:
         supply = self._supply([id for id in self.asked if id not in left])
         if supply is not None:
             volts, low, high = supply
-            return [self._say("supply", left, volts=volts, low=low, high=high)]
+            allowed = span(low, high, "V", decimals=1)
+            return [self._say("supply", left, volts=number(volts, "V", decimals=1), range=allowed)]
         if all(self.heard[id].late_s > LATE_SHARE for id in left):
             return [self._late(left)]
         if len(left) == len(self.asked):
@@ -414,7 +416,7 @@ def _together(found: Sequence[Silence], questions: _Questions) -> Silence:
     for one in found:
         key = (
             one.cause,
-            *(str(value) for name, value in one.values.items() if name not in ("who", "id", "after_ms", "late")),
+            *(str(value) for name, value in one.values.items() if name not in ("who", "id", "after", "late")),
         )
         if key in grouped:
             values = {name: value for name, value in one.values.items() if name != "who"}

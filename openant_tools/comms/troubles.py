@@ -44,7 +44,7 @@ SILENCE: Mapping[str, Trouble] = {
     ),
     "flood": Trouble(
         "nothing can be read although bytes come all the time",
-        "the line never falls silent: {count} bytes that are no answer in {seconds:.1f} s at {baud} baud",
+        "the line never falls silent: {count} bytes that are no answer in {seconds} at {baud} baud",
         "something talks without being asked: another master on the bus, an IMU's port, a servo that broke, or noise",
         "something talks unasked: another program on this port, a wrong adapter, or an open wire that picks up noise; unplug "
         "the servos' cable: where it goes on, it is the adapter or this computer",
@@ -57,7 +57,7 @@ SILENCE: Mapping[str, Trouble] = {
     ),
     "late_answers": Trouble(
         "answers are called late or lost although every servo is well",
-        "{who} answers after {after_ms:.0f} ms, which is too late",
+        "{who} answers after {after}, which is too late",
         "the adapter, a USB hub or a virtual machine holds answers back",
         "set the latency timer to 1 ms (`openant comms ports`), and plug the adapter in without a hub",
     ),
@@ -100,7 +100,7 @@ SILENCE: Mapping[str, Trouble] = {
     ),
     "still_coming": Trouble(
         "a scan lists fewer servos than there are",
-        "answers at {baud} baud were still coming after {seconds:.2f} s, when the time for the last id was over: others may be "
+        "answers at {baud} baud were still coming after {seconds}, when the time for the last id was over: others may be "
         "missing",
         "something delays the answers to a broadcast ping beyond what the vendor allows",
         "scan again; set the latency timer to 1 ms (`openant comms ports`), and plug the adapter in without a hub",
@@ -119,7 +119,7 @@ SILENCE: Mapping[str, Trouble] = {
     ),
     "supply": Trouble(
         "some or all servos are silent",
-        "{who} is silent, and those that answer are supplied with {volts:.1f} V: they need {low:.1f} to {high:.1f} V",
+        "{who} is silent, and those that answer are supplied with {volts}: they need {range}",
         "a servo below its voltage does not start",
         "look at the power connector and at the supply",
     ),

@@ -18,8 +18,8 @@ __all__ = ["page"]
 #: what stands in the words' fields on the page
 EXAMPLE: Mapping[str, object] = {
     "who": "knee_fl (id 31)", "late": "this computer was late by up to 41 ms in 7 % of cycles", "port": "/dev/ttyUSB0",
-    "after_ms": 48.0, "error": "overload", "advice": HARDWARE_ERRORS[-1].advice, "id": 31, "level": 1, "answers": LEVELS[1],
-    "baud": 57600, "speed": "1000000 baud", "volts": 5.1, "low": 6.5, "high": 14.8, "count": 13, "seconds": 0.79,
+    "after": "48 ms", "error": "overload", "advice": HARDWARE_ERRORS[-1].advice, "id": 31, "level": 1, "answers": LEVELS[1],
+    "baud": 57600, "speed": "1000000 baud", "volts": "5.1 V", "range": "6.5 to 14.8 V", "count": 13, "seconds": "0.79 s",
     "before": "hip_fl", "first": "knee_fl", "other": "/dev/serial/by-id/usb-FTDI…", "group": "dialout",
 }  # fmt: skip
 _READER: Mapping[str, object] = {"who": "python monitor.py (process 4711)"}
