@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from openant_tools.errors import BadInput, OpenAntError
+from openant_tools.numbers import exact
 
 __all__ = [
     "LARGEST_TOML", "atomic_writer", "decoded", "json_text", "known", "parse_json", "parse_toml", "read_json", "read_text",
@@ -136,7 +137,9 @@ def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
     with path.open("rb") as stream:
         data = stream.read(largest + 1)
     if len(data) > largest:
-        raise BadInput(f"is larger than {largest / 2**20:.0f} MiB", where=path, remedy="is it the file that you mean?")
+        raise BadInput(
+            f"is larger than {exact(largest / 2**20, 'MiB')}", where=path, remedy="is it the file that you mean?"
+        )
     return decoded(data, path)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.model.gap import gap
+from openant_tools.numbers import number
 from openant_tools.recording.run import Run
 
 __all__ = ["disagreement", "floors", "noise", "resolution", "sensor_floors", "stamp_error", "steps"]
@@ -149,7 +150,7 @@ def disagreement(runs: Sequence[Run], joints: Sequence[str]) -> str:
         return ""
     worst = joints[int(np.argmax(found / np.maximum(least, 1e-12)))]
     return (
-        f"the repeats disagree: two plays of one motion differ by {1e3 * shown:.2f} mrad, {shown / sensors:.0f} times what the sensors "
+        f"the repeats disagree: two plays of one motion differ by {number(shown, 'rad', name='error')}, {number(shown / sensors, decimals=0)} times what the sensors "
         f"leave, most at {worst} → something changed between them (heat, a loose horn, another start): record them again"
     )
 

@@ -279,7 +279,7 @@ def actuator_element(root: etree._Element, plant: Plant, j: int) -> etree._Eleme
 
 
 def number(value: float) -> str:
-    return f"{value:.10g}"
+    return f"{value:.10g}"  # for a file
 
 
 def numbers(values: Sequence[float] | NDArray[np.float64]) -> str:

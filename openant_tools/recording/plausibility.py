@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.numbers import number, typed
 from openant_tools.recording.run import BODY_COLUMNS, JOINT_SIGNALS, Array, Run
 
 __all__ = ["LIMITS", "Limit", "check_names", "check_run", "check_time", "need_signals", "problems"]
@@ -94,13 +95,13 @@ def problems(run: Run, where: str) -> Iterator[BadInput]:
     if len(wrong):
         norm = float(np.linalg.norm(quaternion[wrong[0]]))
         place = _place(where, "base.qw|qx|qy|qz", int(wrong[0]), run.t)
-        yield BadInput(f"a quaternion of norm {norm:.3g} is no orientation", where=place, remedy="normalise it")
+        yield BadInput(f"a quaternion of norm {number(norm)} is no orientation", where=place, remedy="normalise it")
     # At rest and on average when walking, an accelerometer shows 9.81 m/s²; a median of 1 is the same in g.
     with np.errstate(invalid="ignore"):
         norm_acc = np.linalg.norm(run.signal("acc", ("x", "y", "z")), axis=1)
     if np.isfinite(norm_acc).any() and 0.8 < float(np.nanmedian(norm_acc)) < 1.25:
         yield BadInput(
-            f"the body's specific force is {float(np.nanmedian(norm_acc)):.2f} in the median",
+            f"the body's specific force is {number(float(np.nanmedian(norm_acc)))} in the median",
             where=f"{where}, columns acc.x|y|z",
             remedy="accelerations are in m/s² (g × 9.81)",
         )
@@ -109,7 +110,7 @@ def problems(run: Run, where: str) -> Iterator[BadInput]:
         away = np.flatnonzero((command < run.t[0] - 3600.0) | (command > run.t[-1] + 3600.0))
         if len(away):
             yield BadInput(
-                f"cmd_t = {float(command[away[0]]):.6g} s is not on the clock of t",
+                f"cmd_t = {typed(command[away[0]])} s is not on the clock of t",
                 where=_place(where, "cmd_t", int(away[0]), run.t),
                 remedy="give both on the host's monotonic clock, in s",
             )
@@ -188,7 +189,7 @@ def need_signals(run: Run, signals: Sequence[str], where: str) -> None:
         raise BadInput(what, where=where, remedy=remedy)
     if "cmd" in signals and len(run.t) > 1 and float(np.median(np.diff(run.t))) > _SLOWEST_ROW:
         raise BadInput(
-            f"rows are {float(np.median(np.diff(run.t))):.3g} s apart",
+            f"rows are {number(float(np.median(np.diff(run.t))), 's')} apart",
             where=f"{where}, column t",
             remedy="t is in s (ms × 0.001, µs × 1e-6, ns × 1e-9)",
         )
@@ -209,12 +210,12 @@ def _value_problems(name: str, values: Array, limit: Limit, t: Array, where: str
         # The farthest value is the one that a reader sees at once to be wrong.
         row = int(np.flatnonzero(wrong)[0])
         unit = JOINT_SIGNALS.get(name.partition(".")[0]) or BODY_COLUMNS.get(name, "")
-        shown = f"{values[row]:.6g}" + (f" {unit}" if unit not in ("", "1") else "")
+        shown = typed(values[row]) + (f" {unit}" if unit not in ("", "1") else "")
         yield BadInput(f"{shown} cannot be", where=_place(where, name, row, t), remedy=limit.remedy)
 
 
 def _place(where: str, column: str, row: int, t: Array) -> str:
-    return f"{where}, column {column}, row {row + 1} (t = {t[row]:.6g} s)"
+    return f"{where}, column {column}, row {row + 1} (t = {typed(t[row])} s)"
 
 
 def _nearest(name: str, known: Sequence[str]) -> str | None:

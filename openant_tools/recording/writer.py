@@ -27,6 +27,7 @@ from mcap.records import Message
 from mcap.writer import CompressionType, Writer
 
 from openant_tools.errors import BadInput, OpenAntError, StorageFault
+from openant_tools.numbers import number
 from openant_tools.recording.facts import facts_to_json
 from openant_tools.recording.pictures import PICTURE, PICTURE_TOPIC, picture_message, picture_schema
 from openant_tools.recording.run import Facts
@@ -351,7 +352,7 @@ class RecordingWriter:
         if self._kept_t is None:
             self._look_what_is_kept()
         if self._kept_t is not None:
-            kept = f"what was recorded until t = {self._kept_t:.3f} s is kept, {self._kept} rows"
+            kept = f"what was recorded until t = {number(self._kept_t, 's', decimals=3)} is kept, {self._kept} rows"
         return RecordingStopped(
             f"{what}, the recording stopped" + (f"; {kept}" if kept else ""),
             where=self.path,

@@ -18,6 +18,7 @@ from tomlkit.exceptions import TOMLKitError
 
 from openant_tools.errors import BadInput
 from openant_tools.files import decoded, parse_toml
+from openant_tools.numbers import typed
 from openant_tools.robot.fields import ConfigProblem, choice, number, port, read, stranger, switch, text, vector, whole
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS, Kind
 from openant_tools.robot.kit import KITS, PLATFORM_PWM_LIMIT
@@ -402,7 +403,7 @@ def _motors(table: Any, problems: list[ConfigProblem]) -> dict[str, MotorSection
             problems.append(
                 ConfigProblem(
                     f"motors.{motor.joint}.min_rad",
-                    f"{motor.min_rad:.6g} is not below max_rad, {motor.max_rad:.6g}",
+                    f"{typed(motor.min_rad)} is not below max_rad, {typed(motor.max_rad)}",
                     "swap them",
                 )
             )
@@ -480,8 +481,8 @@ def _observation(table: Any, problems: list[ConfigProblem]) -> dict[str, tuple[f
             problems.append(
                 ConfigProblem(
                     f"observation.{column}",
-                    f"{value[0]:.6g} to {value[1]:.6g} {unit} cannot be",
-                    f"low must be below high, both within ±{largest:.4g} {unit}",
+                    f"{typed(value[0])} to {typed(value[1])} {unit} cannot be",
+                    f"low must be below high, both within ±{typed(largest, 4)} {unit}",
                 )
             )
         else:

@@ -40,7 +40,7 @@ IMPRATIO = 10
 
 def _n(*values: float) -> str:
     # Adding 0 turns −0 into 0.
-    return " ".join(f"{value + 0:.6g}" for value in values)
+    return " ".join(f"{value + 0:.6g}" for value in values)  # for a file
 
 
 def _look_from(x: float, y: float, z: float) -> str:

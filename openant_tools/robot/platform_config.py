@@ -18,6 +18,7 @@ from typing import Any
 
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json, write_bytes
+from openant_tools.numbers import number, typed
 from openant_tools.robot.config import MAX_ANGLE_RAD, MAX_OFFSET_RAD, Provenance, RobotConfig, read_document
 from openant_tools.robot.folder import RobotFolder, create_robot
 from openant_tools.robot.joints import JOINT_NAMES, JOINTS
@@ -58,12 +59,10 @@ def _number(value: Any, where: str, low: float, high: float, unit: str) -> float
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise BadInput("is no number", where=where)
     if not low <= value <= high:
-        degrees = unit == "rad" and math.radians(abs(value)) <= high
-        raise BadInput(
-            f"{value:.6g} {unit} cannot be",
-            where=where,
-            remedy=f"if degrees were meant write {math.radians(value):.6g}" if degrees else f"{low:.4g} to {high:.4g}",
-        )
+        remedy = f"{typed(low, 4)} to {typed(high, 4)}"
+        if unit == "rad" and math.radians(abs(value)) <= high:
+            remedy = f"if degrees were meant write {typed(math.radians(value))}"
+        raise BadInput(f"{typed(value)} {unit} cannot be", where=where, remedy=remedy)
     return float(value)
 
 
@@ -148,7 +147,7 @@ def _read_motors(motors: Any, path: Path, values: dict[str, Any], notes: list[st
         offset = values.get(f"motors.{joint.name}.zero_offset_rad")
         if offset is not None and off_grid(offset) > 1e-4:
             notes.append(
-                f"the offset of {joint.name}, {offset:.6g} rad, is {math.degrees(off_grid(offset)):.3g}° off the "
+                f"the offset of {joint.name}, {typed(offset)} rad, is {number(off_grid(offset), 'rad')} off the "
                 "multiples of 45° that the platform's config maker writes"
             )
 
@@ -220,7 +219,7 @@ def export_notes(config: RobotConfig, out: Path | None, *, on_grid: bool = False
     worst = max(config.motors.values(), key=lambda motor: off_grid(motor.zero_offset_rad))
     if on_grid and off_grid(worst.zero_offset_rad) > 1e-4:
         notes.append(
-            f"rounding to 45° moves the zero of {worst.joint} by {math.degrees(off_grid(worst.zero_offset_rad)):.2f}°, "
+            f"rounding to 45° moves the zero of {worst.joint} by {number(off_grid(worst.zero_offset_rad), 'rad')}, "
             "the most of all joints"
         )
     if config.bus.baud != PLATFORM_BAUD:

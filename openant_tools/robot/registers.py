@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.numbers import typed
 
 __all__ = [
     "EEPROM_END", "LOAD_PER_COUNT", "PULSES_PER_TURN", "PWM_FULL", "RAD_PER_PULSE", "RAD_S_PER_COUNT", "Register",
@@ -93,10 +94,10 @@ class Register:
         low, high = self.range
         if not low <= counts <= high:
             unit = f" {self.unit}" if self.unit else ""
-            raise BadInput(
-                f"{self.name} cannot be {counts} (it goes from {low} to {high}"
-                + (f", that is {low * self.scale:.4g} to {high * self.scale:.4g}{unit})" if self.scale != 1 else ")")
-            )
+            ends = f"{low} to {high}"
+            if self.scale != 1:
+                ends += f", that is {typed(low * self.scale, 4)} to {typed(high * self.scale, 4)}{unit}"
+            raise BadInput(f"{self.name} cannot be {counts} (it goes from {ends})")
 
     @property
     def range(self) -> tuple[int, int]:

@@ -591,7 +591,7 @@ def test_oddities_are_noted(tmp_path: Path) -> None:
     data["motor_list"][2]["offset"] += math.radians(3)
     notes = "\n".join(read_platform_config(write_platform(tmp_path / "ant20.json", data)).notes)
     assert "hip_rr has id 11 (place 0 of the list); the platform's guide gives it 10" in notes
-    assert "the offset of hip_fr, -0.733038 rad, is 3° off the multiples of 45°" in notes
+    assert "the offset of hip_fr, -0.733038 rad, is 3.0° off the multiples of 45°" in notes
     assert "the file's name says body tag 20, camera_tag_ids.body says 12" in notes
 
 
@@ -647,7 +647,7 @@ def test_an_export_says_what_the_platform_cannot(ant: RobotFolder, capsys: pytes
     assert (code, json.loads(out)["motor_list"][0]["offset"], err) == (0, 0.8, "")
     code, out, err = run(capsys, "config", "export", "--robot", ant.path, "--grid")
     assert json.loads(out)["motor_list"][0]["offset"] == pytest.approx(math.pi / 4)
-    assert "rounding to 45° moves the zero of hip_rr by 0.84°" in err
+    assert "rounding to 45° moves the zero of hip_rr by 0.8°" in err
     target = ant.path / "mine.json"
     assert "names its files after the tag on the torso, here ant12.json" in run(
         capsys, "config", "export", "--robot", ant.path, "--out", target
