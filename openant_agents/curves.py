@@ -19,6 +19,7 @@ from openant_agents.runs import CurvePoint, read_curve, read_facts
 from openant_env.metrics import WINDOW_S
 from openant_tools.errors import BadInput
 from openant_tools.files import write_bytes
+from openant_tools.numbers import exact
 
 __all__ = ["Band", "RunCurve", "band", "group_runs", "plot_curves", "plot_groups", "read_run_curve"]
 
@@ -230,7 +231,7 @@ def _label(axes: Any) -> None:
     """Names, units and a quiet grid."""
     axes.axhline(0.0, color="0.6", linewidth=0.8)
     axes.set_xlabel("robot time (min)")
-    axes.set_ylabel(f"average reward over {WINDOW_S:.0f} s (cm/s)")
+    axes.set_ylabel(f"average reward over {exact(WINDOW_S, 's')} (cm/s)")
     axes.grid(color="0.92")
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from openant_agents.policies import Policy
 from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput
+from openant_tools.numbers import exact
 
 __all__ = ["LIKELIEST", "SAMPLED", "Frame", "Plays", "PolicyPlay", "Way", "evaluate", "film"]
 
@@ -140,7 +141,9 @@ def evaluate(
         BadInput: a time that is not above 0, or no start.
     """
     if not seconds > 0.0 or starts < 1:
-        raise BadInput(f"there is nothing to evaluate in {starts} × {seconds:g} s", remedy="give a time above 0")
+        raise BadInput(
+            f"there is nothing to evaluate in {starts} × {exact(seconds, 's')}", remedy="give a time above 0"
+        )
 
     def played(number: int) -> PolicyPlay:
         def tell(done: float, average: float) -> None:

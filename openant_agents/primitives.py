@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
+from openant_tools.numbers import exact
 
 __all__ = ["LEGS", "PRIMITIVES", "SECONDS", "PrimitiveGait"]
 
@@ -66,7 +67,7 @@ class PrimitiveGait:
         self.steps = round(SECONDS / dt) if dt > 0.0 else 0
         if self.steps < 1 or abs(self.steps * dt - SECONDS) > 1e-6:
             raise BadInput(
-                f"steps of {dt:g} s do not divide a motion primitive of {SECONDS:g} s",
+                f"steps of {exact(dt, 's')} do not divide a motion primitive of {exact(SECONDS, 's')}",
                 remedy="use dt = 0.05, the paper's, or 0.1",
             )
         table = np.array([[_WORDS[word] for word in line.split()] for line in PRIMITIVES], float)

@@ -166,7 +166,7 @@ class TrainingRun:
             writer = csv.writer(stream)
             if new:
                 writer.writerow(INTERVENTION_COLUMNS)
-            writer.writerow((step, f"{seconds:.3f}", reason))
+            writer.writerow((step, f"{seconds:.3f}", reason))  # for a file
 
     def _cut(self, path: Path, size: int) -> None:
         if size == 0:
@@ -208,7 +208,7 @@ class TrainingRun:
 
     def add_curve_point(self, point: CurvePoint) -> None:
         assert self._curve is not None
-        self._curve.write(f"{point.step},{point.seconds:.3f},{point.average_reward_m_s:.6f}\n")
+        self._curve.write(f"{point.step},{point.seconds:.3f},{point.average_reward_m_s:.6f}\n")  # for a file
         self._curve.flush()
 
     def close(self) -> None:

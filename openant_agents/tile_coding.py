@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from openant_agents.compiled import compiled
 from openant_tools.errors import BadInput
+from openant_tools.numbers import typed
 
 __all__ = ["TileCoder"]
 
@@ -64,7 +65,7 @@ class TileCoder:
         if len(narrow):
             at = narrow[0]
             raise BadInput(
-                f"the bounds of observation {at} leave no room for tiles: {self.low[at]:g} to {self.high[at]:g}",
+                f"the bounds of observation {at} leave no room for tiles: {typed(self.low[at])} to {typed(self.high[at])}",
                 remedy="measure the bounds while the robot moves all its joints",
             )
         if not 1 <= tiles <= MOST_TILES:

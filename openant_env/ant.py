@@ -28,6 +28,7 @@ from openant_tools.effects.acting import Acting
 from openant_tools.effects.commands import CommandPath
 from openant_tools.errors import BadInput
 from openant_tools.model.rollout import fill_setpoints
+from openant_tools.numbers import exact, typed
 from openant_tools.robot.folder import RobotFolder
 
 __all__ = ["Ant"]
@@ -443,9 +444,9 @@ def _whole_steps(dt: float, timestep: float, where: Path) -> int:
     if steps < 1 or abs(ratio - steps) > 1e-6 * steps:
         below = max(1, math.floor(ratio)) * timestep if math.isfinite(ratio) else timestep
         raise BadInput(
-            f"dt = {dt:g} s is no whole number of the model's timestep of {timestep:g} s",
+            f"dt = {exact(dt, 's')} is no whole number of the model's timestep of {exact(timestep, 's')}",
             where=where,
-            remedy=f"use dt = {below:g} or {below + timestep:g}",
+            remedy=f"use dt = {typed(below)} or {typed(below + timestep)}",
         )
     return steps
 

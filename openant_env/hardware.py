@@ -35,6 +35,7 @@ from openant_env.turning import HALF_S, turning_action
 from openant_tools.comms.restart import Interlock, MotionStopped, Restart, StopCause, longest_wait_s
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.files import read_toml
+from openant_tools.numbers import exact, number, percent
 from openant_tools.recording.run import Facts
 from openant_tools.robot.derating import derating_of
 from openant_tools.robot.folder import RobotFolder
@@ -361,7 +362,7 @@ class AntHardware(AntBase):
             self._told_warm = self._t
             joint = int(self._shares.argmin())
             self._notice(
-                f"{self.robot.joints[joint]} is at {self._temps[joint]:.0f} °C: it goes {100 * self._shares[joint]:.0f} % of "
+                f"{self.robot.joints[joint]} is at {number(self._temps[joint], '°C', decimals=0)}: it goes {percent(self._shares[joint])} of "
                 "the way that it is told"
             )
 
@@ -416,7 +417,7 @@ class AntHardware(AntBase):
             if cmd_t - self._told_late > REPEAT_S:
                 self._told_late = cmd_t
                 self._notice(
-                    f"a step took {1e3 * period:.0f} ms instead of {1e3 * self.dt:.0f}, the {self._overruns}. late one: "
+                    f"a step took {number(period, 's')} instead of {number(self.dt, 's')}, the {self._overruns}. late one: "
                     "this computer is busy"
                 )
         return period
@@ -431,9 +432,11 @@ class AntHardware(AntBase):
             self._truncate(info, StopCause.FALL, "the robot lies on its back")
             return self._on_fall == "terminate", self._on_fall == "truncate"
         if lost > self._tag_patience_s:
-            self._truncate(info, StopCause.TAG, f"the camera has not seen the robot for {lost:.1f} s")
+            self._truncate(
+                info, StopCause.TAG, f"the camera has not seen the robot for {number(lost, 's', decimals=1)}"
+            )
         elif silent > IMU_PATIENCE_S:
-            self._truncate(info, StopCause.IMU, f"the IMU has sent nothing for {silent:.1f} s")
+            self._truncate(info, StopCause.IMU, f"the IMU has sent nothing for {number(silent, 's', decimals=1)}")
         elif self._wound:
             self._truncate(info, StopCause.CABLE, self._winding)
         elif self._turns > WINDING_TURNS:
@@ -517,7 +520,7 @@ class AntHardware(AntBase):
             self._need_word()
             why = why or self._why_paused
             if self._unattended and waited > (longest := longest_wait_s(self._stop_cause)):
-                self._interlock.end(f"{why} (for {longest / 60:g} min, and nobody is there)")
+                self._interlock.end(f"{why} (for {exact(longest / 60, 'min')}, and nobody is there)")
                 self._need_word()
             if waited > self._patience_s:
                 raise HardwareFault(f"the robot cannot go on: {why}", remedy="help it, and start again")
@@ -533,7 +536,7 @@ class AntHardware(AntBase):
             self.link.look(LOOK_S)
             waited = self.link.now() - began
         if said:
-            self._notice(f"going on after {waited:.0f} s")
+            self._notice(f"going on after {number(waited, 's')}")
         self._fallen_s, self._stop_cause = 0.0, None
 
     def _turn_back(self) -> str | None:
@@ -546,7 +549,7 @@ class AntHardware(AntBase):
                 return self._why_paused
             if self.link.now() - began > TURN_BACK_S:
                 self._tangled = True
-                why = f"the cable was wound up by {wound_up:.1f} turns, and turning back left {self._turns:.1f}"
+                why = f"the cable was wound up by {number(wound_up, 'turns', decimals=1)}, and turning back left {number(self._turns, decimals=1)}"
                 self._ended_by(StopCause.CABLE, why)
                 return why
             self._stride(turning_action(self.robot.joints, way, k), half_s)
@@ -562,7 +565,7 @@ class AntHardware(AntBase):
         # Legs are led back in the air, where no foot sticks, and set down at once: by a ramp's time it has tipped over.
         for action in (turning_action(self.robot.joints, 0.0, k), np.zeros(len(self.robot.joints))):
             self._stride(action, half_s)
-        self._notice(f"turned back in {self.link.now() - began:.0f} s")
+        self._notice(f"turned back in {number(self.link.now() - began, 's')}")
         self._take(self.link.stand(self.actions.rest, SETTLE_S))
         return self._unseen()
 
@@ -638,7 +641,7 @@ class AntHardware(AntBase):
 
     @property
     def _winding(self) -> str:
-        return f"the cable is wound up by {self._turns:.1f} turns to the {'left' if self._wound_rad > 0 else 'right'}"
+        return f"the cable is wound up by {number(self._turns, 'turns', decimals=1)} to the {'left' if self._wound_rad > 0 else 'right'}"
 
     @property
     def _wound(self) -> bool:
@@ -693,7 +696,7 @@ class AntHardware(AntBase):
             tripped = self._cooling.get(servo.joint, False)
             self._cooling[servo.joint] = temperature >= (cooled if tripped else limit - 1.0)
             if self._cooling[servo.joint]:
-                return f"{servo.joint} is at {temperature:.0f} °C, and cools down to {cooled:.0f} °C"
+                return f"{servo.joint} is at {number(temperature, '°C', decimals=0)}, and cools down to {number(cooled, '°C', decimals=0)}"
         return None
 
     def _unseen(self) -> str | None:

@@ -23,6 +23,7 @@ from openant_tools.comms.restart import POSE_RAD, MotionStopped, Restart, StopCa
 from openant_tools.comms.setup import camera_of_robot, config_of_robot, config_of_unknown_robot, imu_of_robot, open_bus
 from openant_tools.comms.state import passport_registers
 from openant_tools.errors import BadInput, HardwareFault
+from openant_tools.numbers import exact, number
 from openant_tools.recording.run import Facts
 from openant_tools.robot.config import RobotConfig
 from openant_tools.robot.folder import RobotFolder
@@ -48,7 +49,7 @@ def engine_rate(dt: float) -> float:
     """
     cycles = round(dt * ENGINE_HZ)
     if not dt > 0.0 or cycles < 1 or not 0.7 <= cycles / dt / ENGINE_HZ <= 1.5:
-        raise BadInput(f"dt = {dt:g} s is too short for the bus", remedy="use 0.01 s or more")
+        raise BadInput(f"dt = {exact(dt, 's')} is too short for the bus", remedy="use 0.01 s or more")
     return cycles / dt
 
 
@@ -280,7 +281,7 @@ class RobotLink:
         here = np.asarray(self._engine.description["position"], float).tolist()
         seen = {servo.joint: angle for servo, angle in zip(self.config.servos, here, strict=True)}
         apart, joint = max((abs(seen[joint] - angle), joint) for joint, angle in self._sunk.items())
-        return f"{joint} was moved by {apart:.2f} rad since the stop" if apart > POSE_RAD else None
+        return f"{joint} was moved by {number(apart, 'rad')} since the stop" if apart > POSE_RAD else None
 
     def forget_stop(self) -> None:
         """The builder has looked: where the robot lay after the last stop does not count."""

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from openant_tools.errors import BadInput
 from openant_tools.files import write_bytes
+from openant_tools.numbers import column
 from openant_tools.opengl import CHOSEN_GL
 
 __all__ = ["VIDEO_BYTES", "NoOpenGL", "Painter", "write_mp4", "write_strip", "write_video"]
@@ -224,13 +225,12 @@ def write_strip(pictures: Sequence[Image], file: Path, *, seconds_apart: float) 
     height, width, _ = pictures[0].shape
     close_together = ConstrainedLayoutEngine(w_pad=0.01, h_pad=0.01, wspace=0.0, hspace=0.0)
     figure = Figure(figsize=(2.4 * columns, 2.4 * rows * height / width), layout=close_together)
+    times = column([k * seconds_apart for k in range(len(pictures))], "s")
     for k, axes in enumerate(figure.subplots(rows, columns, squeeze=False).flat):
         axes.axis("off")
         if k < len(pictures):
             axes.imshow(pictures[k])
-            axes.text(
-                0.03, 0.95, f"{k * seconds_apart:.2f} s", transform=axes.transAxes, va="top", fontsize=9, color="0.15"
-            )
+            axes.text(0.03, 0.95, times[k], transform=axes.transAxes, va="top", fontsize=9, color="0.15")
     picture = io.BytesIO()
     figure.savefig(picture, format="png", dpi=160)
     write_bytes(file, picture.getvalue())
@@ -269,7 +269,7 @@ def write_mp4(pictures: Sequence[Image], file: Path, *, seconds_apart: float) ->
     made = file.with_name(f".{file.name}")
     command = [
         ffmpeg, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
-        "-r", f"{1 / seconds_apart:.6f}", "-i", "-", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", str(made),
+        "-r", f"{1 / seconds_apart:.6f}", "-i", "-", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", str(made),  # for a file
     ]  # fmt: skip
     try:
         done = subprocess.run(command, input=b"".join(map(bytes, pictures)), capture_output=True, check=False)

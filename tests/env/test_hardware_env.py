@@ -406,7 +406,7 @@ def test_hands_that_moved_the_robot_after_a_stop_keep_it_down(walker: Walker) ->
     sunk = walker.env.link._sunk
     assert {"hip_fl", "knee_rr"} < set(sunk)
     sunk["hip_fl"] += 0.6  # what it will find is not where it was
-    with pytest.raises(MotionStopped, match=r"hip_fl was moved by 0\.\d+ rad since the stop"):
+    with pytest.raises(MotionStopped, match=r"hip_fl was moved by \d+\.\d° since the stop"):
         walker.env.reset()
     assert walker.torque() == 0
     walker.env.resume()
