@@ -141,9 +141,9 @@ def typed(value: float, digits: int = 6) -> str:
     return str(int(value)) if float(value).is_integer() and abs(value) < 1e15 else f"{value:.{digits}g}"
 
 
-def stored(value: float) -> float:
-    """A number as files keep it: six digits, more than any interval leaves meaning to, and fit for reading."""
-    return float(f"{value:.6g}")  # for a file
+def stored(value: float, digits: int = 6) -> float:
+    """A number as files keep it: six digits are more than any interval leaves meaning to, and fit for reading."""
+    return float(f"{value:.{digits}g}")
 
 
 def span(low: float | None, high: float | None, unit: str = "", *, name: str = "", decimals: int | None = None) -> str:

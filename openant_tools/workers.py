@@ -79,7 +79,7 @@ def pass_on(share: float, words: str) -> None:
     fd = _progress_fd()
     if fd is not None:
         with contextlib.suppress(OSError):  # nobody listens any more
-            os.write(fd, f"{share:.4f} {words}\n".encode())
+            os.write(fd, f"{share:.4f} {words}\n".encode())  # for a file
 
 
 @functools.cache

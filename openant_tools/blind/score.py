@@ -19,6 +19,7 @@ from openant_tools.blind.run import folders_of, verdict_path
 from openant_tools.blind.sizes import KINDS
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json, read_toml, reading
+from openant_tools.numbers import number
 from openant_tools.procedure.intervals import wilson
 
 __all__ = ["Case", "Row", "Score", "read", "score"]
@@ -326,4 +327,4 @@ def truth_in_words(case: Case) -> str:
 
 
 def _short(value: Any) -> str:
-    return "[" + ", ".join(f"{v:.3g}" for v in value) + "]" if isinstance(value, list) else f"{value:.3g}"
+    return f"[{', '.join(map(number, value))}]" if isinstance(value, list) else number(value)

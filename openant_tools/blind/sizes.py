@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from openant_tools.numbers import typed
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.kit import PLATFORM_PWM_LIMIT, Kit, kit
 
@@ -54,6 +55,10 @@ def _even(ranges: Ranges, size: int, chance: np.random.Generator) -> float:
     return float(chance.uniform(*ranges[size]))
 
 
+def _range(ends: tuple[float, float]) -> str:
+    return "…".join(map(typed, ends))
+
+
 def _plain(name: str, unit: str, *ranges: tuple[float, float], more: Callable[..., Parameters] | None = None) -> Any:
     """A parameter in its own unit, and what else the effect needs."""
     assert len(ranges) == 3
@@ -62,7 +67,7 @@ def _plain(name: str, unit: str, *ranges: tuple[float, float], more: Callable[..
     def draw(size: int, chance: np.random.Generator, joints: Sequence[str], kit: Kit) -> Parameters:
         return {name: _even(three, size, chance), **(more(size, chance) if more else {})}
 
-    return draw, f"{name} " + ", ".join(f"{a:g}…{b:g}" for a, b in ranges) + (f" {unit}" if unit else "")
+    return draw, f"{name} " + ", ".join(map(_range, ranges)) + (f" {unit}" if unit else "")
 
 
 def _either(name: str, up: Ranges, down: Ranges, nominal: Callable[[str, Kit], float] | None = None) -> Any:
@@ -72,7 +77,7 @@ def _either(name: str, up: Ranges, down: Ranges, nominal: Callable[[str, Kit], f
         scale = _even(up if chance.random() < 0.5 else down, size, chance)
         return {name: scale * (nominal(joints[0], kit) if nominal else 1.0)}
 
-    pairs = [f"{c:g}…{d:g} or {a:g}…{b:g}" for (a, b), (c, d) in zip(up, down, strict=True)]
+    pairs = [f"{_range(less)} or {_range(more)}" for more, less in zip(up, down, strict=True)]
     return draw, f"{name} " + ", ".join(pairs) + (" × nominal" if nominal else "")
 
 
@@ -82,7 +87,7 @@ def _share(name: str, nominal: Callable[[str, Kit], float], *ranges: tuple[float
     def draw(size: int, chance: np.random.Generator, joints: Sequence[str], kit: Kit) -> Parameters:
         return {name: _even(three, size, chance) * nominal(joints[0], kit)}
 
-    return draw, f"{name} " + ", ".join(f"{a:g}…{b:g}" for a, b in ranges) + " × nominal"
+    return draw, f"{name} " + ", ".join(map(_range, ranges)) + " × nominal"
 
 
 def _limit(joint: str, kit: Kit) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 from openant_tools.blind.soak_set import read_soak_answers, read_verdicts, soak_facts
 from openant_tools.blind.soaks import CAUSES, SoakAnswer
 from openant_tools.files import write_bytes, write_text
+from openant_tools.numbers import number, percent, span, typed
 from openant_tools.procedure.intervals import wilson
 from openant_tools.report import plots
 
@@ -140,10 +141,10 @@ def table_lines(found: SoakScore) -> list[str]:
     """The figures as Markdown."""
     lines = ["| what | result | 95 % | n | asked |", "|---|---|---|---|---|"]
     for what, k, n, mark, fewer in found.rows:
-        low, high = wilson(k, n)
-        share = f"{100 * k / n:.1f} %" if n else "–"
+        share = percent(k / n, decimals=1) if n else "–"
+        known = span(*wilson(k, n), unit="share", decimals=1)
         sign = "≤" if fewer else "≥"
-        lines.append(f"| {what} | {share} | {100 * low:.1f} … {100 * high:.1f} % | {n} | {sign} {100 * mark:.0f} % |")
+        lines.append(f"| {what} | {share} | {known} | {n} | {sign} {percent(mark)} |")
     return lines
 
 
@@ -164,9 +165,9 @@ def _failures(found: SoakScore) -> list[str]:
         answer = case.answer
         values = ", ".join(f"{name} {value}" for name, value in answer.parameters.items())
         truth = f"{answer.cause} {' '.join(answer.where)} ({values})" if values else answer.cause
-        said = [f"{one['cause']} {one['probability']:.2f}" for one in case.said.get("causes", [])[:3]]
+        said = [f"{one['cause']} {number(one['probability'], decimals=2)}" for one in case.said.get("causes", [])[:3]]
         lacks = f", without {', '.join(answer.dropped)}" if answer.dropped else ""
-        log = f"{answer.maker}, {answer.seconds:.0f} s at {answer.rate_hz:.0f} Hz, {len(answer.joints)} servos{lacks}"
+        log = f"{answer.maker}, {number(answer.seconds, 's', decimals=0)} at {number(answer.rate_hz, 'Hz', decimals=0)}, {len(answer.joints)} servos{lacks}"
         lines.append(
             f"| {case.name} | {truth} | {case.said.get('error') or case.verdict} | {', '.join(said)} | {log} |"
         )
@@ -235,12 +236,12 @@ def write_soak_docs(found: SoakScore, path: Path) -> None:
         "<!-- Written by `openant comms blind score SET --docs docs/comms-blind.md`: do not edit. -->", "",
         "```sh long",
         f"openant comms blind make --out SET --seed-from COMMIT --key-file KEY --soaks {facts['soaks']} "
-        f"--healthy {facts['mix']['healthy']:.2g} --virtual {facts['mix']['virtual']:.2g}    # answers sealed",
+        f"--healthy {typed(facts['mix']['healthy'], 2)} --virtual {typed(facts['mix']['virtual'], 2)}    # answers sealed",
         "openant comms blind run SET",
         "openant comms blind score SET --key-file KEY --docs docs/comms-blind.md",
         "```", "", *_HOW, "", "## Result", "",
         f"{_how_many(found)}, {len(found.healthy)} of them healthy, {seed}, commitment of the answers "
-        f"`{facts['commitment']}`. {virtual} came from the virtual robot's bus. The slowest diagnosis took {longest:.1f} s.", "",
+        f"`{facts['commitment']}`. {virtual} came from the virtual robot's bus. The slowest diagnosis took {number(longest, 's')}.", "",
         *table_lines(found), "", *_by_cause(found), "",
         f"![Stated probability against share right]({os.path.relpath(pictures, path.parent)}/comms-blind-reliability.png)", "",
         "## Every failure", "", *(_failures(found) if found.failures else ["None."]), "",

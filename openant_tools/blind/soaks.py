@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from openant_tools.numbers import stored
 from openant_tools.robot.joints import JOINT_NAMES
 
 __all__ = ["CAUSES", "LEGS", "SoakAnswer", "SoakMix", "draw_soaks"]
@@ -160,7 +161,7 @@ def _where(
 
 def _between(chance: np.random.Generator, low: float, high: float) -> float:
     """Evenly over the logarithm, to four digits."""
-    return float(f"{np.exp(chance.uniform(np.log(low), np.log(high))):.4g}")
+    return stored(np.exp(chance.uniform(np.log(low), np.log(high))), 4)
 
 
 def _parameters(cause: str, maker: str, chance: np.random.Generator) -> dict[str, Any]:

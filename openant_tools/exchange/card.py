@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json
+from openant_tools.numbers import number
 from openant_tools.robot.folder import RobotFolder
 
 __all__ = ["card"]
@@ -54,7 +55,7 @@ def _diagnosis(folder: RobotFolder) -> str:
             before, after = float(gap["before"]), gap.get("after")
         except (OSError, BadInput, KeyError, TypeError, ValueError):
             continue
-        words = f"{verdict} (`{path.name}`), gap {1e3 * before:.1f} mrad"
+        words = f"{verdict} (`{path.name}`), gap {number(before, 'rad', name='gap')}"
         after = float(after) if isinstance(after, int | float) else math.nan
-        return words + (f", {1e3 * after:.1f} mrad with it" if math.isfinite(after) else "")
+        return words + (f", {number(after, 'rad', name='gap')} with it" if math.isfinite(after) else "")
     return "none was made"

@@ -18,6 +18,7 @@ import numpy as np
 
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json, reading
+from openant_tools.numbers import number, typed
 from openant_tools.optional import pa
 from openant_tools.recording.plausibility import check_time
 from openant_tools.recording.run import Array
@@ -288,7 +289,7 @@ def _matrix(column: pa.ChunkedArray, width: int, path: Path, name: str) -> Array
     if len(bad):
         value = numbers[bad[0]][~np.isfinite(numbers[bad[0]])][0]
         raise BadInput(
-            f"row {int(bad[0]) + 1} holds {value:g}", where=where, remedy="leave that episode out of the dataset"
+            f"row {int(bad[0]) + 1} holds {value}", where=where, remedy="leave that episode out of the dataset"
         )
     return numbers
 
@@ -308,7 +309,7 @@ def _episode(parts: Sequence[_Rows], dataset: DatasetFacts) -> DatasetEpisode:
     )
     if apart is not None and abs(apart * dataset.fps - 1.0) > RATE_SHARE:
         raise BadInput(
-            f"rows are {apart:.4g} s apart where meta/info.json says {dataset.fps:g} a second",
+            f"rows are {number(apart, 's')} apart where meta/info.json says {typed(dataset.fps)} a second",
             where=where,
             remedy="correct `fps` there; `timestamp` is in s",
         )

@@ -22,6 +22,7 @@ from openant_tools.exchange.lerobot_units import (
     joint_units,
     read_calibration,
 )
+from openant_tools.numbers import number, percent, typed
 from openant_tools.recording.plausibility import LIMITS
 from openant_tools.recording.run import Facts, Run
 
@@ -107,7 +108,7 @@ def read_conversion(
         farthest = float(np.abs(scale(np.array([seen[joint].low, seen[joint].high]))).max())
         if farthest > LIMITS["pos"].high:
             raise BadInput(
-                f"{joint}, read in {units[joint]}, reaches {farthest:.4g} rad",
+                f"{joint}, read in {units[joint]}, reaches {number(farthest, 'rad')}",
                 where=where,
                 remedy="an angle lies within four turns: say what it is in with --units, or mend the dataset",
             )
@@ -134,7 +135,7 @@ def convert(conversion: DatasetConversion) -> Iterator[Run]:
         if dataset.tasks.get(episode.index):
             notes.append(dataset.tasks[episode.index])
         if episode.counted:
-            notes.append(f"t is the frame over {dataset.fps:g} per s, not when a row was taken")
+            notes.append(f"t is the frame over {typed(dataset.fps)} per s, not when a row was taken")
         facts = Facts(names, resolution={"pos": RESOLUTION_RAD} if conversion.whole else {}, notes="; ".join(notes))
         yield Run(f"episode_{episode.index:03d}", facts, episode.t, columns)
 
@@ -205,7 +206,7 @@ def _remarks(
     for joint, one in seen.items():
         if units[joint] in ("normalised", "percent") and joint not in without and one.at_end > CUT_OFF * one.rows:
             yield (
-                f"{joint} is at an end of its calibrated range in {100 * one.at_end / one.rows:.0f} % of rows: LeRobot cuts "
+                f"{joint} is at an end of its calibrated range in {percent(one.at_end / one.rows)} of rows: LeRobot cuts "
                 "positions off there"
             )
 

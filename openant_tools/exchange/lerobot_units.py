@@ -20,6 +20,7 @@ import numpy as np
 
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json
+from openant_tools.numbers import number
 from openant_tools.recording.run import Array
 
 __all__ = [
@@ -187,7 +188,7 @@ def _body_unit(seen: Sequence[SeenRange], spans: Sequence[MotorRange | None], ro
         return "normalised", False
     if reach <= 2.0 * math.pi and not robot.startswith(IN_TURNS):
         raise BadInput(
-            f"no number leaves ±{reach:.3g}: these may be radians or degrees",
+            f"no number leaves ±{number(reach)}: these may be radians or degrees",
             remedy="say which: --units radians|degrees",
         )
     if any(one.at_end for one in seen):

@@ -278,4 +278,4 @@ def _origin(element: etree._Element, place: Array, turn: Rotation) -> None:
 
 
 def _n(*values: float) -> str:
-    return " ".join(f"{float(value):.12g}" for value in values)
+    return " ".join(f"{float(value):.12g}" for value in values)  # for a file

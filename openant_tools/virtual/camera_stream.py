@@ -38,6 +38,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from openant_tools.numbers import exact
 from openant_tools.virtual.camera_scene import OverheadCameraSettings, Scene
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ class VirtualCamera:
         if not self._port:
             try:
                 if not self._pipe.poll(timeout):
-                    raise RuntimeError(f"the virtual camera did not start within {timeout:.0f} s")
+                    raise RuntimeError(f"the virtual camera did not start within {exact(timeout, 's')}")
                 self._port = int(self._pipe.recv())
             except (EOFError, OSError):
                 raise RuntimeError("the virtual camera's process died while starting") from None
@@ -177,7 +178,7 @@ class _Picture:
         e = self.exposure
         return (
             f"Content-Type: image/jpeg\r\nContent-Length: {len(self.data)}\r\n"
-            f"X-Timestamp: {e.t:.6f}\r\nX-Delivered: {e.due:.6f}\r\n"
+            f"X-Timestamp: {e.t:.6f}\r\nX-Delivered: {e.due:.6f}\r\n"  # for a file
             f"X-Frame: {e.index}\r\nX-Ordinal: {e.ordinal}\r\n\r\n"
         ).encode()
 

@@ -14,6 +14,7 @@ import tomlkit
 
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.files import read_json
+from openant_tools.numbers import exact
 
 __all__ = ["VIRTUAL_DEFAULT", "clock_of_its_own", "placeable", "placed", "virtual_robot"]
 
@@ -133,7 +134,7 @@ def _await(process: subprocess.Popen[bytes], ready: Path, log: str) -> None:
                 else f"the virtual robot ended with status {process.returncode}"
             )
         if time.monotonic() > give_up:
-            raise HardwareFault(f"the virtual robot is not ready after {START_TIMEOUT_S:.0f} s")
+            raise HardwareFault(f"the virtual robot is not ready after {exact(START_TIMEOUT_S, 's')}")
         time.sleep(0.02)
 
 

@@ -12,8 +12,6 @@ from openant_tools.comms.hardware import changes
 from openant_tools.numbers import chosen, exact, number, percent, span, typed
 from openant_tools.procedure.journal import EepromWrite
 
-HOUSE = ROOT / "openant_tools"
-
 
 @pytest.mark.parametrize(
     ("value", "unit", "low", "high", "name", "shown"),
@@ -61,21 +59,13 @@ def test_columns_signs_and_shares():
 FORMATTED = re.compile(r":[-+<>^=]*[0-9]*(?:\.[0-9]+)?[gfe%]\}")
 
 
-#: they are filled in later, and kept as numbers
-TEMPLATES = {"troubles.py"}
-
-
-def test_screens_commands_and_reports_format_no_number_themselves():
-    """The one exception is a number that a computer reads, such as a coordinate in an SVG or a value in a file or a model."""
-    files = [*HOUSE.glob("tui/**/*.py"), *HOUSE.glob("**/*report*.py"), *HOUSE.glob("report/*.py"), *HOUSE.glob("procedure/*.py"), *HOUSE.glob("calib/*.py"), *HOUSE.glob("cli/*.py"), *HOUSE.glob("sysid/bench/*.py"),
-             *(HOUSE / "bringup" / f"{name}.py" for name in ("check", "comms_step", "gap_check", "identification")),
-             *HOUSE.glob("thermal/*.py"), *(path for path in HOUSE.glob("comms/**/*.py") if path.name not in TEMPLATES),
-             HOUSE / "sysid/rules.py", HOUSE / "robot/servo_gains.py",
-             HOUSE / "bringup/passport.py", HOUSE / "bringup/tracking.py", HOUSE / "comms/step_timing.py"]  # fmt: skip
+def test_no_module_formats_a_number_that_people_read():
+    """What a computer reads, such as a value in a file or a model, is marked as such."""
     found = [
-        f"{path.relative_to(HOUSE)}:{number}"
-        for path in sorted(files)
-        for number, line in enumerate(path.read_text().splitlines(), 1)
+        f"{path.relative_to(ROOT)}:{number}"
+        for package in ("openant_tools", "openant_env", "openant_agents")
+        for path in sorted((ROOT / package).rglob("*.py"))
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
         if FORMATTED.search(line) and "# for a file" not in line
     ]
     assert not found, f"print with openant_tools.numbers: {found}"

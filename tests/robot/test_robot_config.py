@@ -591,7 +591,7 @@ def test_oddities_are_noted(tmp_path: Path) -> None:
     data["motor_list"][2]["offset"] += math.radians(3)
     notes = "\n".join(read_platform_config(write_platform(tmp_path / "ant20.json", data)).notes)
     assert "hip_rr has id 11 (place 0 of the list); the platform's guide gives it 10" in notes
-    assert "the offset of hip_fr, -0.733038 rad, is 3.0° off the multiples of 45°" in notes
+    assert "the offset of hip_fr, -0.733038 rad, is 3° off the multiples of 45°" in notes
     assert "the file's name says body tag 20, camera_tag_ids.body says 12" in notes
 
 
