@@ -18,7 +18,7 @@ import numpy as np
 
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED
 
-__all__ = ["OUTSIDE", "WEIGHTS", "Decision", "Row", "adds", "chances", "decide", "weights"]
+__all__ = ["OUTSIDE", "WEIGHTS", "Decision", "Row", "adds", "chances", "decide", "weights", "worth_fitting"]
 
 #: the weights by their names: of logarithms of probabilities by the evidence, of what held-out data say of a cause, and of how much more
 #: its fit had promised; of how much likelier any cause made what it was fitted to, for all of them, and of what share of that is each one's;
@@ -161,6 +161,17 @@ def decide(rows: Sequence[Row], outside: float) -> Decision:
     if verdict == AMBIGUOUS:
         return Decision(AMBIGUOUS, p[named[0]] + p[named[1]], (best,), (tuple(named[:2]),))
     return Decision(verdict, p[verdict], (best,))
+
+
+def worth_fitting(probability: Mapping[str, float], likelier: Mapping[str, float]) -> list[str]:
+    """Causes in the order in which they may come out, by the evidence (0…1) and by how much likelier (nats) their first steps make the data."""
+    learned, most = weights(), max([0.0, *likelier.values()])
+
+    def worth(name: str) -> float:
+        share = math.log((max(likelier[name], 0.0) + SURE) / (most + SURE))
+        return learned["evidence"] * _log(probability[name]) + learned["share"] * share
+
+    return sorted(likelier, key=worth, reverse=True)
 
 
 def adds(rows: Sequence[Row]) -> Row | None:

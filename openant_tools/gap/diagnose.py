@@ -17,7 +17,7 @@ import numpy as np
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.errors import BadInput
 from openant_tools.gap.assess import Assessment, assess
-from openant_tools.gap.decide import Row, adds, decide
+from openant_tools.gap.decide import Row, adds, decide, worth_fitting
 from openant_tools.gap.diagnosis import AMBIGUOUS, Diagnosis
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.finding import Given, finding
@@ -30,8 +30,8 @@ __all__ = ["diagnose", "hypotheses", "prepare"]
 
 Progress = Callable[[float, str], None]
 
-#: causes that are fitted by themselves, the likeliest by the evidence; and beside what is chosen
-SUSPECTS, FURTHER = 5, 3
+#: causes whose first steps are looked at, the likeliest by the evidence; that are fitted by themselves; and beside what is chosen
+TRIED, SUSPECTS, FURTHER = 15, 5, 3
 #: causes of one improved model
 CAUSES = 3
 #: what a builder's word is worth who expects a cause: odds, to one
@@ -70,6 +70,8 @@ def diagnose(
     assessment = trials.assessment
     decision = decide(rows, assessment.outside)
     chosen = tuple(name for row in decision.selected for name in row.causes)
+    if chosen not in trials.closures:  # named by the evidence alone: held-out data do not tell of it
+        trials.fit([(), chosen])
     while decision.verdict != AMBIGUOUS and chosen in trials.closures and 0 < len(chosen) < CAUSES:
         tell(0.8 + 0.05 * len(chosen), f"what acts beside {' and '.join(chosen)}")
         trials.fit([chosen, *(further := _further(assessment, chosen))])
@@ -86,11 +88,13 @@ def hypotheses(experiment: Experiment, prior: Sequence[str], progress: Progress)
     assessment = assess(experiment.protocol, lambda share, words: progress(0.8 * share, words))
     leads = _expected(assessment, prior)
     ranked = sorted(leads, key=lambda name: -leads[name])
-    suspects = ranked[:SUSPECTS] + [name for name in prior if name in ranked[SUSPECTS:]]
-    progress(0.8, "what the likeliest causes close on held-out parts")
     trials = Trials.of(experiment, assessment)
     # By itself first: causes begin where tolerances have come to, with what was learnt of them, and so does none.
     trials.fit([()])
+    progress(0.82, "where the likeliest causes lead")
+    worth = worth_fitting(leads, trials.promise([name for name in ranked if trials.tells(name)][:TRIED]))
+    suspects = worth[:SUSPECTS] + [name for name in prior if name in ranked and name not in worth[:SUSPECTS]]
+    progress(0.86, "what those worth it close on held-out parts")
     trials.fit([(), *((name,) for name in suspects)])
     return trials, [trials.none(), *(trials.row((name,), leads[name]) for name in ranked)]
 

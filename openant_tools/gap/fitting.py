@@ -28,6 +28,8 @@ INDEPENDENT_S = 0.1
 ITERATIONS = 30
 #: and where a cause is held to what robots of one build differ by, from where it was best
 LOOKS = 3
+#: steps that tell which causes are worth following to their end
+FIRST_STEPS = 3
 #: how often slopes of tolerances are measured, each time where those before lead no farther
 MEASURED = 3
 #: how often errors of each joint in each run are taken to be as large as a step leaves them: no model of a real servo is true, and one
@@ -67,7 +69,7 @@ class Fits:
     def __init__(self, predictions: Predictions) -> None:
         self.predictions = predictions
         self._learnt: dict[int, Floats] = {}
-        self._settled = False
+        self._least = np.inf
         self.found = np.zeros(len(predictions.names))
 
     def nothing(self) -> Refit:
@@ -77,6 +79,12 @@ class Fits:
     def of(self, parts: Iterable[Part], x: Iterable[Mapping[str, float]]) -> Refit:
         """Causes at these coordinates, from where a fit without them came to."""
         return Refit(tuple(parts), tuple(x), self.found)
+
+    def promise(self, starts: Sequence[Refit], training: Sequence[int]) -> list[float]:
+        """Nats by which each is likelier than nothing, once that was fitted, after its first steps; slopes of tolerances as they are there."""
+        descents = [Descent.of(start, len(self.predictions.names), self._learnt) for start in starts]
+        self._follow(descents, list(training), FIRST_STEPS)
+        return [(self._least - one.least) / 2 for one in descents]
 
     def refit(
         self, starts: Sequence[Refit], training: Sequence[int], leave_out: Sequence[Collection[int]]
@@ -94,7 +102,13 @@ class Fits:
             if not one.causes:
                 self._keep(one)
         out = []
-        for one, within in zip(descents, self._within(descents, fitted), strict=True):
+        limited = self._within(descents, fitted)
+        # What may be larger leaves no more: where it does, its descent has ended in a hollow.
+        stuck = [n for n, one in enumerate(descents) if one.least - limited[n].least > 2 * LEAST_GAIN]
+        freed = self._descend([refit_at(limited[n].start, limited[n].at) for n in stuck], fitted) if stuck else ()
+        for n, one in zip(stuck, freed, strict=True):
+            descents[n] = one
+        for one, within in zip(descents, (-0.5 * one.least for one in limited), strict=True):
             folds = [[k for k in one.blocks if k not in left] for left in leave_out]
             # Where a fold leads otherwise than all of them together, from where these came to; held back it would not leave there.
             one.damping = 0.0
@@ -117,14 +131,14 @@ class Fits:
         out: Array = np.maximum(curvature, spread)
         return out
 
-    def _within(self, descents: Sequence[Descent], fitted: Sequence[int]) -> list[float]:
-        """How likely all is with no more of the last cause of each than robots of one build differ by."""
+    def _within(self, descents: Sequence[Descent], fitted: Sequence[int]) -> list[Descent]:
+        """Each with no more of its last cause than robots of one build differ by."""
         limited = [one.of_one_build() if one.causes else one for one in descents]
         beyond = [one for one in limited if not one.inside]
         for one in beyond:
             one.u, one.least = self._solve(one, list(one.blocks)), np.inf
         self._follow(beyond, fitted, LOOKS)
-        return [-0.5 * one.least for one in limited]
+        return limited
 
     def _no_worse(self, descents: list[Descent], fitted: Sequence[int]) -> list[Descent]:
         """Where a hypothesis leaves more than the first, which lacks its last cause, a descent from there in its place."""
@@ -138,7 +152,7 @@ class Fits:
     def _descend(self, starts: Sequence[Refit], fitted: Sequence[int]) -> list[Descent]:
         """Follow each start to where it leaves least on these runs."""
         # Slopes cost the most: causes begin with what was learnt of tolerances without them on the floor, where each takes a simulation.
-        learnt = {k: known for k, known in self._learnt.items() if k in fitted}
+        learnt = {k: known for k, known in self._learnt.items() if k in fitted and self._on_floor(k)}
         descents = [Descent.of(start, len(self.predictions.names), learnt) for start in starts]
         begun = descents
         for n in range(1 if learnt else MEASURED):
@@ -146,7 +160,7 @@ class Fits:
             for one in begun if not learnt else ():
                 one.begin()
             self._follow(begun, fitted, ITERATIONS)
-            if n == 0 and not self._settled and self._other_form(descents[0], fitted):
+            if n == 0 and self._least == np.inf and self._other_form(descents[0], fitted):
                 continue
             begun = [one for one, cost in zip(begun, before, strict=True) if cost - one.least > 2 * LEAST_GAIN]
             if not begun:
@@ -179,10 +193,12 @@ class Fits:
 
     def _keep(self, found: Descent) -> None:
         """Remember what was learnt of tolerances."""
-        on_floor = (k for k in found.slopes if self.predictions.protocol.runs[k].plant.setup is Setup.FLOOR)
-        self._learnt = {k: found.slopes[k][found.causes :] for k in on_floor}
-        self._settled = True
+        self._learnt = {k: slopes[found.causes :] for k, slopes in found.slopes.items()}
+        self._least = found.least
         self.found = found.at[found.causes :]
+
+    def _on_floor(self, k: int) -> bool:
+        return self.predictions.protocol.runs[k].plant.setup is Setup.FLOOR
 
     def _weight(self, k: int) -> Array:
         """(channels,) that errors of a run are multiplied by: its rows go together."""

@@ -20,6 +20,9 @@ __all__ = ["Trials"]
 
 Causes = tuple[str, ...]
 
+#: causes whose first steps are simulated side by side: what each has learnt of every run stays in memory meanwhile
+AT_ONCE = 5
+
 
 @dataclass
 class Trials:
@@ -44,18 +47,26 @@ class Trials:
         done = closures(self.fits, starts, self.experiment.folds, self.experiment.training)
         self.closures |= zip(sets, done, strict=True)
 
+    def tells(self, name: str) -> bool:
+        """Whether held-out data tell of a cause: not what joints' positions hardly show, without a sensor of the body, nor what no
+        simulation repeats."""
+        effect = catalogue()[name]
+        return not effect.random and (not effect.unseen_in_joints or bool(self.fits.predictions.sensed))
+
+    def promise(self, names: Sequence[str]) -> dict[str, float]:
+        """Cause → nats by which its first steps make what was measured likelier, once no cause was fitted."""
+        found = dict[str, float]()
+        for n in range(0, len(names), AT_ONCE):
+            some = names[n : n + AT_ONCE]
+            starts = [self._start((name,)) for name in some]
+            found |= zip(some, self.fits.promise(starts, self.experiment.training), strict=True)
+        return found
+
     def row(self, causes: Causes, probability: float) -> Row:
         """What is known of the last of some causes, beside the others."""
         places = tuple(self.assessment.place(name) for name in causes)
         one, other = self.closures.get(causes), self.closures.get(causes[:-1])
-        effect = catalogue()[causes[-1]]
-        # What joints' positions hardly show, without a sensor of the body, or no simulation repeats, held-out data do not tell.
-        if (
-            one is None
-            or other is None
-            or effect.random
-            or (effect.unseen_in_joints and not self.fits.predictions.sensed)
-        ):
+        if one is None or other is None or not self.tells(causes[-1]):
             return Row(causes, places, probability)
         return Row(
             causes, places, probability, one.support(other), one.foretold, one.likelier(other), one.left, one.closed - other.closed

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openant_tools.gap.decide import OUTSIDE, SURE, Row, adds, chances, decide, weights
+from openant_tools.gap.decide import OUTSIDE, SURE, Row, adds, chances, decide, weights, worth_fitting
 from openant_tools.gap.diagnosis import NONE
 
 NOTHING = Row((), probability=0.05)
@@ -73,6 +73,15 @@ def test_a_healthy_robot_has_nothing() -> None:
     ]
     found = decide(rows, outside=0.03)
     assert (found.verdict, found.selected) == ("none", ())
+
+
+def test_what_is_fitted_is_what_evidence_and_first_steps_speak_for() -> None:
+    probability = {"link_mass": 0.05, "weak_joint": 0.04, "backlash": 0.035, "load_friction": 0.03, "imu_bias": 0.9}
+    likelier = {"link_mass": 120.0, "weak_joint": 2.0, "backlash": -40.0, "load_friction": 260.0}
+    # What was not tried is not fitted; what makes nothing likelier stands by its evidence.
+    assert worth_fitting(probability, likelier) == ["load_friction", "link_mass", "weak_joint", "backlash"]
+    assert worth_fitting(probability, dict.fromkeys(likelier, -1.0)) == list(likelier)
+    assert worth_fitting(probability, {}) == []
 
 
 def test_a_further_cause_comes_in_where_it_is_likelier_there_than_not() -> None:
