@@ -51,12 +51,14 @@ assert np.isfinite(where).all() and np.ptp(where, axis=0).max() > 1e-4
 assert sum(cut) < 30, "its tracker lost the robot, or its motors failed"
 print(f"60 steps, {sum(cut)} truncated, {np.median(weight):.1f} m/s2 at rest, moved {np.linalg.norm(np.ptp(where, axis=0)):.2f} m")
 """
+#: a window's thread that still runs when Python takes itself apart aborts the program after its last word
+END = "\nimport os, sys\nsys.stdout.flush()\nos._exit(0)"
 LEARN = "import runpy, sys\nsys.path.insert(0, sys.argv[1]); sys.argv = sys.argv[2:]\nrunpy.run_path(sys.argv[0], run_name='__main__')"
 
 
 def run(program: str, *words: object, cwd: Path) -> str:
     """What Python says of a program with what is handed to it, on a screen of Xvfb; Enter is pressed whenever it asks."""
-    command = ["xvfb-run", "-a", sys.executable, "-c", HANDED + program, *map(str, words)]
+    command = ["xvfb-run", "-a", sys.executable, "-c", HANDED + program + END, *map(str, words)]
     done = subprocess.run(command, cwd=cwd, input="\n" * 100, capture_output=True, text=True, timeout=150, check=False)
     if done.returncode:
         sys.exit(done.stdout[-1500:] + done.stderr[-1500:])
