@@ -104,10 +104,8 @@ class Fits:
         out = []
         limited = self._within(descents, fitted)
         # What may be larger leaves no more: where it does, its descent has ended in a hollow.
-        stuck = [n for n, one in enumerate(descents) if one.least - limited[n].least > 2 * LEAST_GAIN]
-        freed = self._descend([refit_at(limited[n].start, limited[n].at) for n in stuck], fitted) if stuck else ()
-        for n, one in zip(stuck, freed, strict=True):
-            descents[n] = one
+        hollow = [n for n, one in enumerate(descents) if one.least - limited[n].least > 2 * LEAST_GAIN]
+        self._anew(descents, {n: refit_at(limited[n].start, limited[n].at) for n in hollow}, fitted)
         for one, within in zip(descents, (-0.5 * one.least for one in limited), strict=True):
             folds = [[k for k in one.blocks if k not in left] for left in leave_out]
             # Where a fold leads otherwise than all of them together, from where these came to; held back it would not leave there.
@@ -143,11 +141,16 @@ class Fits:
     def _no_worse(self, descents: list[Descent], fitted: Sequence[int]) -> list[Descent]:
         """Where a hypothesis leaves more than the first, which lacks its last cause, a descent from there in its place."""
         first = descents[0]
-        again = [n for n, one in enumerate(descents) if one.least - first.least > 2 * LEAST_GAIN]
-        starts = [without_last(descents[n].start, refit_at(first.start, first.at)) for n in again]
-        for n, one in zip(again, self._descend(starts, fitted) if again else (), strict=True):
-            descents[n] = one
+        worse = [n for n, one in enumerate(descents) if one.least - first.least > 2 * LEAST_GAIN]
+        bare = refit_at(first.start, first.at)
+        self._anew(descents, {n: without_last(descents[n].start, bare) for n in worse}, fitted)
         return descents
+
+    def _anew(self, descents: list[Descent], starts: Mapping[int, Refit], fitted: Sequence[int]) -> None:
+        """Follow some of them from other starts, in their places."""
+        if starts:
+            for n, one in zip(starts, self._descend(list(starts.values()), fitted), strict=True):
+                descents[n] = one
 
     def _descend(self, starts: Sequence[Refit], fitted: Sequence[int]) -> list[Descent]:
         """Follow each start to where it leaves least on these runs."""

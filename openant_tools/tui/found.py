@@ -175,17 +175,18 @@ def _list(evidence: Sequence[Evidence], width: int) -> list[Text]:
     if not evidence:
         return []
     names = max(len(spelled(one.name)) for one in evidence)
-    parts = [spelled(one.words).replace(" (", "| (").partition("|")[::2] for one in evidence]
-    values = max(len(value) for value, _ in parts)
+    words = [spelled(one.words) for one in evidence]
+    numbers = [shown.partition(" (")[0] for shown in words]  # without their intervals
+    values = max(map(len, numbers))
     bar = BAR if any(one.wanted for one in evidence) else 0
     before = 2 + names + 2 + values + bar + 2
     longest = max((len(word) for one in evidence for word in one.source.split()), default=0)
     beside = width - before >= max(16, longest)  # else the source stands below its number
     lines = []
-    for one, (value, interval) in zip(evidence, parts, strict=True):
+    for one, value, shown in zip(evidence, numbers, words, strict=True):
         line = Text(f"  {spelled(one.name):{names}}  ").append(f"{value:>{values}}", "bold")
         wanted = f"; as it should be: {one.wanted}" if one.wanted else ""
-        source = f"{interval} {one.source}{wanted}".strip()
+        source = f"{shown.removeprefix(value)} {one.source}{wanted}".strip()
         if one.wanted:
             line.append(" ").append_text(allowed_bar(one, BAR - 1))
         else:
