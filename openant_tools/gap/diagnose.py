@@ -6,13 +6,15 @@ comes to), `trials` (what the likeliest close on folds that their fits have not 
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.errors import BadInput
@@ -38,6 +40,14 @@ CAUSES = 3
 EXPECTED = 10.0
 
 
+@contextlib.contextmanager
+def _alike_everywhere() -> Iterator[None]:
+    """Matrices are multiplied by one thread: the sums of several are rounded otherwise than those of another number of cores."""
+    with threadpool_limits(1, "blas"):
+        yield
+
+
+@_alike_everywhere()
 def diagnose(
     runs: Sequence[Run],
     model: Path,
@@ -99,6 +109,7 @@ def hypotheses(experiment: Experiment, prior: Sequence[str], progress: Progress)
     return trials, [trials.none(), *(trials.row((name,), leads[name]) for name in ranked)]
 
 
+@_alike_everywhere()
 def prepare(
     runs: Sequence[Run], model: Path, joints: Sequence[str] | None = None, progress: Progress | None = None
 ) -> int:

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from plants import BENCH, ENCODER_RAD, drive, pendulum, run_of, sweep, write
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from openant_tools.errors import BadInput
 from openant_tools.gap.diagnose import diagnose
@@ -79,6 +80,18 @@ def test_the_order_in_which_runs_are_named_does_not_matter(model: Path, late: Di
         assert same.effect == one.effect
         assert same.probability == pytest.approx(one.probability, abs=1e-6)
     assert other.gap["after"] == pytest.approx(first.gap["after"], rel=1e-3)
+
+
+def test_sums_are_rounded_alike_on_any_number_of_cores(model: Path) -> None:
+    threads = set[int]()
+
+    def look(share: float, words: str) -> None:
+        threads.update(one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas")
+        raise InterruptedError
+
+    with threadpool_limits(2, "blas"), pytest.raises(InterruptedError):
+        diagnose(recorded(pendulum()), model, progress=look)
+    assert threads == {1}
 
 
 def test_bad_input_is_one_line(model: Path) -> None:
