@@ -33,15 +33,18 @@ START = {
     "shortfall": 0.3,
     "likelier": 0.05,
     "share": 1.5,
+    "irregular": 0.25,
     "none": 0.0,
     "outside": 0.0,
     "outside: support": 0.0,
     "outside: left": 0.0,
 }
 FAR = 1.0
-POSITIVE = ("evidence", "support", "shortfall", "likelier", "share")
+POSITIVE = ("evidence", "support", "shortfall", "likelier", "share", "irregular")
+#: what a row is decided on by
+KEPT = ("probability", "support", "foretold", "likelier", "irregular", "left")
 #: the weights of what held-out data say
-HELD_OUT = ("support", "shortfall", "likelier", "share", "outside: support", "outside: left")
+HELD_OUT = ("support", "shortfall", "likelier", "share", "irregular", "outside: support", "outside: left")
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,8 @@ def robot(found: Mapping[str, object], truth: Mapping[str, object]) -> Judged:
         if row["causes"] == [OUTSIDE]:
             outside = row["probability"]
             continue
-        kept = (row[name] for name in ("probability", "support", "foretold", "likelier", "left"))
-        rows.append(Row(tuple(row["causes"]), (), *kept))
+        kept = {name: row[name] for name in KEPT if name in row}
+        rows.append(Row(tuple(row["causes"]), **kept))
     effects = truth.get("effect", [])
     right = {one["effect"] for one in effects}
     # What is hardly beyond tolerance need not be found.

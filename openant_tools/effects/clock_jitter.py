@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from openant_tools.effects.effect import Effect, Ints, Parameter, Scope, Values, amount
+from openant_tools.effects.effect import Chance, Effect, Ints, Parameter, Scope, Values, amount
 from openant_tools.effects.robot import Robot
 
 __all__ = ["effect"]
@@ -24,5 +24,5 @@ effect = Effect(
     native=False,
     parameters=(Parameter("std_s", "s", high=1.0),),
     acts_on="commands",
-    random=True,
+    random=Chance.SCATTERED,
 )

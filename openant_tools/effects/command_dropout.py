@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from openant_tools.effects.effect import Effect, Ints, Parameter, Scope, Values, amount, shape
+from openant_tools.effects.effect import Chance, Effect, Ints, Parameter, Scope, Values, amount, shape
 from openant_tools.effects.robot import Robot
 
 __all__ = ["effect"]
@@ -26,6 +26,5 @@ effect = Effect(
     native=False,
     parameters=(Parameter("fraction", "1", high=0.95), Parameter("longest_s", "s", high=10.0)),
     acts_on="commands",
-    random=True,
-    # A command that is lost is late, too, while a clock that jitters loses none.
+    random=Chance.LOST,
 )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from enum import StrEnum
+from enum import Enum, StrEnum, auto
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -177,6 +177,13 @@ class Parameter:
     shown_by: str = ""
 
 
+class Chance(Enum):
+    """What befalls commands at random times."""
+
+    LOST = auto()
+    SCATTERED = auto()
+
+
 class Action(NamedTuple):
     """What to do, or to record, to tell two effects apart: its name, and in a sentence."""
 
@@ -208,7 +215,7 @@ class Effect:
         signal: the signal of the log that it acts on, where that is not the motion itself.
         silent: whether command and encoder shift alike, so that joint positions hardly show it.
         unseen: names of quantities that joint positions do not show.
-        random: whether it acts at random times: no simulation repeats what happened, and what one closes says little.
+        random: what happens at random times, where it does: no simulation repeats that.
         stated: from the quantities to the catalogue's parameters, where those are not the same.
         restored: from a diagnosis' parameters back to the quantities, with what its coordinates were.
         told_from: effect → what tells this one from it, where commands and positions alone cannot, or hardly (effects.md).
@@ -233,7 +240,7 @@ class Effect:
     signal: str | None = None
     silent: bool = False
     unseen: frozenset[str] = frozenset()
-    random: bool = False
+    random: Chance | None = None
     stated: Callable[[Values, Reference, Ints], dict[str, float]] = lambda values, reference, joints: dict(values)
     restored: Callable[[Values, Values, Reference, Ints], dict[str, float]] = lambda given, x, reference, joints: dict(
         given

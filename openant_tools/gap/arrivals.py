@@ -21,7 +21,7 @@ from openant_tools.model.plant import Plant
 from openant_tools.model.servo import read_damping, read_stiffness, read_velocity_gain
 from openant_tools.recording.run import Run
 
-__all__ = ["KINDS_OF_ONE", "Arrivals"]
+__all__ = ["KINDS_OF_ONE", "Arrivals", "natural_modes", "step_response"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -67,7 +67,7 @@ class Arrivals:
         """
         t, sent = run.t - run.t[0], run.command_times - run.t[0]
         commands = run.signal("cmd", plant.joints)
-        natural, damped = _servos(run, plant)
+        natural, damped = natural_modes(run, plant)
         late, held = [], np.zeros(commands.shape)
         for j in range(len(plant.joints)):
             given = np.isfinite(commands[:, j])
@@ -128,7 +128,7 @@ class Arrivals:
         return out
 
 
-def _servos(run: Run, plant: Plant) -> tuple[Array, Array]:
+def natural_modes(run: Run, plant: Plant) -> tuple[Array, Array]:
     """(joints,) natural frequencies, rad/s, and damping ratios of a model's servos where a run begins."""
     model, data = plant.model, mujoco.MjData(plant.model)
     data.qpos[plant.qpos] = np.nan_to_num(run.signal("pos", plant.joints)[0])
@@ -145,7 +145,7 @@ def _servos(run: Run, plant: Plant) -> tuple[Array, Array]:
 def _answers(t: Array, times: Array, steps: Array, natural: float, damped: float, counts: Bools) -> csr_array:
     """(rows, commands) as `Arrivals.behind`: what rows lie behind, beside those about them, for each second a step is late."""
     grid = np.arange(0.0, ANSWERS_S + STEP_S, STEP_S)
-    position = _step_response(grid, natural, damped)
+    position = step_response(grid, natural, damped)
     found = []
     for at in range(0, len(times), PORTION):
         since = t[:, None] - times[at : at + PORTION]
@@ -155,7 +155,7 @@ def _answers(t: Array, times: Array, steps: Array, natural: float, damped: float
     return csr_array(hstack(found))
 
 
-def _step_response(t: Array, natural: float, damped: float) -> Array:
+def step_response(t: Array, natural: float, damped: float) -> Array:
     """Of a second-order system, the share of a step that it has gone t after it."""
     root = np.sqrt(complex(damped**2 - 1))
     if abs(root) < 1e-3:

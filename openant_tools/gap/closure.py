@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from openant_tools.gap.fitting import Fits
 from openant_tools.gap.hypothesis import Refit
+from openant_tools.gap.innovations import Irregular, irregular
 from openant_tools.gap.nuisance import BODY, HEAT_LOSS, LESS, UNWRITTEN
 from openant_tools.gap.prediction import Predictions
 from openant_tools.model.gap import share_closed
@@ -29,7 +31,7 @@ class Closure:
         squares: (folds, channels) summed over rows; counts: (folds, channels) of how many errors.
         apart: (folds, channels) squares of how far it is from what it is asked about beside, summed over the same rows.
         known: (channels,) mean square of sensors. likelihood, within, std: as of `Fit`.
-        refit: on all training runs together.
+        refit: on all training runs together. irregular: what it leaves says of commands.
     """
 
     before: float
@@ -46,6 +48,7 @@ class Closure:
     known: Array
     refit: Refit
     std: tuple[Mapping[str, float], ...]
+    irregular: Irregular
 
     def support(self, other: Closure) -> float:
         """Logarithm of how much less it leaves than another on the same folds, rms, mean of them, summed over joints and body sensors.
@@ -91,10 +94,13 @@ def closures(
     each, counts = np.zeros((len(starts), len(folds), channels)), np.zeros((len(folds), channels))
     apart = np.zeros_like(each)
     gaps, known = np.zeros((len(starts) + 1, len(folds))), np.zeros(len(folds))
+    left: list[dict[int, Array]] = [{} for _ in starts]
     for f, fold in enumerate(folds):
         held_out = [one.folds[f] for one in found]
         for k in sorted(fold):
             errors = predictions.over_windows(k, held_out)
+            for mine, of_one in zip(left, errors, strict=True):
+                mine.setdefault(k, of_one[:, : predictions.joints])
             squares, good = _squares(errors)
             each[:, f], counts[f] = each[:, f] + squares, counts[f] + good
             apart[:, f] += _squares(errors - errors[0])[0]
@@ -110,10 +116,20 @@ def closures(
         out.append(
             Closure(
                 before, after, floor, _closed(before, after, floor), low, high, one.likelihood, one.within, each[n], apart[n], counts,
-                predictions.sigma**2, one.whole, one.std,
+                predictions.sigma**2, one.whole, one.std, _irregular(predictions, one.whole, left[n]),
             )
         )  # fmt: skip
     return out
+
+
+def _irregular(predictions: Predictions, refit: Refit, left: Mapping[int, Array]) -> Irregular:
+    """What errors of held-out runs say of when their commands came."""
+    runs = [predictions.protocol.runs[k] for k in left]
+    robots = [predictions.robot(refit, k) for k in left]
+    plants = [
+        dataclasses.replace(one.plant, model=robot.model(one.plant)) for one, robot in zip(runs, robots, strict=True)
+    ]
+    return irregular(runs, list(left.values()), plants, [robot.delay for robot in robots])
 
 
 def _squares(errors: Array) -> tuple[Array, Array]:

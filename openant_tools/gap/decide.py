@@ -22,9 +22,10 @@ __all__ = ["OUTSIDE", "WEIGHTS", "Decision", "Row", "adds", "chances", "decide",
 
 #: the weights by their names: of logarithms of probabilities by the evidence, of what held-out data say of a cause, and of how much more
 #: its fit had promised; of how much likelier any cause made what it was fitted to, for all of them, and of what share of that is each one's;
-#: of nothing and of something unknown by themselves, and of this by the most that any cause does, and by the least that any leaves
+#: of what innovations say of commands; of nothing and of something unknown by themselves, and of this by the most that any cause does, and
+#: by the least that any leaves
 WEIGHTS = (
-    "evidence", "support", "shortfall", "likelier", "share", "none", "outside", "outside: support", "outside: left",
+    "evidence", "support", "shortfall", "likelier", "share", "irregular", "none", "outside", "outside: support", "outside: left",
 )  # fmt: skip
 #: where they lie in this package
 FILE = "decision.json"
@@ -58,6 +59,7 @@ class Row:
             than with no more of it than robots of one build differ by.
         left: logarithm of how many times its sensors' errors it leaves on held-out folds; None where it was not fitted.
         gain: share of the excess gap that it closes on held-out folds beyond what is closed without it, for the report.
+        irregular: of a cause that acts at random times nats by which innovations are likelier than without it.
     """
 
     causes: tuple[str, ...]
@@ -68,6 +70,7 @@ class Row:
     likelier: float = 0.0
     left: float | None = None
     gain: float | None = None
+    irregular: float = 0.0
 
     def held_out(self, weights: Mapping[str, float]) -> float:
         """What held-out data say of it, in nats."""
@@ -106,18 +109,21 @@ def weights() -> Mapping[str, float]:
 
 
 def _fitted(rows: Sequence[Row], weights: Mapping[str, float]) -> dict[tuple[str, ...], float]:
-    """Of each hypothesis that was fitted, what that says of it, in nats.
+    """Of each hypothesis that was fitted, or asked of innovations, what that says of it, in nats.
 
     That some cause makes what was measured likelier says that something is wrong, up to a degree; which it is, causes tell by comparison.
     """
     some = [row for row in rows if row.causes and row.support is not None]
     most = max([0.0, *(row.likelier for row in some)])
     ill = weights["likelier"] * SURE * math.asinh(most / SURE)
-    return {
+    said = {
         row.causes: row.held_out(weights)
         + ill
         + weights["share"] * math.log((max(row.likelier, 0.0) + SURE) / (most + SURE))
         for row in some
+    }
+    return said | {
+        row.causes: weights["irregular"] * SURE * math.asinh(row.irregular / SURE) for row in rows if row.irregular
     }
 
 
@@ -183,7 +189,7 @@ def adds(rows: Sequence[Row]) -> Row | None:
         odds = _log(row.probability) - _log(1 - row.probability)
         return 1 / (1 + math.exp(-(learned["evidence"] * odds - learned["none"] + said[row.causes])))
 
-    likeliest = max((row for row in rows if row.support is not None), key=probability, default=None)
+    likeliest = max((row for row in rows if row.causes in said), key=probability, default=None)
     return likeliest if likeliest is not None and probability(likeliest) > PRESENT else None
 
 

@@ -100,7 +100,7 @@ def finding(
 def _rows(trials: Trials, rows: Sequence[Row]) -> tuple[dict[str, Any], ...]:
     """What was decided on, so that it can be decided anew and weights be learned from it."""
     outside = Row((OUTSIDE,), probability=trials.assessment.outside)
-    kept = ("causes", "probability", "support", "foretold", "likelier", "left")
+    kept = ("causes", "probability", "support", "foretold", "likelier", "irregular", "left")
     return tuple({name: getattr(row, name) for name in kept} for row in (*rows, outside))
 
 
@@ -123,7 +123,7 @@ def _found(trials: Trials, row: Row, best: Closure | None) -> Found:
     effect, protocol, assessment = catalogue()[name], trials.experiment.parts, trials.assessment
     alone, at = trials.closures.get((name,)), assessment.place(name)
     evidence = assessment.evidence
-    c, where = evidence.causes.index(name), np.array(at)
+    c = evidence.causes.index(name)
     within = [] if best is None else [part.cause for part in best.refit.hypothesis]
     of = best if name in within else alone
     if of is None:
@@ -131,7 +131,9 @@ def _found(trials: Trials, row: Row, best: Closure | None) -> Found:
         std = {q.name: 0.0 if q.shape else abs(assessment.template(name)[q.name]) * length for q in effect.quantities}
     else:
         k = [part.cause for part in of.refit.hypothesis].index(name)
-        x, std = dict(of.refit.x[k]), dict(of.std[k])
+        x, std, at = dict(of.refit.x[k]), dict(of.std[k]), of.refit.hypothesis[k].joints
+
+    where = np.array(at)
 
     def stated(point: Mapping[str, float]) -> dict[str, float]:
         return effect.stated(effect.values(dict(point), protocol.reference, where), protocol.reference, where)

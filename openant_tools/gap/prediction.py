@@ -96,7 +96,9 @@ class Predictions:
         robot = Robot(len(self.protocol.joints), reference.low, reference.high)
         if not written:
             robot.form = self.form
-        enter(robot, reference, [(p.cause, p.joints, x) for p, x in zip(refit.hypothesis, refit.x, strict=True)])
+        parts = zip(refit.hypothesis, refit.x, strict=True)
+        # What acts at random times no simulation repeats.
+        enter(robot, reference, [(part.cause, part.joints, x) for part, x in parts if not part.definition.random])
         for one, u in zip(self.names, refit.nuisance, strict=True):
             if one.name == HEAT_LOSS:
                 left = 1 / (1 + one.value(float(u)) * (self.protocol.runs[k].warm_c if warm_c is None else warm_c))

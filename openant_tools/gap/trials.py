@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -42,14 +42,20 @@ class Trials:
         return cls(experiment, assessment, Fits(Predictions(experiment.parts, assessment.set_aside)))
 
     def fit(self, sets: Sequence[Causes]) -> None:
-        """Fit sets of causes, each at its best place, on all parts but those of each fold; the first is asked about beside."""
-        starts = [self._start(causes) for causes in sets]
-        done = closures(self.fits, starts, self.experiment.folds, self.experiment.training)
-        self.closures |= zip(sets, done, strict=True)
+        """Fit sets of causes, each at its best place, on all parts but those of each fold; the first is asked about beside.
+
+        What acts at random times is told by what the others leave.
+        """
+        simulated = list(dict.fromkeys(_simulated(causes) for causes in sets))
+        if not self.closures.keys() >= set(simulated) or simulated == list(sets):
+            starts = [self._start(causes) for causes in simulated]
+            done = closures(self.fits, starts, self.experiment.folds, self.experiment.training)
+            self.closures |= zip(simulated, done, strict=True)
+        self.closures |= {causes: self._at_random(causes) for causes in sets if _simulated(causes) != causes}
 
     def tells(self, name: str) -> bool:
-        """Whether held-out data tell of a cause: not what joints' positions hardly show, without a sensor of the body, nor what no
-        simulation repeats."""
+        """Whether fits tell of a cause: not what joints' positions hardly show, without a sensor of the body, nor what no simulation
+        repeats."""
         effect = catalogue()[name]
         return not effect.random and (not effect.unseen_in_joints or bool(self.fits.predictions.sensed))
 
@@ -65,12 +71,42 @@ class Trials:
     def row(self, causes: Causes, probability: float) -> Row:
         """What is known of the last of some causes, beside the others."""
         places = tuple(self.assessment.place(name) for name in causes)
+        if catalogue()[causes[-1]].random:
+            at = self.closures[_simulated(causes)].irregular.joints(catalogue()[causes[-1]])
+            return Row(causes, (*places[:-1], at), probability, irregular=self._irregular(causes))
         one, other = self.closures.get(causes), self.closures.get(causes[:-1])
         if one is None or other is None or not self.tells(causes[-1]):
             return Row(causes, places, probability)
         return Row(
             causes, places, probability, one.support(other), one.foretold, one.likelier(other), one.left, one.closed - other.closed
         )  # fmt: skip
+
+    def _irregular(self, causes: Causes) -> float:
+        """nats by which what others leave is likelier with a cause that acts at random times.
+
+        Beside whichever cause makes it least: where that explains more by itself, it is that cause's part.
+        """
+        effect, beside = catalogue()[causes[-1]], self.closures[_simulated(causes)]
+        alone = beside.irregular.nats(effect)
+        others = [] if _simulated(causes) else [one for known, one in self.closures.items() if len(known) == 1]
+        return min(
+            [alone, *(max(one.irregular.nats(effect), alone - max(one.likelier(beside), 0.0)) for one in others)]
+        )
+
+    def _at_random(self, causes: Causes) -> Closure:
+        """What is closed beside causes that act at random times: as much as without them."""
+        known = self.closures[_simulated(causes)]
+        parts, x, std = list(known.refit.hypothesis), list(known.refit.x), list(known.std)
+        for n, name in enumerate(causes):
+            if (effect := catalogue()[name]).random:
+                names = [q.name for q in effect.quantities]
+                size, deviation = (
+                    dict(zip(names, map(float, of), strict=True)) for of in known.irregular.sizes(effect)
+                )
+                parts.insert(n, Part(name, known.irregular.joints(effect)))
+                x.insert(n, size)
+                std.insert(n, deviation)
+        return replace(known, refit=replace(known.refit, hypothesis=tuple(parts), x=tuple(x)), std=tuple(std))
 
     def none(self) -> Row:
         """What is known of no cause at all."""
@@ -106,3 +142,8 @@ class Trials:
         if before is None:
             return self.fits.of(parts, [self.size(name) for name in causes])
         return Refit(tuple(parts), (*before.refit.x, self.size(causes[-1])), before.refit.nuisance)
+
+
+def _simulated(causes: Causes) -> Causes:
+    """Those that a simulation repeats."""
+    return tuple(name for name in causes if not catalogue()[name].random)

@@ -57,6 +57,17 @@ def test_causes_that_make_it_likelier_are_told_apart_by_how_much() -> None:
     assert p["actuator_lag"] < 2 * p["action_delay"]
 
 
+def test_lost_commands_that_are_seen_one_by_one_lead_whatever_else_fits() -> None:
+    lost = Row(("command_dropout",), ((0, 1),), 0.01, irregular=150.0)
+    rows = [NOTHING, replace(LAG, probability=0.3, support=0.3, likelier=30.0), lost]
+    assert decide(rows, outside=0.3).verdict == "command_dropout"
+    few = replace(lost, irregular=4.0)
+    assert decide([replace(NOTHING, probability=0.8), few], outside=0.1).verdict == NONE
+    beside = Row(("actuator_lag", "command_dropout"), ((0,), (0, 1)), 0.1, irregular=150.0)
+    assert adds([beside]) == beside
+    assert adds([replace(beside, irregular=0.0)]) is None
+
+
 def test_two_that_share_what_is_likely_are_ambiguous() -> None:
     alike = replace(DELAY, probability=0.45, support=LAG.support, foretold=LAG.foretold)
     found = decide([NOTHING, replace(LAG, probability=0.45), alike], outside=0.05)

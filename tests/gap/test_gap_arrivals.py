@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.robot import Form, Robot
 from openant_tools.gap.arrivals import Arrivals
+from openant_tools.gap.innovations import Irregular, irregular
+from openant_tools.gap.protocol import Played
 from openant_tools.gap.simulation import simulate
 from openant_tools.model.plant import Plant, Setup, load_plant
 from openant_tools.model.rollout import Rollouts
@@ -99,3 +102,49 @@ def test_rows_that_nobody_measured_and_joints_without_commands_say_nothing(run: 
     assert (size[:, 1] < -4).all()
     assert skew[:, 1] == pytest.approx(0.0)
     assert np.abs(shared).max() < 0.3, "noise is no packet"
+
+
+LOST, SCATTERED = catalogue()["command_dropout"], catalogue()["clock_jitter"]
+
+
+def left(run: Run, plant: Plant, robot: Robot, noise: float = 3e-4) -> Irregular:
+    """What is said of commands by what the model leaves of a robot."""
+    pos = simulate(Rollouts(plant, [run]), [Robot(len(JOINTS)), robot], seed=3, signals=("pos",)).signals["pos"]
+    errors = (pos[1] - pos[0]).astype(float) + noise * np.random.default_rng(8).standard_normal(pos[0].shape)
+    still = np.zeros(len(JOINTS))
+    return irregular([Played.of(run, plant, still)], [errors], [plant], [still])
+
+
+def test_commands_that_are_lost_are_found_one_by_one(run: Run, plant: Plant) -> None:
+    found = left(run, plant, losing(0.1))
+    assert found.nats(LOST) > max(100, found.nats(SCATTERED))
+    assert found.joints(LOST) == tuple(range(len(JOINTS)))
+    share, longest_s = found.sizes(LOST)[0]
+    assert share == pytest.approx(0.1, abs=0.04)
+    assert longest_s == pytest.approx(0.04, abs=0.025)
+
+
+def test_the_joint_whose_commands_are_lost_is_found(run: Run, plant: Plant) -> None:
+    robot = losing(0.0)
+    robot.dropout, robot.shared_dropout = np.where(np.arange(len(JOINTS)) == 5, 0.15, 0.0), False
+    found = left(run, plant, robot)
+    assert found.nats(LOST) > 15
+    assert found.joints(LOST) == (5,)
+
+
+@pytest.mark.parametrize("std_s", [0.004, 0.008])
+def test_commands_that_scatter_are_not_lost(run: Run, plant: Plant, std_s: float) -> None:
+    found = left(run, plant, late(std_s))
+    assert found.nats(SCATTERED) > max(100, 3 * found.nats(LOST))
+    (size,), (deviation,) = found.sizes(SCATTERED)
+    assert abs(size - std_s) < 2 * deviation < 0.8 * std_s
+
+
+def test_what_a_model_does_wrong_is_no_lost_command(run: Run, plant: Plant) -> None:
+    robot = Robot(len(JOINTS))
+    robot.scale["stiffness"], robot.scale["damping"] = np.full(len(JOINTS), 0.7), np.full(len(JOINTS), 1.6)
+    robot.delay = np.full(len(JOINTS), 0.01)
+    found = left(run, plant, robot)
+    assert found.nats(LOST) < 10
+    assert found.nats(SCATTERED) < 10
+    assert left(run, plant, late(0.001)).nats(SCATTERED) < 3

@@ -1,0 +1,274 @@
+"""Commands that were lost, or acted now sooner and now later, one by one, in the innovations of what a fit leaves.
+
+What acts at random times no simulation repeats, so that no fit shows it. But a servo whose command was lost follows the one before,
+and by how much it is behind from then on its stiffness, damping and inertia say. What a fit leaves of positions is predicted from the
+rows before it (an autoregression, whose innovations have no memory: Kay, Fundamentals of Statistical Signal Processing II, 1998), and
+each command's answer is sought in what is new. Lost ones are taken out one after another while each is likelier than its price
+(matching pursuit), and the same is asked of commands that had come twice as far, which no fault does: what a model does wrong looks
+as much like these. Commands that scatter in time add a variance along all answers together, whose likelihood is exact.
+
+Nothing of it is fitted to what is judged: prices are the same for every recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from openant_tools.effects.effect import Chance, Effect
+from openant_tools.gap.arrivals import natural_modes, step_response
+from openant_tools.gap.protocol import Played
+from openant_tools.model.plant import Plant, Setup
+
+__all__ = ["Irregular", "irregular"]
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+#: rows that predict the next one, and how many of them a joint's prediction is learned from at least
+ORDER, LEAST_ROWS = 3, 60
+#: deviations beyond which an innovation counts as so many: feet strike, torque comes
+FARTHEST = 3.5
+#: how often a deviation is taken anew of innovations that are cut so
+TIMES = 20
+#: commands that are lost in a row
+BURSTS = (1, 2, 3, 5, 8, 12)
+#: nats that a stretch of lost commands costs: one command in thirteen begins one, of any of these lengths
+PRICE = float(np.log(12) + np.log(len(BURSTS)))
+#: variances of when commands act, s², for one of what else is new, a deviation of which is 1
+RATIOS = np.concatenate([[0.0], np.geomspace(0.0002, 0.08, 24) ** 2])
+#: deviation of sizes, as a share: commands that hardly move a joint are not found, and servos do not answer as a second-order system does
+KNOWN = 0.4
+#: nats by which a log has to change where a command is lost, for it to count among those of which it could be told
+TELLS = 2.0
+#: s: how late a command is taken to be where the direction is found
+LATE_S = 0.004
+
+
+@dataclass(frozen=True)
+class Irregular:
+    """What one hypothesis' innovations say of commands.
+
+    Attributes:
+        lost: (joints + 1,) nats by which lost commands of each joint, and of all joints at once, are likelier than none, but for the one
+            stretch that says most.
+        losses: (joints + 1,) commands that were found lost. told: of how many it could be told. longest_s: (joints + 1,) s in a row.
+        scattered: (RATIOS,) nats by which commands that act at times that scatter are likelier than punctual ones. scatter_s: by how much.
+    """
+
+    lost: Array
+    losses: Array
+    told: Array
+    longest_s: Array
+    scattered: Array
+    scatter_s: Array
+
+    def nats(self, effect: Effect) -> float:
+        """By how much it is likelier than on a healthy robot."""
+        if effect.random is Chance.LOST:
+            return float(self.lost.max())
+        healthy = effect.quantities[0].small >= self.scatter_s
+        return max(0.0, float(self.scattered.max() - self.scattered[healthy].max(initial=0.0)))
+
+    def joints(self, effect: Effect) -> tuple[int, ...]:
+        """Whose commands it befalls."""
+        every, where = tuple(range(len(self.lost) - 1)), int(self.lost.argmax())
+        return every if effect.random is Chance.SCATTERED or where == len(every) else (where,)
+
+    def sizes(self, effect: Effect) -> tuple[Array, Array]:
+        """Its coordinates, in the order of its quantities, and standard deviations."""
+        if effect.random is Chance.SCATTERED:
+            weight = np.exp(self.scattered - self.scattered.max())
+            mean = float(weight @ self.scatter_s / weight.sum())
+            return np.array([mean]), np.array([KNOWN * mean])
+        where = int(self.lost.argmax())
+        # Beside a few that nobody saw, of which an eighth are lost.
+        count = self.told[where] + 4.0
+        share = (self.losses[where] + 0.5) / count
+        chance = np.sqrt(share * (1 - share) / count)
+        longest = max(float(self.longest_s[where]), effect.quantities[1].small)
+        return np.array([share, longest]), np.array([max(chance, KNOWN * share), 0.0])
+
+
+@dataclass(frozen=True)
+class _Answers:
+    """One joint in one window.
+
+    Attributes:
+        new: (rows,) innovations, in deviations. held, late: (rows, commands), as these see a setpoint that is a radian off while a
+            command is in force, and a command that comes a second late.
+        times, values: (commands,) s, when they were sent, and rad.
+    """
+
+    new: Array
+    held: Array
+    late: Array
+    times: Array
+    values: Array
+
+    @property
+    def single(self) -> Array:
+        """(rows, commands) what innovations see where one command was lost."""
+        return -self.held * np.diff(self.values, prepend=self.values[0])
+
+    @cached_property
+    def spans(self) -> Ints:
+        """(stretches, 2) from which command up to which ones may have been lost in a row."""
+        n = len(self.values)
+        every = [(first, first + burst) for burst in BURSTS for first in range(1, n - burst + 1)]
+        return np.array(every, np.int64).reshape(-1, 2)
+
+    @cached_property
+    def lost(self) -> Array:
+        """(rows, stretches) what innovations see where these were lost, and the command before them stays in force."""
+        first, stop = self.spans.T
+        up_to = np.pad(np.cumsum(self.held, axis=1), ((0, 0), (1, 0)))
+        at = np.pad(np.cumsum(self.held * self.values, axis=1), ((0, 0), (1, 0)))
+        out: Array = self.values[first - 1] * (up_to[:, stop] - up_to[:, first]) - (at[:, stop] - at[:, first])
+        return out
+
+
+def irregular(
+    runs: Sequence[Played], errors: Sequence[Array], plants: Sequence[Plant], delays: Sequence[Array]
+) -> Irregular:
+    """What is left of some runs says of their commands.
+
+    Args:
+        errors: of each run (rows, joints) rad, measured minus simulated; NaN where nobody knows. plants: how each was simulated, as
+            fitted. delays: of each, (joints,) s by which its commands act later than they are sent.
+    """
+    joints = len(runs[0].plant.joints)
+    lost, largest, losses, told, longest = np.zeros((5, joints + 1))
+    volume, left, rows = np.zeros(len(RATIOS)), np.zeros(len(RATIOS)), 0
+    usual = {
+        setup: _usual([error for one, error in zip(runs, errors, strict=True) if one.plant.setup is setup])
+        for setup in Setup
+    }
+    for one, error, plant, delay in zip(runs, errors, plants, delays, strict=True):
+        modes = natural_modes(one.run, plant)
+        for window in one.windows or [(float(one.run.t[0]), float(one.run.t[-1]) + 1.0)]:
+            answers = [
+                _answers(one, j, error[:, j], window, delay[j], modes[0][j], modes[1][j], usual[one.plant.setup][j])
+                for j in range(joints)
+            ]
+            known = [some for some in answers if some is not None]
+            if not known:
+                continue
+            together = len({some.times.tobytes() for some in known}) == 1
+            for n, group in enumerate([*([some] for some in answers), known if together else [None]]):
+                mine = [some for some in group if some is not None]
+                if not mine:
+                    continue
+                gains, gone, lasts = _pursued(mine, 1.0)
+                lost[n] += sum(gains) - sum(_pursued(mine, -1.0)[0])
+                largest[n] = max([largest[n], *gains])
+                tells = np.sum([np.square(some.single).sum(axis=0) for some in mine], axis=0) > 2 * TELLS
+                losses[n], told[n] = losses[n] + (tells & gone).sum(), told[n] + tells.sum()
+                longest[n] = max(longest[n], lasts)
+            more, rest, count = _scattered(known if together else known[:1])
+            volume, left, rows = volume + more, left + rest, rows + count
+    # What else is new is as large as it is without what commands do.
+    size = left / max(rows, 1)
+    scattered = -0.5 * (rows * np.log(size / size[0]) + volume) if rows else volume
+    # A foot that slips once may look like a lost command in all joints, but not again and again.
+    return Irregular(lost - largest, losses, told, longest, scattered, np.sqrt(RATIOS * size))
+
+
+def _usual(errors: Sequence[Array]) -> list[tuple[Array, float] | None]:
+    """Of each joint how a row follows from those before it, newest first, and the deviation of what is new."""
+    out: list[tuple[Array, float] | None] = []
+    for j in range(errors[0].shape[1] if errors else 0):
+        past, now = zip(*(_lagged(error[:, j]) for error in errors), strict=True)
+        x, y = np.concatenate(past), np.concatenate(now)
+        if len(y) < LEAST_ROWS:
+            out.append(None)
+            continue
+        by = np.linalg.lstsq(x, y, rcond=None)[0]
+        squares = np.square(y - x @ by)
+        size = squares.mean()
+        for _ in range(TIMES):
+            size = np.minimum(squares, FARTHEST**2 * size).mean()
+        out.append((by, float(np.sqrt(size))))
+    return out
+
+
+def _lagged(values: Array) -> tuple[Array, Array]:
+    """(rows, ORDER) of rows before, newest first, and (rows,), where all of them are known."""
+    whole = sliding_window_view(values, ORDER + 1)
+    whole = whole[np.isfinite(whole).all(axis=1)]
+    return whole[:, -2::-1], whole[:, -1]
+
+
+def _answers(
+    one: Played, j: int, error: Array, window: tuple[float, float], delay: float, natural: float, damped: float,
+    usual: tuple[Array, float] | None,
+) -> _Answers | None:  # fmt: skip
+    """A joint in a window; None where too little is known."""
+    t = one.run.t
+    rows = np.flatnonzero((t >= window[0]) & (t < window[1]))
+    if usual is None or len(rows) <= ORDER:
+        return None
+    given = np.isfinite(commands := one.run.column(f"cmd.{one.plant.joints[j]}"))
+    times, first = np.unique(one.run.command_times[given], return_index=True)
+    # What came before a window began is in where it began.
+    here = (np.append(times[1:], np.inf) > t[rows[0]]) & (times < t[rows[-1]])
+    if here.sum() < 2:
+        return None
+    times, values = times[here], commands[given][first][here]
+    acts = times + delay + one.plant.lead_s
+    since = t[rows, None] - np.maximum(acts, t[rows[0]])
+    until = t[rows, None] - np.append(acts[1:], np.inf)
+    whole = step_response(np.maximum(since, 0.0), natural, damped) * (since > 0)
+    held = whole - step_response(np.maximum(until, 0.0), natural, damped) * (until > 0)
+    later = np.maximum(since - LATE_S, 0.0)
+    late = (step_response(later, natural, damped) * (later > 0) - whole) / LATE_S * np.diff(values, prepend=values[0])
+    by, size = usual
+    lags = sliding_window_view(error[rows], ORDER + 1)
+    known = np.isfinite(lags).all(axis=1)
+    if not known.any():
+        return None
+    ahead = np.concatenate([-by[::-1], [1.0]]) / size
+    # The autoregression reaches back where a row's answer was none yet: that is 0, not unknown.
+    new = np.clip(lags[known] @ ahead, -FARTHEST, FARTHEST)
+    seen = [np.einsum("kcl,l->kc", sliding_window_view(x, ORDER + 1, axis=0)[known], ahead) for x in (held, late)]
+    return _Answers(new, seen[0], seen[1], times, values)
+
+
+def _pursued(group: Sequence[_Answers], sign: float) -> tuple[list[float], Bools, float]:
+    """(nats of each stretch, (commands,) which were lost, longest in a row, s); with sign −1 what had come twice as far."""
+    spans, times = group[0].spans, group[0].times
+    gains, gone, longest = list[float](), np.zeros(len(times), bool), 0.0
+    if not len(spans):
+        return gains, gone, longest
+    answers = sign * np.concatenate([some.lost for some in group])
+    half = 0.5 * np.square(answers).sum(axis=0)
+    along = answers.T @ np.concatenate([some.new for some in group])
+    free = np.ones(len(spans), bool)
+    while True:
+        more = np.where(free, along - half - PRICE, 0.0)
+        best = int(more.argmax())
+        if more[best] <= 0:
+            return gains, gone, longest
+        first, stop = spans[best]
+        gains.append(float(more[best]))
+        gone[first:stop] = True
+        longest = max(longest, float(times[min(stop, len(times) - 1)] - times[first]))
+        along = along - answers.T @ answers[:, best]
+        free &= (spans[:, 0] >= stop) | (spans[:, 1] <= first)
+
+
+def _scattered(group: Sequence[_Answers]) -> tuple[Array, Array, int]:
+    """Of commands that scatter, one packet for all joints: (RATIOS,) logarithm of the volume that they add, and squares left; rows."""
+    normal = np.sum([some.late.T @ some.late for some in group], axis=0)
+    shows, ways = np.linalg.eigh(normal)
+    along = np.square(ways.T @ np.sum([some.late.T @ some.new for some in group], axis=0))
+    grows = 1 + RATIOS[:, None] * np.maximum(shows, 0.0)
+    whole = sum(float(some.new @ some.new) for some in group)
+    left = whole - (RATIOS[:, None] / grows * along).sum(axis=1)
+    return np.log(grows).sum(axis=1), left, sum(len(some.new) for some in group)
