@@ -1,11 +1,11 @@
 """Learn how the decision weighs evidence against held-out data, from robots that were diagnosed and whose answers are open.
 
     openant gap blind make --out SET --seed 1 --open …; openant gap blind run SET
-    python -m benchmarks.gap_training.decision SET… [--out openant_tools/gap]
+    python -m benchmarks.gap_training.decision SET… [--keep benchmarks/gap_training/judged] [--out openant_tools/gap]
 
-What a diagnosis decided on stands in its JSON (`rows`), so that nothing is simulated here. Sets of several makers are named together:
-each counts as much as any other, and figures are of each by the weights that the others alone teach, with held-out data and, as an
-ablation, by the evidence alone.
+What a diagnosis decided on stands in its JSON (`rows`), so that nothing is simulated here; `--keep` writes that of each set into one small
+file, which may be named in the set's place. Sets of several makers are named together: each counts as much as any other, and figures are of
+each by the weights that the others alone teach, with held-out data and, as an ablation, by the evidence alone.
 """
 
 from __future__ import annotations
@@ -57,12 +57,38 @@ class Judged:
     ill: bool
 
 
-def judged(folder: Path) -> list[Judged]:
-    """The robots of a set that were diagnosed."""
+def judged(path: Path) -> list[Judged]:
+    """The robots of a set that were diagnosed, or that were kept of one."""
+    if path.is_file():
+        return [_kept(one) for one in json.loads(path.read_text())]
     return [
-        robot(json.loads(path.read_text()), read_toml(folder / path.stem / "truth.toml"))
-        for path in sorted((folder / "verdicts").glob("*.json"))
+        robot(json.loads(found.read_text()), read_toml(path / found.stem / "truth.toml"))
+        for found in sorted((path / "verdicts").glob("*.json"))
     ]
+
+
+def keep(path: Path, some: Sequence[Judged]) -> None:
+    """Write what robots were judged by into a file for `judged`: a line a robot, numbers to six digits."""
+    lines = [json.dumps(_as_json(one), separators=(",", ":")) for one in some]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, "[\n" + ",\n".join(lines) + "\n]\n")
+
+
+def _as_json(one: Judged) -> dict[str, object]:
+    rows = [[*row.causes, *(_short(getattr(row, name)) for name in KEPT)] for row in one.rows]
+    return {"right": sorted(one.right), "ill": one.ill, "outside": _short(one.outside), "rows": rows}
+
+
+def _short(value: float | None) -> float | None:
+    return None if value is None else float(f"{value:.6g}")
+
+
+def _kept(one: Mapping[str, object]) -> Judged:
+    rows = []
+    for values in one["rows"]:
+        causes, numbers = values[: -len(KEPT)], values[-len(KEPT) :]
+        rows.append(Row(tuple(causes), **dict(zip(KEPT, numbers, strict=True))))
+    return Judged(tuple(rows), one["outside"], frozenset(one["right"]), one["ill"])
 
 
 def robot(found: Mapping[str, object], truth: Mapping[str, object]) -> Judged:
@@ -127,9 +153,12 @@ def figures(some: Sequence[Judged], weights: Mapping[str, float]) -> dict[str, s
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sets", type=Path, nargs="+")
+    parser.add_argument("--keep", type=Path)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     sets = [judged(folder) for folder in options.sets]
+    for folder, some in zip(options.sets, sets, strict=True) if options.keep else ():
+        keep(options.keep / f"{folder.name}.json", some)
     for n, folder in enumerate(options.sets):
         if others := [some for k, some in enumerate(sets) if k != n]:
             print(folder.name, "by the others:", figures(sets[n], learned(others)))

@@ -21,7 +21,7 @@ from openant_tools.model.plant import Plant
 from openant_tools.model.servo import read_damping, read_stiffness, read_velocity_gain
 from openant_tools.recording.run import Run
 
-__all__ = ["KINDS_OF_ONE", "Arrivals", "natural_modes", "step_response"]
+__all__ = ["KINDS_OF_ONE", "LATE_S", "Arrivals", "natural_modes", "step_response"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

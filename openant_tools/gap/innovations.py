@@ -21,7 +21,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from openant_tools.effects.effect import Chance, Effect
-from openant_tools.gap.arrivals import natural_modes, step_response
+from openant_tools.gap.arrivals import LATE_S, natural_modes, step_response
 from openant_tools.gap.protocol import Played
 from openant_tools.model.plant import Plant, Setup
 
@@ -47,8 +47,6 @@ RATIOS = np.concatenate([[0.0], np.geomspace(0.0002, 0.08, 24) ** 2])
 KNOWN = 0.4
 #: nats by which a log has to change where a command is lost, for it to count among those of which it could be told
 TELLS = 2.0
-#: s: how late a command is taken to be where the direction is found
-LATE_S = 0.004
 
 
 @dataclass(frozen=True)

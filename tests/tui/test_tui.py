@@ -352,6 +352,22 @@ def test_a_fault_stays_until_it_has_been_seen(robot: RobotFolder) -> None:
     asyncio.run(look())
 
 
+def test_what_no_page_was_written_of_is_not_among_the_findings(robot: RobotFolder) -> None:
+    keep(Finding("estop", True, "torque goes off", (), "", "estop"), robot)
+    (robot.findings / "sysid-fit-20261129T101112Z.json").write_text('{"values": []}')
+
+    async def look() -> None:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(80, 24)) as pilot:
+            await _go(pilot, "findings")
+            await pilot.pause()
+            shown = screen_text(app)
+            assert "torque goes off" in shown
+            assert "sysid-fit" not in shown
+
+    asyncio.run(look())
+
+
 def test_an_observation_outside_its_bounds_is_shown_and_stays_until_seen(robot: RobotFolder) -> None:
     robot.update({"observation.pos.hip_fl": [-0.5, 0.5], "observation.gyro.z": [-1.0, 1.0]})
     rows = np.zeros((1, len(columns(JOINT_NAMES))))

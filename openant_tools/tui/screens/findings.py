@@ -69,7 +69,9 @@ kept in the robot's `findings/`, one a run of a step. The passport is the page t
         if folder is None:
             return []
         passport = folder.passport.with_suffix(".md")
-        found = sorted(folder.findings.glob("*-2*.json"), key=lambda path: path.stem.rpartition("-")[2], reverse=True)
+        # Of fits and comparisons their figures alone lie there: what people read of a finding lies beside it.
+        read = [path for path in folder.findings.glob("*-2*.json") if path.with_suffix(".md").is_file()]
+        found = sorted(read, key=lambda path: path.stem.rpartition("-")[2], reverse=True)
         if not passport.is_file():
             return found
         # The page says what each finding of its making said.
