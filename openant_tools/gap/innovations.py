@@ -43,6 +43,8 @@ BURSTS = (1, 2, 3, 5, 8, 12)
 PRICE = float(np.log(12) + np.log(len(BURSTS)))
 #: variances of when commands act, s², for one of what else is new, a deviation of which is 1
 RATIOS = np.concatenate([[0.0], np.geomspace(0.0002, 0.08, 24) ** 2])
+#: numbers that only must not be zero
+TINY = 1e-12
 #: deviation of sizes, as a share: commands that hardly move a joint are not found, and servos do not answer as a second-order system does
 KNOWN = 0.4
 #: nats by which a log has to change where a command is lost, for it to count among those of which it could be told
@@ -172,7 +174,7 @@ def irregular(
             more, rest, count = _scattered(known if together else known[:1])
             volume, left, rows = volume + more, left + rest, rows + count
     # What else is new is as large as it is without what commands do.
-    size = left / max(rows, 1)
+    size = np.maximum(left, TINY) / max(rows, 1)
     scattered = -0.5 * (rows * np.log(size / size[0]) + volume) if rows else volume
     # A foot that slips once may look like a lost command in all joints, but not again and again.
     return Irregular(lost - largest, losses, told, longest, scattered, np.sqrt(RATIOS * size))
@@ -192,7 +194,7 @@ def _usual(errors: Sequence[Array]) -> list[tuple[Array, float] | None]:
         size = squares.mean()
         for _ in range(TIMES):
             size = np.minimum(squares, FARTHEST**2 * size).mean()
-        out.append((by, float(np.sqrt(size))))
+        out.append((by, max(float(np.sqrt(size)), TINY)))
     return out
 
 

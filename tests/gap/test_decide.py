@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from places import ROOT
 
 from openant_tools.gap.decide import OUTSIDE, SURE, Row, adds, chances, decide, weights, worth_fitting
 from openant_tools.gap.diagnosis import NONE
@@ -103,7 +105,16 @@ def test_a_further_cause_comes_in_where_it_is_likelier_there_than_not() -> None:
     assert adds([Row(pair, ((0,), (0,)), 0.9)]) is None, "held-out data say nothing of it"
 
 
-def test_the_weights_are_those_that_were_learned() -> None:
+def test_the_weights_are_those_that_the_kept_robots_teach() -> None:
+    sys.path.insert(0, str(ROOT))
+    from benchmarks.gap_training.decision import judged, learned
+
+    sets = [judged(path) for path in sorted((ROOT / "benchmarks/gap_training/judged").glob("*.json"))]
+    assert sum(map(len, sets)) == 56
+    assert learned(sets) == pytest.approx(dict(weights()), rel=0.02)
+
+
+def test_weights_speak_for_what_data_speak_for() -> None:
     learned = weights()
     assert min(learned[name] for name in ("evidence", "support", "shortfall")) >= 0
     p = chances([NOTHING, LAG, DELAY], 0.04, learned)
