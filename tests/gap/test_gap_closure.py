@@ -21,6 +21,7 @@ from openant_tools.effects.robot import Robot
 from openant_tools.gap.closure import Closure, calibration_of, closures, heat_loss_of
 from openant_tools.gap.fitting import Fits
 from openant_tools.gap.hypothesis import Part, Refit
+from openant_tools.gap.innovations import Irregular
 from openant_tools.gap.prediction import Predictions
 from openant_tools.gap.protocol import Played, RunSet, rollouts_of
 from openant_tools.gap.simulation import Log, simulate
@@ -166,6 +167,7 @@ def test_what_leaves_nothing_at_all_and_a_fold_without_rows_say_nothing() -> Non
     none = Closure(
         before=0, after=0, floor=0, closed=1, low=1, high=1, likelihood=0.0, within=0.0, squares=np.zeros((2, 1)), apart=np.zeros((2, 1)),
         counts=np.array([[0.0], [50.0]]), known=np.full(1, 4e-8), refit=Refit((), (), np.zeros(0)), std=(),
+        irregular=Irregular(*np.zeros((6, 2))),
     )  # fmt: skip
     some = dataclasses.replace(none, squares=np.array([[0.0], [0.5]]))
     assert none.support(none) == none.foretold == 0.0
