@@ -112,15 +112,6 @@ class Templates:
         single = np.array([where[0] if len(where) == 1 else -1 for _, where, _ in self.bank])
         return np.stack([fit[:, single == j].max(axis=1, initial=0.0) for j in range(self.joints)], axis=1)
 
-    def places(self, fit: Floats) -> dict[str, list[tuple[tuple[int, ...], dict[str, float]]]]:
-        """Cause → where its best templates sit and their coordinates, best first, each place once; fit: (templates,)."""
-        out: dict[str, list[tuple[tuple[int, ...], dict[str, float]]]] = {cause: [] for cause in self.causes}
-        for k in np.argsort(-fit):
-            name, where, x = self.bank[int(k)]
-            if where not in [there for there, _ in out[name]]:
-                out[name].append((where, dict(x)))
-        return out
-
     def peeled(self, z: Floats, times: int) -> Iterator[tuple[Floats, Floats]]:
         """What is left once the best cause at its place is taken out, then the next, and so on (matching pursuit).
 
