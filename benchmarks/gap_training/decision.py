@@ -4,7 +4,7 @@
     python -m benchmarks.gap_training.decision SET… [--keep benchmarks/gap_training/judged] [--out openant_tools/gap]
 
 What a diagnosis decided on stands in its JSON (`rows`), so that nothing is simulated here; `--keep` writes that of each set into one small
-file, which may be named in the set's place. Sets of several makers are named together: each counts as much as any other, and figures are of
+file, which may be named in the set's place. Sets of several makers are named together, and figures are of
 each by the weights that the others alone teach, with held-out data and, as an ablation, by the evidence alone.
 """
 
@@ -122,8 +122,9 @@ def learned(sets: Sequence[Sequence[Judged]], *, held_out: bool = True) -> dict[
         return {name: found.get(name, 0.0) for name in WEIGHTS}
 
     def surprise(x: NDArray[np.float64]) -> float:
-        each = [float(np.mean([_surprise(one, named(x)) for one in some])) for some in sets]
-        return float(np.square((x - start) / FAR).sum()) + max(map(len, sets)) * sum(each)
+        return float(np.square((x - start) / FAR).sum()) + sum(
+            _surprise(one, named(x)) for some in sets for one in some
+        )
 
     return named(minimize(surprise, start).x)
 
