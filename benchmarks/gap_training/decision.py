@@ -163,11 +163,17 @@ def main() -> None:
     parser.add_argument("--keep", type=Path)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
+    for path in options.sets:
+        if not path.is_file() and not (path / "set.toml").is_file():
+            parser.error(f"{path} is neither a set nor what was kept of one")
+    if options.key_file and len(options.key_file) != len(options.sets):
+        parser.error("name a key for each set, or none")
     keys = [read_key(path) for path in options.key_file] or [None] * len(options.sets)
     sets = [judged(folder, key) for folder, key in zip(options.sets, keys, strict=True)]
     for folder, some in zip(options.sets, sets, strict=True) if options.keep else ():
-        keep(options.keep / f"{folder.name}.json", some)
+        keep(options.keep / f"{folder.stem}.json", some)
     for n, folder in enumerate(options.sets):
+        print(folder.name, "by the weights it begins with:", figures(sets[n], START))
         if others := [some for k, some in enumerate(sets) if k != n]:
             print(folder.name, "by the others:", figures(sets[n], learned(others)))
             print(folder.name, "the same, evidence alone:", figures(sets[n], learned(others, held_out=False)))

@@ -101,21 +101,16 @@ class _Answers:
     """One joint in one window.
 
     Attributes:
-        new: (rows,) innovations, in deviations. held, late: (rows, commands), as these see a setpoint that is a radian off while a
-            command is in force, and a command that comes a second late.
+        new: (rows,) innovations, in deviations. to_offset, to_delay: (rows, commands), as these see a setpoint that is a radian off
+            while a command is in force, and a command that comes a second after its time.
         times, values: (commands,) s, when they were sent, and rad.
     """
 
     new: Array
-    held: Array
-    late: Array
+    to_offset: Array
+    to_delay: Array
     times: Array
     values: Array
-
-    @property
-    def single(self) -> Array:
-        """(rows, commands) what innovations see where one command was lost."""
-        return -self.held * np.diff(self.values, prepend=self.values[0])
 
     @cached_property
     def spans(self) -> Ints:
@@ -128,8 +123,8 @@ class _Answers:
     def lost(self) -> Array:
         """(rows, stretches) what innovations see where these were lost, and the command before them stays in force."""
         first, stop = self.spans.T
-        up_to = np.pad(np.cumsum(self.held, axis=1), ((0, 0), (1, 0)))
-        at = np.pad(np.cumsum(self.held * self.values, axis=1), ((0, 0), (1, 0)))
+        up_to = np.pad(np.cumsum(self.to_offset, axis=1), ((0, 0), (1, 0)))
+        at = np.pad(np.cumsum(self.to_offset * self.values, axis=1), ((0, 0), (1, 0)))
         out: Array = self.values[first - 1] * (up_to[:, stop] - up_to[:, first]) - (at[:, stop] - at[:, first])
         return out
 
@@ -144,7 +139,7 @@ def irregular(
             fitted. delays: of each, (joints,) s by which its commands act later than they are sent.
     """
     joints = len(runs[0].plant.joints)
-    lost, largest, losses, told, longest = np.zeros((5, joints + 1))
+    sums, largest = np.zeros((3, joints + 1)), np.zeros((2, joints + 1))
     volume, left, rows = np.zeros(len(RATIOS)), np.zeros(len(RATIOS)), 0
     usual = {
         setup: _usual([error for one, error in zip(runs, errors, strict=True) if one.plant.setup is setup])
@@ -161,23 +156,19 @@ def irregular(
             if not known:
                 continue
             together = len({some.times.tobytes() for some in known}) == 1
-            for n, group in enumerate([*([some] for some in answers), known if together else [None]]):
-                mine = [some for some in group if some is not None]
-                if not mine:
-                    continue
-                gains, gone, lasts = _pursued(mine, 1.0)
-                lost[n] += sum(gains) - sum(_pursued(mine, -1.0)[0])
-                largest[n] = max([largest[n], *gains])
-                tells = np.sum([np.square(some.single).sum(axis=0) for some in mine], axis=0) > 2 * TELLS
-                losses[n], told[n] = losses[n] + (tells & gone).sum(), told[n] + tells.sum()
-                longest[n] = max(longest[n], lasts)
+            groups = [[] if some is None else [some] for some in answers]
+            for n, group in enumerate([*groups, known if together else []]):
+                if group:
+                    said, most = _searched(group)
+                    sums[:, n], largest[:, n] = sums[:, n] + said, np.maximum(largest[:, n], most)
             more, rest, count = _scattered(known if together else known[:1])
             volume, left, rows = volume + more, left + rest, rows + count
     # What else is new is as large as it is without what commands do.
     size = np.maximum(left, TINY) / max(rows, 1)
     scattered = -0.5 * (rows * np.log(size / size[0]) + volume) if rows else volume
     # A foot that slips once may look like a lost command in all joints, but not again and again.
-    return Irregular(lost - largest, losses, told, longest, scattered, np.sqrt(RATIOS * size))
+    (lost, losses, told), (most, longest) = sums, largest
+    return Irregular(lost - most, losses, told, longest, scattered, np.sqrt(RATIOS * size))
 
 
 def _usual(errors: Sequence[Array]) -> list[tuple[Array, float] | None]:
@@ -200,7 +191,7 @@ def _usual(errors: Sequence[Array]) -> list[tuple[Array, float] | None]:
 
 def _lagged(values: Array) -> tuple[Array, Array]:
     """(rows, ORDER) of rows before, newest first, and (rows,), where all of them are known."""
-    whole = sliding_window_view(values, ORDER + 1)
+    whole = sliding_window_view(values, ORDER + 1) if len(values) > ORDER else np.empty((0, ORDER + 1))
     whole = whole[np.isfinite(whole).all(axis=1)]
     return whole[:, -2::-1], whole[:, -1]
 
@@ -224,10 +215,11 @@ def _answers(
     acts = times + delay + one.plant.lead_s
     since = t[rows, None] - np.maximum(acts, t[rows[0]])
     until = t[rows, None] - np.append(acts[1:], np.inf)
-    whole = step_response(np.maximum(since, 0.0), natural, damped) * (since > 0)
-    held = whole - step_response(np.maximum(until, 0.0), natural, damped) * (until > 0)
-    later = np.maximum(since - LATE_S, 0.0)
-    late = (step_response(later, natural, damped) * (later > 0) - whole) / LATE_S * np.diff(values, prepend=values[0])
+    whole, ended, after = (
+        step_response(np.maximum(time, 0.0), natural, damped) for time in (since, until, since - LATE_S)
+    )
+    to_offset = whole - ended
+    to_delay = (after - whole) / LATE_S * np.diff(values, prepend=values[0])
     by, size = usual
     lags = sliding_window_view(error[rows], ORDER + 1)
     known = np.isfinite(lags).all(axis=1)
@@ -236,38 +228,55 @@ def _answers(
     ahead = np.concatenate([-by[::-1], [1.0]]) / size
     # The autoregression reaches back where a row's answer was none yet: that is 0, not unknown.
     new = np.clip(lags[known] @ ahead, -FARTHEST, FARTHEST)
-    seen = [np.einsum("kcl,l->kc", sliding_window_view(x, ORDER + 1, axis=0)[known], ahead) for x in (held, late)]
+    seen = [
+        np.einsum("kcl,l->kc", sliding_window_view(x, ORDER + 1, axis=0)[known], ahead) for x in (to_offset, to_delay)
+    ]
     return _Answers(new, seen[0], seen[1], times, values)
 
 
-def _pursued(group: Sequence[_Answers], sign: float) -> tuple[list[float], Bools, float]:
-    """(nats of each stretch, (commands,) which were lost, longest in a row, s); with sign −1 what had come twice as far."""
-    spans, times = group[0].spans, group[0].times
-    gains, gone, longest = list[float](), np.zeros(len(times), bool), 0.0
-    if not len(spans):
-        return gains, gone, longest
-    answers = sign * np.concatenate([some.lost for some in group])
-    half = 0.5 * np.square(answers).sum(axis=0)
-    along = answers.T @ np.concatenate([some.new for some in group])
-    free = np.ones(len(spans), bool)
-    while True:
-        more = np.where(free, along - half - PRICE, 0.0)
-        best = int(more.argmax())
-        if more[best] <= 0:
-            return gains, gone, longest
-        first, stop = spans[best]
-        gains.append(float(more[best]))
+def _searched(group: Sequence[_Answers]) -> tuple[Array, Array]:
+    """Of joints whose commands are lost at once: nats, of how many that were found, of how many it could be told; nats of the stretch
+    that says most, and s of the longest."""
+    one, new, seen = (
+        group[0],
+        np.concatenate([some.new for some in group]),
+        np.concatenate([some.lost for some in group]),
+    )
+    half = 0.5 * np.square(seen).sum(axis=0)
+    gains, found = _pursued(one.spans, seen, half, new)
+    mirrored = _pursued(one.spans, seen, half, -new)[0]
+    gone, longest = np.zeros(len(one.times), bool), 0.0
+    for first, stop in found:
         gone[first:stop] = True
-        longest = max(longest, float(times[min(stop, len(times) - 1)] - times[first]))
-        along = along - answers.T @ answers[:, best]
-        free &= (spans[:, 0] >= stop) | (spans[:, 1] <= first)
+        longest = max(longest, float(one.times[min(stop, len(gone) - 1)] - one.times[first]))
+    # The first stretches are of one command each.
+    tells = half[: len(gone) - 1] > TELLS
+    nats = sum(gains) - sum(mirrored)
+    return np.array([nats, (tells & gone[1:]).sum(), tells.sum()]), np.array([max(gains, default=0.0), longest])
+
+
+def _pursued(spans: Ints, seen: Array, half: Array, new: Array) -> tuple[list[float], list[Ints]]:
+    """nats of each stretch that is found among what is new, and which commands that is; of −new, those that had gone twice as far.
+
+    Args:
+        spans, seen: as of `_Answers`, of some joints one after another. half: (stretches,) of the squares of what they show.
+    """
+    gains, found = list[float](), list[Ints]()
+    along, free = seen.T @ new, np.ones(len(spans), bool)
+    while (more := np.where(free, along - half - PRICE, 0.0)).max(initial=0.0) > 0:
+        best = int(more.argmax())
+        gains.append(float(more[best]))
+        found.append(spans[best])
+        along = along - seen.T @ seen[:, best]
+        free &= (spans[:, 0] >= spans[best, 1]) | (spans[:, 1] <= spans[best, 0])
+    return gains, found
 
 
 def _scattered(group: Sequence[_Answers]) -> tuple[Array, Array, int]:
     """Of commands that scatter, one packet for all joints: (RATIOS,) logarithm of the volume that they add, and squares left; rows."""
-    normal = np.sum([some.late.T @ some.late for some in group], axis=0)
+    normal = np.sum([some.to_delay.T @ some.to_delay for some in group], axis=0)
     shows, ways = np.linalg.eigh(normal)
-    along = np.square(ways.T @ np.sum([some.late.T @ some.new for some in group], axis=0))
+    along = np.square(ways.T @ np.sum([some.to_delay.T @ some.new for some in group], axis=0))
     grows = 1 + RATIOS[:, None] * np.maximum(shows, 0.0)
     whole = sum(float(some.new @ some.new) for some in group)
     left = whole - (RATIOS[:, None] / grows * along).sum(axis=1)

@@ -148,3 +148,9 @@ def test_what_a_model_does_wrong_is_no_lost_command(run: Run, plant: Plant) -> N
     assert found.nats(LOST) < 10
     assert found.nats(SCATTERED) < 10
     assert left(run, plant, late(0.001)).nats(SCATTERED) < 3
+
+
+def test_a_few_rows_say_nothing_of_commands(run: Run, plant: Plant) -> None:
+    short, still = run.between(0.0, 2.5 * PERIOD_S), np.zeros(len(JOINTS))
+    found = irregular([Played.of(short, plant, still)], [np.zeros((3, len(JOINTS)))], [plant], [still])
+    assert found.nats(LOST) == found.nats(SCATTERED) == 0.0
