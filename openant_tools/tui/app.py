@@ -21,7 +21,7 @@ from textual.theme import Theme
 from textual.widget import Widget
 from textual.widgets import Input
 
-from openant_tools.bringup.walk import BENCH, BESIDE, WALK
+from openant_tools.bringup.walk import BENCH, BESIDE, WALK, standing
 from openant_tools.errors import OpenAntError
 from openant_tools.robot.folder import RobotFolder
 from openant_tools.robot.kit import KITS
@@ -69,9 +69,8 @@ SCREENS: Mapping[str, tuple[type[Page], str]] = {
     "settings": (SettingsScreen, "The robot's folder, how it looks, what this machine has"),
 }
 
-#: words → source for `Session.start_virtual`, of the virtual robots that can be chosen
-VIRTUAL_ROBOTS: tuple[tuple[str, str | None], ...] = (
-    ("Loose motors in their box, for the walk from its beginning (kept in this folder)", None),
+#: words → source for `Session.start_virtual`, of the virtual robots that can be chosen beside the walk's own
+VIRTUAL_ROBOTS: tuple[tuple[str, str], ...] = (
     ("A healthy robot on its stand, ids and zeros as they should be", VIRTUAL_DEFAULT),
     ("A healthy robot on the floor, under its camera", str(SCENARIOS / "floor.toml")),
 )
@@ -410,11 +409,18 @@ class OpenAnt(App[int]):
             self._in_background("ending the virtual robot", self.session.end_virtual, self.refresh_walk)
 
     def _ask_virtual(self) -> None:
-        self.push_screen(Question("Which virtual robot?", *(words for words, _ in VIRTUAL_ROBOTS)), self._chose_virtual)
+        """Offer the robot of this folder's walk, as far as it is built, and healthy ones."""
+        states = {} if self.session.folder is None else standing(self.session.folder)
+        if states and states["legs"].state == "ok":
+            own = "The robot of this walk, built, on its stand (kept in this folder)"
+        else:
+            own = "Loose motors in their box, for the walk from its beginning (kept in this folder)"
 
-    def _chose_virtual(self, choice: int | None) -> None:
-        if choice is not None:
-            self.start_virtual(VIRTUAL_ROBOTS[choice][1])
+        def chose(choice: int | None) -> None:
+            if choice is not None:
+                self.start_virtual([None, *(source for _, source in VIRTUAL_ROBOTS)][choice])
+
+        self.push_screen(Question("Which virtual robot?", own, *(words for words, _ in VIRTUAL_ROBOTS)), chose)
 
     def start_virtual(self, source: str | None) -> None:
         """Start a virtual robot and tell the first screen."""

@@ -35,7 +35,7 @@ from openant_tools.errors import HardwareFault
 from openant_tools.files import write_text
 from openant_tools.gap.diagnosis import Diagnosis, Found, Span
 from openant_tools.procedure.finding import Evidence, Finding, keep
-from openant_tools.procedure.step import Ask, Bench, Intent, Live, Procedure, Say, Step
+from openant_tools.procedure.step import Ask, Bench, Intent, Live, Procedure, Progress, Say, Step
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run, write_table
 from openant_tools.robot.folder import RobotFolder, create_robot
@@ -52,6 +52,7 @@ from openant_tools.tui.page import Page
 from openant_tools.tui.process import Process
 from openant_tools.tui.screens import settings
 from openant_tools.tui.screens.gap import GapScreen
+from openant_tools.tui.screens.learn import LearnScreen
 from openant_tools.tui.screens.live import LiveScreen
 from openant_tools.tui.screens.step import StepScreen
 from openant_tools.tui.screens.walk import WalkScreen
@@ -699,6 +700,9 @@ def test_the_stop_key_reaches_a_robot_that_moves(tmp_path: Path) -> None:
     asyncio.run(stop())
 
 
+HEEDED = threading.Event()
+
+
 def asks(bench: Bench) -> Procedure:
     """A procedure with one question."""
     yield Ask("Is it so?", ("yes", "no"), default="yes")
@@ -732,6 +736,45 @@ def test_a_key_that_is_pressed_twice_answers_once(robot: RobotFolder) -> None:
     asyncio.run(press())
 
 
+def moves(bench: Bench) -> Procedure:
+    """A procedure that looks, asks, and then takes its time without a word; many numbers come of it."""
+    yield Progress(0.3, "looking")
+    yield Intent("move", moves=True)
+    yield Live({"x": 1.0}, "mm", "moving")
+    HEEDED.wait(PATIENCE_S)
+    return Finding(
+        "moves", True, "it moved", tuple(Evidence(f"number {k}", k, "mm", "here") for k in range(40)), "", "none"
+    )
+
+
+def test_what_was_granted_is_under_way_and_the_page_keys_scroll_what_came_of_it(robot: RobotFolder) -> None:
+    HEEDED.clear()
+
+    async def scroll() -> None:
+        app = OpenAnt(robot.path)
+        async with app.run_test(size=(80, 24)) as pilot:
+            app.push_screen(StepScreen(Step("moves", "Moves", "Moves.", f"{__name__}:moves", moves=True)))
+            await choose(pilot, "Begin")
+            await choose(pilot, "Yes, do it")
+            await until(pilot, lambda: "Under way: move." in screen_text(app))
+            await until(pilot, lambda: "running 30 %" in screen_text(app))
+            assert "looking" not in screen_text(app), "that was before it asked"
+            HEEDED.set()
+            await until(pilot, lambda: "Begin again" in offered(app))
+            assert "number 39" not in screen_text(app)
+            await pilot.press("pagedown", "pagedown", "pagedown")
+            await until(pilot, lambda: "number 39" in screen_text(app))
+            assert "it moved" in screen_text(app)
+            await pilot.press("pageup", "pageup", "pageup")
+            await until(pilot, lambda: "number 0" in screen_text(app))
+            chooser = app.screen.query_one("#choices", Choices)
+            assert chooser.has_focus
+            assert chooser.highlighted == 0, "what is asked stays as it was"
+        app.session.close()
+
+    asyncio.run(scroll())
+
+
 def test_help_on_a_question_is_about_the_step_below_it(robot: RobotFolder) -> None:
     async def ask() -> None:
         app = OpenAnt(robot.path)
@@ -748,9 +791,6 @@ def test_help_on_a_question_is_about_the_step_below_it(robot: RobotFolder) -> No
         app.session.close()
 
     asyncio.run(ask())
-
-
-HEEDED = threading.Event()
 
 
 def heedless(bench: Bench) -> Procedure:
@@ -917,6 +957,11 @@ def test_what_was_learned_is_evaluated_played_compared_and_diagnosed_from_its_sc
             for id_ in ("evaluate", "compare", "play"):
                 chooser.highlighted = next(k for k, line in enumerate(chooser.options) if line.id == id_)
                 await pilot.press("enter")
+                with monkeypatch.context() as while_it_runs:
+                    while_it_runs.setattr(Process, "running", True)
+                    cast(LearnScreen, app.screen_stack[1]).draw_progress()
+                    await pilot.pause()
+                    assert "playing   openant" in screen_text(app) or id_ == "play"
             assert "inside the circle, facing its reward" in screen_text(app), "what moves asks"
             await pilot.press("escape", "d")
             await pilot.pause()

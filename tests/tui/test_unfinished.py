@@ -55,6 +55,38 @@ def test_the_one_robot_that_lies_here_goes_on_with_the_cursor_on_its_next_step(t
     with_program(tmp_path, look)
 
 
+def test_from_a_step_that_was_done_the_cursor_goes_on_to_the_next(tmp_path: Path) -> None:
+    folder = built_so_far(tmp_path / "my-ant", "connect", "estop")
+
+    async def do(app: OpenAnt, pilot: Pilot[int]) -> None:
+        for done, following in ((False, "ids"), (True, "centre")):
+            await pilot.press("3", "enter")
+            await until(pilot, lambda: isinstance(app.screen, StepScreen))
+            keep(Finding("ids", done, "as it is", (), "", "ids", problems=() if done else ("so",)), folder)
+            await pilot.press("escape")
+            option = app.screen.query_one(WalkList).highlighted_option
+            assert option is not None
+            assert option.id == following
+
+    with_program(folder.path, do)
+
+
+def test_the_virtual_robot_of_a_walk_is_offered_as_far_as_it_is_built(tmp_path: Path) -> None:
+    steps = ("connect", "estop", "ids", "centre", "legs")
+    for built, words in (
+        (steps[:4], "Loose motors in their box"),
+        (steps, "The robot of this walk, built, on its stand"),
+    ):
+        folder = built_so_far(tmp_path / f"ant-{len(built)}", *built)
+
+        async def ask(app: OpenAnt, pilot: Pilot[int], words: str = words) -> None:
+            await pilot.press("v")
+            await until(pilot, lambda: "Which virtual robot?" in screen_text(app))
+            assert words in screen_text(app)
+
+        with_program(folder.path, ask)
+
+
 def test_of_several_robots_one_is_chosen_and_a_kit_never_opens_another_kits_robot(tmp_path: Path) -> None:
     built_so_far(tmp_path / "my-ant", "connect")
     built_so_far(tmp_path / "older")

@@ -52,7 +52,8 @@ stands on the screen. *A first look* trains for a quarter of an hour of robot ti
 demo does; the others have the paper's. You may leave this screen meanwhile. Stopping saves; the same choice goes on from there. `Space` stops
 training on the robot, too, with torque off.
 
-A step is 0.12 s. The seed is what chance begins with; each number has a run of its own.
+*sac*, soft actor-critic, learns small neural networks; *sarsa* a table of what each move was worth, over tiles of what the
+robot sees. A step is 0.12 s. The seed is what chance begins with; each number has a run of its own.
 
 The curve is the average reward over the last 120 s of robot time, in cm/s: how fast it walks where it should. The dotted line
 is what the paper's agents reached.
@@ -232,7 +233,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         text = Text()
         if training is not None:
             if training.running:
-                text.append_text(marked("wait", "training"))
+                text.append_text(marked("wait", "training" if isinstance(training, TrainingProcess) else "playing"))
             else:
                 code = training.exit_code
                 text.append_text(

@@ -118,8 +118,9 @@ where the number lies. `l` shows the log of what was said and done instead.
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape", "leave", "Leave"),
         Binding("l", "log", "Log"),
-        Binding("pageup", "scroll(-1)", "Scroll", key_display="pgup/dn"),
-        Binding("pagedown", "scroll(1)", "Scroll", show=False),
+        # The list of answers, which has the focus, has such keys of its own.
+        Binding("pageup", "scroll(-1)", "Scroll", key_display="pgup/dn", priority=True),
+        Binding("pagedown", "scroll(1)", "Scroll", show=False, priority=True),
     ]
 
     def __init__(self, step: Step) -> None:
@@ -315,7 +316,8 @@ where the number lies. `l` shows the log of what was said and done instead.
             self.offer("It ended without a finding.", [*self._beginnings("Begin again"), self._back()])
         else:
             self.show_finding(finding)
-            self._now = _sentence(finding.next_action) or "Nothing is left to do here."
+            rest = "Nothing is left to do here." if finding.ok else "See why below; begin again once that is mended."
+            self._now = _sentence(finding.next_action) or rest
             [*ahead, again] = self._beginnings("Begin again")
             names = list(WALK)
             after = names.index(self.step.name) + 1 if self.step.name in names else len(names)
@@ -528,6 +530,8 @@ where the number lies. `l` shows the log of what was said and done instead.
             self.say(Text(f"{mark('info')} {self._pending.words}", style="bold"))
         self._now = _under_way(self._pending) if isinstance(self._pending, Intent) else self.step.does
         self._pending = None
+        if self._progress is not None:  # it was busy with that before it asked
+            self._progress = Progress(self._progress.share, "")
         self.say(Text(f"  {mark('ok')} {asked}{words}", style=MARKS["todo"].colour))
         self.offer("", [])
         self._run.reply(answer)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
@@ -90,6 +91,7 @@ class WalkScreen(Page):
     def __init__(self) -> None:
         super().__init__()
         self._shown: Path | None = None
+        self._standing: dict[str, Standing] = {}
 
     def body(self) -> ComposeResult:
         yield Static(id="continue")
@@ -111,13 +113,19 @@ class WalkScreen(Page):
     def refresh_steps(self) -> None:
         """Read the robot's findings anew."""
         walk = self.query_one(WalkList)
-        chosen = walk.highlighted
+        chosen, names = walk.highlighted, list(WALK)
         folder = self.session.folder
-        self._standing = standing(folder) if folder is not None else {}
+        before, self._standing = self._standing, standing(folder) if folder is not None else {}
         words = "No robot yet: Enter on a step makes its folder" if folder is None else continues(folder)
         self.query_one("#continue", Static).update(Text(spelled(words), style="bold"))
         if folder is not None and folder.path != self._shown:
             chosen, self._shown = None, folder.path
+        elif (
+            chosen is not None
+            and chosen < len(names)
+            and _done(before, names[chosen]) < _done(self._standing, names[chosen])
+        ):
+            chosen = None  # from a step that was done the cursor goes on to the next
         walk.clear_options()
         for n, (name, step) in enumerate(WALK.items(), 1):
             state = standing_mark(self._standing[name]) if name in self._standing else marked("todo")
@@ -126,7 +134,7 @@ class WalkScreen(Page):
         walk.add_option(Option(Text(" b On the bench", style="bold"), id=BENCH))
         offer = "End the virtual robot" if self.session.virtual is not None else "Start a virtual robot"
         walk.add_option(Option(Text(f" v {offer}", style="bold"), id=VIRTUAL))
-        first = next((k for k, name in enumerate(WALK) if self._state(name) != "ok"), 0)
+        first = next((k for k, name in enumerate(names) if not _done(self._standing, name)), 0)
         walk.highlighted = first if chosen is None else min(chosen, walk.option_count - 1)
 
     def go_to(self, name: str) -> None:
@@ -138,9 +146,6 @@ class WalkScreen(Page):
         option = self.query_one(WalkList).highlighted_option
         name = None if option is None else option.id
         return step_help(WALK[name]) if name is not None and name in WALK else ""
-
-    def _state(self, name: str) -> str:
-        return self._standing[name].state if name in self._standing else "todo"
 
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
         about = self.query_one("#about", Static)
@@ -160,6 +165,10 @@ class WalkScreen(Page):
             self.ant.action_bench()
         elif event.option_id is not None:
             self.ant.open_step(event.option_id)
+
+
+def _done(states: Mapping[str, Standing], name: str) -> bool:
+    return name in states and states[name].state == "ok"
 
 
 _ABOUT_CHECK = Text.assemble(
