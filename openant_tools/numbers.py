@@ -119,9 +119,10 @@ def column(values: Sequence[float | None], unit: str = "", *, name: str = "") ->
     factor, read = readable(most, unit, name)
     whole = all(_whole(factor * value) for value in known)
     places = 0 if whole else decimals_of(factor * most, None, read)
-    if unit in SMALL and read != unit:  # each alone might choose the larger unit
-        return [number(None if v is None else factor * v, read, decimals=places) for v in values]
-    return [number(value, unit, name=name, decimals=places) for value in values]
+    # Each alone might choose another unit.
+    return [
+        UNKNOWN if v is None or not math.isfinite(v) else f"{_plain(factor * v, places)}{_joined(read)}" for v in values
+    ]
 
 
 def exact(value: float, unit: str = "") -> str:

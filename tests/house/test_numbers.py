@@ -9,7 +9,7 @@ import pytest
 from places import ROOT
 
 from openant_tools.comms.hardware import changes
-from openant_tools.numbers import chosen, exact, number, percent, span, typed
+from openant_tools.numbers import chosen, column, exact, number, percent, span, typed
 from openant_tools.procedure.journal import EepromWrite
 
 
@@ -42,6 +42,8 @@ def test_columns_signs_and_shares():
     assert span(-math.pi / 4, math.pi / 4, "rad") == "−45 to 45°"
     assert span(5, 60, "s") == "5 to 60 s"
     assert span(0.00011, 0.00019, "kg·m²") == "0.00011 to 0.00019 kg·m²"
+    assert column((0.1, 0.045, None), "m") == ["0.100 m", "0.045 m", "unknown"]
+    assert column((0.02, 0.045), "m") == ["20 mm", "45 mm"]
     assert exact(0.5, "s") == "0.5 s"
     assert exact(1_000_000, "baud") == "1000000 baud"
     assert (typed(-0.7853981634), typed(3.0), typed(1.23456, 4)) == ("-0.785398", "3", "1.235")
