@@ -116,8 +116,12 @@ class Robot:
     def do(self, procedure: Procedure, builder: Builder | None = None) -> tuple[Finding, Builder]:
         """Run a procedure; its finding, and who ran it."""
         builder = builder or self.builder()
+        before = len(builder.events)
         try:
-            return drive(procedure, builder), builder
+            found = drive(procedure, builder)
+            shares = [e.share for e in builder.events[before:] if isinstance(e, Progress) and e.share is not None]
+            assert shares == sorted(shares), f"what is done does not become undone: {shares}"
+            return found, builder
         finally:
             builder.hands.close()
 

@@ -12,7 +12,7 @@ from openant_tools.comms.soak import soak
 from openant_tools.numbers import exact, number
 from openant_tools.procedure.by_time import minutes, noted
 from openant_tools.procedure.finding import together
-from openant_tools.procedure.relay import relayed
+from openant_tools.procedure.relay import relayed, within
 from openant_tools.procedure.step import Ask, Bench, Intent, Procedure, Say
 from openant_tools.procedure.unfinished import Parts, unfinished
 from openant_tools.recording.tables import read_run
@@ -22,6 +22,8 @@ __all__ = ["comms_step"]
 COMMAND = "openant calib comms"
 #: Long enough for every joint to swing to both sides and back, and to rest; an hour finds what is rare.
 DEFAULT_MIN, LONGEST_MIN = 1.0, 600.0
+#: share of the step that passes with torque off
+AT_REST = 0.2
 
 
 def comms_step(bench: Bench) -> Procedure:
@@ -30,7 +32,7 @@ def comms_step(bench: Bench) -> Procedure:
     Raises:
         HardwareFault: not all servos answer.
     """
-    still = yield from comms_health(bench)
+    still = yield from within((0.0, AT_REST), comms_health(bench))
     path = bench.folder.recordings / "comms-soak.mcap"
     left = unfinished(bench.folder, "comms")
     length = None if left is None or not path.is_file() else next(iter(left.done.values())).get("minutes")
@@ -54,7 +56,8 @@ def comms_step(bench: Bench) -> Procedure:
         moves=True,
     )
     config, text = engine_config(bench), bench.folder.config_file.read_text(encoding="utf-8")
-    soaked = yield from noted(soak(config, path, 60 * length, resume=resume, robot_toml=text), parts, minutes=length)
+    soaking = soak(config, path, 60 * length, resume=resume, robot_toml=text)
+    soaked = yield from within((AT_REST, 1.0), noted(soaking, parts, minutes=length))
     told = yield from relayed(lambda progress, notice: diagnose_dropouts([read_run(path, need=())]))
     moving = dropouts_finding(told, [bench.folder.relative(path)], COMMAND)
     if soaked.whole:

@@ -11,7 +11,7 @@ from openant_tools.comms.state import of_robot_toml
 from openant_tools.files import known
 from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding
-from openant_tools.procedure.relay import relayed
+from openant_tools.procedure.relay import relayed, within
 from openant_tools.procedure.step import Bench, Intent, Procedure, Say
 from openant_tools.procedure.unfinished import Parts
 from openant_tools.recording.tables import read_run
@@ -25,6 +25,8 @@ COMMAND = "openant bringup"
 PROTOCOL = "stand"
 #: s of each recording: a fit takes as long as its data, and this is what tells friction and inertia apart.
 RECORD_S = 16.0
+#: share of the step that recording takes
+RECORDED = 0.3
 #: what is recorded, in order; the fit, which asks nobody, follows
 TAKES = ("the motion to fit", "another to judge by", "the same again", "fit")
 TIMES = ("", "once", "twice", "three times")
@@ -52,15 +54,17 @@ def identification(bench: Bench) -> Procedure:
     if missing:
         much = f"{TIMES[len(missing)]} for {number(RECORD_S, 's', decimals=0)}"
         yield Intent(f"play `{PROTOCOL}` {much} on the stand, legs free, and fit the model to what is seen", moves=True)
-        yield from record_takes(
+        recording = record_takes(
             engine_config(bench, imu=None),
             missing,
             robot_toml=bench.folder.config_file.read_text(encoding="utf-8"),
             made=lambda take: parts.done(named[take.path], stamp=stamp, robot=robot),
         )
+        yield from within((0.0, RECORDED), recording)
     fitted, held_out = [read_run(take.path) for take in wanted], [read_run(take.path) for take in judge]
     nominal = bench.folder.path / NOMINAL_MODEL
-    result = yield from relayed(lambda progress, notice: sysid.fit(fitted, nominal, held_out, progress=progress))
+    fitting = relayed(lambda progress, notice: sysid.fit(fitted, nominal, held_out, progress=progress))
+    result = yield from within((RECORDED, 1.0), fitting)
     parts.end()
     # Geared servos rub the more the more they bear, which plain MuJoCo cannot do and the environment can.
     richer = result.with_effects
@@ -85,7 +89,9 @@ def identification(bench: Bench) -> Procedure:
             ),
             Evidence("floor", result.floor, "rad", "two repeats of that recording"),
         ),
-        "" if closer else "look at fit/report.html; the nominal model stays in use",
+        "how well it fits, joint by joint: fit/report.html"
+        if closer
+        else "look at fit/report.html; the nominal model stays in use",
         COMMAND,
         data={
             "report": bench.folder.relative(shown / "report.html"),

@@ -66,6 +66,8 @@ TURNED_SHARE = 0.3
 GYRO_FACTOR = 1.5
 #: Views of a ChArUco board, and the longest wait for the next one that differs, s.
 VIEWS, VIEW_S = 10, 60.0
+#: shares of the step when the lens is known, and when the motion is over
+LOOKED, MOVED = 0.1, 0.9
 #: Share of the picture's width by which a view must differ from all before it.
 NEW_VIEW = 0.03
 #: as `calibrate` calls its source
@@ -158,14 +160,15 @@ def arena(bench: Bench) -> Procedure:
     problems, wrong, unsure = list[str](), list[str](), list[str]()
     values = dict[str, object]()
     parts = Parts(bench.folder, "arena", (LENS, MOTION, CIRCLE, BACK))
-    if parts.before:
+    then = parts.before.get(LENS, {}).get("where", where)
+    if then != where:
+        yield Say(f"it was another camera then ({then}): lens, look and motion are made again", "warn")
+    elif parts.before:
         yield Say(parts.words)
     seen = parts.before.get(MOTION, {})
     if seen.get("where") == where and _path(bench).is_file():
         view, record = _View.of_note(seen), read_recording(_path(bench))
     else:
-        if seen:
-            yield Say(f"it was another camera then ({seen['where']}): look and motion are made again", "warn")
         yield Progress(0.0, f"looking through {where}")
         view = yield from _view(bench, config, where, parts)
         setup = replace(config.camera, body_tag_id=view.body_id, latency_s=None)
@@ -259,7 +262,9 @@ def arena(bench: Bench) -> Procedure:
             values["camera.latency_s"] = round(latency_s, 4)
     radius = parts.before.get(CIRCLE, {}).get("radius_m")
     if radius is None:
-        radius = yield Ask("Radius of the circle?", unit="m", default=config.arena.radius_m, low=0.1, high=5.0)
+        radius = yield Ask(
+            "Radius of the circle in which it may walk?", unit="m", default=config.arena.radius_m, low=0.1, high=5.0
+        )
         parts.done(CIRCLE, radius_m=radius)
     centre = [round(float(np.median(lying[axis])), 4) for axis in ("x", "y")]
     values |= {"arena.centre_m": centre, "arena.radius_m": radius}
@@ -432,7 +437,7 @@ def _board_views(camera: Camera, clock: Clock, board: CharucoBoard) -> Subroutin
         seen.append(view)
         pictures.append(gray)
         give_up = clock.now() + VIEW_S
-        yield Progress(len(pictures) / VIEWS, f"view {len(pictures)} of {VIEWS}")
+        yield Progress(LOOKED * len(pictures) / VIEWS, f"view {len(pictures)} of {VIEWS}")
     return pictures
 
 
@@ -469,7 +474,7 @@ def _stand_and_wiggle(
         engine.ask(messages.Torque(True))
         facts = Facts(joints=names, setup="floor", protocol="arena", extra={"phases": phases})
         engine.ask(messages.Record(str(path), facts, overwrite=True))
-        yield from play_watched(engine, messages.Play(played, "arena"), len(played) / rate, "standing up and turning")
+        yield from play_watched(engine, messages.Play(played, "arena"), len(played) / rate, MOTION, (LOOKED, MOVED))
         engine.ask(messages.StopRecording())
         engine.ask(messages.Torque(False))
     return read_recording(path)

@@ -1,4 +1,5 @@
-"""Work that reports by callbacks, as a procedure: it runs in a thread, its progress comes as events."""
+"""Work that reports by callbacks, as a procedure: it runs in a thread, its progress comes as events. And work as a part of a
+procedure: how far it is, as a share of the whole."""
 
 from __future__ import annotations
 
@@ -7,9 +8,9 @@ import threading
 from collections.abc import Callable
 from typing import TypeVar
 
-from openant_tools.procedure.step import Event, Progress, Say, Subroutine
+from openant_tools.procedure.step import Answer, Event, Progress, Say, Subroutine
 
-__all__ = ["relayed"]
+__all__ = ["relayed", "within"]
 
 T = TypeVar("T")
 
@@ -55,3 +56,20 @@ def relayed(
     if failure:
         raise failure[0]
     return outcome[0]
+
+
+def within(part: tuple[float, float], work: Subroutine[T]) -> Subroutine[T]:
+    """Do the work as this part, from share to share, of a procedure, whose progress never goes back; its result."""
+    answer: Answer = None
+    begin, end = part
+    try:
+        while True:
+            event = work.send(answer)
+            if isinstance(event, Progress) and event.share is not None:
+                event = Progress(begin + event.share * (end - begin), event.words)
+            answer = yield event
+    except StopIteration as ended:
+        result: T = ended.value
+        return result
+    finally:
+        work.close()

@@ -152,7 +152,7 @@ def record_takes(
                     yield Progress((past + played) / total, words)
                 time.sleep(LOOK_S)
 
-        for take in wanted:
+        for nth, take in enumerate(wanted, 1):
             protocol, extra = take.protocol, dict[str, Any]()
             if take.work_s:
                 extra["work_s"], extra["rise_k"] = yield from _work(engine, take.work_s, play)
@@ -179,7 +179,7 @@ def record_takes(
                 },
             )
             engine.ask(messages.Record(str(take.path), facts, robot_toml, pictures=pictures))
-            yield from play(protocol, take.seed, take.path.stem)
+            yield from play(protocol, take.seed, f"{protocol.name}, recording {nth} of {len(wanted)}")
             written, cycles = engine.ask(messages.StopRecording())
             done.append(Recorded(Path(written), cycles))
             made(take)

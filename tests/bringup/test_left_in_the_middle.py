@@ -62,7 +62,7 @@ def test_a_watch_over_the_bus_goes_on_with_its_next_minute(tmp_path: Path) -> No
     soak = tmp_path / "ant" / "recordings" / "comms-soak.mcap"
     with robot(tmp_path / "ant") as there:
         note = left(
-            there, comms_step, "comms", lambda event: isinstance(event, Progress) and (event.share or 0) > 0.6 and "lost" in event.words,
+            there, comms_step, "comms", lambda event: isinstance(event, Progress) and (event.share or 0) > 0.68 and "lost" in event.words,
             **{"how long": 1.5},
         )  # fmt: skip
         assert (note.words, note.next) == ("1 of 2", "minute 2")
@@ -93,7 +93,10 @@ def test_motions_that_were_recorded_are_not_played_again_unless_the_robot_is_ano
 ) -> None:
     with robot(tmp_path / "ant", motor={"coulomb_nm": 0.09}) as there:
         note = left(
-            there, identification, "identify", lambda event: isinstance(event, Progress) and "held-out-2" in event.words
+            there,
+            identification,
+            "identify",
+            lambda event: isinstance(event, Progress) and "recording 3 of 3" in event.words,
         )
         assert (note.words, note.next) == ("2 of 4", "the same again")
         recorded = {
