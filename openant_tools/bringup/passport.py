@@ -11,11 +11,12 @@ from openant_tools.bringup.robot_picture import robot_picture
 from openant_tools.bringup.tracking import Moment, draw_moment, worst_moment
 from openant_tools.bringup.walk import WALK, standing
 from openant_tools.errors import BadInput
-from openant_tools.numbers import number, span
+from openant_tools.numbers import column, number, span
 from openant_tools.procedure.finding import Evidence, Finding
 from openant_tools.procedure.step import Bench, Procedure, Progress
 from openant_tools.recording.tables import read_run
 from openant_tools.report import Figure, KeyFigure, Mark, Part, Picture, Report, ReportSummary, plots
+from openant_tools.robot.config import RobotConfig
 from openant_tools.robot.folder import NOMINAL_MODEL, RobotFolder
 from openant_tools.robot.joints import JOINTS
 
@@ -118,20 +119,22 @@ def passport(folder: RobotFolder) -> Report:
         f"openant check --robot {folder.path}        # before every session\n"
         f"openant config export --robot {folder.path}   # for the platform's own software"
     )
-    report.section("Where values came from").table(
-        ["value", "how", "command", "recording", "date"],
-        [
-            [
-                name,
-                entry.how,
-                entry.command or "",
-                entry.recording or "",
-                entry.date.strftime("%Y-%m-%d") if entry.date else "",
-            ]
-            for name, entry in config.provenance.items()
-        ],
-    )
+    report.section("Where values came from").table(["value", "how", "command", "recording", "date"], _origins(config))
     return report
+
+
+def _origins(config: RobotConfig) -> list[list[str]]:
+    """Where each value came from; what several joints have from the same is told once."""
+    told: dict[tuple[str, ...], list[str]] = {}
+    for name, entry in config.provenance.items():
+        joint = next((part for part in name.split(".") if part in JOINTS), "")
+        day = entry.date.strftime("%Y-%m-%d") if entry.date else ""
+        alike = name.replace(joint, "*") if joint else name
+        told.setdefault((alike, entry.how, entry.command or "", entry.recording or "", day), []).append(joint)
+    return [
+        [alike.replace("*", joints[0]) if len(joints) == 1 else f"{alike} ({len(joints)} joints)", *rest]
+        for (alike, *rest), joints in told.items()
+    ]
 
 
 def _figures(folder: RobotFolder) -> list[KeyFigure]:
@@ -148,7 +151,8 @@ def _figures(folder: RobotFolder) -> list[KeyFigure]:
 
 def _recordings(folder: RobotFolder) -> list[Path]:
     """Of which its values were made, each once."""
-    named = dict.fromkeys(entry.recording for entry in folder.config().provenance.values() if entry.recording)
+    origins = folder.config().provenance.values()
+    named = dict.fromkeys(name for entry in origins if entry.recording for name in entry.recording.split(", "))
     return [folder.path / name for name in named]
 
 
@@ -235,7 +239,7 @@ def _sensors(report: Report, folder: RobotFolder) -> None:
             ["tags: origin, body", f"{camera.origin_tag_id}, {camera.body_tag_id}"],
             [
                 "tags: edge of origin, body",
-                " and ".join(number(x, "m") for x in (camera.origin_tag_size_m, camera.body_tag_size_m)),
+                " and ".join(column((camera.origin_tag_size_m, camera.body_tag_size_m), "m")),
             ],
         ],
     )

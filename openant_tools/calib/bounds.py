@@ -407,7 +407,7 @@ def coverage_picture(runs: Sequence[Run], path: Path) -> Path:
             hip, knee = run.column(f"pos.hip_{leg}"), run.column(f"pos.knee_{leg}")
             setup = run.facts.setup or ""
             place.plot(np.degrees(hip), np.degrees(knee), ".", ms=1.5, color=colours.get(setup, "#000000"), label=setup)
-        place.set_title(leg, fontsize=10)
+        place.set_title(f"{JOINTS[f'hip_{leg}'].leg.words} leg", fontsize=10)
         place.grid(alpha=0.3)
     for row in axes[:, 0]:
         row.set_ylabel("knee (°)")

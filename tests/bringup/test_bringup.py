@@ -18,9 +18,11 @@ from openant_tools.cli.calib import calib
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.errors import BadInput, HardwareFault
 from openant_tools.procedure.finding import Finding, keep
-from openant_tools.procedure.relay import relayed
-from openant_tools.procedure.step import Answer, Declined, Event, Intent, Progress, Say
+from openant_tools.procedure.relay import relayed, within
+from openant_tools.procedure.step import Answer, Ask, Declined, Event, Intent, Progress, Say
+from openant_tools.robot.config import Provenance
 from openant_tools.robot.folder import create_robot
+from openant_tools.robot.joints import JOINT_NAMES
 
 TITLES = (
     "Connect", "Emergency stop", "Motor IDs", "Centring", "Leg by leg", "Inventory", "Zeros and directions", "Observation bounds",
@@ -182,6 +184,31 @@ def test_work_with_callbacks_is_a_procedure_and_ends_when_it_is_closed():
     assert result == [7]
 
 
+def test_work_that_is_a_part_tells_its_share_of_the_whole_and_is_ended_with_it():
+    ended, answers = [], []
+
+    def work():
+        try:
+            answers.append((yield Ask("how far?")))
+            yield Progress(0.5, "half")
+            yield Progress(None, "who knows")
+            return 7
+        finally:
+            ended.append(True)
+
+    procedure = within((0.2, 1.0), work())
+    assert procedure.send(None) == Ask("how far?")
+    assert procedure.send("so far") == Progress(0.6, "half")
+    assert next(procedure) == Progress(None, "who knows")
+    with pytest.raises(StopIteration) as over:
+        next(procedure)
+    assert (over.value.value, answers, ended) == (7, ["so far"], [True])
+    procedure = within((0.0, 0.2), work())
+    next(procedure)
+    procedure.close()
+    assert ended == [True, True]
+
+
 def test_what_the_work_raises_is_raised_by_the_procedure():
     def work(progress, notice):
         raise HardwareFault("it fell")
@@ -210,6 +237,24 @@ def test_a_passport_says_what_is_known_and_what_is_not(tmp_path):
         assert words in page
         assert words in text
     assert "not done" in text
+    assert "0.100 m and 0.045 m" in text
+
+
+def test_a_passport_links_every_recording_and_tells_once_what_joints_share(tmp_path):
+    folder = create_robot(tmp_path / "ant")
+    folder.recordings.mkdir(exist_ok=True)
+    for name in ("a.mcap", "b.mcap"):
+        (folder.recordings / name).write_text("")
+    zeros = dict.fromkeys((f"motors.{joint}.zero_offset_rad" for joint in JOINT_NAMES), 0.1)
+    folder.update(zeros, provenance=Provenance("measured", "openant calib zeros"))
+    folder.update(
+        {"arena.radius_m": 0.3}, provenance=Provenance("measured", "a test", "recordings/a.mcap, recordings/b.mcap")
+    )
+    page = write_passport(folder)[0].read_text()
+    assert page.count("openant calib zeros") == 1
+    assert "motors.*.zero_offset_rad (8 joints)" in page
+    for name in ("a.mcap", "b.mcap"):
+        assert f'<a href="./recordings/{name}">{name}</a>' in page
 
 
 # ---- the commands -----------------------------------------------------------------------------------------------------
