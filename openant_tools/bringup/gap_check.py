@@ -8,6 +8,7 @@ import numpy as np
 
 from openant_tools.errors import BadInput
 from openant_tools.gap.measure import Measurement, difference, measure
+from openant_tools.gap.regime import Regime
 from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding, latest
 from openant_tools.procedure.relay import relayed
@@ -61,14 +62,18 @@ def gap_check(bench: Bench) -> Procedure:
         False if worse else None if unsure else True,
         f"simulated joints are {number(after.gaps['pos'], 'rad', name='error', decimals=2)} off (nominal {number(1e3 * before.gaps['pos'], decimals=2)}, "
         f"floor {number(1e3 * after.floors['pos'], decimals=2)})"
-        + (f", most at {worst.joint} in {worst.regime}" if worst else ""),
+        + (f", most at {worst.joint} while {Regime(worst.regime).words}" if worst else ""),
         (
             Evidence("position gap, nominal", before.gaps["pos"], "rad", "0.5 s horizon, held-out recording"),
             Evidence("position gap, calibrated", after.gaps["pos"], "rad", "the same", most=before.gaps["pos"]),
             Evidence("floor", after.floors["pos"], "rad", "repeats of the recording"),
-            Evidence("gap closed", closed, "share", "1 − excess after / before"),
+            Evidence("gap closed", closed, "share", "of what the nominal model is off beyond the floor"),
         ),
-        "the calibrated model is worse: record again, or `openant gap diagnose`" if worse else "",
+        "the calibrated model is worse: record again, or `openant gap diagnose`"
+        if worse
+        else "train on the calibrated model, which is no worse; `openant gap diagnose` tells what it lacks"
+        if unsure
+        else "",
         COMMAND,
         data={"by_joint_rad": gap_by_joint(after), "measure": after.as_json()},
         problems=("the calibrated model is farther off than the nominal one",) if worse else (),

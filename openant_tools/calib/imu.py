@@ -65,6 +65,8 @@ REST_S = 1.0
 STILL_M_S2, STILL_RAD_S = 0.35, 0.08
 #: Poses held by hand are a few degrees off; beyond this the answer is not to be trusted.
 AGREE_RAD, LOW_RAD = math.radians(6), math.radians(15)
+#: a board that is turned by less sits straight
+STRAIGHT_RAD = math.radians(1)
 #: Share by which |acc| may miss gravity by the scale that its sensor should have; a wrong one is a factor of two.
 GRAVITY_SHARE = 0.06
 #: rad; the short turn, and the long one (a little less than half, so that its way round is plain); s for a quarter
@@ -190,6 +192,8 @@ def imu(bench: Bench) -> Procedure:
     nominal = min((*msp.ACC_LSB_PER_G_NEW, msp.ACC_LSB_PER_G_OLD), key=lambda lsb: abs(math.log(acc_counts / lsb)))
     scale_error = acc_counts / nominal - 1
     axis, angle = _axis_words(found.vector_rad)
+    straight = angle <= STRAIGHT_RAD
+    about = "" if straight else f"rotation about {axis}, from "
     gyro_bias = found.rotation @ level.gyro
     evidence = (
         Evidence(
@@ -199,14 +203,18 @@ def imu(bench: Bench) -> Procedure:
         Evidence("gyro bias", float(np.linalg.norm(gyro_bias)), "rad/s", "at rest, level"),
         Evidence("gyro noise", float(level.gyro_noise.max()), "rad/s", "standard deviation at rest"),
         Evidence("acc noise", float(level.acc_noise.max()), "m/s²", "standard deviation at rest"),
-        Evidence("mounting", angle, "rad", f"rotation about {axis}, from gravity in {len(POSES)} poses"),
+        Evidence("acc counts for 1 g", acc_counts, "1", f"{len(POSES)} poses at rest"),
+        Evidence("mounting", angle, "rad", f"{about}gravity in {len(POSES)} poses"),
         Evidence("poses disagree by", found.disagreement_rad, "rad", "angles between measured directions"),
         Evidence(
             "quarter turn", turned, "rad",
             f"integral of the gyro about the body's vertical, {number(info.gyro_lsb_per_dps)} counts for 1 °/s",
         ),
         *([] if gyro is None else [
-            Evidence("gyro counts for 1 °/s", gyro.counts_per_dps, "1", f"turns by hand: {len(turns)}", gyro.low, gyro.high)
+            Evidence(
+                "gyro counts for 1 °/s", gyro.counts_per_dps, "1",
+                f"turns by hand: {len(turns)}{f'; {gyro.step} a step' if gyro.step else ''}", gyro.low, gyro.high,
+            )
         ]),
     )  # fmt: skip
     unsure = list[str]()
@@ -268,11 +276,9 @@ def imu(bench: Bench) -> Procedure:
     return Finding(
         "imu",
         False if not sound else None if unsure else True,
-        f"{info.variant} {info.firmware}, {number(acc_counts, 'LSB/g', decimals=0)}, {number(counts, decimals=2)} counts for 1 °/s"
-        + ("" if gyro is None else f" ({gyro.step} a step)" if gyro.step else " (as measured)")
-        + ", mounted "
-        + (f"at {number(angle, 'rad', decimals=0)} about {axis}, " if angle > math.radians(1) else "straight, ")
-        + f"{number(info.rate_hz, 'samples/s', decimals=0)}",
+        "the board is mounted "
+        + ("straight" if straight else f"at {number(angle, 'rad', decimals=0)} about {axis}")
+        + f"; {info.variant} {info.firmware} sends {number(info.rate_hz, 'samples/s', decimals=0)}",
         evidence,
         "run it again; nothing was written" if not sound else "turn it again: run this step again" if unsure else "",
         COMMAND,

@@ -63,7 +63,7 @@ def fit_report(result: Identification) -> Report:
     wanted: dict[str, list[str]] = {}
     for value in result.values:
         if value.record_next:
-            wanted.setdefault(value.record_next, []).append(f"{value.name} ({value.words})")
+            wanted.setdefault(value.record_next, []).append(f"{_said(value.name)} ({value.words})")
     answer = ReportSummary(
         _sentence(result),
         Figure(
@@ -80,10 +80,10 @@ def fit_report(result: Identification) -> Report:
             KeyFigure(
                 f"held-out error, {exact(HORIZON_S, 's')}",
                 _change(result.before.horizon, result.after.horizon),
-                "re-initialised from measurement",
+                "begun anew from what was measured each time",
             ),
             KeyFigure("floor", _error(result.floor), "what no model could beat"),
-            KeyFigure("excess gap closed", percent(closed) if math.isfinite(closed) else "–", "on held-out runs"),
+            KeyFigure("gap closed", percent(closed) if math.isfinite(closed) else "–", "of what is above the floor"),
         ),
     )
     report = Report(
@@ -122,6 +122,12 @@ def fit_report(result: Identification) -> Report:
         [[j, _error(result.noise[j]), number(result.correlation_s[j], "s")] for j in result.joints],
     )
     return report
+
+
+def _said(name: str) -> str:
+    """The name of a value, `zero_offset.hip_rr`, as one says it."""
+    kind, _, joint = name.partition(".")
+    return f"{kind.replace('_', ' ')} of {joint}" if joint else kind.replace("_", " ")
 
 
 def _then(result: Identification, wanted: dict[str, list[str]]) -> str:

@@ -78,7 +78,8 @@ _HELP: Mapping[str, tuple[str, str, str, str]] = {
     ),
     "imu": (
         "Scale, bias, noise and mounting of the sensor that feels turns and gravity.",
-        "**IMU**: gyro and accelerometer on the flight controller. **Bias**: what it says at rest, where it should say nothing.",
+        "**IMU**: gyro and accelerometer on the flight controller. **Bias**: what it says at rest, where it should say nothing. "
+        "**Counts**: the raw numbers that it sends; so many make 1 g (the pull of gravity), so many a turn of 1 °/s.",
         "Poses that disagree: it was still moving. Gravity that is not 9.8 m/s²: the board's range is set otherwise in "
         "Betaflight.",
         "imu-and-camera.md",
@@ -86,7 +87,10 @@ _HELP: Mapping[str, tuple[str, str, str, str]] = {
     "arena": (
         "Where the robot is, comes from a camera above it and tags: this measures the camera's height, the origin, the circle, "
         "and how late the picture is.",
-        "**Tag**: a printed square that a camera reads, with a number. **Latency**: the age of a picture when it arrives.",
+        "**Tag**: a printed square that a camera reads, with a number; one lies at the **origin**, from where places are "
+        "measured, one is on the robot. **ChArUco board**: a printed chessboard with tags in its fields; pictures of it say how the "
+        "lens bends what it shows. **Field of view**: how wide the lens looks, by its data sheet. **Latency**: the age of a "
+        "picture when it arrives; **stamps** are the times that the camera's driver gives its pictures.",
         "No tag seen: glare, or it is printed too small. A size that does not fit the height: the tag's edge in robot.toml is "
         "not what you printed.",
         "imu-and-camera.md",
@@ -101,7 +105,8 @@ _HELP: Mapping[str, tuple[str, str, str, str]] = {
     ),
     "thermal": (
         "How warm the servos get while they hold, how they cool, and from that how long the robot can work.",
-        "**Soak**: holding one pose until it is warm. **Shutdown**: a servo that is too hot lets go and must be restarted.",
+        "**Soak**: holding one pose until it is warm. **Two-node fit**: each servo as a motor that warms within minutes in a case "
+        "that warms within an hour. **Shutdown**: a servo that is too hot lets go and must be restarted.",
         "A servo much warmer than its neighbours: its joint rubs, or its leg carries more. Warming for ever: rest between "
         "sessions, the forecast says how long.",
         "thermal.md",

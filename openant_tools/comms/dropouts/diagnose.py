@@ -315,12 +315,8 @@ def _first(measures: Measures) -> int:
 
 def _sentence(verdict: str, best: Suspect, measures: Measures, tied: Sequence[str]) -> str:
     log = measures.log
-    lost, asked, reads = int(log.lost.sum()), int(log.answers.sum()), len(log.t)
-    count = (
-        f"{lost} of {asked} answers lost in {number(log.seconds, 's', decimals=0)}"
-        if lost
-        else f"no answer lost in {reads} reads"
-    )
+    lost, asked = int(log.lost.sum()), int(log.answers.sum())
+    count = f"{lost} of {asked} answers lost in {number(log.seconds, 's', decimals=0)}"
     if verdict == "none":
         return f"{count}: nothing is wrong with the bus"
     if verdict == "unknown":
