@@ -216,9 +216,11 @@ class Table:
                 else:
                     cells.append(f"<td{side}>{_inline(_shown(cell))}</td>")
             body.append(f"<tr>{''.join(cells)}</tr>")
-        caption = f"<caption>{_inline(self.caption)}</caption>" if self.caption else ""
-        table = f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
-        return f"<div class=scroll>{table}</div>"
+        # Outside of what is scrolled sideways, so that all of it is seen beside a wide table.
+        caption = f'<p class=caption id="{key}-caption">{_inline(self.caption)}</p>' if self.caption else ""
+        named = f' aria-labelledby="{key}-caption"' if self.caption else ""
+        table = f"<table{named}><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
+        return f"{caption}<div class=scroll>{table}</div>"
 
     def markdown(self, key: str, save: SavePicture) -> str:
         lines = [

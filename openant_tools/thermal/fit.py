@@ -92,7 +92,7 @@ GEAR_PRIOR = HeatPrior(0.5, 0.25, 0.0, "1", "share of the gear's power that stay
 PARAMETER_WORDS: Mapping[str, str] = {
     **{name: prior.words for name, prior in PRIORS.items()},
     "leg_w_k": LEG_PRIOR.words, "exponent": EXPONENT_PRIOR.words, "gear": GEAR_PRIOR.words, "room_c": "temperature of the room",
-    "start_k": "case at the start, over its first reading", "start_winding_k": "winding at the start, over its case",
+    "start_k": "case at the start", "start_winding_k": "winding at the start, over its case",
     "held_w": "heat of a pose whose load nobody logged",
 }  # fmt: skip
 #: A thermometer on the wall, and a guess from the coldest servo.
@@ -393,7 +393,7 @@ ENTERED = 0.5
 
 def _unit(name: str) -> str:
     return {
-        "leg_w_k": LEG_PRIOR.unit, "exponent": "1", "gear": "1", "room_c": "°C", "start_k": "K", "start_winding_k": "K",
+        "leg_w_k": LEG_PRIOR.unit, "exponent": "1", "gear": "1", "room_c": "°C", "start_k": "°C", "start_winding_k": "K",
         "held_w": "W",
     }.get(name) or PRIORS[name].unit  # fmt: skip
 

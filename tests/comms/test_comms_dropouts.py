@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from openant_tools.comms.dropouts.causes import CAUSES
 from openant_tools.comms.dropouts.diagnose import diagnose_dropouts
 from openant_tools.comms.dropouts.log import read_log
 from openant_tools.comms.dropouts.outcome import dropout_effects, dropouts_finding
+from openant_tools.comms.dropouts.report import dropouts_report
 from openant_tools.errors import BadInput
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import read_run, write_table
@@ -176,6 +179,16 @@ def test_a_healthy_log_is_called_healthy(seed: int) -> None:
     assert found.verdict == "none"
     assert found.next_test == ""
     assert found.suspects[0].probability < 0.5
+
+
+def test_a_report_names_causes_in_words_and_counts_answers() -> None:
+    log = Log()
+    bad_cable(log)
+    found = diagnose_dropouts([log.run()])
+    page = html.unescape(dropouts_report(found).html()).replace("\u00a0", " ")
+    assert all(cause.words in page for cause in CAUSES.values())
+    assert not [name for name in CAUSES if re.search(rf">{name}<", page)]
+    assert f"{int(found.measures.log.lost.sum())} of {int(found.measures.log.answers.sum())} answers" in page
 
 
 def test_losses_are_seen_where_only_measurements_tell() -> None:

@@ -212,6 +212,12 @@ def test_numbers_stand_to_the_right_and_missing_ones_are_a_dash() -> None:
     assert "<td>yes</td>" in html
 
 
+def test_what_a_table_shows_stands_beside_it_and_is_not_scrolled_with_it() -> None:
+    html = Table(["n"], [[1]], "How many.").html("t")
+    assert html.startswith('<p class=caption id="t-caption">How many.</p><div class=scroll>')
+    assert '<table aria-labelledby="t-caption">' in html
+
+
 def test_colours_are_told_apart_and_words_carry_the_tone_too() -> None:
     assert len(set(plots.CYCLE)) == 7
     assert '<span class="mark bad">' in Table(["v"], [[Mark("no", "bad")]]).html("t")

@@ -365,6 +365,8 @@ def test_a_finding_says_it_all_and_the_table_warns_while_cold(lite: Inputs, whol
     assert "reaches 72 °C" in finding.what
     assert warning in finding.problems
     assert any(parameter.name == "thermal.knee_fl.case_j_k" for parameter in finding.parameters)
+    start = next(one for one in found.estimates if one.name == "start_k")
+    assert (start.unit, start.value) == ("°C", pytest.approx(lite.observed[0].temperature[0], abs=2)), "a temperature"
     assert Finding.of_json(json.loads(json.dumps(finding.as_json()))).what == finding.what
 
 

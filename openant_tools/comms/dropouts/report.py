@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from openant_tools.comms.dropouts.causes import CAUSES
 from openant_tools.comms.dropouts.diagnose import LISTED, DropoutDiagnosis
 from openant_tools.comms.dropouts.log import WORDS
 from openant_tools.numbers import number, percent
@@ -71,13 +72,13 @@ def dropouts_report(found: DropoutDiagnosis) -> Report:
         "good" if found.healthy_bus else "bad" if named else "warn",
         (
             KeyFigure("lost", number(lost / max(1, asked), "share"), f"{lost} of {asked} answers"),
-            KeyFigure("watched", number(log.seconds, "s", decimals=0), f"{len(log.t)} reads"),
+            KeyFigure("watched", number(log.seconds, "s", decimals=0), f"of {len(log.joints)} servos"),
         ),
     )
     report = Report("The bus", ", ".join(log.names), answer, made_by="openant comms diagnose")
     rows = [
         [
-            one.cause,
+            CAUSES[one.cause].words,
             ", ".join(one.where),
             percent(one.probability),
             "; ".join(w.words for w in one.evidence if w.nats > 0),
@@ -89,7 +90,11 @@ def dropouts_report(found: DropoutDiagnosis) -> Report:
     report.section("Causes considered").table(["cause", "where", "probability", "what speaks for it"], rows)
     if named:
         against = [[why.words, number(why.nats, sign=True, decimals=1)] for why in best.evidence]
-        report.section("Evidence").table(["seen", "nats"], against, f"For (+) and against (−) {best.cause}.")
+        report.section("Evidence").table(
+            ["seen", "nats"],
+            against,
+            f"For (+) and against (−) {CAUSES[best.cause].words}; a nat makes it e times as likely.",
+        )
     shown = [
         [number(one.from_s, decimals=2), number(one.to_s - one.from_s, decimals=2), str(one.stop - one.start),
          ", ".join(log.joints[k] for k in one.joints), ", ".join(one.words)]
