@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from openant_tools.numbers import number, readable
+from openant_tools.numbers import number, percent, readable
 from openant_tools.report import Figure, KeyFigure, Mark, Report, ReportSummary, plots
 from openant_tools.report.parts import Tone
 from openant_tools.sysid.compare import FAMILY_ERROR, Change, Comparison, Estimate
+from openant_tools.sysid.kinds import said
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,7 +27,9 @@ def comparison_report(result: Comparison) -> Report:
     surest = max(result.compared, key=lambda change: -change.p, default=None)
     figures = [KeyFigure("changed", str(len(result.changed)), f"of {len(result.compared)} compared")]
     if surest is not None:
-        figures.append(KeyFigure("surest difference", surest.name, f"by chance alone: p {_chance(surest.p_holm)}"))
+        figures.append(
+            KeyFigure("surest difference", said(surest.name), f"chance alone makes it in {percent(surest.p_holm)}")
+        )
     where = ", ".join(result.joints_changed) or "the robot"
     answer = ReportSummary(
         result.sentence,

@@ -19,6 +19,7 @@ from openant_tools.report.parts import Tone
 from openant_tools.sysid.data_sheet import data_sheet_model
 from openant_tools.sysid.dataset import Dataset
 from openant_tools.sysid.identify import Identification, Value
+from openant_tools.sysid.kinds import said
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -63,7 +64,7 @@ def fit_report(result: Identification) -> Report:
     wanted: dict[str, list[str]] = {}
     for value in result.values:
         if value.record_next:
-            wanted.setdefault(value.record_next, []).append(f"{_said(value.name)} ({value.words})")
+            wanted.setdefault(value.record_next, []).append(f"{said(value.name)} ({value.words})")
     answer = ReportSummary(
         _sentence(result),
         Figure(
@@ -122,12 +123,6 @@ def fit_report(result: Identification) -> Report:
         [[j, _error(result.noise[j]), number(result.correlation_s[j], "s")] for j in result.joints],
     )
     return report
-
-
-def _said(name: str) -> str:
-    """The name of a value, `zero_offset.hip_rr`, as one says it."""
-    kind, _, joint = name.partition(".")
-    return f"{kind.replace('_', ' ')} of {joint}" if joint else kind.replace("_", " ")
 
 
 def _then(result: Identification, wanted: dict[str, list[str]]) -> str:

@@ -24,6 +24,7 @@ __all__ = [
     "SPEED_LIMIT",
     "ZERO_OFFSET",
     "Kind",
+    "said",
 ]
 
 ACTION_DELAY = "action_delay"
@@ -75,3 +76,9 @@ def _of_laws() -> Iterator[Kind]:
 
 _found = {kind.name: kind for effect in catalogue().values() for kind in effect.kinds}
 KINDS: dict[str, Kind] = {name: _found[name] for name in NAMES} | {kind.name: kind for kind in _of_laws()}
+
+
+def said(name: str) -> str:
+    """The name of a value, `zero_offset.hip_rr`, as one says it."""
+    kind, _, joint = name.partition(".")
+    return f"{kind.replace('_', ' ')} of {joint}" if joint else kind.replace("_", " ")
