@@ -90,7 +90,8 @@ class BodyCamera:
         self.keeping = False
         self._kept: deque[tuple[float, bytes]] = deque(maxlen=QUEUE)
         self._kept_at = -np.inf
-        self._seen_at = clock.now()
+        # Nobody is missed before the first picture, however long the robot took to be opened.
+        self._seen_at = np.inf
         self._lost = ""
         self._said: tuple[str, float] = ("", -np.inf)
         self._error: OpenAntError | None = None
@@ -204,7 +205,7 @@ class BodyCamera:
         if isinstance(result, BodyPose):
             self._seen_at, self._lost = self._clock.now(), ""
         else:
-            self._lost = result.reason
+            self._seen_at, self._lost = min(self._seen_at, self._clock.now()), result.reason
         self._results.append(result)
 
     def _lean_at(self, t: float) -> tuple[float, float] | None:

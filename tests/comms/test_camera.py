@@ -439,6 +439,7 @@ def test_the_engines_camera_gives_poses_in_order_and_tells_what_is_wrong_once(st
         return results, news
 
     try:
+        stepped.sleep_until(stepped.t + 0.6)  # the servos are opened meanwhile
         results, news = watch(1.0)
         last = results[-1]
         assert isinstance(last, BodyPose)
