@@ -235,6 +235,8 @@ def prepared(tmp_path_factory: pytest.TempPathFactory, thorough: bool) -> Path:
         run("sysid record --protocol stand --seconds 8 --robot my-ant --out one.mcap", folder)
         for name in ("sac-1", "sac-2"):
             run(f"train sac --robot my-ant --steps 30 --out my-ant/runs/{name}", folder)
+        run("thermal soak --robot my-ant --minutes 1 --out bare.mcap", folder)
+        shutil.copy(folder / "bare.mcap", folder / "finned.mcap")
     else:
         t = np.arange(0.0, 4.0, 0.01)
         write_table(
@@ -242,7 +244,8 @@ def prepared(tmp_path_factory: pytest.TempPathFactory, thorough: bool) -> Path:
         )
         run("rec import one.csv --out one.mcap", folder)
     for name in RECORDINGS:
-        shutil.copy(folder / "one.mcap", folder / name)
+        if not (folder / name).exists():
+            shutil.copy(folder / "one.mcap", folder / name)
     return folder
 
 
@@ -264,7 +267,9 @@ def test_the_commands_of_a_page_work_in_their_order(
     if any("config new" in line for line in lines):  # it begins without a robot
         shutil.rmtree(folder / "my-ant")
     for name in (name for line in lines for name in re.findall(r"--out (\S+)", line)):  # which the page makes
-        shutil.rmtree(folder / name) if (folder / name).is_dir() else (folder / name).unlink(missing_ok=True)
+        made = folder / name
+        shutil.rmtree(made) if made.is_dir() else made.unlink(missing_ok=True)
+        made.with_name(f"{made.stem}-held-out{made.suffix}").unlink(missing_ok=True)
     for block in blocks(page):
         if block.language == "sh" and block.text.startswith("cat > "):
             subprocess.run(["bash", "-c", block.text], cwd=folder, check=True)
@@ -315,6 +320,8 @@ def fit_for_here(words: list[str]) -> list[str]:
     if "--virtual" in words and "--port" in words:  # which the virtual robot has of its own
         at = words.index("--port")
         words = [*words[:at], *words[at + 2 :]]
+    if words[:2] == ["rec", "view"] and "--out" not in words:  # here is no screen to open a window on
+        words = [*words, "--out", "view.rrd"]
     if words[:2] == ["comms", "watch"]:  # until Ctrl-C
         words = [*words, "--seconds", "2"]
     for option, most in AMOUNTS.items():
