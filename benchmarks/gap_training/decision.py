@@ -26,27 +26,25 @@ from openant_tools.gap.decide import FILE, OUTSIDE, WEIGHTS, Row, chances
 from openant_tools.gap.diagnosis import NONE
 from openant_tools.virtual.seal import read_key
 
-#: where weights begin: what 48 robots of three sets had taught whose rows were not kept, and a quarter of the nats of innovations; and how far
-#: from there costs as much as one robot's surprise, of those that cannot be negative in logarithms: what should show and does not never
-#: speaks for a cause
+#: where weights begin: where all speak as loud as they would if they were right, but nats, of which few are; and how far from there costs as much
+#: as one robot's surprise, of those that cannot be negative in logarithms: what should show and does not never speaks for a cause
 START = {
-    "evidence": 0.774,
-    "support": 1.14,
-    "shortfall": 0.241,
-    "likelier": 0.0611,
-    "share": 3.03,
+    "evidence": 1.0,
+    "support": 1.0,
+    "shortfall": 0.25,
+    "uneven": 0.5,
+    "beyond": 0.05,
     "irregular": 0.25,
-    "none": 1.81,
-    "outside": -0.458,
-    "outside: support": 1.03,
-    "outside: left": 0.888,
+    "none": 1.0,
+    "outside": 0.0,
+    "outside: uneven": 1.0,
 }
 FAR = 0.5
-POSITIVE = ("evidence", "support", "shortfall", "likelier", "share", "irregular")
+POSITIVE = ("evidence", "support", "shortfall", "uneven", "beyond", "irregular", "outside: uneven")
 #: what a row is decided on by
-KEPT = ("probability", "support", "foretold", "likelier", "irregular", "left")
+KEPT = ("probability", "support", "foretold", "uneven", "likelier", "within", "irregular")
 #: the weights of what held-out data say
-HELD_OUT = ("support", "shortfall", "likelier", "share", "irregular", "outside: support", "outside: left")
+HELD_OUT = ("support", "shortfall", "uneven", "beyond", "irregular", "outside: uneven")
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from openant_tools.gap.classifier import classifier, weights
 from openant_tools.gap.ensemble import robots_at, templates_at, templates_of
 from openant_tools.gap.evidence import Evidence, Layouts, RunLayout, Scale, anomalies, evidence_of, unknown_signals
 from openant_tools.gap.features import Floats
+from openant_tools.gap.hypothesis import sized
 from openant_tools.gap.population import Case
 from openant_tools.gap.posterior import NONE, OUTSIDE, features_of, log_posterior
 from openant_tools.gap.protocol import RunSet
@@ -29,7 +30,7 @@ from openant_tools.gap.refine import refined
 from openant_tools.gap.templates import Template
 from openant_tools.workers import tied
 
-__all__ = ["Assessment", "assess", "layouts_of"]
+__all__ = ["Assessment", "Lead", "assess", "layouts_of"]
 
 Bools = NDArray[np.bool_]
 
@@ -42,6 +43,15 @@ VERSION = 10
 
 
 @dataclass(frozen=True)
+class Lead:
+    """Where a cause would sit (indices of joints), and its coordinates, by its best template."""
+
+    cause: str
+    joints: tuple[int, ...]
+    x: Mapping[str, float]
+
+
+@dataclass(frozen=True)
 class Assessment:
     """What the evidence of a recording comes to.
 
@@ -49,7 +59,8 @@ class Assessment:
         none, outside: probabilities. leads: cause → that it leads the gap. present: cause → that it is there, whatever leads.
         set_aside: signal → times the farthest healthy robot by which it behaves as none that is known: it had no part in this.
         anomalies: signal → how far it is from the model's, in what healthy robots are off by: above 1 beyond nearly all of them.
-        evidence: the rows, of one robot.
+        evidence: the rows, of one robot. protocol: the recording as it was simulated for that. scale: what it was measured by. seen:
+            (features,) of the recording.
     """
 
     none: float
@@ -59,6 +70,9 @@ class Assessment:
     set_aside: Mapping[str, float]
     anomalies: Mapping[str, float]
     evidence: Evidence
+    protocol: RunSet
+    scale: Scale
+    seen: Floats
 
     def ranked(self) -> list[str]:
         """Causes, the likeliest to lead first."""
@@ -76,6 +90,19 @@ class Assessment:
     def template(self, cause: str) -> Mapping[str, float]:
         """Coordinates of its best template."""
         return self._best(cause)[2]
+
+    def beside(self, known: Mapping[str, tuple[tuple[int, ...], Mapping[str, float]]]) -> list[Lead]:
+        """Where every cause would sit, and how large it would be, beside causes that are known (name → indices of joints, coordinates): by what
+        a robot that has these leaves of the recording. The best fit first.
+        """
+        case = Case({name: (at, dict(x)) for name, (at, x) in known.items()}, -1)
+        robot = np.concatenate(templates_at(self.protocol, [case]), axis=1)
+        left = self.scale.whitened(self.seen[None]) - self.scale.vectors(robot)
+        templates = self.scale.templates
+        fit, length = templates.fits(left)[0], np.linalg.norm(templates.vectors, axis=1)
+        best = sorted((int(some[fit[some].argmax()]) for some in templates.of_cause), key=lambda k: -fit[k])
+        bank = templates.bank
+        return [Lead(bank[k][0], bank[k][1], sized(bank[k][0], bank[k][2], float(fit[k] / length[k]))) for k in best]
 
     def _best(self, cause: str) -> Template:
         return self.evidence.bank[int(self.evidence.places[0, self.evidence.causes.index(cause)])]
@@ -129,6 +156,9 @@ def assess(
         set_aside,
         anomalies(scale, healthy[MEASURE:], seen),
         evidence,
+        coarse,
+        scale,
+        seen,
     )
 
 

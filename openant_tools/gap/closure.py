@@ -28,6 +28,7 @@ class Closure:
 
     Attributes:
         before, after, floor: rad, of joints. closed: share of the excess that is gone; low, high: over the folds, 95 %.
+        joints: how many channels are positions, the first ones.
         squares: (folds, channels) summed over rows; counts: (folds, channels) of how many errors.
         apart: (folds, channels) squares of how far it is from what it is asked about beside, summed over the same rows.
         known: (channels,) mean square of sensors. likelihood, within, std: as of `Fit`.
@@ -42,6 +43,7 @@ class Closure:
     high: float
     likelihood: float
     within: float
+    joints: int
     squares: Array
     apart: Array
     counts: Array
@@ -64,14 +66,21 @@ class Closure:
         return self._less(self.squares + self.apart)
 
     @property
-    def left(self) -> float:
-        """Logarithm of how many times its sensors' errors it leaves on held-out folds, rms, mean of them and of what was measured there."""
-        there = self.counts > 0
-        each = 0.5 * np.log1p(self.squares / np.maximum(self.counts, 1.0) / self.known)
-        return float(each[there].mean()) if there.any() else 0.0
+    def uneven(self) -> float:
+        """Logarithm of how many times its sensors' errors the joint that it leaves worst keeps on held-out folds, rms, mean of them, less that
+        of the median joint."""
+        known = self.known[: self.joints]
+        squares, counts = self.squares[:, : self.joints], self.counts[:, : self.joints]
+        each = 0.5 * np.log1p(squares / np.maximum(counts, 1.0) / known)
+        joints = each.sum(axis=0) / np.maximum((counts > 0).sum(axis=0), 1)
+        return float(joints.max() - np.median(joints))
 
     def likelier(self, other: Closure) -> float:
-        """nats by which what it was fitted to is likelier than by any robot of one build: a little of its cause is none."""
+        """nats by which what it was fitted to is likelier than by another."""
+        return self.likelihood - other.likelihood
+
+    def beyond(self, other: Closure) -> float:
+        """The same, than by any robot of one build: a little of its cause is none."""
         return self.likelihood - max(other.likelihood, self.within)
 
     def _less(self, squares: Array) -> float:
@@ -115,8 +124,8 @@ def closures(
         low, high = _interval(both[0], both[1], known, floor)
         out.append(
             Closure(
-                before, after, floor, _closed(before, after, floor), low, high, one.likelihood, one.within, each[n], apart[n], counts,
-                predictions.sigma**2, one.whole, one.std, _irregular(predictions, one.whole, left[n]),
+                before, after, floor, _closed(before, after, floor), low, high, one.likelihood, one.within, predictions.joints,
+                each[n], apart[n], counts, predictions.sigma**2, one.whole, one.std, _irregular(predictions, one.whole, left[n]),
             )
         )  # fmt: skip
     return out

@@ -1,8 +1,9 @@
 """The decision: a pure function of frozen rows, one for each hypothesis, of learned weights and of explicit costs.
 
 A row says how likely its cause is to lead by the evidence, and what its fit says of it: how much less of the gap it leaves on held-out data
-than a re-fit within tolerance does, how much less it should leave there, and how much likelier it made what it was fitted to. So data speak
-for a cause and against it: one that leaves more, or that should leave less and does not, is no longer likely, whatever the evidence said.
+than a re-fit within tolerance does, how much less it should leave there, how evenly joints share it, and how much likelier it made what it was
+fitted to. So data speak for a cause and against it: one that leaves more, or that should leave less and does not, is no longer likely,
+whatever the evidence said. Where all that is known leaves much at one joint and little at the others, something else is at that joint.
 """
 
 from __future__ import annotations
@@ -20,12 +21,11 @@ from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED
 
 __all__ = ["OUTSIDE", "WEIGHTS", "Decision", "Row", "adds", "chances", "decide", "weights", "worth_fitting"]
 
-#: the weights by their names: of logarithms of probabilities by the evidence, of what held-out data say of a cause, and of how much more
-#: its fit had promised; of how much likelier any cause made what it was fitted to, for all of them, and of what share of that is each one's;
-#: of what innovations say of commands; of nothing and of something unknown by themselves, and of this by the most that any cause does, and
-#: by the least that any leaves
+#: the weights by their names: of logarithms of probabilities by the evidence; of what held-out data say of a cause, of how much more its fit
+#: had promised, of how much more evenly it leaves joints; of how much likelier it made what it was fitted to than any robot of one build; of
+#: what innovations say of commands; of nothing and of something unknown by themselves, and of this by how unevenly joints are left
 WEIGHTS = (
-    "evidence", "support", "shortfall", "likelier", "share", "irregular", "none", "outside", "outside: support", "outside: left",
+    "evidence", "support", "shortfall", "uneven", "beyond", "irregular", "none", "outside", "outside: uneven",
 )  # fmt: skip
 #: where they lie in this package
 FILE = "decision.json"
@@ -35,8 +35,7 @@ OUTSIDE = "outside"
 LEAST = 1e-6
 #: nats by which held-out data speak strongly against a cause
 STRONGLY = 3.0
-#: nats beyond which what was fitted says little more of whether anything is wrong: no model of a real robot is true, and a wrong cause can be
-#: surer than any right one; and that do not tell causes apart, since no likelihood is known better than that
+#: nats beyond which what was fitted says little more: no model of a real robot is true, and a wrong cause can be surer than any right one
 SURE = 30.0
 #: what it costs to give a wrong name, to say that nothing is wrong where something is, to leave open what is known (an open question is
 #: better than a wrong all-clear), and to name it as one of two
@@ -55,9 +54,10 @@ class Row:
         support: logarithm of how much less it leaves of the gap on held-out folds, mean of them and summed over joints, than what it is asked
             about beside does (no further cause, or the others); None where it was not fitted, or where nothing that was recorded
             tells.
-        foretold: what that would be if it were right; likelier: nats by which what it was fitted to is, its sizes and tolerances with it,
-            than with no more of it than robots of one build differ by.
-        left: logarithm of how many times its sensors' errors it leaves on held-out folds; None where it was not fitted.
+        foretold: what that would be if it were right. uneven: logarithm of how many times its sensors' errors the joint that it leaves worst
+            keeps there, less that of the median joint.
+        likelier: nats by which what it was fitted to is, its sizes and tolerances with it, than what it is asked about beside makes it.
+            within: the same, with no more of its cause than robots of one build differ by.
         gain: share of the excess gap that it closes on held-out folds beyond what is closed without it, for the report.
         irregular: of a cause that acts at random times nats by which innovations are likelier than without it.
     """
@@ -67,8 +67,9 @@ class Row:
     probability: float = 0.0
     support: float | None = None
     foretold: float = 0.0
+    uneven: float | None = None
     likelier: float = 0.0
-    left: float | None = None
+    within: float = 0.0
     gain: float | None = None
     irregular: float = 0.0
 
@@ -90,13 +91,14 @@ class Decision:
     """What is said.
 
     Attributes:
-        verdict: a cause, or NONE, AMBIGUOUS, UNEXPLAINED. confidence: that it is right.
+        verdict: a cause, or NONE, AMBIGUOUS, UNEXPLAINED. confidence: that it is right. chances: of each cause, that it leads.
         selected: rows that go into an improved model, of an ambiguous verdict the likelier one. alike: then, sets that cannot be told
             apart.
     """
 
     verdict: str
     confidence: float
+    chances: Mapping[str, float]
     selected: tuple[Row, ...] = ()
     alike: tuple[tuple[str, ...], ...] = ()
 
@@ -108,33 +110,30 @@ def weights() -> Mapping[str, float]:
     return {name: float(text[name]) for name in WEIGHTS}
 
 
-def _fitted(rows: Sequence[Row], weights: Mapping[str, float]) -> dict[tuple[str, ...], float]:
-    """Of each hypothesis that was fitted, or asked of innovations, what that says of it, in nats.
+def _fitted(rows: Sequence[Row], uneven: float, weights: Mapping[str, float]) -> dict[tuple[str, ...], float]:
+    """Of each hypothesis that was fitted, or asked of innovations, what that says of it, in nats; `uneven` is without their last causes.
 
-    That some cause makes what was measured likelier says that something is wrong, up to a degree; which it is, causes tell by comparison.
+    A little of any cause is in every robot: a hypothesis has to be likelier than what robots of one build come to by any of them.
     """
-    some = [row for row in rows if row.causes and row.support is not None]
-    most = max([0.0, *(row.likelier for row in some)])
-    ill = weights["likelier"] * SURE * math.asinh(most / SURE)
-    said = {
-        row.causes: row.held_out(weights)
-        + ill
-        + weights["share"] * math.log((max(row.likelier, 0.0) + SURE) / (most + SURE))
-        for row in some
-    }
-    return said | {
-        row.causes: weights["irregular"] * SURE * math.asinh(row.irregular / SURE) for row in rows if row.irregular
-    }
+    usual = max([0.0, *(row.within for row in rows if row.support is not None)])
+    out = {}
+    for row in rows:
+        if row.support is not None:
+            evened = weights["uneven"] * (uneven - (uneven if row.uneven is None else row.uneven))
+            out[row.causes] = row.held_out(weights) + evened + weights["beyond"] * _sure(row.likelier - usual)
+        elif row.irregular:
+            out[row.causes] = weights["irregular"] * _sure(row.irregular)
+    return out
 
 
 def chances(rows: Sequence[Row], outside: float, weights: Mapping[str, float]) -> dict[str, float]:
-    """NONE, OUTSIDE and the cause of each hypothesis → probability; they come to one."""
-    most = max((row.support for row in rows if row.support is not None), default=0.0)
-    left = min((row.left for row in rows if row.left is not None), default=0.0)
-    fits = weights["outside: support"] * max(most, 0.0) + weights["outside: left"] * left
-    logits = {OUTSIDE: weights["outside"] + fits + weights["evidence"] * _log(outside)}
-    said = _fitted(rows, weights)
-    for row in rows:
+    """NONE, OUTSIDE and the cause of each hypothesis of one at most → probability; they come to one."""
+    uneven = min((row.uneven for row in rows if row.uneven is not None), default=0.0)
+    logits = {OUTSIDE: weights["outside"] + weights["outside: uneven"] * uneven + weights["evidence"] * _log(outside)}
+    none = next(row for row in rows if not row.causes)
+    singles = [row for row in rows if len(row.causes) == 1]
+    said = _fitted(singles, none.uneven or 0.0, weights)
+    for row in (none, *singles):
         name, more = (row.causes[0], said.get(row.causes, 0.0)) if row.causes else (NONE, weights["none"])
         logits[name] = weights["evidence"] * _log(row.probability) + more
     # Sorted: sums of the same numbers are the same, in whatever order rows come.
@@ -146,7 +145,7 @@ def decide(rows: Sequence[Row], outside: float) -> Decision:
     """The verdict that costs least.
 
     Args:
-        rows: the hypotheses, one of them without causes. outside: probability, by the evidence, of something that no catalogue has.
+        rows: the hypotheses, one of them without causes; of several causes together what they leave. outside: probability, by the evidence, of something that no catalogue has.
     """
     learned = weights()
     p = chances(rows, outside, learned)
@@ -159,31 +158,34 @@ def decide(rows: Sequence[Row], outside: float) -> Decision:
         costs[AMBIGUOUS] = EITHER * (p[named[0]] + p[named[1]]) + WRONG * (1 - p[named[0]] - p[named[1]])
     verdict = min(costs, key=lambda name: costs[name])
     if verdict == NONE:
-        return Decision(NONE, none)
+        return Decision(NONE, none, p)
     if verdict == UNEXPLAINED:
-        return Decision(UNEXPLAINED, unknown)
+        return Decision(UNEXPLAINED, unknown, p)
 
     best = next(row for row in rows if row.causes == (named[0],))
     if verdict == AMBIGUOUS:
-        return Decision(AMBIGUOUS, p[named[0]] + p[named[1]], (best,), (tuple(named[:2]),))
-    return Decision(verdict, p[verdict], (best,))
+        return Decision(AMBIGUOUS, p[named[0]] + p[named[1]], p, (best,), (tuple(named[:2]),))
+    return Decision(verdict, p[verdict], p, (best,))
 
 
 def worth_fitting(probability: Mapping[str, float], likelier: Mapping[str, float]) -> list[str]:
     """Causes in the order in which they may come out, by the evidence (0…1) and by how much likelier (nats) their first steps make the data."""
-    learned, most = weights(), max([0.0, *likelier.values()])
+    learned = weights()
 
     def worth(name: str) -> float:
-        share = math.log((max(likelier[name], 0.0) + SURE) / (most + SURE))
-        return learned["evidence"] * _log(probability[name]) + learned["share"] * share
+        return learned["evidence"] * _log(probability[name]) + learned["beyond"] * _sure(max(likelier[name], 0.0))
 
     return sorted(likelier, key=worth, reverse=True)
 
 
-def adds(rows: Sequence[Row]) -> Row | None:
-    """Of hypotheses with one cause more than is selected, the likeliest one whose last cause is likelier there than not."""
+def adds(rows: Sequence[Row], uneven: float) -> Row | None:
+    """Of hypotheses with one cause more than is selected, the likeliest one whose last cause is likelier there than not.
+
+    Args:
+        uneven: as what is selected leaves it.
+    """
     learned = weights()
-    said = _fitted(rows, learned)
+    said = _fitted(rows, uneven, learned)
 
     def probability(row: Row) -> float:
         odds = _log(row.probability) - _log(1 - row.probability)
@@ -191,6 +193,10 @@ def adds(rows: Sequence[Row]) -> Row | None:
 
     likeliest = max((row for row in rows if row.causes in said), key=probability, default=None)
     return likeliest if likeliest is not None and probability(likeliest) > PRESENT else None
+
+
+def _sure(nats: float) -> float:
+    return SURE * math.asinh(nats / SURE)
 
 
 def _log(probability: float) -> float:

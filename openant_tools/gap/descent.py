@@ -147,6 +147,13 @@ class Descent:
             slopes=dict(self.slopes),
         )  # fmt: skip
 
+    def of_this_size(self) -> Descent:
+        """With its causes as large as they are."""
+        still = np.arange(len(self.u)) < self.causes
+        return dataclasses.replace(
+            self, low=np.where(still, self.u, self.low), high=np.where(still, self.u, self.high), bends=self.bends & ~still,
+        )  # fmt: skip
+
     def begin(self) -> None:
         """Once more, from where it was best."""
         self.u, self.damping, self.least, self.slopes, self.errors = self.at, 0.0, np.inf, {}, {}

@@ -19,8 +19,8 @@ from threadpoolctl import threadpool_limits
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.errors import BadInput
 from openant_tools.gap.assess import Assessment, assess
-from openant_tools.gap.decide import Row, adds, decide, worth_fitting
-from openant_tools.gap.diagnosis import AMBIGUOUS, Diagnosis
+from openant_tools.gap.decide import Decision, Row, adds, decide, worth_fitting
+from openant_tools.gap.diagnosis import AMBIGUOUS, UNEXPLAINED, Diagnosis
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.finding import Given, finding
 from openant_tools.gap.trials import Trials
@@ -32,8 +32,9 @@ __all__ = ["diagnose", "hypotheses", "prepare"]
 
 Progress = Callable[[float, str], None]
 
-#: causes whose first steps are looked at, the likeliest by the evidence; that are fitted by themselves; and beside what is chosen
-TRIED, SUSPECTS, FURTHER = 15, 5, 3
+#: causes whose first steps are looked at, the likeliest by the evidence, and that are fitted then: by themselves, and beside what is chosen
+TRIED, SUSPECTS = 15, 5
+SECONDS, FURTHER = 6, 2
 #: causes of one improved model
 CAUSES = 3
 #: what a builder's word is worth who expects a cause: odds, to one
@@ -79,16 +80,23 @@ def diagnose(
     trials, rows = hypotheses(experiment, prior, lambda share, words: tell(0.02 + 0.73 * share, words))
     assessment = trials.assessment
     decision = decide(rows, assessment.outside)
-    chosen = tuple(name for row in decision.selected for name in row.causes)
+    chosen = _likeliest(decision)
     if chosen not in trials.closures:  # named by the evidence alone: held-out data do not tell of it
         trials.fit([(), chosen])
     while decision.verdict != AMBIGUOUS and chosen in trials.closures and 0 < len(chosen) < CAUSES:
         tell(0.8 + 0.05 * len(chosen), f"what acts beside {' and '.join(chosen)}")
-        trials.fit([chosen, *(further := _further(assessment, chosen))])
-        more = adds([trials.row(causes, assessment.present[causes[-1]]) for causes in further])
+        further = _further(trials, chosen)
+        trials.fit([chosen, *further])
+        beside = [trials.row(causes, assessment.present[causes[-1]]) for causes in further]
+        more = adds(beside, trials.closures[chosen].uneven)
         if more is None:
             break
         chosen = more.causes
+        rows.append(more)
+    # What several causes explain together is not unexplained.
+    decision = decide(rows, assessment.outside)
+    if decision.verdict not in chosen:
+        chosen = tuple(name for row in decision.selected for name in row.causes)
     tell(1.0, "decision")
     return finding(trials, Given(model, tuple(runs), tuple(hold_out), tuple(prior)), rows, decision, chosen)
 
@@ -102,7 +110,7 @@ def hypotheses(experiment: Experiment, prior: Sequence[str], progress: Progress)
     # By itself first: causes begin where tolerances have come to, with what was learnt of them, and so does none.
     trials.fit([()])
     progress(0.82, "where the likeliest causes lead")
-    worth = worth_fitting(leads, trials.promise([name for name in ranked if trials.tells(name)][:TRIED]))
+    worth = worth_fitting(leads, trials.promise([(name,) for name in ranked if trials.tells(name)][:TRIED]))
     suspects = worth[:SUSPECTS] + [name for name in prior if name in ranked and name not in worth[:SUSPECTS]]
     progress(0.86, "what those worth it close on held-out parts")
     trials.fit([(), *((name,) for name in suspects)])
@@ -122,10 +130,20 @@ def prepare(
     return assess(experiment.protocol, progress or (lambda share, words: None)).robots
 
 
-def _further(assessment: Assessment, chosen: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """What is chosen with one cause more, the likeliest ones."""
-    present = sorted(assessment.present, key=lambda name: -assessment.present[name])
-    return [(*chosen, name) for name in present if name not in chosen][:FURTHER]
+def _likeliest(decision: Decision) -> tuple[str, ...]:
+    """The cause beside which others are looked for: also where something unknown is likelier so far."""
+    if decision.verdict == UNEXPLAINED:
+        return (max(decision.chances, key=lambda name: decision.chances[name]),)
+    return tuple(name for row in decision.selected for name in row.causes)
+
+
+def _further(trials: Trials, chosen: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """What is chosen with one cause more: those that fit what it leaves, whose first steps promise most, and then one of random times."""
+    found = trials.beside(chosen)
+    told = [causes for causes in found if trials.tells(causes[-1])][:SECONDS]
+    worth = worth_fitting(trials.assessment.present, trials.promise(told, chosen))
+    random = [] if any(catalogue()[name].random for name in chosen) else [c for c in found if catalogue()[c[-1]].random]
+    return [*((*chosen, name) for name in worth[:FURTHER]), *random]
 
 
 def _expected(assessment: Assessment, prior: Sequence[str]) -> dict[str, float]:

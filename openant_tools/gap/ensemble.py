@@ -141,10 +141,10 @@ def _side_by_side(bank: Sequence[Case], played: Played) -> list[list[int]]:
     out: list[list[int]] = []
     begun: dict[tuple[object, ...], list[list[int]]] = {}
     for n, case in enumerate(bank):
-        ((name, (at, x)),) = case.causes.items()
-        if len(at) > 1:
+        if len(case.causes) != 1 or len(next(iter(case.causes.values()))[0]) > 1:
             out.append([n])
             continue
+        ((name, (at, x)),) = case.causes.items()
         groups = begun.setdefault((name, *x.items()), [])
         free = next((one for one in groups if tree[at[0]] not in {tree[_only(bank[m])] for m in one}), None)
         if free is None:

@@ -13,7 +13,7 @@ from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.effect import Scope
 from openant_tools.gap.closure import Closure, calibration_of, heat_loss_of
 from openant_tools.gap.decide import OUTSIDE, Decision, Row
-from openant_tools.gap.diagnosis import Diagnosis, Found, Span
+from openant_tools.gap.diagnosis import UNEXPLAINED, Diagnosis, Found, Span
 from openant_tools.gap.measure import measure
 from openant_tools.gap.next import suggestion
 from openant_tools.gap.residual import residual_after
@@ -67,8 +67,12 @@ def finding(
                 f"servos lose {number(loss, 'share')} of their torque per °C; a written model is always as warm as on average here, and "
                 f"leaves {number(predictions.written(best.refit, judged), 'rad', name='gap')}"
             )
+    elif decision.verdict == UNEXPLAINED:
+        closest = trials.closures.get((max(decision.chances, key=lambda name: decision.chances[name]),), plain)
+        rest = residual_after(predictions, closest.refit, judged, measured)[0]
     effects = sorted(
-        (_found(trials, row, best) for row in rows if row.causes), key=lambda one: -_rank(one, rows, chosen)
+        (_found(trials, row, best, decision.chances[row.causes[0]]) for row in rows if len(row.causes) == 1),
+        key=lambda one: -_rank(one, decision, chosen),
     )
     return Diagnosis(
         model=str(given.model),
@@ -89,7 +93,7 @@ def finding(
         where=where,
         calibration=calibration,
         removal=removal,
-        refuted={row.causes[0]: _why_not(row, plain) for row in rows if row.causes and row.refuted},
+        refuted={row.causes[0]: _why_not(row, plain) for row in rows if len(row.causes) == 1 and row.refuted},
         notes=tuple(notes),
         rest={} if rest is None else rest.as_json(),
         sensors=_sensors(trials, given),
@@ -100,15 +104,15 @@ def finding(
 def _rows(trials: Trials, rows: Sequence[Row]) -> tuple[dict[str, Any], ...]:
     """What was decided on, so that it can be decided anew and weights be learned from it."""
     outside = Row((OUTSIDE,), probability=trials.assessment.outside)
-    kept = ("causes", "probability", "support", "foretold", "likelier", "irregular", "left")
+    kept = ("causes", "probability", "support", "foretold", "uneven", "likelier", "within", "irregular")
     return tuple({name: getattr(row, name) for name in kept} for row in (*rows, outside))
 
 
-def _rank(one: Found, rows: Sequence[Row], chosen: Sequence[str]) -> float:
+def _rank(one: Found, decision: Decision, chosen: Sequence[str]) -> float:
     """What is chosen, in its order, before what is likelier to lead."""
     if one.effect in chosen:
         return float(len(chosen) - chosen.index(one.effect)) + 1.0
-    return next(row.probability * (0.0 if row.refuted else 1.0) for row in rows if row.causes == (one.effect,))
+    return decision.chances[one.effect]
 
 
 def _why_not(row: Row, plain: Closure) -> str:
@@ -117,8 +121,8 @@ def _why_not(row: Row, plain: Closure) -> str:
     return f"on held-out data it {words} than a re-fit within tolerance, which closes {percent(plain.closed)}"
 
 
-def _found(trials: Trials, row: Row, best: Closure | None) -> Found:
-    """One cause, as it is in the improved model if that has it, else by itself."""
+def _found(trials: Trials, row: Row, best: Closure | None, leads: float) -> Found:
+    """One cause, as it is in the improved model if that has it, else by itself; `leads` is how likely it leads."""
     (name,) = row.causes
     effect, protocol, assessment = catalogue()[name], trials.experiment.parts, trials.assessment
     alone, at = trials.closures.get((name,)), assessment.place(name)
@@ -155,7 +159,7 @@ def _found(trials: Trials, row: Row, best: Closure | None) -> Found:
     elif len(at) == len(protocol.joints) and Scope.ALL in effect.scopes:
         joints = "all"
     return Found(
-        name, joints, spans, assessment.present[name], None if alone is None else alone.closed,
+        name, joints, spans, max(leads, assessment.present[name]), None if alone is None else alone.closed,
         None if alone is None else alone.low, None if alone is None else alone.high, effect.native, x,
     )  # fmt: skip
 

@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear
 
 from openant_tools.gap.descent import LEAST_GAIN, Descent
 from openant_tools.gap.features import Floats
-from openant_tools.gap.hypothesis import Part, Refit, refit_at, sizes, without_last
+from openant_tools.gap.hypothesis import Hypothesis, Part, Refit, refit_at, sized, sizes, without_last
 from openant_tools.gap.nuisance import TILTS
 from openant_tools.gap.prediction import Predictions
 from openant_tools.gap.protocol import Played
@@ -28,10 +28,13 @@ INDEPENDENT_S = 0.1
 ITERATIONS = 30
 #: and where a cause is held to what robots of one build differ by, from where it was best
 LOOKS = 3
-#: steps that tell which causes are worth following to their end
-FIRST_STEPS = 3
+#: times a size by templates that are tried to begin from; steps in which tolerances are moved to each, and that tell which causes are worth
+#: following to their end
+SIZES, FIRST_STEPS = (0.5, 1.0, 2.0), 2
 #: how often slopes of tolerances are measured, each time where those before lead no farther
 MEASURED = 3
+#: hypotheses, those that leave least, that go on by slopes which are measured where they have come to
+FINISHED = 3
 #: how often errors of each joint in each run are taken to be as large as a step leaves them: no model of a real servo is true, and one
 #: that trusts its sensors follows what no parameter explains, to the ends of all of them
 INFLATIONS = 4
@@ -68,7 +71,7 @@ class Fits:
 
     def __init__(self, predictions: Predictions) -> None:
         self.predictions = predictions
-        self._learnt: dict[int, Floats] = {}
+        self._learnt: dict[Hypothesis, dict[int, Floats]] = {}
         self._least = np.inf
         self.found = np.zeros(len(predictions.names))
 
@@ -80,11 +83,23 @@ class Fits:
         """Causes at these coordinates, from where a fit without them came to."""
         return Refit(tuple(parts), tuple(x), self.found)
 
-    def promise(self, starts: Sequence[Refit], training: Sequence[int]) -> list[float]:
-        """Nats by which each is likelier than nothing, once that was fitted, after its first steps; slopes of tolerances as they are there."""
-        descents = [Descent.of(start, len(self.predictions.names), self._learnt) for start in starts]
-        self._follow(descents, list(training), FIRST_STEPS)
-        return [(self._least - one.least) / 2 for one in descents]
+    def begun(
+        self, starts: Sequence[Refit], training: Sequence[int], beside: Hypothesis = ()
+    ) -> list[tuple[Refit, float]]:
+        """Where each has come to by its first steps, from the best of some sizes of its last cause, and the logarithm of how likely that is.
+
+        Tolerances have taken up what a cause does while there was none: to each size they are moved first.
+
+        Args:
+            beside: a hypothesis that was fitted, which lacks the last cause: slopes of tolerances are as they are there.
+        """
+        fitted, tolerances, learnt = list(training), len(self.predictions.names), self._slopes(beside)
+        tried = [[Descent.of(some, tolerances, learnt).of_this_size() for some in _sized(start)] for start in starts]
+        self._follow([one for some in tried for one in some], fitted, FIRST_STEPS)
+        best = [min(some, key=lambda one: one.least) for some in tried]
+        descents = [Descent.of(refit_at(one.start, one.at), tolerances, learnt) for one in best]
+        self._follow(descents, fitted, FIRST_STEPS)
+        return [(refit_at(one.start, one.at), -0.5 * one.least) for one in descents]
 
     def refit(
         self, starts: Sequence[Refit], training: Sequence[int], leave_out: Sequence[Collection[int]]
@@ -97,15 +112,15 @@ class Fits:
             starts: the first is what the others are asked about beside: each has one cause more.
         """
         fitted = list(training)
-        descents = self._no_worse(self._descend(starts, fitted), fitted)
-        for one in descents:
-            if not one.causes:
-                self._keep(one)
+        beside = starts[0].hypothesis
+        descents = self._no_worse(self._descend(starts, fitted, beside), fitted)
+        for one in [one for one in descents if not one.causes] + self._finish(descents[1:], fitted):
+            self._keep(one)
         out = []
         limited = self._within(descents, fitted)
         # What may be larger leaves no more: where it does, its descent has ended in a hollow.
         hollow = [n for n, one in enumerate(descents) if one.least - limited[n].least > 2 * LEAST_GAIN]
-        self._anew(descents, {n: refit_at(limited[n].start, limited[n].at) for n in hollow}, fitted)
+        self._anew(descents, {n: refit_at(limited[n].start, limited[n].at) for n in hollow}, fitted, beside)
         for one, within in zip(descents, (-0.5 * one.least for one in limited), strict=True):
             folds = [[k for k in one.blocks if k not in left] for left in leave_out]
             # Where a fold leads otherwise than all of them together, from where these came to; held back it would not leave there.
@@ -143,19 +158,21 @@ class Fits:
         first = descents[0]
         worse = [n for n, one in enumerate(descents) if one.least - first.least > 2 * LEAST_GAIN]
         bare = refit_at(first.start, first.at)
-        self._anew(descents, {n: without_last(descents[n].start, bare) for n in worse}, fitted)
+        self._anew(descents, {n: without_last(descents[n].start, bare) for n in worse}, fitted, first.start.hypothesis)
         return descents
 
-    def _anew(self, descents: list[Descent], starts: Mapping[int, Refit], fitted: Sequence[int]) -> None:
+    def _anew(
+        self, descents: list[Descent], starts: Mapping[int, Refit], fitted: Sequence[int], beside: Hypothesis
+    ) -> None:
         """Follow some of them from other starts, in their places."""
         if starts:
-            for n, one in zip(starts, self._descend(list(starts.values()), fitted), strict=True):
+            for n, one in zip(starts, self._descend(list(starts.values()), fitted, beside), strict=True):
                 descents[n] = one
 
-    def _descend(self, starts: Sequence[Refit], fitted: Sequence[int]) -> list[Descent]:
+    def _descend(self, starts: Sequence[Refit], fitted: Sequence[int], beside: Hypothesis) -> list[Descent]:
         """Follow each start to where it leaves least on these runs."""
         # Slopes cost the most: causes begin with what was learnt of tolerances without them on the floor, where each takes a simulation.
-        learnt = {k: known for k, known in self._learnt.items() if k in fitted and self._on_floor(k)}
+        learnt = {k: slopes for k, slopes in self._slopes(beside).items() if k in fitted and self._on_floor(k)}
         descents = [Descent.of(start, len(self.predictions.names), learnt) for start in starts]
         begun = descents
         for n in range(1 if learnt else MEASURED):
@@ -169,6 +186,19 @@ class Fits:
             if not begun:
                 break
         return descents
+
+    def _finish(self, descents: Sequence[Descent], fitted: Sequence[int]) -> list[Descent]:
+        """Follow those that leave least by slopes of tolerances that are learnt where they have come to."""
+        # On the stand slopes cost little: there they were learnt where each had come to.
+        floor = any(self._on_floor(k) for k in fitted)
+        finished = begun = sorted(descents, key=lambda one: one.least)[:FINISHED] if floor else []
+        for _ in range(MEASURED - 1):
+            before = [one.least for one in begun]
+            for one in begun:
+                one.begin()
+            self._follow(begun, fitted, ITERATIONS)
+            begun = [one for one, cost in zip(begun, before, strict=True) if cost - one.least > 2 * LEAST_GAIN]
+        return finished
 
     def _follow(self, descents: Sequence[Descent], fitted: Sequence[int], at_most: int) -> None:
         """Take so many steps, or until none goes on."""
@@ -196,9 +226,14 @@ class Fits:
 
     def _keep(self, found: Descent) -> None:
         """Remember what was learnt of tolerances."""
-        self._learnt = {k: slopes[found.causes :] for k, slopes in found.slopes.items()}
-        self._least = found.least
-        self.found = found.at[found.causes :]
+        self._learnt[found.start.hypothesis] = {k: slopes[found.causes :] for k, slopes in found.slopes.items()}
+        if not found.causes:
+            self._least = found.least
+            self.found = found.at
+
+    def _slopes(self, hypothesis: Hypothesis) -> Mapping[int, Floats]:
+        """Of each run how tolerances move it, where a hypothesis was fitted, or else no cause; nothing before that."""
+        return self._learnt.get(hypothesis) or self._learnt.get((), {})
 
     def _on_floor(self, k: int) -> bool:
         return self.predictions.protocol.runs[k].plant.setup is Setup.FLOOR
@@ -299,3 +334,10 @@ class Fits:
             else:
                 used.append((mine, [(n + k, mask)]))
         return out + [members for _, members in used]
+
+
+def _sized(start: Refit) -> list[Refit]:
+    """A hypothesis with its last cause so many times as large."""
+    *others, last = start.x
+    cause = start.hypothesis[-1].cause
+    return [dataclasses.replace(start, x=(*others, sized(cause, last, times))) for times in SIZES]

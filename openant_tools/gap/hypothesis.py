@@ -12,7 +12,18 @@ from numpy.typing import NDArray
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.effect import Cause, Quantity
 
-__all__ = ["Hypothesis", "Part", "Refit", "bounds_of", "prior_of", "quantities", "refit_at", "sizes", "without_last"]
+__all__ = [
+    "Hypothesis",
+    "Part",
+    "Refit",
+    "bounds_of",
+    "prior_of",
+    "quantities",
+    "refit_at",
+    "sized",
+    "sizes",
+    "without_last",
+]
 
 Array = NDArray[np.float64]
 
@@ -49,6 +60,15 @@ def bounds_of(q: Quantity) -> tuple[float, float]:
     # A share cannot be more than all.
     share = q.unit == "1" and not q.signed
     return -q.large * BEYOND if q.signed else 0.0, min(q.large * BEYOND, WHOLE) if share else q.large * BEYOND
+
+
+def sized(cause: str, x: Mapping[str, float], times: float) -> dict[str, float]:
+    """A cause so many times as large as at these coordinates, within bounds; its shapes as they are."""
+    out = {}
+    for q in catalogue()[cause].quantities:
+        low, high = bounds_of(q)
+        out[q.name] = x[q.name] if q.shape else float(np.clip(times * x[q.name], low, high))
+    return out
 
 
 @dataclass(frozen=True)

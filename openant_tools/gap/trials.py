@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap.assess import Assessment
 from openant_tools.gap.closure import Closure, closures
 from openant_tools.gap.decide import Row
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.fitting import Fits
-from openant_tools.gap.hypothesis import Part, Refit, bounds_of
+from openant_tools.gap.hypothesis import Part, Refit, sized
 from openant_tools.gap.prediction import Predictions
 
 __all__ = ["Trials"]
@@ -30,12 +28,14 @@ class Trials:
 
     Attributes:
         closures: causes → what they close; of none at all what a re-fit within tolerance does by itself.
+        starts: causes → where their first steps have led.
     """
 
     experiment: Experiment
     assessment: Assessment
     fits: Fits
     closures: dict[Causes, Closure] = field(default_factory=dict)
+    starts: dict[Causes, Refit] = field(default_factory=dict)
 
     @classmethod
     def of(cls, experiment: Experiment, assessment: Assessment) -> Trials:
@@ -54,23 +54,28 @@ class Trials:
         self.closures |= {causes: self._at_random(causes) for causes in sets if _simulated(causes) != causes}
 
     def tells(self, name: str) -> bool:
-        """Whether fits tell of a cause: not what joints' positions hardly show, without a sensor of the body, nor what no simulation
-        repeats."""
+        """Whether fits tell of a cause: not what no simulation repeats, nor what only a sensor shows that is not there."""
         effect = catalogue()[name]
-        return not effect.random and (not effect.unseen_in_joints or bool(self.fits.predictions.sensed))
+        return not effect.random and (
+            effect.of_body or not effect.unseen_in_joints or bool(self.fits.predictions.sensed)
+        )
 
-    def promise(self, names: Sequence[str]) -> dict[str, float]:
-        """Cause → nats by which its first steps make what was measured likelier, once no cause was fitted."""
+    def promise(self, sets: Sequence[Causes], beside: Causes = ()) -> dict[str, float]:
+        """Last cause of each → nats by which its first steps make what was measured likelier than what was fitted beside."""
         found = dict[str, float]()
-        for n in range(0, len(names), AT_ONCE):
-            some = names[n : n + AT_ONCE]
-            starts = [self._start((name,)) for name in some]
-            found |= zip(some, self.fits.promise(starts, self.experiment.training), strict=True)
+        for n in range(0, len(sets), AT_ONCE):
+            some = [_simulated(causes) for causes in sets[n : n + AT_ONCE]]
+            starts, known = [self._start(causes) for causes in some], self.closures[_simulated(beside)]
+            begun = self.fits.begun(starts, self.experiment.training, known.refit.hypothesis)
+            for causes, (refit, likelihood) in zip(some, begun, strict=True):
+                self.starts[causes] = refit
+                found[causes[-1]] = likelihood - known.likelihood
         return found
 
     def row(self, causes: Causes, probability: float) -> Row:
         """What is known of the last of some causes, beside the others."""
-        places = tuple(self.assessment.place(name) for name in causes)
+        where = {part.cause: part.joints for part in self._start(_simulated(causes)).hypothesis}
+        places = tuple(where.get(name) or self.assessment.place(name) for name in causes)
         if catalogue()[causes[-1]].random:
             at = self.closures[_simulated(causes)].irregular.joints(catalogue()[causes[-1]])
             return Row(causes, (*places[:-1], at), probability, irregular=self._irregular(causes))
@@ -78,7 +83,8 @@ class Trials:
         if one is None or other is None or not self.tells(causes[-1]):
             return Row(causes, places, probability)
         return Row(
-            causes, places, probability, one.support(other), one.foretold, one.likelier(other), one.left, one.closed - other.closed
+            causes, places, probability, one.support(other), one.foretold, one.uneven, one.likelier(other),
+            one.within - other.likelihood, one.closed - other.closed,
         )  # fmt: skip
 
     def _irregular(self, causes: Causes) -> float:
@@ -89,9 +95,7 @@ class Trials:
         effect, beside = catalogue()[causes[-1]], self.closures[_simulated(causes)]
         alone = beside.irregular.nats(effect)
         others = [] if _simulated(causes) else [one for known, one in self.closures.items() if len(known) == 1]
-        return min(
-            [alone, *(max(one.irregular.nats(effect), alone - max(one.likelier(beside), 0.0)) for one in others)]
-        )
+        return min([alone, *(max(one.irregular.nats(effect), alone - max(one.beyond(beside), 0.0)) for one in others)])
 
     def _at_random(self, causes: Causes) -> Closure:
         """What is closed beside causes that act at random times: as much as without them."""
@@ -110,7 +114,7 @@ class Trials:
 
     def none(self) -> Row:
         """What is known of no cause at all."""
-        return Row((), probability=self.assessment.none, left=self.closures[()].left)
+        return Row((), probability=self.assessment.none, uneven=self.closures[()].uneven)
 
     def removal(self, causes: Causes) -> dict[str, float]:
         """Of causes together, what closes less without each, the most first; of those that were tried without it."""
@@ -125,16 +129,30 @@ class Trials:
     def size(self, name: str) -> Mapping[str, float]:
         """How large a cause would be by its best template's amplitude: where fits start from."""
         evidence = self.assessment.evidence
-        c = evidence.causes.index(name)
-        _, _, x = evidence.bank[int(evidence.places[0, c])]
-        amplitude, out = float(evidence.amplitudes[0, c]), {}
-        for q in catalogue()[name].quantities:
-            low, high = bounds_of(q)
-            out[q.name] = x[q.name] if q.shape else float(np.clip(amplitude * x[q.name], low, high))
+        amplitude = float(evidence.amplitudes[0, evidence.causes.index(name)])
+        return sized(name, self.assessment.template(name), amplitude)
+
+    def beside(self, causes: Causes) -> list[Causes]:
+        """Those with one cause more, by what they leave of the recording: the best fit first, where and as large as it is there."""
+        known = self.closures[_simulated(causes)].refit
+        out = []
+        for lead in self.assessment.beside(
+            {part.cause: (part.joints, x) for part, x in zip(known.hypothesis, known.x, strict=True)}
+        ):
+            if lead.cause not in causes:
+                out.append((*causes, lead.cause))
+                self.starts.setdefault(
+                    _simulated(out[-1]),
+                    Refit((*known.hypothesis, Part(lead.cause, lead.joints)), (*known.x, lead.x), known.nuisance),
+                )
         return out
 
     def _start(self, causes: Causes) -> Refit:
-        """From what is known: the same without its last cause, and that one as large as templates say."""
+        """From what is known: the same, or it without its last cause, and that one as large as templates say."""
+        if causes in self.closures:
+            return self.closures[causes].refit
+        if causes in self.starts:
+            return self.starts[causes]
         if not causes:
             return self.fits.nothing()
         parts = [Part(name, self.assessment.place(name)) for name in causes]

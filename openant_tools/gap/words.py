@@ -36,7 +36,10 @@ def sentence(found: Diagnosis) -> str:
     words = f"{one.effect} ({where_words(one.joints)}): {catalogue()[one.effect].words}"
     beside = [name for name in found.selected if name != found.verdict]
     more = f", with {' and '.join(beside)} beside it" if beside else ""
-    return f"{words}{more}; the improved model closes {percent(closed(found))} of the gap on held-out runs ({sure})."
+    closes = f"closes {percent(closed(found))} of the gap on held-out runs ({sure})."
+    if catalogue()[one.effect].random and not beside:
+        return f"{words}; no model repeats that, and what else the improved one moves within tolerance {closes}"
+    return f"{words}{more}; the improved model {closes}"
 
 
 def rest_words(found: Diagnosis) -> str:

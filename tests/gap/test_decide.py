@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from places import ROOT
 
 from openant_tools.gap.decide import OUTSIDE, SURE, Row, adds, chances, decide, weights, worth_fitting
-from openant_tools.gap.diagnosis import NONE
+from openant_tools.gap.diagnosis import NONE, UNEXPLAINED
 
 NOTHING = Row((), probability=0.05)
 LAG = Row(("actuator_lag",), ((0,),), 0.85, support=2.5, foretold=2.6, gain=0.5)
@@ -44,19 +45,35 @@ def test_what_should_leave_less_there_and_does_not_is_less_likely() -> None:
     assert decide([NOTHING, unseen], outside=0.04).verdict == "actuator_lag"
 
 
-def test_causes_that_make_it_likelier_are_told_apart_by_how_much() -> None:
-    """No share of what the best one explains is a second cause; and what some cause explains is not nothing."""
+def test_causes_are_told_apart_by_how_much_likelier_they_are_than_any_robot_of_one_build() -> None:
     best, other = (replace(one, probability=0.3, support=1.0, foretold=1.0) for one in (LAG, DELAY))
     rows = [replace(NOTHING, probability=0.4), replace(best, likelier=400.0), replace(other, likelier=250.0)]
-    p = chances(rows, 0.04, weights())
-    # All else being equal, by the learned weight of their shares: 400 and 250 nats, each known to SURE.
-    told = ((400.0 + SURE) / (250.0 + SURE)) ** weights()["share"]
-    assert told > 2
-    assert p["actuator_lag"] / p["action_delay"] == pytest.approx(told)
-    assert p[NONE] < chances([rows[0], best, other], 0.04, weights())[NONE]
-    # What nobody knows to a few nats, causes do not share by.
-    p = chances([rows[0], replace(best, likelier=3.0), replace(other, likelier=1.0)], 0.04, weights())
-    assert p["actuator_lag"] < 2 * p["action_delay"]
+
+    def odds(*within: float) -> float:
+        limited = [replace(row, within=most) for row, most in zip(rows[1:], within, strict=True)]
+        p = chances([rows[0], *limited], 0.04, weights())
+        return p["actuator_lag"] / p["action_delay"]
+
+    def sure(nats: float) -> float:
+        return weights()["beyond"] * SURE * math.asinh(nats / SURE)
+
+    assert odds(0.0, 0.0) == pytest.approx(math.exp(sure(400.0) - sure(250.0)))
+    # A little of one cause explains what much of the other does: that one is none.
+    assert odds(230.0, 0.0) == odds(0.0, 230.0) == pytest.approx(math.exp(sure(170.0) - sure(20.0)))
+    assert odds(230.0, 0.0) > 2 * odds(0.0, 0.0)
+    # What some cause explains is not nothing; what a little of it explains as well is.
+    none = [chances([rows[0], replace(rows[1], within=most)], 0.04, weights())[NONE] for most in (0.0, 399.0)]
+    assert none[0] < 0.1 < none[1]
+
+
+def test_one_joint_that_nothing_explains_is_something_unknown() -> None:
+    some = replace(LAG, probability=0.4, support=0.8, foretold=0.9)
+    rows = [replace(NOTHING, uneven=2.6), replace(some, uneven=2.5), replace(DELAY, support=0.0, uneven=2.6)]
+    assert decide(rows, outside=0.35).verdict == UNEXPLAINED
+    # A cause that leaves all joints alike explains it, and so do two together.
+    assert decide([rows[0], replace(rows[1], uneven=0.2), rows[2]], outside=0.35).verdict == "actuator_lag"
+    both = Row(("actuator_lag", "backlash"), ((0,), (0,)), 0.5, support=2.0, foretold=2.0, uneven=0.2)
+    assert decide([*rows, both], outside=0.35).verdict == "actuator_lag"
 
 
 def test_lost_commands_that_are_seen_one_by_one_lead_whatever_else_fits() -> None:
@@ -66,8 +83,8 @@ def test_lost_commands_that_are_seen_one_by_one_lead_whatever_else_fits() -> Non
     few = replace(lost, irregular=4.0)
     assert decide([replace(NOTHING, probability=0.8), few], outside=0.1).verdict == NONE
     beside = Row(("actuator_lag", "command_dropout"), ((0,), (0, 1)), 0.1, irregular=150.0)
-    assert adds([beside]) == beside
-    assert adds([replace(beside, irregular=0.0)]) is None
+    assert adds([beside], 0.0) == beside
+    assert adds([replace(beside, irregular=0.0)], 0.0) is None
 
 
 def test_two_that_share_what_is_likely_are_ambiguous() -> None:
@@ -100,9 +117,9 @@ def test_what_is_fitted_is_what_evidence_and_first_steps_speak_for() -> None:
 def test_a_further_cause_comes_in_where_it_is_likelier_there_than_not() -> None:
     pair = ("actuator_lag", "backlash")
     there = Row(pair, ((0,), (0,)), 0.5, support=2.0, foretold=2.0, likelier=40.0)
-    assert adds([there, replace(there, probability=0.3)]) == there
-    assert adds([replace(there, probability=0.02, support=0.0, likelier=0.0)]) is None
-    assert adds([Row(pair, ((0,), (0,)), 0.9)]) is None, "held-out data say nothing of it"
+    assert adds([there, replace(there, probability=0.3)], 0.0) == there
+    assert adds([replace(there, probability=0.02, support=0.0, likelier=0.0)], 0.0) is None
+    assert adds([Row(pair, ((0,), (0,)), 0.9)], 0.0) is None, "held-out data say nothing of it"
 
 
 def test_the_weights_are_those_that_the_kept_robots_teach() -> None:

@@ -15,6 +15,7 @@ import pytest
 from plants import BENCH, ENCODER_RAD, SERVO, drive, pendulum, run_of, sweep, write
 
 import openant_tools.gap.descent as descent
+import openant_tools.gap.fitting as fitting
 import openant_tools.gap.prediction as prediction
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.robot import Robot
@@ -125,7 +126,7 @@ def test_torque_that_goes_a_little_later_than_its_row_is_no_late_sensor(tmp_path
     plain, late = closures(fits, [fits.nothing(), fits.of([Part("sensor_delay", (0,))], [start])], [(0,), (1,)], [0, 1])
     u = dict(zip((one.name for one in predictions.names), plain.refit.nuisance, strict=True))
     assert u["switching"] == pytest.approx(later, abs=0.1)
-    assert late.likelier(plain) < descent.LEAST_GAIN
+    assert late.beyond(plain) < descent.LEAST_GAIN
     assert "switching" not in calibration_of(predictions, plain.refit, [0]), "it is none of the robot"
 
 
@@ -159,18 +160,28 @@ def test_a_cause_no_larger_than_robots_of_one_build_differ_by_is_none(
     plain, found = closures(fits, [fits.nothing(), fits.of([Part("backlash", (0,))], [start])], [(0,), (1,)], [0, 1])
     assert found.refit.x[0]["gap_rad"] == pytest.approx(gap_rad, abs=0.002)
     assert found.likelihood > plain.likelihood + 10
-    assert (found.likelier(plain) > 10) == beyond
+    assert (found.beyond(plain) > 10) == beyond
+    # First steps begin at the best of several sizes.
+    half = fits.of([Part("backlash", (0,))], [start | {"gap_rad": gap_rad / 2}])
+    ((first, likelihood),) = fits.begun([half], [0, 1])
+    assert first.x[0]["gap_rad"] == pytest.approx(gap_rad, rel=0.3)
+    assert plain.likelihood + 10 < likelihood < found.likelihood + 2 * descent.LEAST_GAIN
 
 
 def test_what_leaves_nothing_at_all_and_a_fold_without_rows_say_nothing() -> None:
     """Of a log without noise: no sensor has a floor there."""
     none = Closure(
-        before=0, after=0, floor=0, closed=1, low=1, high=1, likelihood=0.0, within=0.0, squares=np.zeros((2, 1)), apart=np.zeros((2, 1)),
+        before=0, after=0, floor=0, closed=1, low=1, high=1, likelihood=0.0, within=0.0, joints=1, squares=np.zeros((2, 1)),
+            apart=np.zeros((2, 1)),
         counts=np.array([[0.0], [50.0]]), known=np.full(1, 4e-8), refit=Refit((), (), np.zeros(0)), std=(),
         irregular=Irregular(*np.zeros((6, 2))),
     )  # fmt: skip
     some = dataclasses.replace(none, squares=np.array([[0.0], [0.5]]))
-    assert none.support(none) == none.foretold == 0.0
+    assert none.support(none) == none.foretold == none.uneven == 0.0
+    # Of three joints one is left at ten times its sensor's error on the fold that has rows; what sensors of the body keep is none of a joint.
+    kept, rows = 4e-8 * np.array([[0.0] * 4, [1.0, 99.0, 1.0, 1e4]]), np.array([[0.0], [50.0]]).repeat(4, axis=1)
+    one = dataclasses.replace(none, joints=3, squares=kept * rows, counts=rows, known=np.full(4, 4e-8))
+    assert one.uneven == pytest.approx(math.log(10 / math.sqrt(2)))
     assert 0 < none.support(some) == -some.support(none) < 10
 
 
@@ -198,7 +209,7 @@ BOX = f"""\
 """
 
 
-def test_a_board_that_sits_askew_is_told_by_what_it_reads(tmp_path: Path) -> None:
+def test_a_board_that_sits_askew_is_told_by_what_it_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It moves no joint: what an IMU says names it, how far it is turned is found, and the gap of joints stays what it was."""
     robot, turned = mujoco.MjModel.from_xml_string(BOX.replace("IMU", "0 0.12 0")), []
     data, chance, t = mujoco.MjData(robot), np.random.default_rng(4), np.arange(125) / 50
@@ -225,8 +236,14 @@ def test_a_board_that_sits_askew_is_told_by_what_it_reads(tmp_path: Path) -> Non
     plain, askew, loaded = closures(fits, asked, [(0,), (1,)], [0, 1])
     assert askew.refit.x[0]["y_rad"] == pytest.approx(0.12, abs=0.025)
     assert askew.support(plain) > max(0.2, loaded.support(plain) + 0.2)
-    assert askew.likelier(plain) > max(10, loaded.likelier(plain) + 10)
+    assert askew.beyond(plain) > max(10, loaded.beyond(plain) + 10)
     assert askew.after == pytest.approx(plain.after, rel=0.05)
+    # On a floor what leaves least goes on by slopes that are measured where it has come to.
+    monkeypatch.setattr(fitting, "FINISHED", 0)
+    fits = Fits(predictions)
+    fits.refit([fits.nothing()], [0, 1], [])
+    before = fits.refit([fits.nothing(), fits.of([parts[0]], [starts[0]])], [0, 1], [])[1]
+    assert before.likelihood <= askew.likelihood
     without = Predictions(predictions.protocol, without=("gyro", "acc"))
     assert without.sensed == ()
     assert without.measured[0].shape == (len(t), 1)
