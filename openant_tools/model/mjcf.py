@@ -321,6 +321,9 @@ def _write_actuator(element: etree._Element, plant: Plant, variant: mujoco.MjMod
         if stiffness or velocity:
             element.set("biasprm", numbers(after[:3]))
             element.set("gainprm", numbers(variant.actuator_gainprm[i][:3]))
+    elif is_motor(variant, int(i)):
+        if (given.actuator_gainprm[i] != variant.actuator_gainprm[i]).any():
+            _set_motor(element, variant.actuator_gainprm[i])
     else:
         if stiffness:
             element.set("kp", number(-after[1]))
@@ -367,6 +370,13 @@ def _set_damping_ratios(
             element.set("dampratio", number(wanted / of_one))
 
 
+def _set_motor(element: etree._Element, motor: NDArray[np.float64]) -> None:
+    """What a DC motor is and how its loop works, from its gain parameters."""
+    element.set("motorconst", numbers([motor[MOTOR_CONSTANT]] * 2))
+    element.set("resistance", number(motor[RESISTANCE]))
+    element.set("controller", numbers([motor[KP], 0, motor[KD], 0, 0, motor[VMAX]]))
+
+
 def _write_motor(element: etree._Element, variant: mujoco.MjModel, i: int) -> None:
     """Put a DC motor in a position servo's place (plant.motor_form): same name, joint, order and control."""
     motor = variant.actuator_gainprm[i]
@@ -376,9 +386,7 @@ def _write_motor(element: etree._Element, variant: mujoco.MjModel, i: int) -> No
     for name, value in kept.items():
         element.set(name, value)
     element.set("input", "pos")
-    element.set("motorconst", numbers([motor[MOTOR_CONSTANT]] * 2))
-    element.set("resistance", number(motor[RESISTANCE]))
-    element.set("controller", numbers([motor[KP], 0, motor[KD], 0, 0, motor[VMAX]]))
+    _set_motor(element, motor)
     # It leaves its class, which was made for the servo, and takes along what else stood there.
     if variant.actuator_ctrllimited[i]:
         element.set("ctrlrange", numbers(variant.actuator_ctrlrange[i]))
@@ -530,22 +538,22 @@ def _check(out: Path, plant: Plant, variant: mujoco.MjModel) -> None:
     written = load_plant(out, plant.joints, Setup.FLOOR)
     for j, joint in enumerate(plant.joints):
         i, k, dof, adr = written.actuator[j], plant.actuator[j], plant.dof[j], plant.qpos[j]
-        pairs = [
-            (written.model.actuator_biasprm[i, 1:3], variant.actuator_biasprm[k, 1:3]),
-            (written.model.actuator_gainprm[i], variant.actuator_gainprm[k]),
-            (written.model.actuator_forcerange[i], variant.actuator_forcerange[k]),
-            (_lag(written.model, int(i)), _lag(variant, int(k))),
-            (written.model.actuator_delay[i], variant.actuator_delay[k]),
-            (written.model.dof_damping[written.dof[j]], variant.dof_damping[dof]),
-            (written.model.dof_armature[written.dof[j]], variant.dof_armature[dof]),
-            (written.model.dof_frictionloss[written.dof[j]], variant.dof_frictionloss[dof]),
-            (written.model.dof_solimp[written.dof[j]], variant.dof_solimp[dof]),
-            (written.model.qpos0[written.qpos[j]], variant.qpos0[adr]),
-        ]
-        for got, wanted in pairs:
+        pairs = {
+            "stiffness": (written.model.actuator_biasprm[i, 1:3], variant.actuator_biasprm[k, 1:3]),
+            "gain": (written.model.actuator_gainprm[i], variant.actuator_gainprm[k]),
+            "torque limit": (written.model.actuator_forcerange[i], variant.actuator_forcerange[k]),
+            "lag": (_lag(written.model, int(i)), _lag(variant, int(k))),
+            "delay": (written.model.actuator_delay[i], variant.actuator_delay[k]),
+            "damping": (written.model.dof_damping[written.dof[j]], variant.dof_damping[dof]),
+            "armature": (written.model.dof_armature[written.dof[j]], variant.dof_armature[dof]),
+            "friction loss": (written.model.dof_frictionloss[written.dof[j]], variant.dof_frictionloss[dof]),
+            "softness of friction (solimp)": (written.model.dof_solimp[written.dof[j]], variant.dof_solimp[dof]),
+            "reference": (written.model.qpos0[written.qpos[j]], variant.qpos0[adr]),
+        }
+        for what, (got, wanted) in pairs.items():
             if not np.allclose(got, wanted, rtol=1e-8, atol=1e-12):
                 raise BadInput(
-                    f"the values of joint {joint!r} do not survive in this file's structure",
+                    f"the {what} of joint {joint!r} does not survive in this file's structure",
                     where=plant.path,
                     remedy=EXPAND,
                 )

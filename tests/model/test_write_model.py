@@ -275,6 +275,19 @@ def test_a_servo_found_electrical_becomes_a_motor_of_the_same_name_and_order(tmp
     assert not [line for line in out.read_text().splitlines() if "<dcmotor" in line and "kp=" in line]
 
 
+def test_a_motor_that_a_fit_has_written_is_fitted_again(tmp_path: Path) -> None:
+    plant = load_plant(nominal_model_path("standard"), setup=Setup.FLOOR, electrical=True)
+    first = write_model(
+        nominal_model_path("standard"), apply(plant, choose(plant, ["electrical_damping"]), np.full(8, 3.0)), tmp_path / "first.xml"
+    )  # fmt: skip
+    again = load_plant(first, setup=Setup.FLOOR)
+    chosen = choose(again, ["stiffness", "damping", "torque_limit"])
+    variant = apply(again, chosen, np.full(len(chosen), 0.5))
+    assert (variant.actuator_gainprm != again.model.actuator_gainprm).any()
+    second = write_model(first, variant, tmp_path / "second.xml")
+    same_physics(mujoco.MjModel.from_xml_path(str(second)), variant)
+
+
 @pytest.mark.parametrize("of", ["default", 'default class="servo"'])
 def test_a_motor_takes_nothing_from_defaults_that_were_meant_for_the_servo(of: str, tmp_path: Path) -> None:
     """Its force range least of all, nor does it lose what its class said about delays and controls."""
@@ -568,7 +581,7 @@ def test_a_value_that_the_file_cannot_carry_leaves_no_file(tmp_path: Path) -> No
     variant.actuator_biasprm[1, 0] = 0.0
     variant.actuator_biasprm[1, 1] = -9.0  # and not its gain: a position actuator cannot be that
     (tmp_path / "out").mkdir()
-    with pytest.raises(BadInput, match="the values of joint 'second' do not survive in this file's structure"):
+    with pytest.raises(BadInput, match="the gain of joint 'second' does not survive in this file's structure"):
         write_model(source, variant, tmp_path / "out" / "mine.xml")
     assert list((tmp_path / "out").iterdir()) == []
 
@@ -578,7 +591,7 @@ def test_an_existing_file_survives_a_refusal(tmp_path: Path) -> None:
     variant = load_plant(source, setup=Setup.FLOOR).model
     variant.actuator_biasprm[1, 1] = -9.0
     kept = plants.write(tmp_path / "kept.xml", "what stood here before")
-    with pytest.raises(BadInput, match="do not survive"):
+    with pytest.raises(BadInput, match="does not survive"):
         write_model(source, variant, kept)
     assert kept.read_text() == "what stood here before"
 
