@@ -22,7 +22,7 @@ from openant_tools.gap.classifier import classifier, weights
 from openant_tools.gap.ensemble import robots_at, templates_at, templates_of
 from openant_tools.gap.evidence import Evidence, Layouts, RunLayout, Scale, anomalies, evidence_of, unknown_signals
 from openant_tools.gap.features import Floats
-from openant_tools.gap.hypothesis import sized
+from openant_tools.gap.hypothesis import Part, Refit, sized
 from openant_tools.gap.population import Case
 from openant_tools.gap.posterior import NONE, OUTSIDE, features_of, log_posterior
 from openant_tools.gap.protocol import RunSet
@@ -30,7 +30,7 @@ from openant_tools.gap.refine import refined
 from openant_tools.gap.templates import Template
 from openant_tools.workers import tied
 
-__all__ = ["Assessment", "Lead", "assess", "layouts_of"]
+__all__ = ["Assessment", "assess", "layouts_of"]
 
 Bools = NDArray[np.bool_]
 
@@ -40,15 +40,6 @@ MEASURE, OTHERS, BATCH = 72, 24, 32
 PARTS = 4
 #: of simulated robots: raise it where the same recording gives others
 VERSION = 10
-
-
-@dataclass(frozen=True)
-class Lead:
-    """Where a cause would sit (indices of joints), and its coordinates, by its best template."""
-
-    cause: str
-    joints: tuple[int, ...]
-    x: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -91,18 +82,21 @@ class Assessment:
         """Coordinates of its best template."""
         return self._best(cause)[2]
 
-    def beside(self, known: Mapping[str, tuple[tuple[int, ...], Mapping[str, float]]]) -> list[Lead]:
-        """Where every cause would sit, and how large it would be, beside causes that are known (name → indices of joints, coordinates): by what
-        a robot that has these leaves of the recording. The best fit first.
+    def beside(self, known: Refit) -> list[tuple[Part, dict[str, float]]]:
+        """Where every cause would sit, and its coordinates, beside causes that were fitted: by what a robot that has these leaves of the
+        recording. The best fit first.
         """
-        case = Case({name: (at, dict(x)) for name, (at, x) in known.items()}, -1)
+        parts = zip(known.hypothesis, known.x, strict=True)
+        case = Case({part.cause: (part.joints, dict(x)) for part, x in parts}, -1)
         robot = np.concatenate(templates_at(self.protocol, [case]), axis=1)
         left = self.scale.whitened(self.seen[None]) - self.scale.vectors(robot)
         templates = self.scale.templates
         fit, length = templates.fits(left)[0], np.linalg.norm(templates.vectors, axis=1)
-        best = sorted((int(some[fit[some].argmax()]) for some in templates.of_cause), key=lambda k: -fit[k])
-        bank = templates.bank
-        return [Lead(bank[k][0], bank[k][1], sized(bank[k][0], bank[k][2], float(fit[k] / length[k]))) for k in best]
+        out = []
+        for k in sorted((int(some[fit[some].argmax()]) for some in templates.of_cause), key=lambda k: -fit[k]):
+            name, joints, x = templates.bank[k]
+            out.append((Part(name, joints), sized(name, x, float(fit[k] / length[k]))))
+        return out
 
     def _best(self, cause: str) -> Template:
         return self.evidence.bank[int(self.evidence.places[0, self.evidence.causes.index(cause)])]

@@ -102,6 +102,16 @@ class Decision:
     selected: tuple[Row, ...] = ()
     alike: tuple[tuple[str, ...], ...] = ()
 
+    @property
+    def likeliest(self) -> str:
+        """The cause that likeliest leads, whatever is said."""
+        return max(self.chances, key=lambda name: self.chances[name])
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """Those that are selected."""
+        return tuple(name for row in self.selected for name in row.causes)
+
 
 @cache
 def weights() -> Mapping[str, float]:
@@ -119,7 +129,7 @@ def _fitted(rows: Sequence[Row], uneven: float, weights: Mapping[str, float]) ->
     out = {}
     for row in rows:
         if row.support is not None:
-            evened = weights["uneven"] * (uneven - (uneven if row.uneven is None else row.uneven))
+            evened = 0.0 if row.uneven is None else weights["uneven"] * (uneven - row.uneven)
             out[row.causes] = row.held_out(weights) + evened + weights["beyond"] * _sure(row.likelier - usual)
         elif row.irregular:
             out[row.causes] = weights["irregular"] * _sure(row.irregular)

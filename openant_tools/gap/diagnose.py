@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.errors import BadInput
 from openant_tools.gap.assess import Assessment, assess
-from openant_tools.gap.decide import Decision, Row, adds, decide, worth_fitting
+from openant_tools.gap.decide import Row, adds, decide, worth_fitting
 from openant_tools.gap.diagnosis import AMBIGUOUS, UNEXPLAINED, Diagnosis
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.finding import Given, finding
@@ -80,7 +80,8 @@ def diagnose(
     trials, rows = hypotheses(experiment, prior, lambda share, words: tell(0.02 + 0.73 * share, words))
     assessment = trials.assessment
     decision = decide(rows, assessment.outside)
-    chosen = _likeliest(decision)
+    # Others are looked for also beside a cause than which something unknown is likelier so far.
+    chosen = (decision.likeliest,) if decision.verdict == UNEXPLAINED else decision.causes
     if chosen not in trials.closures:  # named by the evidence alone: held-out data do not tell of it
         trials.fit([(), chosen])
     while decision.verdict != AMBIGUOUS and chosen in trials.closures and 0 < len(chosen) < CAUSES:
@@ -96,7 +97,7 @@ def diagnose(
     # What several causes explain together is not unexplained.
     decision = decide(rows, assessment.outside)
     if decision.verdict not in chosen:
-        chosen = tuple(name for row in decision.selected for name in row.causes)
+        chosen = decision.causes
     tell(1.0, "decision")
     return finding(trials, Given(model, tuple(runs), tuple(hold_out), tuple(prior)), rows, decision, chosen)
 
@@ -128,13 +129,6 @@ def prepare(
     """
     experiment = Experiment.of(sorted(runs, key=_content), model, joints_in_common(runs, model, joints))
     return assess(experiment.protocol, progress or (lambda share, words: None)).robots
-
-
-def _likeliest(decision: Decision) -> tuple[str, ...]:
-    """The cause beside which others are looked for: also where something unknown is likelier so far."""
-    if decision.verdict == UNEXPLAINED:
-        return (max(decision.chances, key=lambda name: decision.chances[name]),)
-    return tuple(name for row in decision.selected for name in row.causes)
 
 
 def _further(trials: Trials, chosen: tuple[str, ...]) -> list[tuple[str, ...]]:

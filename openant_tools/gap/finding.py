@@ -68,7 +68,7 @@ def finding(
                 f"leaves {number(predictions.written(best.refit, judged), 'rad', name='gap')}"
             )
     elif decision.verdict == UNEXPLAINED:
-        closest = trials.closures.get((max(decision.chances, key=lambda name: decision.chances[name]),), plain)
+        closest = trials.closures.get((decision.likeliest,), plain)
         rest = residual_after(predictions, closest.refit, judged, measured)[0]
     effects = sorted(
         (_found(trials, row, best, decision.chances[row.causes[0]]) for row in rows if len(row.causes) == 1),

@@ -136,15 +136,11 @@ class Trials:
         """Those with one cause more, by what they leave of the recording: the best fit first, where and as large as it is there."""
         known = self.closures[_simulated(causes)].refit
         out = []
-        for lead in self.assessment.beside(
-            {part.cause: (part.joints, x) for part, x in zip(known.hypothesis, known.x, strict=True)}
-        ):
-            if lead.cause not in causes:
-                out.append((*causes, lead.cause))
-                self.starts.setdefault(
-                    _simulated(out[-1]),
-                    Refit((*known.hypothesis, Part(lead.cause, lead.joints)), (*known.x, lead.x), known.nuisance),
-                )
+        for part, x in self.assessment.beside(known):
+            if part.cause not in causes:
+                out.append((*causes, part.cause))
+                start = Refit((*known.hypothesis, part), (*known.x, x), known.nuisance)
+                self.starts.setdefault(_simulated(out[-1]), start)
         return out
 
     def _start(self, causes: Causes) -> Refit:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any, TypeVar
 
-from openant_tools.procedure.step import Answer, Progress, Subroutine
+from openant_tools.procedure.relay import passing
+from openant_tools.procedure.step import Progress, Subroutine
 from openant_tools.procedure.unfinished import Parts
 
 __all__ = ["minutes", "noted"]
@@ -20,18 +21,13 @@ def minutes(seconds: float) -> tuple[str, ...]:
 
 def noted(work: Subroutine[T], parts: Parts, **facts: Any) -> Subroutine[T]:
     """Do the work, and note each part, with these facts, once its progress is past it; its result."""
-    answer: Answer = None
     past = 0
-    try:
-        while True:
-            event = work.send(answer)
-            if isinstance(event, Progress) and event.share is not None:
-                while past < int(event.share * len(parts.of) + 1e-9):
-                    parts.done(parts.of[past], **facts)
-                    past += 1
-            answer = yield event
-    except StopIteration as end:
-        result: T = end.value
-        return result
-    finally:
-        work.close()
+
+    def note(event: Progress) -> Progress:
+        nonlocal past
+        while past < int((event.share or 0.0) * len(parts.of) + 1e-9):
+            parts.done(parts.of[past], **facts)
+            past += 1
+        return event
+
+    return passing(work, note)

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from openant_tools.procedure.step import Answer, Event, Progress, Say, Subroutine
 
-__all__ = ["relayed", "within"]
+__all__ = ["passing", "relayed", "within"]
 
 T = TypeVar("T")
 
@@ -58,18 +58,23 @@ def relayed(
     return outcome[0]
 
 
-def within(part: tuple[float, float], work: Subroutine[T]) -> Subroutine[T]:
-    """Do the work as this part, from share to share, of a procedure, whose progress never goes back; its result."""
+def passing(work: Subroutine[T], change: Callable[[Progress], Progress]) -> Subroutine[T]:
+    """Do the work, and pass on what it yields, its progress as `change` has it where that is a share; its result."""
     answer: Answer = None
-    begin, end = part
     try:
         while True:
             event = work.send(answer)
             if isinstance(event, Progress) and event.share is not None:
-                event = Progress(begin + event.share * (end - begin), event.words)
+                event = change(event)
             answer = yield event
     except StopIteration as ended:
         result: T = ended.value
         return result
     finally:
         work.close()
+
+
+def within(part: tuple[float, float], work: Subroutine[T]) -> Subroutine[T]:
+    """Do the work as this part, from share to share, of a procedure, whose progress never goes back; its result."""
+    begin, end = part
+    return passing(work, lambda event: Progress(begin + (event.share or 0.0) * (end - begin), event.words))
