@@ -76,7 +76,7 @@ def apply(found: Diagnosis, model: Path, out: Path, *, robot: Path | None = None
     if engine is not None and not carries(engine, "action_delay") and improved.delay.any():  # as calibrated
         entries += entries_of({("action_delay", "delay_s"): improved.delay.copy()}, plant.joints)
         improved.delay[:] = 0.0
-    beside = out.with_name(f"{out.stem}.effects.toml")
+    effects_file = out.with_name(f"{out.stem}.effects.toml")
     with (
         folder.hold() if folder is not None else contextlib.nullcontext()
     ):  # between reading its effects and writing them
@@ -91,11 +91,11 @@ def apply(found: Diagnosis, model: Path, out: Path, *, robot: Path | None = None
             _into_folder(folder, out, [*others, *entries], found)
             written.append(folder.config_file)
         elif entries:
-            write_text(beside, as_toml(entries, f"What MuJoCo has no feature for; goes with {out.name}"))
-            written.append(beside)
+            write_text(effects_file, as_toml(entries, f"What MuJoCo has no feature for; goes with {out.name}"))
+            written.append(effects_file)
         else:
-            beside.unlink(missing_ok=True)  # of an earlier diagnosis, which would act beside this model
-    where = "robot.toml" if folder is not None else beside.name
+            effects_file.unlink(missing_ok=True)  # of an earlier diagnosis, which would act beside this model
+    where = "robot.toml" if folder is not None else effects_file.name
     carried = [
         f"{one.effect} ({_where(one)}): "
         + (

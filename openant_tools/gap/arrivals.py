@@ -122,9 +122,9 @@ class Arrivals:
             speed, acceleration, np.gradient(acceleration, self.t), error, np.roll(error, 1), np.roll(error, -1),
             turn, np.roll(turn, 1), position, speed * np.abs(speed), error * np.abs(error),
         ]  # fmt: skip
-        beside = against_neighbours(np.stack(every, axis=1)[None].astype(np.float32), self.t)[0] * self.counts[:, None]
-        size = np.linalg.norm(beside, axis=0)
-        out: Array = np.linalg.qr(beside[:, size > 1e-9] / size[size > 1e-9])[0]
+        near = against_neighbours(np.stack(every, axis=1)[None].astype(np.float32), self.t)[0] * self.counts[:, None]
+        size = np.linalg.norm(near, axis=0)
+        out: Array = np.linalg.qr(near[:, size > 1e-9] / size[size > 1e-9])[0]
         return out
 
 

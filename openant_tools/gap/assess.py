@@ -82,7 +82,7 @@ class Assessment:
         """Coordinates of its best template."""
         return self._best(cause)[2]
 
-    def beside(self, known: Refit) -> list[tuple[Part, dict[str, float]]]:
+    def further(self, known: Refit) -> list[tuple[Part, dict[str, float]]]:
         """Where every cause would sit, and its coordinates, beside causes that were fitted: by what a robot that has these leaves of the
         recording. The best fit first.
         """

@@ -30,7 +30,7 @@ class Closure:
         before, after, floor: rad, of joints. closed: share of the excess that is gone; low, high: over the folds, 95 %.
         joints: how many channels are positions, the first ones.
         squares: (folds, channels) summed over rows; counts: (folds, channels) of how many errors.
-        apart: (folds, channels) squares of how far it is from what it is asked about beside, summed over the same rows.
+        apart: (folds, channels) squares of how far it is from what it is compared with, summed over the same rows.
         known: (channels,) mean square of sensors. likelihood, within, std: as of `Fit`.
         refit: on all training runs together. irregular: what it leaves says of commands.
     """
@@ -95,7 +95,7 @@ def closures(
     """What each hypothesis leaves of the gap.
 
     Args:
-        starts: the first is what the others are asked about beside.
+        starts: the first is what the others are compared with.
         folds: runs judged together by fits that have not seen them. training: the runs to fit on, but for those of the fold.
     """
     predictions, found = fits.predictions, fits.refit(starts, training, folds)

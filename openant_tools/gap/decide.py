@@ -51,12 +51,12 @@ class Row:
     Attributes:
         causes: names, the one that is asked about last; empty for none. joints: of each cause, indices.
         probability: by the evidence: that it leads, or of a further cause that it is there; of none, that nothing leads.
-        support: logarithm of how much less it leaves of the gap on held-out folds, mean of them and summed over joints, than what it is asked
-            about beside does (no further cause, or the others); None where it was not fitted, or where nothing that was recorded
+        support: logarithm of how much less it leaves of the gap on held-out folds, mean of them and summed over joints, than what it is compared
+            with does (no further cause, or the others); None where it was not fitted, or where nothing that was recorded
             tells.
         foretold: what that would be if it were right. uneven: logarithm of how many times its sensors' errors the joint that it leaves worst
             keeps there, less that of the median joint.
-        likelier: nats by which what it was fitted to is, its sizes and tolerances with it, than what it is asked about beside makes it.
+        likelier: nats by which what it was fitted to is, its sizes and tolerances with it, than what it is compared with makes it.
             within: the same, with no more of its cause than robots of one build differ by.
         gain: share of the excess gap that it closes on held-out folds beyond what is closed without it, for the report.
         irregular: of a cause that acts at random times nats by which innovations are likelier than without it.

@@ -88,8 +88,8 @@ def diagnose(
         tell(0.8 + 0.05 * len(chosen), f"what acts beside {' and '.join(chosen)}")
         further = _further(trials, chosen)
         trials.fit([chosen, *further])
-        beside = [trials.row(causes, assessment.present[causes[-1]]) for causes in further]
-        more = adds(beside, trials.closures[chosen].uneven)
+        asked = [trials.row(causes, assessment.present[causes[-1]]) for causes in further]
+        more = adds(asked, trials.closures[chosen].uneven)
         if more is None:
             break
         chosen = more.causes
@@ -133,7 +133,7 @@ def prepare(
 
 def _further(trials: Trials, chosen: tuple[str, ...]) -> list[tuple[str, ...]]:
     """What is chosen with one cause more: those that fit what it leaves, whose first steps promise most, and then one of random times."""
-    found = trials.beside(chosen)
+    found = trials.further(chosen)
     told = [causes for causes in found if trials.tells(causes[-1])][:SECONDS]
     worth = worth_fitting(trials.assessment.present, trials.promise(told, chosen))
     random = [] if any(catalogue()[name].random for name in chosen) else [c for c in found if catalogue()[c[-1]].random]

@@ -84,16 +84,16 @@ class Fits:
         return Refit(tuple(parts), tuple(x), self.found)
 
     def begun(
-        self, starts: Sequence[Refit], training: Sequence[int], beside: Hypothesis = ()
+        self, starts: Sequence[Refit], training: Sequence[int], base: Hypothesis = ()
     ) -> list[tuple[Refit, float]]:
         """Where each has come to by its first steps, from the best of some sizes of its last cause, and the logarithm of how likely that is.
 
         Tolerances have taken up what a cause does while there was none: to each size they are moved first.
 
         Args:
-            beside: a hypothesis that was fitted, which lacks the last cause: slopes of tolerances are as they are there.
+            base: a hypothesis that was fitted, which lacks the last cause: slopes of tolerances are as they are there.
         """
-        fitted, tolerances, learnt = list(training), len(self.predictions.names), self._slopes(beside)
+        fitted, tolerances, learnt = list(training), len(self.predictions.names), self._slopes(base)
         tried = [[Descent.of(some, tolerances, learnt).of_this_size() for some in _sized(start)] for start in starts]
         self._follow([one for some in tried for one in some], fitted, FIRST_STEPS)
         best = [min(some, key=lambda one: one.least) for some in tried]
@@ -109,18 +109,18 @@ class Fits:
         All share one linearisation each, at what is found on all of the training runs; and are simulated side by side.
 
         Args:
-            starts: the first is what the others are asked about beside: each has one cause more.
+            starts: the first is what the others are compared with: each has one cause more.
         """
         fitted = list(training)
-        beside = starts[0].hypothesis
-        descents = self._no_worse(self._descend(starts, fitted, beside), fitted)
+        base = starts[0].hypothesis
+        descents = self._no_worse(self._descend(starts, fitted, base), fitted)
         for one in [one for one in descents if not one.causes] + self._finish(descents[1:], fitted):
             self._keep(one)
         out = []
         limited = self._within(descents, fitted)
         # What may be larger leaves no more: where it does, its descent has ended in a hollow.
         hollow = [n for n, one in enumerate(descents) if one.least - limited[n].least > 2 * LEAST_GAIN]
-        self._anew(descents, {n: refit_at(limited[n].start, limited[n].at) for n in hollow}, fitted, beside)
+        self._anew(descents, {n: refit_at(limited[n].start, limited[n].at) for n in hollow}, fitted, base)
         for one, within in zip(descents, (-0.5 * one.least for one in limited), strict=True):
             folds = [[k for k in one.blocks if k not in left] for left in leave_out]
             # Where a fold leads otherwise than all of them together, from where these came to; held back it would not leave there.
@@ -162,17 +162,17 @@ class Fits:
         return descents
 
     def _anew(
-        self, descents: list[Descent], starts: Mapping[int, Refit], fitted: Sequence[int], beside: Hypothesis
+        self, descents: list[Descent], starts: Mapping[int, Refit], fitted: Sequence[int], base: Hypothesis
     ) -> None:
         """Follow some of them from other starts, in their places."""
         if starts:
-            for n, one in zip(starts, self._descend(list(starts.values()), fitted, beside), strict=True):
+            for n, one in zip(starts, self._descend(list(starts.values()), fitted, base), strict=True):
                 descents[n] = one
 
-    def _descend(self, starts: Sequence[Refit], fitted: Sequence[int], beside: Hypothesis) -> list[Descent]:
+    def _descend(self, starts: Sequence[Refit], fitted: Sequence[int], base: Hypothesis) -> list[Descent]:
         """Follow each start to where it leaves least on these runs."""
         # Slopes cost the most: causes begin with what was learnt of tolerances without them on the floor, where each takes a simulation.
-        learnt = {k: slopes for k, slopes in self._slopes(beside).items() if k in fitted and self._on_floor(k)}
+        learnt = {k: slopes for k, slopes in self._slopes(base).items() if k in fitted and self._on_floor(k)}
         descents = [Descent.of(start, len(self.predictions.names), learnt) for start in starts]
         begun = descents
         for n in range(1 if learnt else MEASURED):

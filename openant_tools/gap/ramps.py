@@ -54,9 +54,9 @@ def ramps(t: Array, cmd: Array, off: Bools, *, floor: bool) -> Bools:
     commanded = np.flatnonzero(np.isfinite(cmd).all(axis=1))
     if not len(commanded):
         return out
-    beside = np.concatenate([t[1:][off[1:] != off[:-1]], t[commanded[[0, -1]]]])
+    ends_at = np.concatenate([t[1:][off[1:] != off[:-1]], t[commanded[[0, -1]]]])
     ways = _ways(t, cmd)
-    ends = [way for way in ways if (np.abs(beside[:, None] - t[[way.first, way.last]]) < NEAR_S).any()]
+    ends = [way for way in ways if (np.abs(ends_at[:, None] - t[[way.first, way.last]]) < NEAR_S).any()]
     homes = np.array([cmd[commanded[0]], *(way.end for way in ends)])
     resets = [way for way in ways if floor and way.jumped and (np.abs(way.end - homes) < SAME_RAD).all(axis=1).any()]
     for way in [*ends, *resets]:

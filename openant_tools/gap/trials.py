@@ -42,7 +42,7 @@ class Trials:
         return cls(experiment, assessment, Fits(Predictions(experiment.parts, assessment.set_aside)))
 
     def fit(self, sets: Sequence[Causes]) -> None:
-        """Fit sets of causes, each at its best place, on all parts but those of each fold; the first is asked about beside.
+        """Fit sets of causes, each at its best place, on all parts but those of each fold; the first is what they are compared with.
 
         What acts at random times is told by what the others leave.
         """
@@ -60,12 +60,12 @@ class Trials:
             effect.of_body or not effect.unseen_in_joints or bool(self.fits.predictions.sensed)
         )
 
-    def promise(self, sets: Sequence[Causes], beside: Causes = ()) -> dict[str, float]:
+    def promise(self, sets: Sequence[Causes], base: Causes = ()) -> dict[str, float]:
         """Last cause of each → nats by which its first steps make what was measured likelier than what was fitted beside."""
         found = dict[str, float]()
         for n in range(0, len(sets), AT_ONCE):
             some = [_simulated(causes) for causes in sets[n : n + AT_ONCE]]
-            starts, known = [self._start(causes) for causes in some], self.closures[_simulated(beside)]
+            starts, known = [self._start(causes) for causes in some], self.closures[_simulated(base)]
             begun = self.fits.begun(starts, self.experiment.training, known.refit.hypothesis)
             for causes, (refit, likelihood) in zip(some, begun, strict=True):
                 self.starts[causes] = refit
@@ -92,10 +92,10 @@ class Trials:
 
         Beside whichever cause makes it least: where that explains more by itself, it is that cause's part.
         """
-        effect, beside = catalogue()[causes[-1]], self.closures[_simulated(causes)]
-        alone = beside.irregular.nats(effect)
+        effect, base = catalogue()[causes[-1]], self.closures[_simulated(causes)]
+        alone = base.irregular.nats(effect)
         others = [] if _simulated(causes) else [one for known, one in self.closures.items() if len(known) == 1]
-        return min([alone, *(max(one.irregular.nats(effect), alone - max(one.beyond(beside), 0.0)) for one in others)])
+        return min([alone, *(max(one.irregular.nats(effect), alone - max(one.beyond(base), 0.0)) for one in others)])
 
     def _at_random(self, causes: Causes) -> Closure:
         """What is closed beside causes that act at random times: as much as without them."""
@@ -132,11 +132,11 @@ class Trials:
         amplitude = float(evidence.amplitudes[0, evidence.causes.index(name)])
         return sized(name, self.assessment.template(name), amplitude)
 
-    def beside(self, causes: Causes) -> list[Causes]:
+    def further(self, causes: Causes) -> list[Causes]:
         """Those with one cause more, by what they leave of the recording: the best fit first, where and as large as it is there."""
         known = self.closures[_simulated(causes)].refit
         out = []
-        for part, x in self.assessment.beside(known):
+        for part, x in self.assessment.further(known):
             if part.cause not in causes:
                 out.append((*causes, part.cause))
                 start = Refit((*known.hypothesis, part), (*known.x, x), known.nuisance)
