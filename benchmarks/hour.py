@@ -9,9 +9,10 @@ is that someone: it puts the robot back and gives the same command again, and ke
 page (`openant train report`), an evaluation of five starts on the same robot, and the reference: the same seed for as many steps
 as an hour has, without faults, in stepped time.
 
-A run that has its `summary.json` is done: the same command goes on with the first one that has none, from its beginning. The
-table of all that are done is printed, and stands in OUT/hours.md. Nobody else should use this computer meanwhile: the virtual
-robot's physics and camera take their share of it, which the page tells.
+A run that has its `summary.json` is done: the same command goes on with the first one that has none, and of that with what it
+lacks, the hour with its evaluation or the reference. The table of all that are done is printed, and stands in OUT/hours.md.
+Nobody else should use this computer meanwhile: the virtual robot's physics and camera take their share of it, which the page
+tells.
 """
 
 from __future__ import annotations
@@ -104,53 +105,56 @@ class Hour:
     def summary(self) -> Path:
         return self.folder / "summary.json"
 
-    def do(self) -> dict[str, Any]:
-        """The run from its beginning to its summary."""
+    def do(self) -> None:
+        """The run from its beginning, or from the part that it has not done yet, to its summary."""
+        lived = self._read("hour")
+        if lived is None:
+            self._live()
+            lived = {"happened": self.happened, "help": self.help}
+            write_text(self.folder / "hour.json", json_text(lived, indent=2))
+        if self._read("reference") is None:
+            self._refer()
+        found = {
+            "agent": self.agent, "seed": self.seed, "minutes": self.minutes, **lived,
+            **{part: self._read(part) for part in ("page", "eval", "reference")},
+        }  # fmt: skip
+        write_text(self.summary, json_text(found, indent=2))
+
+    def _live(self) -> None:
+        """The hour, its page, and an evaluation on the same robot."""
         shutil.rmtree(self.folder, ignore_errors=True)
         self.folder.mkdir(parents=True)
-        robot = create_robot(
-            self.folder / "ant",
-            values={"camera.body_tag_id": 12},
-            provenance={"motors": Provenance("measured", "benchmark")},
+        create_robot(
+            self.robot, values={"camera.body_tag_id": 12}, provenance={"motors": Provenance("measured", "benchmark")}
         )
-        run, ready = self.folder / "run", self.folder / "ready.json"
-        faulty, plain = self.folder / "real.toml", self.folder / "stepped.toml"
-        write_text(faulty, SCENARIO.format(mode="real") + PULL)
-        write_text(plain, SCENARIO.format(mode="stepped"))
-        with self._virtual(faulty, ready):
-            place = ["--robot", str(robot.path), "--virtual", str(ready), "--yes"]
-            self._live(
-                run, ready, [*self._train(run), "--unattended", *place, "--steps", str(10 * HOUR_STEPS[self.agent])]
-            )
+        run, ready, scenario = self.folder / "run", self.folder / "ready.json", self.folder / "real.toml"
+        write_text(scenario, SCENARIO.format(mode="real") + PULL)
+        with self._virtual(scenario, ready):
+            place = self._on(ready)
+            steps = ["--steps", str(10 * HOUR_STEPS[self.agent])]
+            self._learn(run, ready, [*self._train(run), "--unattended", *place, *steps])
             self._done("page", ["train", "report", str(run), "--json", str(self.folder / "page.json")])
             self._done(
                 "eval", ["eval", str(run), "--env", "hardware", *place, "--starts", "5", "--seconds", "30",
                          "--json", str(self.folder / "eval.json")],
             )  # fmt: skip
-        reference = self.folder / "reference"
-        steps = max(1, round(HOUR_STEPS[self.agent] * self.minutes / 60))
+
+    def _refer(self) -> None:
+        """The same seed for as many steps as an hour has, without faults, in stepped time."""
+        reference, scenario = self.folder / "reference", self.folder / "stepped.toml"
+        shutil.rmtree(reference, ignore_errors=True)
+        write_text(scenario, SCENARIO.format(mode="stepped"))
+        steps = ["--steps", str(max(1, round(HOUR_STEPS[self.agent] * self.minutes / 60)))]
         exact = ["--learn", "sync"] if self.agent == "sac" else []
-        self._done(
-            "reference",
-            [
-                *self._train(reference),
-                "--robot",
-                str(robot.path),
-                "--virtual",
-                str(plain),
-                "--yes",
-                "--steps",
-                str(steps),
-                *exact,
-            ],
-        )
+        self._done("reference", [*self._train(reference), *self._on(scenario), *steps, *exact])
         self._done("reference-page", ["train", "report", str(reference), "--json", str(self.folder / "reference.json")])
-        found = {
-            "agent": self.agent, "seed": self.seed, "minutes": self.minutes, "happened": self.happened, "help": self.help,
-            **{part: self._read(part) for part in ("page", "eval", "reference")},
-        }  # fmt: skip
-        write_text(self.summary, json_text(found, indent=2))
-        return found
+
+    @property
+    def robot(self) -> Path:
+        return self.folder / "ant"
+
+    def _on(self, virtual: Path) -> list[str]:
+        return ["--robot", str(self.robot), "--virtual", str(virtual), "--yes"]
 
     def _train(self, out: Path) -> list[str]:
         return ["train", self.agent, "--env", "hardware", "--seed", str(self.seed), "--out", str(out)]
@@ -184,7 +188,7 @@ class Hour:
 
     # ---- the hour ----
 
-    def _live(self, run: Path, ready: Path, arguments: Sequence[str]) -> None:
+    def _learn(self, run: Path, ready: Path, arguments: Sequence[str]) -> None:
         """Train until the hour is over; do what the script says, and help where someone is needed."""
         control = VirtualControl(json.loads(ready.read_text())["control"])
         said = (self.folder / "train.txt").open("a")
@@ -225,7 +229,7 @@ class Hour:
 
     def _help(self, control: VirtualControl, run: Path, at_s: float) -> None:
         """The builder's word after an end, with hands where the robot needs them."""
-        lines = read_log(run)
+        lines, _ = read_log(run)
         why = lines[-1].words if lines and lines[-1].words.startswith("ended: ") else "ended: killed"
         hands = any(word in why for word in HANDS)
         if hands:
@@ -234,7 +238,7 @@ class Hour:
 
     def _unseen(self, run: Path) -> bool:
         """Whether the camera has not seen the robot for longer than by the script."""
-        lines = read_log(run)
+        lines, _ = read_log(run)
         waits = [line for line in lines[-3:] if line.words.startswith("waiting: the camera does not see")]
         return bool(waits) and lines[-1] == waits[-1] and time.time() - waits[-1].at > UNSEEN_S
 

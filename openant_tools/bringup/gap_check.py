@@ -8,7 +8,7 @@ import numpy as np
 
 from openant_tools.errors import BadInput
 from openant_tools.gap.measure import Measurement, difference, measure
-from openant_tools.gap.regime import Regime
+from openant_tools.gap.words import part_words
 from openant_tools.numbers import number
 from openant_tools.procedure.finding import Evidence, Finding, latest
 from openant_tools.procedure.relay import relayed
@@ -62,7 +62,7 @@ def gap_check(bench: Bench) -> Procedure:
         False if worse else None if unsure else True,
         f"simulated joints are {number(after.gaps['pos'], 'rad', name='error', decimals=2)} off (nominal {number(1e3 * before.gaps['pos'], decimals=2)}, "
         f"floor {number(1e3 * after.floors['pos'], decimals=2)})"
-        + (f", most at {worst.joint} while {Regime(worst.regime).words}" if worst else ""),
+        + (f"; {part_words(worst.share, worst.joint, worst.regime)}" if worst else ""),
         (
             Evidence("position gap, nominal", before.gaps["pos"], "rad", "0.5 s horizon, held-out recording"),
             Evidence("position gap, calibrated", after.gaps["pos"], "rad", "the same", most=before.gaps["pos"]),

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from openant_tools.gap.measure import UNITS, Measurement
 from openant_tools.gap.regime import Regime
-from openant_tools.numbers import exact, number, percent
+from openant_tools.gap.words import SIGNALS, part_words, restart_words
+from openant_tools.numbers import number, percent
 from openant_tools.report import Figure, KeyFigure, Report, ReportSummary, plots
 
 if TYPE_CHECKING:
@@ -21,7 +23,8 @@ __all__ = ["gap_report", "sentence", "table"]
 TOLD = 12
 #: s shown around the worst moment
 WINDOW_S = 3.0
-_NAMES = {"pos": "position", "vel": "velocity"}
+#: letters of a line below a column of the picture
+COLUMN_LETTERS = 13
 
 
 def sentence(found: Measurement) -> str:
@@ -32,22 +35,22 @@ def sentence(found: Measurement) -> str:
         return "The gap lies within what no model could beat: nothing here is to be explained."
     first = next(place for place in found.places if place.signal == "pos")
     off, floor = (number(one["pos"], "rad", name="gap") for one in (found.gaps, found.floors))
-    part = "most of it" if first.share > 0.5 else "the largest part of it"
     return (
-        f"The simulation is off by {off} (floor {floor}); {part}, {percent(first.share)}, at {first.joint} while "
-        f"{first.regime.words}."
+        f"The simulation is off by {off}, where no model could do better than {floor}; "
+        f"{part_words(first.share, first.joint, first.regime)}."
     )
 
 
 def table(found: Measurement) -> list[str]:
     """The numbers for a terminal: each signal's gap and floor, then where most of it lies."""
+    words = max((len(regime.words) for regime in Regime))
     lines = [
-        f"{_NAMES[signal]}: {_shown(signal, value)}, floor {_shown(signal, found.floors[signal])}"
+        f"{SIGNALS[signal]}: {_shown(signal, value)}, floor {_shown(signal, found.floors[signal])}"
         for signal, value in found.gaps.items()
     ]
-    lines.append(f"{'signal':8}  {'joint':13}  {'while':11}  {'share':>7}  {'gap':>11}")
+    lines.append(f"{'signal':8}  {'joint':13}  {'while':{words}}  {'share':>7}  {'gap':>11}")
     lines += [
-        f"{_NAMES[place.signal]:8}  {place.joint:13}  {place.regime:11}  {percent(place.share, decimals=1):>7}  "
+        f"{SIGNALS[place.signal]:8}  {place.joint:13}  {place.regime.words:{words}}  {percent(place.share, decimals=1):>7}  "
         f"{_shown(place.signal, place.gap):>11}"
         for place in found.places[:TOLD]
     ]
@@ -56,18 +59,19 @@ def table(found: Measurement) -> list[str]:
 
 def gap_report(found: Measurement) -> Report:
     """Everything about where the gap lies."""
-    horizon = "full runs" if found.horizon_s is None else f"re-initialised every {exact(found.horizon_s, 's')}"
     nothing = not found.doubt and (not found.places or found.excess("pos") == 0)
     answer = ReportSummary(
         sentence(found),
         Figure(
-            worst(found), "Measured and simulated around the moment at which position is farthest off, and the command."
+            worst(found),
+            "Commanded, measured and simulated around the moment at which position is farthest off. "
+            f"{restart_words(found.horizon_s)}.",
         ),
-        "Nothing that was measured here is to be believed until repeats of one motion agree."
+        "Until that is settled, no figure here is to be believed."
         if found.doubt
-        else "A better model could not be told from this one with these runs."
+        else "These runs could not tell a better model from this one."
         if nothing
-        else "A policy that is trained in this simulation meets a robot that moves otherwise, above all there.",
+        else "A policy that is trained in this simulation meets a robot that moves differently, above all there.",
         "Record the same motion twice with nothing changed in between, and measure again."
         if found.doubt
         else "Train on it; measure again with motions of another kind."
@@ -75,7 +79,7 @@ def gap_report(found: Measurement) -> Report:
         else "Fit the model (`openant sysid fit`), or ask for the cause: `openant gap diagnose` on the same runs.",
         "bad" if found.doubt else "good" if nothing else "",
         [
-            KeyFigure(_NAMES[signal], _shown(signal, value), f"floor {_shown(signal, found.floors[signal])}; {horizon}")
+            KeyFigure(f"{SIGNALS[signal]} off by", _shown(signal, value), f"floor {_shown(signal, found.floors[signal])}")
             for signal, value in found.gaps.items()
         ],
     )
@@ -87,13 +91,13 @@ def gap_report(found: Measurement) -> Report:
     )
     report.section("Where").figure(
         shares(found),
-        "Share of the excess of position by joint and by what the joint was doing; the squares of the error beyond the floor "
-        "are shared out, so that all add to 100 %.",
+        "How much of the position's error lies at which joint, and what the joint was doing meanwhile: shares of the squared "
+        "error beyond the floor, together 100 %.",
     )
     report.table(
         ["signal", "joint", "while", "share", "gap", "for"],
         [
-            [_NAMES[place.signal], place.joint, place.regime.words, percent(place.share, decimals=1),
+            [SIGNALS[place.signal], place.joint, place.regime.words, percent(place.share, decimals=1),
              _shown(place.signal, place.gap), number(place.seconds, "s", decimals=1)]
             for place in found.places
             if place.share >= 0.005
@@ -101,9 +105,10 @@ def gap_report(found: Measurement) -> Report:
     )  # fmt: skip
     acting = ", ".join(dict.fromkeys(name for name, _ in found.effects))
     report.section("How it was measured").text(
-        f"Each run is simulated from its measured state with its own commands, {horizon}. The floor comes from "
-        f"{'repeats of the same commands' if found.from_repeats else _sensors(found)}. "
-        "The gap is the root mean square of measured minus simulated over all joints and samples."
+        f"The simulation is given each run's own commands. {restart_words(found.horizon_s)}. "
+        "The gap is how far measured and simulated differ: the root mean square over all joints and samples. "
+        "The floor is the gap that no model could beat; it comes from "
+        f"{'repeats of the same commands' if found.from_repeats else _sensors(found)}."
         + (f" Beside the model act: {acting}." if acting else "")
     )
     return report
@@ -114,15 +119,16 @@ def _shown(signal: str, value: float) -> str:
 
 
 def shares(found: Measurement) -> MatplotlibFigure:
-    """Joints against regimes."""
+    """Joints against what they were doing, as far as any was."""
     figure: MatplotlibFigure
-    table = np.zeros((len(found.joints), len(Regime)))
-    for place in found.places:
-        if place.signal == "pos":
-            table[found.joints.index(place.joint), list(Regime).index(place.regime)] = 100 * place.share
+    places = [place for place in found.places if place.signal == "pos"]
+    seen = [regime for regime in Regime if any(place.regime == regime for place in places)]
+    table = np.zeros((len(found.joints), len(seen)))
+    for place in places:
+        table[found.joints.index(place.joint), seen.index(place.regime)] = 100 * place.share
     figure, axes = plots.figure(height=1.2 + 0.32 * len(found.joints))
     image = axes.imshow(table, cmap="cividis", vmin=0.0, aspect="auto")
-    axes.set_xticks(range(len(Regime)), [regime.value for regime in Regime])
+    axes.set_xticks(range(len(seen)), [textwrap.fill(regime.words, COLUMN_LETTERS) for regime in seen])
     axes.set_yticks(range(len(found.joints)), found.joints)
     axes.grid(False)
     half = table.max() / 2
@@ -137,9 +143,7 @@ def shares(found: Measurement) -> MatplotlibFigure:
             fontsize=8,
             color="black" if value > half else "white",
         )
-    axes.set_xlabel("what the joint does")
-    axes.set_ylabel("joint")
-    figure.colorbar(image, ax=axes, label="share of the excess (%)")
+    figure.colorbar(image, ax=axes, label="share of the error (%)")
     return figure
 
 

@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.apply import robot_of
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
+from openant_tools.gap.regime import Regime
 from openant_tools.gap.simulation import simulate
-from openant_tools.gap.words import closed, rest_words, sentence, standing, what_next, where_words
+from openant_tools.gap.words import (
+    SIGNALS, closed, rest_words, restart_words, sentence, standing, what_next, where_words,
+)  # fmt: skip
 from openant_tools.model.gap import HORIZON_S
 from openant_tools.model.of_run import plants_of
 from openant_tools.model.rollout import Rollouts
-from openant_tools.numbers import exact, number, percent
+from openant_tools.numbers import number, percent
 from openant_tools.recording.run import Run
 from openant_tools.report import Figure, KeyFigure, Report, ReportSummary, Table, plots
 from openant_tools.robot.joints import JOINTS
@@ -54,8 +57,8 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
         sentence(found),
         Figure(
             worst(found, held_out or runs, model),
-            f"Measured and simulated around the moment at which the given model is farthest off, re-initialised every "
-            f"{exact(HORIZON_S, 's')}; of {'the held-out runs' if held_out else 'all runs'}.",
+            f"Measured and simulated around the moment of {'the held-out runs' if held_out else 'all runs'} at which the given "
+            f"model is farthest off. {restart_words(HORIZON_S)}.",
         ),
         _meaning(found) + left,
         what_next(found),
@@ -64,7 +67,7 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
             KeyFigure("gap before" if improved else "gap", _error(gap["before"]), "the model as given"),
             *([KeyFigure("gap after", _error(gap["after"]), "the improved model")] if improved else []),
             KeyFigure("floor", _error(gap["floor"]), "what no model could beat"),
-            *([KeyFigure("closed", percent(share), "of the excess, on held-out runs")] if improved else []),
+            *([KeyFigure("closed", percent(share), "of the gap above the floor, on held-out runs")] if improved else []),
         ),
     )
     report = Report(
@@ -74,13 +77,14 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
     if found.where:
         report.section("Where it lies").figure(
             places(found),
-            "Where the excess gap of the given model lies, largest first, and what the improved model leaves of it; on a walking "
-            "robot also by joint from above.",
+            "At which joint the given model is off, and while the joint does what; largest part first, and what the improved "
+            "model leaves of it."
+            + (" From above: each joint as large as its part, chosen ones ringed." if _of_ant(found) else ""),
         )
     runners_up = [one for one in found.effects if one.effect not in found.selected][:RUNNERS_UP]
     if runners_up:
         report.section("Why not something else", open=True).table(
-            ["effect", "where", "present", "closes alone", "why not"],
+            ["effect", "where", "how likely", "closes by itself", "why not"],
             [
                 [one.effect, where_words(one.joints), percent(one.probability), _percent(one.gap_closed), standing(found, one)]
                 for one in runners_up
@@ -88,9 +92,9 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
         )  # fmt: skip
     if found.sensors:
         report.section("Sensors").table(
-            ["signal", "of", "finding", "had a part in the verdict"],
+            ["signal", "of", "finding", "used for the verdict"],
             [
-                [one["signal"], where_words(_joints(one["joints"])), str(one["finding"]).replace("_", " "), "yes" if one["used"] else "no"]
+                [_signal(one["signal"]), where_words(_joints(one["joints"])), _sensor_words(one["finding"]), "yes" if one["used"] else "no"]
                 for one in found.sensors
             ],
         )  # fmt: skip
@@ -101,10 +105,12 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
 def _meaning(found: Diagnosis) -> str:
     """What the verdict is good for."""
     if found.verdict == NONE:
-        return "The simulation is as good as robots of one build are alike."
-    if found.verdict in (AMBIGUOUS, UNEXPLAINED):
-        return "Do not build one of these causes into the model yet: another experiment decides first."
-    return "With it in the model the simulation moves as the robot does, as far as the gap is closed."
+        return "The simulation is as close to this robot as another robot of its build would be."
+    if found.verdict == AMBIGUOUS:
+        return "Do not put one of these causes into the model for good yet: another experiment decides first."
+    if found.verdict == UNEXPLAINED:
+        return "A policy that is trained in this simulation meets a robot that moves differently; do not put a cause into the model by guess."
+    return "With this in the model the simulation moves as the robot does, but for what is left of the gap."
 
 
 def _error(rad: float) -> str:
@@ -113,16 +119,18 @@ def _error(rad: float) -> str:
 
 def _details(report: Report, found: Diagnosis) -> None:
     report.section("Details")
-    parts = [Table(["held out", "closure lost without it"], [[name, value] for name, value in found.removal.items()])]
     if found.removal:
-        report.details("What each selected effect is worth", *parts)
+        rows = [[name, percent(value)] for name, value in found.removal.items()]
+        report.details("What each effect of the improved model is worth", Table(["effect", "closes less without it"], rows))
     report.figure(
-        candidates(found), "How likely each effect is present beyond tolerance, and what it closes by itself."
+        candidates(found),
+        "How likely this robot has each effect, beyond what robots of one build differ by, and how much of the gap it closes by "
+        "itself; those with a star are in the improved model.",
     )
     report.details(
         "All effects considered",
         Table(
-            ["effect", "where", "present", "closes alone", "interval", "parameters", "MuJoCo carries it"],
+            ["effect", "where", "how likely", "closes by itself", "interval", "parameters", "MuJoCo carries it"],
             [
                 [one.effect, where_words(one.joints), percent(one.probability, decimals=1), _percent(one.gap_closed),
                  _between(one.gap_closed_low, one.gap_closed_high), _parameters(one), one.native]
@@ -131,29 +139,51 @@ def _details(report: Report, found: Diagnosis) -> None:
         ),
     )  # fmt: skip
     if found.where:
-        names = list(dict.fromkeys(name for place in found.where for name in place))
-        report.details(
-            "Where the gap lies, all of it",
-            Table(names, [[place.get(name) for name in names] for place in found.where]),
-        )
+        report.details("Where the gap lies, all of it", _all_places(found))
     if found.calibration:
         rows = [[kind, joint, value] for kind, values in found.calibration.items() for joint, value in values.items()]
-        report.details("What moved within tolerance", Table(["kind", "joint", "factor or amount"], rows))
+        report.details("What moved as far as robots of one build differ", Table(["quantity", "joint", "factor or amount"], rows))
     if found.notes:
         report.text("\n".join(f"- {note}" for note in found.notes))
+
+
+def _all_places(found: Diagnosis) -> Table:
+    rows = [
+        [SIGNALS[place["signal"]], place["joint"], Regime(place["regime"]).words, percent(place["share"], decimals=1),
+         percent(after, decimals=1) if (after := place.get("share_after")) is not None else None]
+        for place in found.where
+    ]  # fmt: skip
+    return Table(["signal", "joint", "while", "share", "left by the improved model"], rows)
+
+
+def _signal(column: str) -> str:
+    """What a signal of a run is called."""
+    return plots.SIGNAL_LABELS.get(column, (column.upper(),))[0]
+
+
+def _sensor_words(finding: str) -> str:
+    known = {"as_modelled": "as modelled", "unknown_form": "like none that is known"}
+    return known.get(finding, finding)
+
+
+def _of_ant(found: Diagnosis) -> bool:
+    return any(place["joint"] in JOINTS for place in found.where)
 
 
 def places(found: Diagnosis) -> MatplotlibFigure:
     """A bar of shares, and the robot from above where it has legs."""
     figure: MatplotlibFigure
     largest = [place for place in found.where if float(place["share"]) >= LEAST_SHARE][:PLACES] or list(found.where[:1])
-    of_ant = {str(place["joint"]) for place in found.where} & set(JOINTS)
-    if of_ant:
-        figure, (axes, legs) = plots.figure(1, 2, height=3.0, width_ratios=[3, 2])
+    height_in = 0.8 + 0.36 * len(largest)
+    if _of_ant(found):
+        figure, (axes, legs) = plots.figure(1, 2, height=max(3.0, height_in), width_ratios=[3, 2])
         _leg_map(legs, found)
     else:
-        figure, axes = plots.figure(height=0.7 + 0.28 * len(largest))
-    labels = [f"{place['signal']} · {place['joint']} · {place['regime']}" for place in largest]
+        figure, axes = plots.figure(height=height_in)
+    labels = [
+        f"{place['joint']} ({SIGNALS[place['signal']]})\n{Regime(place['regime']).words}"
+        for place in largest
+    ]
     before = [100 * float(place["share"]) for place in largest]
     after = [place.get("share_after") for place in largest]
     known = any(share is not None for share in after)
@@ -165,7 +195,7 @@ def places(found: Diagnosis) -> MatplotlibFigure:
     axes.set_yticks(at, labels)
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
-    axes.set_xlabel("share of the excess of its signal before (%)")
+    axes.set_xlabel("share of the error before (%)")
     return figure
 
 
@@ -211,9 +241,9 @@ def candidates(found: Diagnosis) -> MatplotlibFigure:
     shown = found.effects[:CANDIDATES]
     figure, axes = plots.figure(height=0.8 + 0.34 * len(shown))
     at = np.arange(len(shown))
-    axes.barh(at - 0.19, [100 * one.probability for one in shown], 0.36, color=plots.BLUE, label="present")
+    axes.barh(at - 0.19, [100 * one.probability for one in shown], 0.36, color=plots.BLUE, label="how likely")
     alone = [math.nan if one.gap_closed is None else 100 * max(one.gap_closed, 0.0) for one in shown]
-    axes.barh(at + 0.19, alone, 0.36, color=plots.GREEN, label="closes alone")
+    axes.barh(at + 0.19, alone, 0.36, color=plots.GREEN, label="closes by itself")
     for k, one in enumerate(shown):
         if one.gap_closed_low is not None and one.gap_closed_high is not None:
             ends = [100 * max(one.gap_closed_low, 0.0), 100 * max(one.gap_closed_high, 0.0)]
@@ -223,7 +253,7 @@ def candidates(found: Diagnosis) -> MatplotlibFigure:
     axes.invert_yaxis()
     axes.set_xlim(0, 100)
     axes.grid(axis="y", visible=False)
-    axes.set_xlabel("probability, and share of the excess gap closed on held-out runs (%)")
+    axes.set_xlabel("probability, and share of the gap closed on held-out runs (%)")
     plots.legend(axes)
     return figure
 

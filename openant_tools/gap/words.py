@@ -6,17 +6,36 @@ import math
 
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
+from openant_tools.gap.regime import Regime
 from openant_tools.model.gap import share_closed
-from openant_tools.numbers import number, percent, span
+from openant_tools.numbers import exact, number, percent, span
 
-__all__ = ["closed", "rest_words", "sentence", "standing", "what_next", "where_words"]
+__all__ = ["SIGNALS", "closed", "part_words", "rest_words", "restart_words", "sentence", "standing", "what_next", "where_words"]
+
+#: signal of a place → what it is called
+SIGNALS = {"pos": "position", "vel": "velocity"}
+#: share from which a part is most of the whole
+MOST = 0.5
+
+
+def part_words(share: float, joint: str, regime: Regime) -> str:
+    """The largest part of a gap, as a sentence goes on after what "it" is."""
+    part = "most of it" if share > MOST else "its largest part"
+    return f"{part} ({percent(share)}) lies at {joint} while {regime.words}"
+
+
+def restart_words(horizon_s: float | None) -> str:
+    """From where a simulation goes on, whose gap is measured."""
+    if horizon_s is None:
+        return "The simulation starts once from what was measured, and then goes on by itself"
+    return f"Every {exact(horizon_s, 's')} the simulation starts again from what was measured"
 
 
 def sentence(found: Diagnosis) -> str:
     """The verdict, with its confidence."""
     sure = f"confidence {percent(found.confidence)}"
     if found.verdict == NONE:
-        return f"Nothing beyond the floor and the tolerance of robots of one build ({sure})."
+        return f"Nothing beyond the floor and what robots of one build differ by ({sure})."
     by_name = {one.effect: one for one in reversed(found.effects)}
     if found.verdict == AMBIGUOUS:
         sets = "; ".join(" or ".join(group) for group in found.ambiguous_with)
@@ -24,7 +43,7 @@ def sentence(found: Diagnosis) -> str:
         words = f"The gap is real, but these runs cannot tell its causes apart: {candidates} ({sure})."
         if not found.selected:
             return words
-        return f"{words} With {found.selected[0]} {percent(closed(found))} of it closes on held-out runs."
+        return f"{words} With {found.selected[0]} in the model, {percent(closed(found))} of the gap closes on held-out runs."
     if found.verdict == UNEXPLAINED:
         best = _closest(found)
         closest = "" if best is None else f"; closest is {best.effect}" + (
@@ -36,10 +55,10 @@ def sentence(found: Diagnosis) -> str:
     words = f"{one.effect} ({where_words(one.joints)}): {catalogue()[one.effect].words}"
     beside = [name for name in found.selected if name != found.verdict]
     more = f", with {' and '.join(beside)} beside it" if beside else ""
-    closes = f"closes {percent(closed(found))} of the gap on held-out runs ({sure})."
+    closes = f"closes {percent(closed(found))} of the gap on held-out runs."
     if catalogue()[one.effect].random and not beside:
-        return f"{words}; no model repeats that, and what else the improved one moves within tolerance {closes}"
-    return f"{words}{more}; the improved model {closes}"
+        return f"{words} ({sure}). No model repeats that; by what else it moves within tolerance the improved one {closes}"
+    return f"{words}{more} ({sure}). The improved model {closes}"
 
 
 def rest_words(found: Diagnosis) -> str:
@@ -49,8 +68,8 @@ def rest_words(found: Diagnosis) -> str:
     band = span(low, high, "Hz", decimals=1)
     text = f"What is left is largest at {rest['joint']}, {percent(rest['share'])} of it from {band}"
     if rest["regressor"] is None:
-        return f"{text}, where it follows nothing that was looked at."
-    return f"{text}, where it follows {rest['regressor']} (coherence {number(rest['coherence'], decimals=2)})."
+        return f"{text}; there it follows nothing that was looked at."
+    return f"{text}; there {percent(rest['coherence'])} of it follows {rest['regressor']}."
 
 
 def where_words(joints: tuple[str, ...] | str) -> str:
@@ -72,15 +91,15 @@ def standing(found: Diagnosis, one: Found) -> str:
         return "closest, and not enough"
     if one.effect in found.selected:
         lost = found.removal.get(one.effect)
-        return "selected" + (f"; without it {percent(lost)} less closes" if lost is not None else "")
+        return "in the improved model" + (f"; without it {percent(lost)} less closes" if lost is not None else "")
     if any(one.effect in group for group in found.ambiguous_with):
         return "these runs cannot tell"
     leads = next((other for other in found.effects if other.effect == found.verdict), None)
     if one.gap_closed is not None and leads is not None and leads.gap_closed is not None:
-        return f"by itself it closes {percent(one.gap_closed)}, {leads.effect} {percent(leads.gap_closed)}"
+        return f"by itself it closes {percent(one.gap_closed)}, but {leads.effect} closes {percent(leads.gap_closed)}"
     if one.gap_closed is not None:
         return f"by itself it closes {percent(one.gap_closed)}, which is not enough"
-    return f"the recording looks as with it in {percent(one.probability)} of cases"
+    return f"of robots whose recordings look like this one, {percent(one.probability)} have it"
 
 
 def _closest(found: Diagnosis) -> Found | None:
@@ -94,4 +113,4 @@ def what_next(found: Diagnosis) -> str:
         return found.next_experiment
     if found.verdict == NONE:
         return "Nothing: the model is as good as these runs can tell."
-    return "Write the improved model with `openant gap apply`, and record another motion to hold out against it."
+    return "Write the improved model with `openant gap apply`, and judge it by another motion, recorded for that."

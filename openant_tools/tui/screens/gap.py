@@ -224,14 +224,15 @@ def _when(path: Path) -> str:
 
 def _page(found: Diagnosis) -> Text:
     """The verdict in the order in which one asks: what, where, which, how far, what next."""
-    from openant_tools.gap.words import closed, sentence, what_next
+    from openant_tools.gap.regime import Regime
+    from openant_tools.gap.words import SIGNALS, closed, sentence, what_next
 
     text = Text.assemble((spelled(sentence(found)), "bold"), "\n")
     text.append("\nWhere\n", "bold")
     for place in found.where[:PLACES]:
         share = float(place["share"])
-        text.append(f" {place['signal']:6.6}{place['joint']:9.9}{place['regime']:10.10}")
-        text.append_text(_bar(share, ORANGE)).append(f" {percent(share):>5}\n")
+        text.append(f" {place['joint']:8.8} ").append_text(_bar(share, ORANGE)).append(f" {percent(share):>5}\n")
+        text.append(f"   {SIGNALS[place['signal']]} while {Regime(place['regime']).words}\n")
     text.append_text(_by_leg(found))
     text.append("\nWhich, and how likely\n", "bold")
     for one in found.effects[:CANDIDATES]:
