@@ -12,15 +12,18 @@ from openant_tools.gap.measure import UNITS, Measurement
 from openant_tools.gap.regime import Regime
 from openant_tools.gap.words import SIGNALS, part_words, restart_words
 from openant_tools.numbers import number, percent
-from openant_tools.report import Figure, KeyFigure, Report, ReportSummary, plots
+from openant_tools.report import Figure, KeyFigure, Report, ReportSummary, Table, plots
 
 if TYPE_CHECKING:
+    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure as MatplotlibFigure
 
 __all__ = ["gap_report", "sentence", "table"]
 
 #: places that a terminal is told
 TOLD = 12
+#: of the excess, below which a place is not worth a line
+LEAST_SHARE = 0.005
 #: s shown around the worst moment
 WINDOW_S = 3.0
 #: letters of a line below a column of the picture
@@ -43,7 +46,7 @@ def sentence(found: Measurement) -> str:
 
 def table(found: Measurement) -> list[str]:
     """The numbers for a terminal: each signal's gap and floor, then where most of it lies."""
-    words = max((len(regime.words) for regime in Regime))
+    words = max(len(regime.words) for regime in Regime)
     lines = [
         f"{SIGNALS[signal]}: {_shown(signal, value)}, floor {_shown(signal, found.floors[signal])}"
         for signal, value in found.gaps.items()
@@ -79,7 +82,9 @@ def gap_report(found: Measurement) -> Report:
         else "Fit the model (`openant sysid fit`), or ask for the cause: `openant gap diagnose` on the same runs.",
         "bad" if found.doubt else "good" if nothing else "",
         [
-            KeyFigure(f"{SIGNALS[signal]} off by", _shown(signal, value), f"floor {_shown(signal, found.floors[signal])}")
+            KeyFigure(
+                f"{SIGNALS[signal]} off by", _shown(signal, value), f"floor {_shown(signal, found.floors[signal])}"
+            )
             for signal, value in found.gaps.items()
         ],
     )
@@ -94,15 +99,8 @@ def gap_report(found: Measurement) -> Report:
         "How much of the position's error lies at which joint, and what the joint was doing meanwhile: shares of the squared "
         "error beyond the floor, together 100 %.",
     )
-    report.table(
-        ["signal", "joint", "while", "share", "gap", "for"],
-        [
-            [SIGNALS[place.signal], place.joint, place.regime.words, percent(place.share, decimals=1),
-             _shown(place.signal, place.gap), number(place.seconds, "s", decimals=1)]
-            for place in found.places
-            if place.share >= 0.005
-        ],
-    )  # fmt: skip
+    for signal in found.gaps:
+        report.details(f"{SIGNALS[signal].capitalize()}, in numbers", _places(found, signal))
     acting = ", ".join(dict.fromkeys(name for name, _ in found.effects))
     report.section("How it was measured").text(
         f"The simulation is given each run's own commands. {restart_words(found.horizon_s)}. "
@@ -118,6 +116,16 @@ def _shown(signal: str, value: float) -> str:
     return number(value, UNITS[signal], name="gap" if signal == "pos" else "")
 
 
+def _places(found: Measurement, signal: str) -> Table:
+    rows = [
+        [place.joint, place.regime.words, percent(place.share, decimals=1), _shown(signal, place.gap),
+         number(place.seconds, "s", decimals=1)]
+        for place in found.places
+        if place.signal == signal and place.share >= LEAST_SHARE
+    ]  # fmt: skip
+    return Table(["joint", "while", "share", "off by", "for"], rows)
+
+
 def shares(found: Measurement) -> MatplotlibFigure:
     """Joints against what they were doing, as far as any was."""
     figure: MatplotlibFigure
@@ -127,24 +135,21 @@ def shares(found: Measurement) -> MatplotlibFigure:
     for place in places:
         table[found.joints.index(place.joint), seen.index(place.regime)] = 100 * place.share
     figure, axes = plots.figure(height=1.2 + 0.32 * len(found.joints))
-    image = axes.imshow(table, cmap="cividis", vmin=0.0, aspect="auto")
+    # Of the page's own paper where nothing lies, so that the numbers can be read on light and dark.
+    axes.imshow(table, cmap=_paper_to(plots.BLUE), vmin=0.0, aspect="auto")
     axes.set_xticks(range(len(seen)), [textwrap.fill(regime.words, COLUMN_LETTERS) for regime in seen])
     axes.set_yticks(range(len(found.joints)), found.joints)
     axes.grid(False)
-    half = table.max() / 2
-    for row, column in np.argwhere(table >= 0.5):
-        value = table[row, column]
-        axes.text(
-            column,
-            row,
-            number(value, decimals=0),
-            ha="center",
-            va="center",
-            fontsize=8,
-            color="black" if value > half else "white",
-        )
-    figure.colorbar(image, ax=axes, label="share of the error (%)")
+    for row, column in np.argwhere(table >= 100 * LEAST_SHARE):
+        axes.text(column, row, percent(table[row, column] / 100), ha="center", va="center", fontsize=8, color=plots.INK)
     return figure
+
+
+def _paper_to(colour: str) -> Colormap:
+    """From nothing to a colour through which ink can be read."""
+    from matplotlib.colors import LinearSegmentedColormap, to_rgba
+
+    return LinearSegmentedColormap.from_list("share", [to_rgba(colour, 0.0), to_rgba(colour, 0.6)])
 
 
 def worst(found: Measurement) -> MatplotlibFigure:

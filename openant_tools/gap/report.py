@@ -16,8 +16,15 @@ from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis,
 from openant_tools.gap.regime import Regime
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.words import (
-    SIGNALS, closed, rest_words, restart_words, sentence, standing, what_next, where_words,
-)  # fmt: skip
+    SIGNALS,
+    closed,
+    rest_words,
+    restart_words,
+    sentence,
+    standing,
+    what_next,
+    where_words,
+)
 from openant_tools.model.gap import HORIZON_S
 from openant_tools.model.of_run import plants_of
 from openant_tools.model.rollout import Rollouts
@@ -67,7 +74,11 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
             KeyFigure("gap before" if improved else "gap", _error(gap["before"]), "the model as given"),
             *([KeyFigure("gap after", _error(gap["after"]), "the improved model")] if improved else []),
             KeyFigure("floor", _error(gap["floor"]), "what no model could beat"),
-            *([KeyFigure("closed", percent(share), "of the gap above the floor, on held-out runs")] if improved else []),
+            *(
+                [KeyFigure("closed", percent(share), "of the gap above the floor, on held-out runs")]
+                if improved
+                else []
+            ),
         ),
     )
     report = Report(
@@ -84,20 +95,14 @@ def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[R
     runners_up = [one for one in found.effects if one.effect not in found.selected][:RUNNERS_UP]
     if runners_up:
         report.section("Why not something else", open=True).table(
-            ["effect", "where", "how likely", "closes by itself", "why not"],
+            ["effect", "why not", "where", "how likely", "closes by itself"],
             [
-                [one.effect, where_words(one.joints), percent(one.probability), _percent(one.gap_closed), standing(found, one)]
+                [one.effect, standing(found, one), where_words(one.joints), percent(one.probability), _percent(one.gap_closed)]
                 for one in runners_up
             ],
         )  # fmt: skip
     if found.sensors:
-        report.section("Sensors").table(
-            ["signal", "of", "finding", "used for the verdict"],
-            [
-                [_signal(one["signal"]), where_words(_joints(one["joints"])), _sensor_words(one["finding"]), "yes" if one["used"] else "no"]
-                for one in found.sensors
-            ],
-        )  # fmt: skip
+        _sensors(report, found)
     _details(report, found)
     return report
 
@@ -121,7 +126,9 @@ def _details(report: Report, found: Diagnosis) -> None:
     report.section("Details")
     if found.removal:
         rows = [[name, percent(value)] for name, value in found.removal.items()]
-        report.details("What each effect of the improved model is worth", Table(["effect", "closes less without it"], rows))
+        report.details(
+            "What each effect of the improved model is worth", Table(["effect", "closes less without it"], rows)
+        )
     report.figure(
         candidates(found),
         "How likely this robot has each effect, beyond what robots of one build differ by, and how much of the gap it closes by "
@@ -141,8 +148,10 @@ def _details(report: Report, found: Diagnosis) -> None:
     if found.where:
         report.details("Where the gap lies, all of it", _all_places(found))
     if found.calibration:
-        rows = [[kind, joint, value] for kind, values in found.calibration.items() for joint, value in values.items()]
-        report.details("What moved as far as robots of one build differ", Table(["quantity", "joint", "factor or amount"], rows))
+        moved = [[kind, joint, value] for kind, values in found.calibration.items() for joint, value in values.items()]
+        report.details(
+            "What moved as far as robots of one build differ", Table(["quantity", "joint", "factor or amount"], moved)
+        )
     if found.notes:
         report.text("\n".join(f"- {note}" for note in found.notes))
 
@@ -156,14 +165,23 @@ def _all_places(found: Diagnosis) -> Table:
     return Table(["signal", "joint", "while", "share", "left by the improved model"], rows)
 
 
-def _signal(column: str) -> str:
-    """What a signal of a run is called."""
-    return plots.SIGNAL_LABELS.get(column, (column.upper(),))[0]
-
-
-def _sensor_words(finding: str) -> str:
+def _sensors(report: Report, found: Diagnosis) -> None:
+    report.section("Sensors")
+    names = [plots.SIGNAL_LABELS.get(one["signal"], (one["signal"].upper(),))[0] for one in found.sensors]
+    if all(one["used"] and one["finding"] == "as_modelled" for one in found.sensors):
+        report.text(f"All signals behave as modelled, and all were used for the verdict: {', '.join(names)}.")
+        return
     known = {"as_modelled": "as modelled", "unknown_form": "like none that is known"}
-    return known.get(finding, finding)
+    rows = [
+        [
+            name,
+            where_words(_joints(one["joints"])),
+            known.get(one["finding"], one["finding"]),
+            "yes" if one["used"] else "no",
+        ]
+        for name, one in zip(names, found.sensors, strict=True)
+    ]
+    report.table(["signal", "of", "finding", "used for the verdict"], rows)
 
 
 def _of_ant(found: Diagnosis) -> bool:
@@ -180,10 +198,7 @@ def places(found: Diagnosis) -> MatplotlibFigure:
         _leg_map(legs, found)
     else:
         figure, axes = plots.figure(height=height_in)
-    labels = [
-        f"{place['joint']} ({SIGNALS[place['signal']]})\n{Regime(place['regime']).words}"
-        for place in largest
-    ]
+    labels = [f"{place['joint']} ({SIGNALS[place['signal']]})\n{Regime(place['regime']).words}" for place in largest]
     before = [100 * float(place["share"]) for place in largest]
     after = [place.get("share_after") for place in largest]
     known = any(share is not None for share in after)
@@ -225,7 +240,7 @@ def _leg_map(axes: Axes, found: Diagnosis) -> None:
             )  # fmt: skip
             axes.annotate(
                 f"{name}\n{percent(share[name])}", (x, y), xytext=(-left * (6 + 10 * math.sqrt(share[name])), 0), textcoords="offset points",
-                ha="right" if left > 0 else "left", va="center", fontsize=7,
+                ha="right" if left > 0 else "left", va="top" if along > 0 else "bottom", fontsize=7,
             )  # fmt: skip
     axes.scatter([0], [0], s=500, color=plots.INK, alpha=0.25, zorder=1)
     axes.set_xlim(-4.6, 4.6)

@@ -8,12 +8,24 @@ from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
 from openant_tools.gap.regime import Regime
 from openant_tools.model.gap import share_closed
-from openant_tools.numbers import exact, number, percent, span
+from openant_tools.numbers import exact, percent, span
 
-__all__ = ["SIGNALS", "closed", "part_words", "rest_words", "restart_words", "sentence", "standing", "what_next", "where_words"]
+__all__ = [
+    "BY_ITSELF",
+    "SIGNALS",
+    "closed",
+    "part_words",
+    "rest_words",
+    "restart_words",
+    "sentence",
+    "standing",
+    "what_next",
+    "where_words",
+]
 
 #: signal of a place → what it is called
 SIGNALS = {"pos": "position", "vel": "velocity"}
+BY_ITSELF = "by itself it closes"
 #: share from which a part is most of the whole
 MOST = 0.5
 
@@ -57,7 +69,9 @@ def sentence(found: Diagnosis) -> str:
     more = f", with {' and '.join(beside)} beside it" if beside else ""
     closes = f"closes {percent(closed(found))} of the gap on held-out runs."
     if catalogue()[one.effect].random and not beside:
-        return f"{words} ({sure}). No model repeats that; by what else it moves within tolerance the improved one {closes}"
+        return (
+            f"{words} ({sure}). No model repeats that; by what else it moves within tolerance the improved one {closes}"
+        )
     return f"{words}{more} ({sure}). The improved model {closes}"
 
 
@@ -96,9 +110,9 @@ def standing(found: Diagnosis, one: Found) -> str:
         return "these runs cannot tell"
     leads = next((other for other in found.effects if other.effect == found.verdict), None)
     if one.gap_closed is not None and leads is not None and leads.gap_closed is not None:
-        return f"by itself it closes {percent(one.gap_closed)}, but {leads.effect} closes {percent(leads.gap_closed)}"
+        return f"{BY_ITSELF} {percent(one.gap_closed)}, but {leads.effect} closes {percent(leads.gap_closed)}"
     if one.gap_closed is not None:
-        return f"by itself it closes {percent(one.gap_closed)}, which is not enough"
+        return f"{BY_ITSELF} {percent(one.gap_closed)}, which is not enough"
     return f"of robots whose recordings look like this one, {percent(one.probability)} have it"
 
 

@@ -15,6 +15,7 @@ from openant_tools.cli.gap import gap
 from openant_tools.errors import BadInput
 from openant_tools.gap.measure import Measurement, measure
 from openant_tools.gap.regime import Regime, regimes
+from openant_tools.gap.words import part_words
 from openant_tools.model.plant import load_plant
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import write_table
@@ -102,7 +103,21 @@ def test_the_command_tells_shows_and_writes(model: Path, tmp_path: Path) -> None
     told = json.loads((tmp_path / "g.json").read_text())
     assert told["signals"]["pos"]["gap"] > told["signals"]["pos"]["floor"]
     assert sum(place["share"] for place in told["where"] if place["signal"] == "pos") == pytest.approx(1.0)
-    assert "position is farthest off" in (tmp_path / "r" / "report.html").read_text()
+    page = (tmp_path / "r" / "report.html").read_text()
+    assert "position is farthest off" in page
+    assert "Every 0.5\u00a0s the simulation starts again from what was measured" in page
+    assert Regime.REVERSAL.words in page
+    assert Regime.REVERSAL.words in ran.output
+    for never in (Regime.RELEASED.words, Regime.RELEASED.value):
+        assert never not in page, "what no joint was seen in has no column"
+
+
+def test_what_is_called_most_of_a_gap_is_more_than_its_half() -> None:
+    assert (
+        part_words(0.79, "hip_rl", Regime.SATURATED)
+        == "most of it (79 %) lies at hip_rl while the servo gives all it may"
+    )
+    assert part_words(0.06, "knee_fl", Regime.HOLD) == "its largest part (6 %) lies at knee_fl while it stands"
 
 
 @pytest.mark.parametrize(

@@ -350,7 +350,15 @@ def test_one_page_says_it_all(model: Path, tmp_path: Path) -> None:
     diagnosed = dataclasses.replace(diagnosed, effects=(*diagnosed.effects, unfitted))
     page = diagnosis_report(diagnosed, runs, [], model).html()
     assert "None" not in page  # a cause that was not fitted closes nothing that anybody knows
-    for words in ("action_delay (all)", "confidence 95\u00a0%", "floor", "What to do next", "Where", "improved model"):
+    for words in (
+        "action_delay (all)",
+        "confidence 95\u00a0%",
+        "floor",
+        "What to do next",
+        "Where",
+        "improved model",
+        "starts again from what was measured",
+    ):
         assert words in page
     assert sentence(dataclasses.replace(diagnosed, verdict="none", selected=())).startswith("Nothing beyond the floor")
     assert "closest is action_delay" in sentence(dataclasses.replace(diagnosed, verdict="unexplained", selected=()))
