@@ -488,18 +488,30 @@ class OpenAnt(App[int]):
         number = self._typed + digit if f"{self._typed}{digit}" in _NUMBERS else digit
         if number not in _NUMBERS:
             self._typed = ""
+            self._announce()
             return
         self._typed = number
         for screen in self.screen_stack:
             if isinstance(screen, WalkScreen):
                 screen.go_to(_NUMBERS[number])
-        if not isinstance(self.screen, WalkScreen):
-            self.notify(f"{number} {WALK[_NUMBERS[number]].title}: Enter opens it", timeout=TYPED_S)
+        self._announce()
         self.set_timer(TYPED_S, partial(self._forget_typed, number))
+
+    @property
+    def announced(self) -> str:
+        """See `page.Program`; the walk shows it by its cursor."""
+        if not self._typed or isinstance(self.screen, WalkScreen):
+            return ""
+        return f"{self._typed} {WALK[_NUMBERS[self._typed]].title}: Enter opens it"
+
+    def _announce(self) -> None:
+        if isinstance(self.screen, Page):
+            self.screen.draw()
 
     def _forget_typed(self, number: str) -> None:
         if self._typed == number:
             self._typed = ""
+            self._announce()
 
     def action_open_typed(self) -> None:
         name, self._typed = _NUMBERS[self._typed], ""

@@ -36,9 +36,13 @@ class Program(Protocol):
 
     Attributes:
         session: what all screens work on.
+        announced: what Enter opens, where a step's number was typed; else "".
     """
 
     session: Session
+
+    @property
+    def announced(self) -> str: ...
 
     def action_go(self, name: str) -> None:
         """Open a screen by its name."""
@@ -170,7 +174,9 @@ class Page(Screen[None]):
         session = self.session
         text = Text.assemble(("Open Ant", "bold"), f"  {self.title}  ", no_wrap=True, overflow=overflow())
         text.append(session.name if session.folder is not None else "no robot's folder", "bold")
-        if session.doing:
+        if self.ant.announced:
+            text.append(f"  {mark('info')} {self.ant.announced}", "bold")
+        elif session.doing:
             text.append(f"  {mark('wait')} {session.doing}", MARKS["wait"].colour)
         elif session.feed is not None:
             text.append(f"  {mark('info')} {session.feed.title}")

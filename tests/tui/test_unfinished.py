@@ -155,8 +155,11 @@ def test_a_steps_number_and_enter_open_it_and_never_while_one_types(tmp_path: Pa
         assert option.id == "identify"
         await pilot.press("enter")
         await until(pilot, lambda: isinstance(app.screen, StepScreen) and app.screen.step.name == "identify")
-        await pilot.press("4", "enter")
+        await pilot.press("4")
+        await until(pilot, lambda: "4 Centring: Enter opens it" in screen_text(app))
+        await pilot.press("enter")
         await until(pilot, lambda: isinstance(app.screen, StepScreen) and app.screen.step.name == "centre")
+        assert "Enter opens it" not in screen_text(app), "it is said as long as it holds"
         await pilot.press("f1")
         await until(pilot, lambda: "Horn: the disc on the servo's shaft" in screen_text(app))
         await pilot.press("escape", "escape")
