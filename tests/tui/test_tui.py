@@ -952,6 +952,7 @@ def test_what_was_learned_is_evaluated_played_compared_and_diagnosed_from_its_sc
             await _go(pilot, "learn")
             await pilot.pause()
             assert "sac-0  does not walk yet (−2.3 cm/s)" in screen_text(app)
+            assert screen_text(app).count("│") >= 8, "a curve that one can read"
             chooser = app.screen.query_one("#choices", Choices)
             chooser.focus()
             for id_ in ("evaluate", "compare", "play"):
@@ -962,6 +963,8 @@ def test_what_was_learned_is_evaluated_played_compared_and_diagnosed_from_its_sc
                     cast(LearnScreen, app.screen_stack[1]).draw_progress()
                     await pilot.pause()
                     assert "playing   openant" in screen_text(app) or id_ == "play"
+                    assert [line.id for line in chooser.options] == ["stop"], "one thing at a time"
+                cast(LearnScreen, app.screen_stack[1]).draw_progress()
             assert "inside the circle, facing its reward" in screen_text(app), "what moves asks"
             await pilot.press("escape", "d")
             await pilot.pause()

@@ -71,15 +71,19 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
                 yield Label("seed")
                 yield Input("0", type="integer", id="seed")
                 yield Label("30000 steps are an hour of robot time", classes="after")
-            yield Choices(
-                Option(f"A first look, in simulation: {FIRST_STEPS} steps with settings that walk sooner", id=FIRST),
-                *(Option(f"Train {name} in simulation: {_WORDS[name]}", id=name) for name in AGENTS),
-                *(Option(f"Train {name} on the robot: it moves", id=f"{name}{ON_ROBOT}") for name in AGENTS),
-                Option("Stop and save", id="stop", disabled=not self.session.learning),
-                *self._after(),
-                id="choices",
-            )
+            yield Choices(id="choices")
         yield Static(id="progress")
+
+    def _options(self) -> list[Option]:
+        """What can be done now: one thing at a time runs, and the room of the rest is the curve's meanwhile."""
+        if self.session.learning:
+            return [Option("Stop and save", id="stop")]
+        return [
+            Option(f"A first look, in simulation: {FIRST_STEPS} steps with settings that walk sooner", id=FIRST),
+            *(Option(f"Train {name} in simulation: {_WORDS[name]}", id=name) for name in AGENTS),
+            *(Option(f"Train {name} on the robot: it moves", id=f"{name}{ON_ROBOT}") for name in AGENTS),
+            *self._after(),
+        ]
 
     def _newest(self) -> Path | None:
         """The run that learned last."""
@@ -102,11 +106,17 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
     def on_mount(self) -> None:
         super().on_mount()
         self.set_interval(REFRESH_S, self.draw_progress)
-        self._finished = True
-        self.query_one("#choices", Choices).highlighted = 0
+        self._offer()
         self.query_one("#steps", Input).focus()
         # The room for the curve is known once the screen is laid out.
         self.call_after_refresh(self.draw_progress)
+
+    def _offer(self) -> None:
+        chooser = self.query_one("#choices", Choices)
+        chooser.clear_options()
+        chooser.add_options(self._options())
+        chooser.highlighted = 0
+        self._offered_while = self.session.learning
 
     def _use(self, choice: str) -> None:
         """Do with the newest run what was chosen."""
@@ -221,15 +231,9 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
     def draw_progress(self) -> None:
         """From the files of the run."""
         training, folder = self.session.training, self.session.folder
-        running = self.session.learning
-        if self._finished != (not running):
-            self._finished = not running
-            chooser = self.query_one("#choices", Choices)
-            (chooser.enable_option if running else chooser.disable_option)("stop")
-            if self._finished:  # there is a run now with which something can be done
-                for option in self._after():
-                    if all(option.id != other.id for other in chooser.options):
-                        chooser.add_option(option)
+        if self._offered_while != self.session.learning:
+            self._offer()
+            self.call_after_refresh(self.draw_progress)  # into the room that there is then
         text = Text()
         if training is not None:
             if training.running:
@@ -267,11 +271,11 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         text.append(spelled(walks_at(float(reward[-1]))), "bold")
         text.append(f"; step {number(step[-1])}{share}, {minutes} min of robot time\n")
         stop = max(float(step[-1]), float(steps or 0.0))
-        # Of what is under way the command takes a second line.
-        room = self.query_one("#progress").size.height - text.plain.count("\n") - (4 if steps is None else 5)
+        # Its axis takes two lines, what it is the last, and the command of what is under way a second one.
+        room = self.query_one("#progress").size.height - text.plain.count("\n") - (3 if steps is None else 4)
         for line in curve_lines(step, 100 * reward, stop, level, self.size.width - 4, min(max(room, 3), MOST_ROWS)):
             text.append_text(line).append("\n")
         text.append(
-            f"mean of the last 120 s{'; the paper (dotted): ' if words else ''}{words}\n",
+            f"mean of 120 s{f'; dotted: the paper, {words}' if words else ''}\n",
             "dim" if not plain() else "",
         )
