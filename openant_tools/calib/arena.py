@@ -271,7 +271,7 @@ def arena(bench: Bench) -> Procedure:
     yield Hands("Put it back on its stand.", "place", setup="stand")
     rest(bench)
     parts.end()
-    bench.folder.update(values, provenance=Provenance("measured", COMMAND, bench.folder.relative(_path(bench))))
+    bench.folder.update(values, provenance=Provenance.measured(COMMAND, bench.folder.relative(_path(bench))))
     ok = False if wrong else None if unsure else True
     return Finding(
         "arena",

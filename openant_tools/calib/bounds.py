@@ -161,7 +161,7 @@ def bounds(bench: Bench) -> Procedure:
     values: dict[str, object] = {}
     for joint, (low, high) in limits.items():
         values |= {f"motors.{joint}.min_rad": low, f"motors.{joint}.max_rad": high}
-    bench.folder.update(values, provenance=Provenance("measured", COMMAND))
+    bench.folder.update(values, provenance=Provenance.measured(COMMAND))
     if swept is None:
         swept = yield from sweep(engine_config(bench, imu=None), _path(bench, SWEEP), "slow sweep", SHARES[SWEEP])
         parts.done(SWEEP, **facts)
@@ -199,7 +199,7 @@ def bounds(bench: Bench) -> Procedure:
     recording = ", ".join(bench.folder.relative(run.path) for run in runs if run.path)
     bench.folder.update(
         {f"observation.{name}": [round(low, 5), round(high, 5)] for name, (low, high) in found.items()},
-        provenance={"observation": Provenance("measured", COMMAND, recording)},
+        provenance={"observation": Provenance.measured(COMMAND, recording)},
     )
     picture = coverage_picture(runs, bench.folder.findings / "bounds-coverage.png")
     yield Drawing("What the motions covered:", picture=picture)

@@ -266,11 +266,11 @@ def imu(bench: Bench) -> Procedure:
             "imu.gyro_bias_rad_s": [round(float(x), 6) for x in gyro_bias],
             "imu.acc_counts_per_g": round(acc_counts, 1),
         }
-        provenance = dict.fromkeys(values, Provenance("measured", COMMAND))
+        provenance = dict.fromkeys(values, Provenance.measured(COMMAND))
         if gyro is not None:
             values["imu.gyro_counts_per_dps"] = round(counts, 4)
-            provenance["imu.gyro_counts_per_dps"] = Provenance(
-                "measured", COMMAND, low=round(gyro.low, 4), high=round(gyro.high, 4)
+            provenance["imu.gyro_counts_per_dps"] = Provenance.measured(
+                COMMAND, low=round(gyro.low, 4), high=round(gyro.high, 4)
             )
         bench.folder.update(values, provenance=provenance)
     return Finding(

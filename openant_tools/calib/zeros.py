@@ -205,7 +205,7 @@ def zeros(bench: Bench) -> Procedure:
         f"{number(NUDGE_RAD, 'rad', decimals=0)} with the motors, on the stand",
         moves=True,
     )
-    bench.folder.update(values, provenance=Provenance("measured", COMMAND))
+    bench.folder.update(values, provenance=Provenance.measured(COMMAND))
     nudged = yield from _nudge_all(bench, joints)
     problems += nudged.problems
     evidence += nudged.evidence

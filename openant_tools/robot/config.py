@@ -295,6 +295,15 @@ class Provenance:
     low: float | None = number(-math.inf, math.inf, "", None)
     high: float | None = number(-math.inf, math.inf, "", None)
 
+    @classmethod
+    def measured(
+        cls, command: str, recording: str | None = None, low: float | None = None, high: float | None = None
+    ) -> Provenance:
+        """Of what a command has measured just now."""
+        return cls(
+            "measured", command, recording, datetime.datetime.now(datetime.UTC).replace(microsecond=0), low, high
+        )
+
 
 @dataclass(frozen=True)
 class RobotConfig:

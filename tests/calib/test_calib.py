@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import itertools
 import math
 from dataclasses import replace
@@ -307,6 +308,8 @@ def test_bounds_that_were_left_after_the_sweep_do_not_sweep_again(tmp_path, bris
         assert shares(builder.events)[-1] > 0.6
         assert unfinished(ant.folder, "bounds").next == "back on its stand"
         finding, builder = ant.do(bounds(ant.bench))
+        assert is_dated(ant, "observation.pos.hip_rr")
+        assert is_dated(ant, "motors.hip_rr.max_rad")
         assert finding.ok, finding.problems
         moving = [event.words for event in builder.events if isinstance(event, Intent) and event.moves]
         assert (moving, [e for e in builder.events if isinstance(e, Ask)]) == ([], [])
@@ -478,6 +481,13 @@ def test_old_firmware_is_said_with_what_it_lacks(tmp_path):
 FAST = ("hip_rr", "knee_rr", "hip_fr")
 
 
+def is_dated(ant, path: str) -> bool:
+    """Whether robot.toml says that the value there was measured a moment ago."""
+    told = ant.folder.config().provenance_of(path)
+    age = datetime.datetime.now(datetime.UTC) - told.date
+    return told.how == "measured" and datetime.timedelta(0) <= age < datetime.timedelta(minutes=20)
+
+
 def test_a_well_built_robot_has_its_zeros_on_the_grid(tmp_path):
     zero = [{"effect": "zero_offset", "joints": ["knee_rr"], "parameters": {"angle_rad": 0.03}}]
     with robot(tmp_path / "ant", effect=zero) as ant:
@@ -485,6 +495,7 @@ def test_a_well_built_robot_has_its_zeros_on_the_grid(tmp_path):
         assert (finding.ok, finding.problems) == (True, ())
         assert "the stand holds the torso so still that its gyro does not see the nudges" in builder.said
         assert ant.folder.config().motors["knee_rr"].zero_offset_rad == pytest.approx(math.pi + 0.03, abs=0.004)
+        assert is_dated(ant, "motors.knee_rr.zero_offset_rad")
         assert not any(ant.torque())
 
 
@@ -638,6 +649,8 @@ def test_a_gyro_of_another_step_is_found_by_turns_kept_and_used(tmp_path):
         assert told is not None
         assert (told.how, told.command) == ("measured", "openant calib imu")
         assert told.low < 1000 / 70 < told.high
+        assert is_dated(ant, "imu.gyro_counts_per_dps")
+        assert is_dated(ant, "imu.mounting_rad")
         # The bias is in the new scale, too.
         assert kept.imu.gyro_bias_rad_s[2] == pytest.approx(0.02 * ST_SENSOR, abs=0.003)
 
@@ -838,6 +851,7 @@ def test_the_arena_is_measured_by_the_robot_itself_which_moves_once_however_ofte
         assert [event.words for event in builder.events if isinstance(event, Hands)] == ["Put it back on its stand."]
         assert not [event for event in builder.events if isinstance(event, Ask | Intent)]
         assert ant.folder.config().arena.radius_m == 0.6
+        assert is_dated(ant, "arena.radius_m")
         assert finding.ok, finding
         assert finding.data["centre_m"] == pytest.approx([0.75, -0.30], abs=0.02)
         camera = ant.folder.config().camera
