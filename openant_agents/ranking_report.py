@@ -21,7 +21,7 @@ def ranking_report(ranking: Ranking) -> Report:
     best, agreed = max(found.items(), key=lambda item: item[1].spearman.value)
     told = agreed.spearman.low > 0
     answer = ReportSummary(
-        f"The simulation “{best}” ranks {agreed.policies} policies most as the robot does: Spearman {_words(agreed.spearman)}."
+        f"The simulation “{best}” ranks {agreed.policies} policies most as the robot does: rank correlation {_words(agreed.spearman)}, where 1 is the same order."
         if told
         else f"Of {agreed.policies} policies, no simulation is known to rank them as the robot does.",
         Figure(
@@ -39,12 +39,15 @@ def ranking_report(ranking: Ranking) -> Report:
         "good" if told else "warn",
     )
     return Report("Ranking of policies", ", ".join(found), answer, made_by="openant policies rank").section("Figures").table(
-        ["simulation", "Spearman", "Kendall", "rank violation", "regret", "of the best"],
+        ["simulation", "Spearman", "Kendall", "rank violation", "regret"],
         [
             [name, _words(one.spearman), _words(one.kendall), _words(one.rank_violation_m_s, 100, "cm/s"),
-             _words(one.regret_m_s, 100, "cm/s"), percent(one.regret_share)]
+             f"{_words(one.regret_m_s, 100, 'cm/s')}, {percent(one.regret_share)}"]
             for name, one in found.items()
         ],
+        caption="Spearman and Kendall: correlation of the ranks, 1 is the same order. Rank violation: by how much reward on the robot "
+        "policies in the wrong order differ at most, in the mean. Regret: by how much the simulation's best falls short of the "
+        "robot's, also as a share of that.",
     )  # fmt: skip
 
 
@@ -81,9 +84,8 @@ def _picture(ranking: Ranking) -> MatplotlibFigure:
                 marker="o", markersize=12, markerfacecolor="none", markeredgecolor=plots.INK, linestyle="",
                 label="best in this simulation",
             )  # fmt: skip
-            agreed = ranking.agreements[name]
-            rho, lost = agreed.spearman, 100 * agreed.regret_m_s.value
-            panel.set_title(f"{name}: Spearman {_words(rho)},\nregret {number(lost, 'cm/s', decimals=1)}")
+            rho = ranking.agreements[name].spearman.value
+            panel.set_title(f"{name}\ncorrelation {number(rho, decimals=2)}")
             panel.set_xlabel(plots.axis_label("simulated reward", "cm/s"))
         panels[0][0].set_ylabel(plots.axis_label("reward on the robot", "cm/s"))
         handles, labels = panels[0][0].get_legend_handles_labels()

@@ -45,7 +45,7 @@ def loop_report(loop: Loop, result: Result, made_by: str = "openant loop") -> Re
         Figure(
             _rewards_figure(result),
             "Average reward per second, sampled as in training: small marks are starts, large ones their mean with its 95 % "
-            "interval. The grey line between simulation and robot is what the simulation promises too much, or too little.",
+            "interval. The grey line from simulation to robot is what the simulation promises too much, or too little.",
         ),
         "\n\n".join(means),
         _then(loop, result),
@@ -67,8 +67,13 @@ def loop_report(loop: Loop, result: Result, made_by: str = "openant loop") -> Re
     ]
     columns = ["agent", "played in", "average reward", "starts", "set up again", "step"]
     report.section("Every play").table(columns, rows)
-    spans = [[name, speed(span)] for name, span in result.promised_m_s.items() if result.improved or name != "after"]
-    report.table(["agent", "simulation less robot"], spans)
+    agents = {"before": "robot_before", "after": "robot_after", "control": "control_after"}
+    spans = [
+        [PLACES[agents[name]][0], speed(span)]
+        for name, span in result.promised_m_s.items()
+        if result.improved or name != "after"
+    ]
+    report.table(["agent", "reward in simulation less that on the robot"], spans)
     report.section("What the simulation lacked").text(sentence(result.diagnosis))
     report.add(Files("In full:", [loop.folder / "gap" / "report.html"], loop.folder))
     lines = [line for stage in loop.stages() for line in stage.command_lines]
@@ -96,7 +101,7 @@ def what_was_found(result: Result) -> str:
     """What the diagnosis named, and what was made of it."""
     found = result.diagnosis
     if result.improved:
-        return f"{sentence(found)} The improved simulation has {' and '.join(found.selected)}."
+        return f"{sentence(found)} The improved simulation is the given one with {' and '.join(found.selected)}."
     if found.verdict == NONE:
         why = "What the robot does beyond this simulation is as small as between two robots of one build."
     elif found.verdict == UNEXPLAINED:
@@ -166,10 +171,10 @@ def _figures(result: Result) -> list[KeyFigure]:
         keys.append(KeyFigure("on the robot, after", speed(result.robot_after.mean), f"control {speed(control)}"))
     else:
         keys.append(KeyFigure("on the robot, control", speed(control)))
-    keys.append(KeyFigure("simulation less robot, before", speed(promised["before"], sign=True)))
+    keys.append(KeyFigure("simulation promises more by, before", speed(promised["before"], sign=True)))
     if result.improved:
         note = f"control {speed(promised['control'], sign=True)}"
-        keys.append(KeyFigure("simulation less robot, after", speed(promised["after"], sign=True), note))
+        keys.append(KeyFigure("simulation promises more by, after", speed(promised["after"], sign=True), note))
     return keys
 
 

@@ -124,7 +124,7 @@ def _closest(found: Diagnosis) -> Found | None:
 def what_next(found: Diagnosis) -> str:
     """What to do now."""
     if found.next_experiment:
-        return found.next_experiment
+        return f"{found.next_experiment[:1].upper()}{found.next_experiment[1:]}."
     if found.verdict == NONE:
         return "Nothing: the model is as good as these runs can tell."
     return "Write the improved model with `openant gap apply`, and judge it by another motion, recorded for that."

@@ -38,7 +38,7 @@ def plan_report(plan: Plan) -> Report:
     good = sum(one.verdict == "identified" for one in plan.expectations)
     busiest = max((peak for one in plan.forecasts for peak in one.peaks), key=lambda peak: peak.saturated)
     nearest = min(plan.forecasts, key=lambda one: one.clearance_m)
-    open_ = [one.name for one in plan.expectations if one.verdict != "identified"]
+    open_ = _open(plan)
     near = number(min(nearest.clearance_m, NEAR_M), "m", decimals=0)
     answer = ReportSummary(
         f"Do not play it: {'; '.join(objections)}."
@@ -46,14 +46,11 @@ def plan_report(plan: Plan) -> Report:
         else f"It may be played, and will identify {good} of {len(plan.expectations)} parameters in {number(plan.seconds, 's', decimals=0)}.",
         Figure(
             expected_shares(plan.expectations),
-            "The width of each expected 95 % interval as a share of the prior's: 100 % is what is known today. One dot a joint.",
+            "How wide each value's 95 % interval will be, against what is known before anything is recorded (100 %): the farther "
+            "left, the more will be known. One dot a joint.",
         ),
-        f"{first.words[:1].upper()}{first.words[1:]}. "
-        + (
-            f"Not settled by it: {', '.join(open_[:6])}{f' and {len(open_) - 6} more' if len(open_) > 6 else ''}."
-            if open_
-            else "It settles everything."
-        ),
+        f"“{first.name}”: {first.words}. "
+        + (f"It does not settle {'; '.join(open_)}." if open_ else "It settles everything."),
         "Choose another protocol or smaller limits, and plan again."
         if objections
         else "Put the robot on its stand and record it: `openant sysid record`, with the same protocol or `--plan`.",
@@ -77,11 +74,11 @@ def plan_report(plan: Plan) -> Report:
         "Plan of recordings", f"{plan.asked.model.name} · {first.name}", answer, made_by="openant sysid plan"
     )
     report.section("What will be known").table(
-        ["parameter", "expected (95 % interval)", "known today", "verdict", "tied to"],
+        ["parameter", "verdict", "expected (95 % interval)", "known today", "tied to"],
         [
             [
-                one.name, number(one.nominal, one.unit, one.low, one.high), span(one.prior_low, one.prior_high, one.unit),
-                Mark(one.verdict, _TONE[one.verdict]),
+                one.name, Mark(one.verdict, _TONE[one.verdict]),
+                number(one.nominal, one.unit, one.low, one.high), span(one.prior_low, one.prior_high, one.unit),
                 f"{one.tied_to} ({number(one.correlation, sign=True, decimals=2)})" if one.tied_to else "",
             ]
             for one in plan.expectations
@@ -116,6 +113,20 @@ def plan_report(plan: Plan) -> Report:
     return report
 
 
+def _open(plan: Plan) -> list[str]:
+    """What it leaves open, a phrase for each kind of parameter."""
+    left: dict[str, list[str]] = {}
+    for one in plan.expectations:
+        kind, _, label = one.name.partition(".")
+        if one.verdict != "identified":
+            left.setdefault(kind.replace("_", " "), []).append(label)
+    of = {kind: sum(one.name.startswith(f"{kind.replace(' ', '_')}.") for one in plan.expectations) for kind in left}
+    return [
+        f"{kind} ({f'all {of[kind]}' if len(labels) == of[kind] > 1 else ', '.join(labels)})"
+        for kind, labels in left.items()
+    ]
+
+
 def _error(rad: float) -> str:
     return number(rad, "rad", name="residual")
 
@@ -147,8 +158,7 @@ def expected_shares(expectations: Sequence[Expectation]) -> MatplotlibFigure:
         axes.invert_yaxis()
         axes.axvline(1.0, linestyle=":", color=plots.INK)
         axes.xaxis.set_major_formatter(lambda share, _: percent(share, decimals=1 if share < 0.01 else 0))
-        axes.set_xlabel("expected interval, of what is known today (%)")
-        axes.set_ylabel("parameter")
+        axes.set_xlabel("expected interval, as a share of what is known today")
     plots.legend(axes)
     return figure
 

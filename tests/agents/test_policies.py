@@ -267,7 +267,9 @@ def test_policies_are_played_and_ranked_from_the_command_line(runs, tmp_path, ca
     answer = json.loads((tmp_path / "rank.json").read_text())
     assert answer["agreement"]["lite"]["policies"] == 4
     assert answer["policies"]["two"]["real_m_s"] == 0.05
-    assert "<svg" in (tmp_path / "report" / "report.html").read_text()
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "<svg" in page
+    assert "Regret: by how much the simulation" in page, "what its columns are is said beside them"
 
 
 def test_what_cannot_be_ranked_is_refused_in_one_line(runs, tmp_path, capsys):

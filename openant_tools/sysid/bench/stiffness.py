@@ -452,7 +452,7 @@ def stiffness_finding(
     return Finding(
         step="stiffness",
         ok=False if problems else None if unsure else True,
-        what=f"{joint}: {best.words}{by}. " + "; ".join(words) + ".",
+        what=f"{joint} is {best.words} stiff{by}. " + "; ".join(words) + ".",
         evidence=tuple(evidence),
         next_action=" ".join(dict.fromkeys(actions)),
         problems=tuple(problems),
