@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.apply import robot_of
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
@@ -115,6 +116,8 @@ def _meaning(found: Diagnosis) -> str:
         return "Do not put one of these causes into the model for good yet: another experiment decides first."
     if found.verdict == UNEXPLAINED:
         return "A policy that is trained in this simulation meets a robot that moves differently; do not put a cause into the model by guess."
+    if catalogue()[found.verdict].random:
+        return "What befalls commands by chance, no simulation repeats: a policy has to stand it, and is best trained with as much of it."
     return "With this in the model the simulation moves as the robot does, but for what is left of the gap."
 
 

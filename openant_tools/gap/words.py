@@ -47,7 +47,7 @@ def sentence(found: Diagnosis) -> str:
     """The verdict, with its confidence."""
     sure = f"confidence {percent(found.confidence)}"
     if found.verdict == NONE:
-        return f"Nothing beyond the floor and what robots of one build differ by ({sure})."
+        return f"Nothing beyond the floor is off by more than robots of one build differ ({sure})."
     by_name = {one.effect: one for one in reversed(found.effects)}
     if found.verdict == AMBIGUOUS:
         sets = "; ".join(" or ".join(group) for group in found.ambiguous_with)
@@ -69,9 +69,7 @@ def sentence(found: Diagnosis) -> str:
     more = f", with {' and '.join(beside)} beside it" if beside else ""
     closes = f"closes {percent(closed(found))} of the gap on held-out runs."
     if catalogue()[one.effect].random and not beside:
-        return (
-            f"{words} ({sure}). No model repeats that; by what else it moves within tolerance the improved one {closes}"
-        )
+        return f"{words} ({sure}). No model repeats that; with what else was fitted within tolerance the improved model {closes}"
     return f"{words}{more} ({sure}). The improved model {closes}"
 
 
