@@ -23,8 +23,11 @@ lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
+# Benchmarks are not run in CI: at least what they call has to be there.
 types: $(VENV)/.dev
 	nice $(BIN)/mypy
+	MYPYPATH=benchmarks:tests nice $(BIN)/mypy benchmarks/*.py
+	nice $(BIN)/mypy --explicit-package-bases benchmarks/gap_training
 
 contracts: $(VENV)/.dev
 	$(BIN)/lint-imports

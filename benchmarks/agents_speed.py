@@ -114,13 +114,13 @@ def main() -> None:
     found = sarsa_speed.measure(1000)
     own, python = (np.median(each) for each in found.values())
     row("SARSA(λ) decision against a dictionary in plain Python", "10×", "40×", f"{python / own:.1f}× ({own:.2f} ms)")
-    for what, first, then, waited in (
+    for what, asked, later, waited in (
         ("deadline to action beside a learner, 50 ms loop, p99", "2 ms", "1 ms", beside_a_learner()),
         ("the same with nobody learning: what the machine takes", "–", "–", deadlines(ours, lambda: None)),
         ("the same, an update before each action (`--learn sync`)", "–", "–", deadlines(ours, ours.update)),
     ):
         here = f"{np.percentile(waited, 99):.1f} ms (median {np.median(waited):.1f})"
-        row(what, first, then, f"{here}, load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+        row(what, asked, later, f"{here}, load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
 
 
 if __name__ == "__main__":

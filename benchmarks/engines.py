@@ -68,7 +68,8 @@ MODELS: dict[str, tuple[str, str]] = {
 
 def commands() -> np.ndarray:
     t = 0.002 * np.arange(STEPS)
-    return 0.9 * np.sign(np.sin(2 * math.pi * 4 * t)) + 0.4  # (steps,) rad; down to where the arm meets the floor
+    # (steps,) rad; down to where the arm meets the floor
+    return np.asarray(0.9 * np.sign(np.sin(2 * math.pi * 4 * t)) + 0.4)
 
 
 def in_mujoco(model: mujoco.MjModel) -> np.ndarray:
@@ -120,7 +121,7 @@ def version(package: str) -> str:
             return importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
-    return mujoco.__version__
+    return str(mujoco.__version__)
 
 
 def play(engine: str, out: Path) -> None:

@@ -141,8 +141,8 @@ class Hour:
 
     def _refer(self) -> None:
         """The same seed for as many steps as an hour has, without faults, in stepped time."""
+        # What was cut goes on from its last checkpoint.
         reference, scenario = self.folder / "reference", self.folder / "stepped.toml"
-        shutil.rmtree(reference, ignore_errors=True)
         write_text(scenario, SCENARIO.format(mode="stepped"))
         steps = ["--steps", str(max(1, round(HOUR_STEPS[self.agent] * self.minutes / 60)))]
         exact = ["--learn", "sync"] if self.agent == "sac" else []

@@ -186,7 +186,7 @@ class TrueWalk:
                     self._set_up(b)
                     continue
                 total[b] += self.tasks[b].reward(x, y)
-        return (total / (rows * self.dt)).tolist()
+        return [float(one) for one in total / (rows * self.dt)]
 
     def _clock(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         clocks = self.robot.clocks

@@ -10,6 +10,7 @@ import threading
 import time
 import tty
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 from campaign import Campaign
@@ -17,8 +18,9 @@ from fuzz_transactions import KINDS, faults, transact
 
 from openant_tools.comms.bus import Bus, BusTiming
 from openant_tools.comms.clock import RealClock
-from openant_tools.comms.faults import HardwareFault, NeverSilent
+from openant_tools.comms.faults import NeverSilent
 from openant_tools.comms.line import SerialLine
+from openant_tools.errors import HardwareFault
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 from faulty_line import IDS, FaultyLine
@@ -87,11 +89,12 @@ def _babble(seed: int) -> bool:
     bus = Bus(line, RealClock(), BusTiming(return_delay_s=0.0, latency_timer_s=1e-3))
     longest, said = 0.0, False
     try:
-        for ask in (
+        asks: list[Callable[[], object]] = [
             lambda: bus.broadcast_ping(),
             *[lambda: bus.sync_read(120, 27, IDS)] * 60,
             lambda: bus.read(10, 31, 1),
-        ):
+        ]
+        for ask in asks:
             began = time.monotonic()
             try:
                 ask()

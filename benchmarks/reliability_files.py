@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 import signal
@@ -11,7 +12,11 @@ import tempfile
 from pathlib import Path
 
 from campaign import Campaign
-from fuzz_readers import READERS, fuzz
+from fuzz_readers import fuzz
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from readers import READERS
 
 from openant_tools.robot.folder import RobotFolder, create_robot
 
@@ -27,7 +32,7 @@ def campaigns() -> list[Campaign]:
         Campaign(
             f"{kind}: {EACH} mutations are read, or refused in one line",
             2,
-            lambda k, kind=kind: not fuzz(kind, k, EACH),
+            functools.partial(_refused, kind),
         )
         for kind in READERS
     ]
@@ -36,6 +41,10 @@ def campaigns() -> list[Campaign]:
         Campaign("two programs change one robot.toml at once: every change is kept", 2, _concurrent_updates),
         Campaign("who holds a robot is killed (SIGKILL): the next one has it at once", 3, _holder_killed),
     ]
+
+
+def _refused(kind: str, k: int) -> bool:
+    return not fuzz(kind, k, EACH)
 
 
 def _program(code: str, *arguments: object) -> subprocess.Popen[str]:

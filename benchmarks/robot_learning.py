@@ -98,9 +98,9 @@ def main() -> None:
                 time.sleep(0.05)
             control = VirtualControl(json.loads(ready.read_text())["control"])
             train = [
-                *start, "train", "sac", "--env", "hardware", "--robot", robot.path, "--virtual", ready, "--yes",
-                "--steps", str(steps), "--learning-start", str(min(500, steps // 6)), "--out", run,
-                "--json", folder / "result.json",
+                *start, "train", "sac", "--env", "hardware", "--robot", str(robot.path), "--virtual", str(ready), "--yes",
+                "--steps", str(steps), "--learning-start", str(min(500, steps // 6)), "--out", str(run),
+                "--json", str(folder / "result.json"),
             ]  # fmt: skip
             began = time.monotonic()
             process = subprocess.Popen(train)

@@ -33,8 +33,8 @@ class Usual(Sac):
         self.actor = Actor(OBSERVATIONS, ACTIONS, settings)
         self.critics, self.targets = (Critics(OBSERVATIONS, ACTIONS, settings) for _ in range(2))
         self.targets.requires_grad_(False)
-        self.actor_optimiser = torch.optim.Adam(self.actor.parameters(), lr=settings.actor_step)
-        self.critic_optimiser = torch.optim.Adam(self.critics.parameters(), lr=settings.critic_step)
+        self.usual_actor = torch.optim.Adam(self.actor.parameters(), lr=settings.actor_step)
+        self.usual_critic = torch.optim.Adam(self.critics.parameters(), lr=settings.critic_step)
         self.entropy_optimiser = torch.optim.Adam([self.log_alpha], lr=settings.entropy_step)
         random = np.random.default_rng(0)
         widths = (OBSERVATIONS, ACTIONS, 1, 1, 1, OBSERVATIONS)
@@ -53,18 +53,18 @@ class Usual(Sac):
             target = settings.reward_scale * reward.flatten() * dt.flatten() + discount * value
         first, second = self.critics(torch.cat([observation, action], 1))
         loss = F.mse_loss(first, target) + F.mse_loss(second, target)
-        self.critic_optimiser.zero_grad()
-        loss.backward()
-        self.critic_optimiser.step()
+        self.usual_critic.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.usual_critic.step()
         self.updates += 1
         if self.updates % settings.policy_every == 0:
             for _ in range(settings.policy_every):
                 new, log_pi = self.actor(observation, self._normal(settings.batch))
                 value = torch.min(*self.critics(torch.cat([observation, new], 1)))
                 actor_loss = (self.log_alpha.exp().detach() * log_pi - value).mean()
-                self.actor_optimiser.zero_grad()
+                self.usual_actor.zero_grad()
                 actor_loss.backward()
-                self.actor_optimiser.step()
+                self.usual_actor.step()
                 with torch.no_grad():
                     _, log_pi = self.actor(observation, self._normal(settings.batch))
                 entropy_loss = (-self.log_alpha.exp() * (log_pi + self.target_entropy)).mean()
@@ -89,7 +89,7 @@ def stable_baselines() -> Callable[[], object]:
     from stable_baselines3 import SAC
     from stable_baselines3.common.logger import Logger
 
-    class Nothing(gymnasium.Env):
+    class Nothing(gymnasium.Env):  # type: ignore[misc]
         observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBSERVATIONS,), np.float32)
         action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32)
 
@@ -98,6 +98,7 @@ def stable_baselines() -> Callable[[], object]:
     )
     model.set_logger(Logger(None, []))
     random = np.random.default_rng(0)
+    assert model.replay_buffer is not None
     for _ in range(4096):
         seen, then = random.normal(size=(2, 1, OBSERVATIONS)).astype(np.float32)
         action = random.uniform(-1, 1, (1, ACTIONS)).astype(np.float32)

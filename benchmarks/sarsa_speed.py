@@ -26,13 +26,14 @@ def ours(observations: np.ndarray) -> Callable[[int], None]:
     settings = SarsaSettings()
     coder = TileCoder(np.full(24, -1.0), np.ones(24), tiles=4, tilings=192, rows=2**25)
     agent = Sarsa(coder, 8, settings, seed=0)
-    state = {"rows": coder.rows_of(observations[0]), "action": 0}
+    rows_before, action_before = coder.rows_of(observations[0]), 0
 
     def decide(k: int) -> None:
+        nonlocal rows_before, action_before
         rows = agent.rows_of(observations[k])
         action = agent.choose(rows)
-        agent.learn(state["rows"], state["action"], 0.01, 0.5, rows, action)
-        state["rows"], state["action"] = rows, action
+        agent.learn(rows_before, action_before, 0.01, 0.5, rows, action)
+        rows_before, action_before = rows, action
 
     return decide
 
@@ -56,21 +57,22 @@ def plain(observations: np.ndarray) -> Callable[[int], None]:
             rows.append(index.setdefault(tuple(box), len(index)))
         return rows
 
-    state = {"rows": tiles(observations[0].tolist()), "action": 0}
+    rows_before, action_before = tiles(observations[0].tolist()), 0
 
     def decide(k: int) -> None:
+        nonlocal rows_before, action_before
         rows = tiles(observations[k].tolist())
         values = [sum(w[row] for row in rows) for w in weights]
         action = int(random.integers(8)) if random.random() < settings.epsilon else int(np.argmax(values))
-        before = weights[state["action"]]
-        error = 0.05 + settings.gamma**10 * values[action] - sum(before[row] for row in state["rows"])
+        before = weights[action_before]
+        error = 0.05 + settings.gamma**10 * values[action] - sum(before[row] for row in rows_before)
         traces[:] = [(r, a, s * fading) for r, a, s in traces if s * fading >= 1e-4]
-        traces.append((state["rows"], state["action"], 1.0))
+        traces.append((rows_before, action_before, 1.0))
         for r, a, strength in traces:
             w, step = weights[a], settings.step_size * error * strength
             for row in r:
                 w[row] += step
-        state["rows"], state["action"] = rows, action
+        rows_before, action_before = rows, action
 
     return decide
 

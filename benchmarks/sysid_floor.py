@@ -76,7 +76,11 @@ def main() -> None:
             for value, scale in zip(result.values, (1.0, 1e3), strict=True):
                 true = truth[value.name.partition(".")[0]]
                 cells += [f"{scale * true:.3g}", f"{scale * value.value:.3g}"]
-                cells += [f"{scale * value.low:.3g} – {scale * value.high:.3g}"]
+                cells += [
+                    "–"
+                    if value.low is None or value.high is None
+                    else f"{scale * value.low:.3g} – {scale * value.high:.3g}"
+                ]
             error = f"{1e3 * result.before.full:.2f} → {1e3 * result.after.full:.2f}"
             print(f"| {' | '.join(cells)} | {error} | {seconds:.0f} |", flush=True)
 

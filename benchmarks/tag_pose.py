@@ -33,7 +33,7 @@ def turn(roll: float, pitch: float, yaw: float) -> np.ndarray:
     """World from body: about x, then y, then z."""
     axes = np.diag([roll, pitch, yaw])
     x, y, z = (np.asarray(cv2.Rodrigues(axis)[0]) for axis in axes)
-    return z @ y @ x
+    return np.asarray(z @ y @ x)
 
 
 def measure(family: str, distance: float, pictures: int, rng: np.random.Generator) -> list[dict[str, float | bool]]:

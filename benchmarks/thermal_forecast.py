@@ -153,7 +153,9 @@ def _run(world: World, rows: list[list[Array]]) -> Run:
             columns[f"cur.{joint}"] = table[:, 2, k]
         columns[f"volt.{joint}"] = table[:, 3, k]
     motors = {joint: servo.model.name for joint, servo in zip(world.joints, world.servos, strict=True)}
-    return Run("drawn", Facts(world.joints, motors=motors), np.arange(len(rows)) * 2 * STEP_S, columns)
+    return Run(
+        "drawn", Facts(world.joints, motors=motors), 2 * STEP_S * np.arange(len(rows), dtype=np.float64), columns
+    )
 
 
 def case(seed: int) -> Case | None:

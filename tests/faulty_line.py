@@ -71,7 +71,8 @@ class FaultyLine(MemoryLine):
         if asked.code == p2.Inst.PING and asked.id in IDS:
             replies.append(p2.Status(asked.id, 0, register_bytes(asked.id, 0, 3)))
         elif asked.code == p2.Inst.READ and asked.id in IDS:
-            replies.append(self._read(asked.id, *struct.unpack("<HH", asked.params), at))
+            address, count = struct.unpack("<HH", asked.params)
+            replies.append(self._read(asked.id, address, count, at))
         elif asked.code == p2.Inst.WRITE and asked.id in IDS:
             address = int.from_bytes(asked.params[:2], "little")
             if address == WRITABLE:

@@ -194,7 +194,12 @@ def torque_after_kill(name: str, victims: tuple[Victim, ...], folder: Path) -> d
 
         def in_time(done: Callable[[], bool], actors: Sequence[int]) -> float:
             waited = InLine([*actors, _serving(scenario)])
-            took = after(lambda: waited.look() or done(), 5.0)
+
+            def looked() -> bool:
+                waited.look()
+                return done()
+
+            took = after(looked, 5.0)
             if took > OFF_S >= took - waited.seconds:
                 raise Late(f"{name}: {took:.2f} s, of which processes waited {waited.seconds:.2f} s for a processor")
             return took

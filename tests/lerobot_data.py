@@ -29,14 +29,14 @@ def written(counts: NDArray[Any], entry: Mapping[str, int], mode: str) -> NDArra
         return (counts - (low + high) / 2) * 360 / (TURN - 1)
     share = (np.clip(counts, low, high) - low) / (high - low)
     if mode == "percent":
-        return 100 - 100 * share if entry["drive_mode"] else 100 * share
-    return (200 * share - 100) * (-1 if entry["drive_mode"] else 1)
+        return np.asarray(100 - 100 * share if entry["drive_mode"] else 100 * share)
+    return np.asarray((200 * share - 100) * (-1 if entry["drive_mode"] else 1))
 
 
 def counts_of(rows: int, joint: int, entry: Mapping[str, int], phase: float = 0.0) -> NDArray[Any]:
     """Raw positions of a slow swing through three quarters of the range."""
     middle, half = (entry["range_min"] + entry["range_max"]) / 2, (entry["range_max"] - entry["range_min"]) / 2
-    return np.round(middle + 0.75 * half * np.sin(np.arange(rows) * 0.1 * (joint + 1) + phase))
+    return np.asarray(np.round(middle + 0.75 * half * np.sin(np.arange(rows) * 0.1 * (joint + 1) + phase)))
 
 
 def angles(counts: NDArray[Any], entry: Mapping[str, int]) -> NDArray[Any]:

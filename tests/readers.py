@@ -44,7 +44,7 @@ class Reader:
 
 
 def _run() -> Run:
-    t = np.arange(12) * 0.01
+    t = 0.01 * np.arange(12, dtype=np.float64)
     columns: dict[str, Any] = {
         "cmd.hinge": np.sin(t), "pos.hinge": np.sin(t), "torque.hinge": np.ones(12), "gyro.x": t, "wake": t,
         "err.hinge": np.array(["timeout", *[""] * 11], object),
@@ -283,7 +283,7 @@ def _verdict(folder: Path) -> None:
 
 
 def _scored(path: Path) -> Any:
-    from openant_tools.blind.answers import Answer
+    from openant_tools.blind.draw import Answer
     from openant_tools.blind.score import Case, score
     from openant_tools.files import read_json
 

@@ -10,7 +10,7 @@ import select
 import threading
 import time
 import tty
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -87,7 +87,7 @@ class Talker:
                 count += 1
                 heapq.heappush(waiting, (now + after_s + self.late_s, count, answer))
 
-    def _protocol_2(self, items: list[object]) -> Iterator[tuple[float, bytes]]:
+    def _protocol_2(self, items: Sequence[object]) -> Iterator[tuple[float, bytes]]:
         for asked in items:
             if isinstance(asked, p2.Instruction):
                 for place, id in enumerate(self.ids):

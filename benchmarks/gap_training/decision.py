@@ -15,6 +15,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,7 +85,7 @@ def _short(value: float | None) -> float | None:
     return None if value is None else float(f"{value:.6g}")
 
 
-def _kept(one: Mapping[str, object]) -> Judged:
+def _kept(one: Mapping[str, Any]) -> Judged:
     rows = []
     for values in one["rows"]:
         causes, numbers = values[: -len(KEPT)], values[-len(KEPT) :]
@@ -92,7 +93,7 @@ def _kept(one: Mapping[str, object]) -> Judged:
     return Judged(tuple(rows), one["outside"], frozenset(one["right"]), one["ill"])
 
 
-def robot(found: Mapping[str, object], truth: Mapping[str, object]) -> Judged:
+def robot(found: Mapping[str, Any], truth: Mapping[str, Any]) -> Judged:
     rows, outside = [], 0.0
     for row in found["rows"]:
         if row["causes"] == [OUTSIDE]:
@@ -166,7 +167,8 @@ def main() -> None:
             parser.error(f"{path} is neither a set nor what was kept of one")
     if options.key_file and len(options.key_file) != len(options.sets):
         parser.error("name a key for each set, or none")
-    keys = [read_key(path) for path in options.key_file] or [None] * len(options.sets)
+    keys: list[bytes | None] = [read_key(path) for path in options.key_file]
+    keys = keys or [None] * len(options.sets)
     sets = [judged(folder, key) for folder, key in zip(options.sets, keys, strict=True)]
     for folder, some in zip(options.sets, sets, strict=True) if options.keep else ():
         keep(options.keep / f"{folder.stem}.json", some)

@@ -24,8 +24,8 @@ from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run
 from openant_tools.robot.joints import JOINTS
 from openant_tools.robot.mjcf import nominal_mjcf
-from openant_tools.sysid.excitation import CommandSpace, fade
-from openant_tools.sysid.floor_motion import Gait, LegLifts, PushUps, Scrub, Segment, WeightShifts
+from openant_tools.sysid.excitation import CommandSpace, Segment, fade
+from openant_tools.sysid.floor_motion import Gait, LegLifts, PushUps, Scrub, WeightShifts
 
 __all__ = ["Experiment", "experiment"]
 

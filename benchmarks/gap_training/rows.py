@@ -6,12 +6,13 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from openant_tools.arrays import read_arrays
-from openant_tools.effects.robot import Reference
+from openant_tools.effects.robot import Reference, Seen
 from openant_tools.gap.evidence import Evidence, Layouts, RunLayout, Scale, evidence_of
 from openant_tools.gap.features import ARRIVAL, IMU_DELAY, LATENESS, Floats
 from openant_tools.gap.population import Case
@@ -97,9 +98,11 @@ def read_shard(folder: Path, seed: int) -> Shard:
         return np.concatenate([np.atleast_2d(arrays[f"{name}{k}"].astype(np.float32)) for k in runs], axis=1)
 
     numbers = {name: np.array(value) for name, value in facts["reference"].items()}
+    # What was seen of angles has its part in templates, which are simulated here already.
+    still = np.zeros_like(numbers["torque"])
     reference = Reference(
         **{name: numbers[name] for name in ("torque", "stiffness", "damping", "limit", "armature", "friction")},
-        robot_kg=float(numbers["robot_kg"]), floor=True, imu=True, tracker=True, seen=None,
+        robot_kg=float(numbers["robot_kg"]), floor=True, imu=True, tracker=True, seen=Seen(still, still, still, 0.0),
     )  # fmt: skip
     layouts = [RunLayout(one["setup"], one["seconds"], one["groups"], one["joints"]) for one in facts["runs"]]
     return Shard(
@@ -127,5 +130,5 @@ def _refined(folder: Path, seed: int) -> dict[int, tuple[list[Case], Floats]]:
     }
 
 
-def _case(stated: dict[str, list[object]], seed: int) -> Case:
+def _case(stated: dict[str, list[Any]], seed: int) -> Case:
     return Case({name: (tuple(joints), dict(x)) for name, (joints, x) in stated.items()}, seed)

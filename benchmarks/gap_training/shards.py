@@ -116,7 +116,8 @@ def _stated(case: Case) -> dict[str, list[object]]:
 
 
 def _cases(made: Experiment, seed: int, healthy: int, ill: int) -> list[Case]:
-    causes, out, k = applicable(made.protocol), {True: [], False: []}, 0
+    causes, k = applicable(made.protocol), 0
+    out: dict[bool, list[Case]] = {True: [], False: []}
     while len(out[True]) < healthy or len(out[False]) < ill:
         case = draw(made.protocol, 100_000 * (seed + 1) + k, causes)
         out[not case.causes].append(case)

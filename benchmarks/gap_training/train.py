@@ -181,7 +181,7 @@ def weighed(parts: Sequence[Described], odds: Sequence[Floats]) -> dict[str, flo
     # As many robots count as outsiders as have nothing, and half of all have causes.
     kinds = [np.where(part.outside, 2, np.minimum(part.count, 1)) for part in parts]
     weight = [REFINED if part.refined else 1.0 for part in parts]
-    of = sum(w * np.bincount(kind, minlength=3) for w, kind in zip(weight, kinds, strict=True))
+    of = np.sum([w * np.bincount(kind, minlength=3) for w, kind in zip(weight, kinds, strict=True)], axis=0)
     share = np.array([0.25, 0.5, 0.25]) / np.maximum(of, 1)
 
     def surprise(w: NDArray[np.float64]) -> float:
@@ -189,7 +189,7 @@ def weighed(parts: Sequence[Described], odds: Sequence[Floats]) -> dict[str, flo
         for features, truth, kind, counts in zip(x, right, kinds, weight, strict=True):
             p = log_posterior(features, named)
             total -= counts * float((share[kind] * np.logaddexp.reduce(np.where(truth, p, -np.inf), axis=1)).sum())
-        return total + float(np.square(w / FAR).sum()) / of.sum()
+        return total + float(np.square(w / FAR).sum() / of.sum())
 
     start = np.array([{"odds": 1.0, "none: odds": 0.0}.get(name, 0.0) for name in WEIGHTS])
     return dict(zip(WEIGHTS, minimize(surprise, start, method="L-BFGS-B").x.tolist(), strict=True))
@@ -208,7 +208,7 @@ def _right(part: Described) -> Bools:
 
 def figures(parts: Sequence[Described], odds: Sequence[Floats], weights: dict[str, float]) -> dict[str, float]:
     """Of robots of unseen experiments, shares: first name right (of one cause), among the first two, named, alarms, outsiders refused."""
-    first, two, named, alarms, refused, said = [], [], [], [], [], []
+    first, two, named, alarms, refused, said = (list[bool]() for _ in range(6))
     for part, z in zip(parts, odds, strict=True):
         p = log_posterior(features_of(part.rows.astype(np.float32), z), weights)
         verdict, one = p.argmax(axis=1), part.count == 1
@@ -217,7 +217,7 @@ def figures(parts: Sequence[Described], odds: Sequence[Floats], weights: dict[st
             continue
         hit = np.take_along_axis(part.true, np.argsort(-p[:, 2:], axis=1), axis=1)
         first += hit[one, 0].tolist()
-        two += hit[one, :2].any(axis=1).tolist()
+        named += np.logical_and(hit[one, 0], verdict[one] > 1).tolist()
         named += (hit[one, 0] & (verdict[one] > 1)).tolist()
         said += hit[(verdict > 1) & (part.count > 0), 0].tolist()
         alarms += (verdict[part.count == 0] != NONE).tolist()
@@ -268,7 +268,7 @@ def main() -> None:
     for refined in (False, True):  # as a diagnosis looks at them apart
         some = [(part, z) for part, z in zip(parts, odds, strict=True) if part.refined == refined]
         if some:
-            print(figures(*zip(*some, strict=True), weights), flush=True)
+            print(figures([part for part, _ in some], [z for _, z in some], weights), flush=True)
     if options.out:
         write_arrays(options.out / "classifier.npz", taught([part for some in every for part in some]).arrays())
         write_text(options.out / "posterior.json", json_text(weights))
