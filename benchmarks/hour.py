@@ -32,8 +32,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from robot_learning import first
-
 from openant_tools.bringup.run_log import read_log
 from openant_tools.comms.clock import VirtualControl
 from openant_tools.errors import OpenAntError
@@ -168,7 +166,7 @@ class Hour:
         with (self.folder / "virtual.txt").open("a") as said:
             virtual = subprocess.Popen(
                 [*OPENANT, "virtual", "start", "--scenario", str(scenario), "--ready-file", str(ready)],
-                stdout=said, stderr=said, preexec_fn=first,
+                stdout=said, stderr=said,
             )  # fmt: skip
             try:
                 while not ready.is_file():

@@ -10,7 +10,6 @@ The virtual robot stands for servos that do not share this computer: where that 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
 import signal
@@ -44,14 +43,6 @@ def wait_for(run: Path, steps: int, process: subprocess.Popen[bytes]) -> None:
         if process.poll() is not None:
             sys.exit(f"training ended with status {process.returncode} at step {rows(run)} of {steps}")
         time.sleep(0.05)
-
-
-def first() -> None:
-    """Called in a process that is to come before others: it and, where Linux shares processors between sessions, its own."""
-    os.setsid()
-    with contextlib.suppress(OSError):
-        os.nice(-10)
-        Path("/proc/self/autogroup").write_text("-10", encoding="ascii")
 
 
 def periods(recordings: Sequence[Path]) -> np.ndarray:
@@ -89,9 +80,7 @@ def main() -> None:
         scenario, ready, run = folder / "floor.toml", folder / "ready.json", folder / "run"
         scenario.write_text('[robot]\nsetup = "floor"\n[clock]\nmode = "real"\n')
         start = [sys.executable, "-m", "openant_tools.cli"]
-        virtual = subprocess.Popen(
-            [*start, "virtual", "start", "--scenario", scenario, "--ready-file", ready], preexec_fn=first
-        )
+        virtual = subprocess.Popen([*start, "virtual", "start", "--scenario", scenario, "--ready-file", ready])
         process: subprocess.Popen[bytes] | None = None
         try:
             while not ready.is_file():

@@ -25,7 +25,14 @@ from numpy.typing import NDArray
 from openant_agents.learner import Job, SharedWeights
 from openant_agents.runs import has_checkpoint
 from openant_agents.sac import CURVE_EVERY, Sac, SacSettings, device_of, learned_by, one_thread, run_facts_of, sizes
-from openant_agents.training import Training, TrainingProgress, finite_or_raise, reset_or_stop, training_run
+from openant_agents.training import (
+    Training,
+    TrainingProgress,
+    finite_or_raise,
+    in_time_with,
+    reset_or_stop,
+    training_run,
+)
 from openant_tools.errors import BadInput, HardwareFault, StorageFault
 
 __all__ = ["LearnerProcess", "train_async"]
@@ -168,7 +175,8 @@ def train_async(
         try:
             acting = _Acting(Training(env, run, steps, report, stop), agent, settings, learner, events)
             acting.remember(checkpoint, rows)
-            acting.go(seed)
+            with in_time_with(env):
+                acting.go(seed)
             learner.end(acting.state)
             return acting.training.end(acting.learning, learner.updates)
         finally:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openant_agents.policies import Policy
+from openant_agents.training import in_time_with
 from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput
 from openant_tools.numbers import exact
@@ -150,7 +151,8 @@ def evaluate(
             if report is not None:
                 report(number * seconds + done, average)
 
-        return _play(env, policy, way, seconds, seed + number, tell, lambda: None)
+        with in_time_with(env):
+            return _play(env, policy, way, seconds, seed + number, tell, lambda: None)
 
     return Plays(way, tuple(played(number) for number in range(starts)))
 

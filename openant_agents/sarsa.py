@@ -45,6 +45,7 @@ from openant_agents.training import (
     check_trained_on,
     described,
     finite_or_raise,
+    in_time_with,
     reset_or_stop,
     run_facts,
     training_run,
@@ -420,7 +421,8 @@ def train(
         scribe = _Scribe()
         try:
             training = Training(env, run, steps, report, stop, scribe.write)
-            return _train(training, gait, bounds, scribe, settings, seed, events, begun)
+            with in_time_with(env):
+                return _train(training, gait, bounds, scribe, settings, seed, events, begun)
         finally:
             scribe.close()
 

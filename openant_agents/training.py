@@ -12,7 +12,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from openant_agents.runs import CurvePoint, TrainingRun
 from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput
+from openant_tools.scheduling import ACTS, in_time
 
 __all__ = [
     "CHECKPOINT_EVERY_S",
@@ -34,6 +35,7 @@ __all__ = [
     "described",
     "event_writer",
     "finite_or_raise",
+    "in_time_with",
     "reset_or_stop",
     "run_facts",
     "stop_on_signal",
@@ -301,6 +303,11 @@ def stop_on_signal() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def in_time_with(env: gymnasium.Env[Any, Any]) -> AbstractContextManager[None]:
+    """While this thread chooses actions, it does so in time where the robot does not wait for it."""
+    return in_time(ACTS) if getattr(env.unwrapped, "real_time", False) else nullcontext()
 
 
 def reset_or_stop(env: gymnasium.Env[Any, Any], seed: int | None, stop: threading.Event) -> Any | None:

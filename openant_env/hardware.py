@@ -338,6 +338,11 @@ class AntHardware(AntBase):
             self._reason, self._ready = info["reason"], False
         return observation, reward, terminated, truncated, info
 
+    @property
+    def real_time(self) -> bool:
+        """Whether the robot goes on while an agent chooses: all but a virtual one whose time is stepped."""
+        return not self.link.stepped
+
     def render(self) -> NDArray[np.uint8] | None:
         """The overhead camera's newest picture, (height, width, 3), at most 640 wide; None without `rgb_array`.
 

@@ -22,6 +22,7 @@ from openant_tools.comms.tags import BodyLost, BodyPose, BodyTracker, TagSetup
 from openant_tools.errors import HardwareFault, OpenAntError
 from openant_tools.numbers import number
 from openant_tools.optional import cv2
+from openant_tools.scheduling import gives_way
 
 __all__ = ["BodyCamera", "CameraConfig"]
 
@@ -186,6 +187,7 @@ class BodyCamera:
         self._camera.close()
 
     def _run(self) -> None:
+        gives_way()
         while not self._stop.wait(POLL_S):
             try:
                 self._look()

@@ -46,6 +46,7 @@ from openant_tools.comms.servos import Block
 from openant_tools.comms.silence import explained
 from openant_tools.errors import BadInput, HardwareFault, OpenAntError
 from openant_tools.recording.writer import RecordingStopped
+from openant_tools.scheduling import LOOP, in_time
 from openant_tools.signals import TOLD_TO_GO
 
 __all__ = ["Engine", "main", "run"]
@@ -53,6 +54,8 @@ __all__ = ["Engine", "main", "run"]
 
 #: s for which the parent may take its time to hear the last words
 LAST_WORDS_S = 0.5
+#: s for which the camera's thread may keep the interpreter from a cycle that is due; Python's own 5 ms are half a cycle
+SWITCH_S = 2e-4
 #: s between two notes of what a virtual robot takes of this computer
 PROCESSOR_EVERY_S = 10.0
 
@@ -72,7 +75,8 @@ def run(config: EngineConfig, parent: Parent, ring: Ring) -> None:
         try:
             engine = _connected(config, parent, ring, owned)
             if engine is not None:
-                engine.loop()
+                with contextlib.nullcontext() if engine.stepped else in_time(LOOP):
+                    engine.loop()
         except HardwareFault as error:  # a virtual robot that ended
             parent.notice(str(error))
 
@@ -134,6 +138,11 @@ class Engine:
         self._worst_wake = 0.0
         #: when it was noted last what a virtual robot takes of this computer, s
         self._noted_at = -float("inf")
+
+    @property
+    def stepped(self) -> bool:
+        """Whether a virtual robot's time stands still between cycles."""
+        return self._clock.stepped
 
     # ---- the loop ------------------------------------------------------------------------------------------------
 
@@ -600,6 +609,7 @@ def _refusal(number: int, command: messages.Command | None, error: OpenAntError)
 
 def main() -> None:
     """Argument: file descriptors of the connection and of the ring. The config comes first over the connection."""
+    sys.setswitchinterval(SWITCH_S)
     connection, ring_fd = Connection(int(sys.argv[1])), int(sys.argv[2])
     config, width = connection.recv()
     run(config, Parent(connection), Ring(width, ring_fd))

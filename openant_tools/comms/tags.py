@@ -26,7 +26,7 @@ import math
 import re
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +81,11 @@ JUMP_M, JUMP_M_S, JUMP_PICTURES = 0.10, 3.0, 10
 LEAN_APART_RAD = math.radians(25.0)
 #: Pictures without a tag after which it is asked why.
 ASK_WHY = 15
+#: s after which the whole picture is searched again, for a second sheet; meanwhile both tags are looked for where they were, in a box that is
+#: wider by so many edge lengths on each side: a tenth of the work, and of the time until a pose is known
+WHOLE_S, AROUND = 0.09, 1.5
+#: px that boxes begin at a multiple of: the detector's tiles lie as they do in the whole picture, however it is decimated
+TILE_PX = 24
 
 # Tag axes (up, left, out) in the frame that IPPE_SQUARE wants (right, up, out).
 _IPPE_FROM_TAG = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -158,6 +163,14 @@ class TagDetector:
             Sighting(int(d.tag_id), np.asarray(d.corners[::-1], float) - 0.5, float(d.decision_margin), int(d.hamming))
             for d in found
         ]
+
+    def around(self, gray: Gray, last: Sighting) -> list[Sighting]:
+        """The same tag, also more than once, near where it was last."""
+        reach = AROUND * last.size_px
+        first = np.floor((last.corners.min(axis=0) - reach) / TILE_PX).astype(int).clip(0) * TILE_PX
+        end = np.ceil(last.corners.max(axis=0) + reach).astype(int)
+        found = self.detect(gray[first[1] : end[1], first[0] : end[0]])
+        return [replace(one, corners=one.corners + first) for one in found if one.id == last.id]
 
 
 @dataclass(frozen=True)
@@ -249,6 +262,8 @@ class BodyTracker:
         self._jumped = 0
         self._jump_words = ""
         self._unread, self._why = 0, ""
+        self._whole_t = -math.inf
+        self._near: tuple[Sighting, ...] = ()
 
     @property
     def origin(self) -> tuple[Array, Array] | None:
@@ -277,7 +292,7 @@ class BodyTracker:
             )
         lens = self._intrinsics.scaled(*size)
         self._size = size
-        sightings = self._detector.detect(gray)
+        sightings = self._sightings(gray, t)
         for which, tag in (("origin", setup.origin_id), ("body", setup.body_id)):
             if _twins(sightings, tag, setup):
                 self._twin = (t, f"{which} tag {tag} is seen twice: take the other sheet with this number away")
@@ -286,6 +301,7 @@ class BodyTracker:
         origin = best(sightings, setup.origin_id, setup)
         self._note_origin(origin, lens, t)
         seen = best(sightings, setup.body_id, setup)
+        self._near = () if origin is None or seen is None else (origin, seen)
         self._unread = 0 if origin is not None and seen is not None else self._unread + 1
         if self._elsewhere:
             return BodyLost(t, "the origin tag or the camera has moved")
@@ -306,6 +322,15 @@ class BodyTracker:
         if seen is None:
             return BodyLost(t, self._why_not(sightings) + self._other_reading(gray))
         return self._steady(self._pose(seen, lens, t, tilt, began))
+
+    def _sightings(self, gray: Gray, t: float) -> list[Sighting]:
+        """The tags in a picture: of one soon after another that showed both, these two, else all of them."""
+        if self._near and 0.0 <= t - self._whole_t < WHOLE_S:
+            again = [one for last in self._near for one in self._detector.around(gray, last)]
+            if all(best(again, last.id, self.setup) for last in self._near):
+                return again
+        self._whole_t = t
+        return self._detector.detect(gray)
 
     def _other_reading(self, gray: Gray) -> str:
         """What else the picture may be, looked at now and then while tags are missing."""

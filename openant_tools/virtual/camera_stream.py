@@ -39,6 +39,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from openant_tools.numbers import exact
+from openant_tools.scheduling import gives_way
 from openant_tools.virtual.camera_scene import OverheadCameraSettings, Scene
 
 if TYPE_CHECKING:
@@ -149,6 +150,7 @@ class VirtualCamera:
 def _serve(settings: OverheadCameraSettings, seed: int, shared: Any, pipe: Connection) -> None:
     """The camera's process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the robot's process decides when to end
+    gives_way()
     feed = _Feed(settings, seed, shared)
     server = _Server(("127.0.0.1", 0), _Handler)
     server.feed = feed

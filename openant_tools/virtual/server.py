@@ -55,6 +55,7 @@ from typing import Any, Protocol
 
 from openant_tools.errors import OpenAntError
 from openant_tools.files import write_text
+from openant_tools.scheduling import ROBOT, in_time
 from openant_tools.virtual.camera_scene import Scene
 from openant_tools.virtual.lateness import HOP_S, WaitTimer
 from openant_tools.virtual.ports import ClientPort, PtyPort, TcpPort
@@ -232,8 +233,9 @@ class Server:
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
         """Serve until `until()` (looked at a few hundred times a second) or an interrupt."""
-        while not until():
-            self.turn()
+        with contextlib.nullcontext() if self.stepped else in_time(ROBOT):
+            while not until():
+                self.turn()
 
     # ---- the loop ----
 

@@ -72,6 +72,21 @@ def test_two_sheets_with_one_number_give_no_pose_by_turns(tracker: BodyTracker) 
     assert reason(tracker.track(with_sheet(here, 0), 14.0)).startswith("origin tag 0 is seen twice")
 
 
+def test_between_whole_searches_tags_are_found_where_they_were_and_just_as_well(tracker: BodyTracker) -> None:
+    whole = BodyTracker(TagSetup(), CAMERA.intrinsics)
+    settle(whole, CAMERA)
+    for k in range(10):
+        picture = photo(CAMERA, scene(x=0.25 + 0.003 * k, y=0.12), k)
+        near, all_of_it = tracker.track(picture, 1.0 + k / 30), whole.track(picture, 1.0 + k / 5)
+        assert isinstance(near, BodyPose)
+        assert isinstance(all_of_it, BodyPose)
+        assert np.allclose(near.position, all_of_it.position, atol=1e-4)
+    # A second sheet elsewhere is noticed with the next whole search, three pictures later at most.
+    picture = with_sheet(picture, 12)
+    results = [tracker.track(picture, 1.0 + k / 30) for k in range(10, 13)]
+    assert "seen twice" in reason(results[-1])
+
+
 def test_a_sheet_that_is_seen_only_while_the_robot_is_not_is_no_robot(tracker: BodyTracker) -> None:
     there = with_sheet(photo(CAMERA, AWAY), 12, at=(30, 250), cell=7)
     assert isinstance(tracker.track(photo(CAMERA, HERE), 1.0), BodyPose)
