@@ -27,7 +27,7 @@ def in_time(priority: int) -> Iterator[None]:
     It must sleep between its deadlines: nothing of lower priority runs meanwhile.
     """
     try:
-        before = os.sched_getscheduler(0), os.sched_getparam(0)
+        policy, param = os.sched_getscheduler(0), os.sched_getparam(0)
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except (AttributeError, OSError):  # not Linux, or not allowed
         yield
@@ -35,7 +35,8 @@ def in_time(priority: int) -> Iterator[None]:
     try:
         yield
     finally:
-        os.sched_setscheduler(0, *before)
+        # Who is no root may not take the flag back.
+        os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, param)
 
 
 def gives_way() -> None:

@@ -150,7 +150,8 @@ class VirtualCamera:
 def _serve(settings: OverheadCameraSettings, seed: int, shared: Any, pipe: Connection) -> None:
     """The camera's process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the robot's process decides when to end
-    gives_way()
+    if shared is None:  # else the robot waits for it
+        gives_way()
     feed = _Feed(settings, seed, shared)
     server = _Server(("127.0.0.1", 0), _Handler)
     server.feed = feed
