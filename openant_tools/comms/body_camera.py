@@ -1,14 +1,12 @@
-"""The overhead camera as the engine uses it: pictures become poses beside the bus loop, its faults are told once.
+"""The overhead camera: its pictures become poses, its faults are told once.
 
-Finding tags takes 10 to 60 ms a picture, so in real time a thread does it (the detector and OpenCV let other threads
-run); the loop takes what is ready. Under a stepped clock pictures are asked for and searched in turn with everything
-else, so that every run is the same.
+Finding tags takes 5 to 60 ms a picture, so in real time a process does it (`camera_process`). Under a stepped clock pictures are asked
+for and searched in turn with everything else, so that every run is the same.
 """
 
 from __future__ import annotations
 
 import re
-import threading
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -22,11 +20,10 @@ from openant_tools.comms.tags import BodyLost, BodyPose, BodyTracker, TagSetup
 from openant_tools.errors import HardwareFault, OpenAntError
 from openant_tools.numbers import number
 from openant_tools.optional import cv2
-from openant_tools.scheduling import gives_way
 
 __all__ = ["BodyCamera", "CameraConfig"]
 
-#: px of a picture that is shown to somebody; a larger one would keep the bus waiting while it is handed over
+#: px of a picture that is shown to somebody: a larger one takes long to hand over
 WIDEST = 640
 #: Of pictures that are kept: s between two at least, px of their width at most, JPEG's quality. At 1920 px an hour of them
 #: would be several GB.
@@ -39,12 +36,8 @@ LOST_S = 0.5
 LEANS = 128
 #: An attitude of this age is not that of the picture.
 LEAN_FRESH_S = 0.05
-#: Poses that nobody takes are given up.
+#: Pictures that nobody takes are given up.
 QUEUE = 64
-#: s; an older pose is not where the robot is now. A camera of 30 pictures a second and 0.1 s latency is within it.
-FRESH_S = 0.25
-#: s between two looks for a new picture: a fifteenth of a period at 30 Hz
-POLL_S = 0.002
 
 
 @dataclass(frozen=True)
@@ -85,8 +78,6 @@ class BodyCamera:
             self._camera.close()
             raise
         self._leans: deque[tuple[float, float, float]] = deque(maxlen=LEANS)
-        self._results: deque[BodyPose | BodyLost] = deque(maxlen=QUEUE)
-        self._pose: BodyPose | None = None
         self._image: NDArray[np.uint8] | None = None
         self.keeping = False
         self._kept: deque[tuple[float, bytes]] = deque(maxlen=QUEUE)
@@ -96,11 +87,6 @@ class BodyCamera:
         self._lost = ""
         self._said: tuple[str, float] = ("", -np.inf)
         self._error: OpenAntError | None = None
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-        if not clock.stepped:
-            self._thread = threading.Thread(target=self._run, name="body-camera", daemon=True)
-            self._thread.start()
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -117,20 +103,29 @@ class BodyCamera:
         self._leans.append((t, roll, pitch))
 
     def poses(self) -> list[BodyPose | BodyLost]:
-        """What became of the pictures since the last call, in order; does not wait."""
-        if self._thread is None:
-            self._look()
-        out = []
-        while self._results:
-            out.append(self._results.popleft())
-        if out:
-            self._pose = out[-1] if isinstance(out[-1], BodyPose) else None
-        return out
+        """What became of the newest picture, if there is one since the last call; does not wait for it."""
+        frame = self._camera.newest() if self._error is None else None
+        if frame is None:
+            return []
+        self._image = frame.image
+        if self.keeping and frame.t - self._kept_at > KEPT_EVERY_S - 1e-6:
+            self._kept_at = frame.t
+            self._kept.append((frame.t, _jpeg(frame.image)))
+        try:
+            result = self._tracker.track(frame.image, frame.t, self._lean_at(frame.t))
+        except OpenAntError as error:  # the lens and the picture do not fit any more
+            self._error = error
+            return []
+        if isinstance(result, BodyPose):
+            self._seen_at, self._lost = self._clock.now(), ""
+        else:
+            self._seen_at, self._lost = min(self._seen_at, self._clock.now()), result.reason
+        return [result]
 
     def picture(self) -> NDArray[np.uint8] | None:
         """The newest picture, (height, width, 3) in RGB, at most `WIDEST` wide; None before the first.
 
-        Pixels are left out to fit, not averaged: this is called between two cycles of the bus.
+        Pixels are left out to fit, not averaged.
         """
         image = self._image
         if image is None:
@@ -142,19 +137,6 @@ class BodyCamera:
     def kept(self) -> list[tuple[float, bytes]]:
         """The pictures kept since the last call: s when each was taken, and its JPEG."""
         return [self._kept.popleft() for _ in range(len(self._kept))]
-
-    @property
-    def taken_at(self) -> float:
-        """s, when the picture of the last pose was taken; NaN where the robot was lost."""
-        return float("nan") if self._pose is None else self._pose.t
-
-    def newest(self, t: float) -> tuple[float, float, float, float]:
-        """x, y, z (m) and yaw (rad) of the last pose taken by `poses`, as of `t`; NaN where it is old or was lost."""
-        pose = self._pose
-        if pose is None or t - pose.t > FRESH_S:
-            return (float("nan"),) * 4
-        x, y, z = pose.position.tolist()
-        return x, y, z, pose.yaw
 
     def news(self) -> str | None:
         """What is wrong, once when it begins and from time to time while it lasts."""
@@ -180,38 +162,11 @@ class BodyCamera:
         return str(fault)
 
     def close(self) -> None:
-        """Stop looking and let go of the camera."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
+        """Let go of the camera."""
         self._camera.close()
 
-    def _run(self) -> None:
-        gives_way()
-        while not self._stop.wait(POLL_S):
-            try:
-                self._look()
-            except OpenAntError as error:  # the lens and the picture do not fit any more
-                self._error = error
-                return
-
-    def _look(self) -> None:
-        frame = self._camera.newest()
-        if frame is None:
-            return
-        self._image = frame.image
-        if self.keeping and frame.t - self._kept_at > KEPT_EVERY_S - 1e-6:
-            self._kept_at = frame.t
-            self._kept.append((frame.t, _jpeg(frame.image)))
-        result = self._tracker.track(frame.image, frame.t, self._lean_at(frame.t))
-        if isinstance(result, BodyPose):
-            self._seen_at, self._lost = self._clock.now(), ""
-        else:
-            self._seen_at, self._lost = min(self._seen_at, self._clock.now()), result.reason
-        self._results.append(result)
-
     def _lean_at(self, t: float) -> tuple[float, float] | None:
-        near = min(tuple(self._leans), key=lambda lean: abs(lean[0] - t), default=None)
+        near = min(self._leans, key=lambda lean: abs(lean[0] - t), default=None)
         return None if near is None or abs(near[0] - t) > LEAN_FRESH_S else (near[1], near[2])
 
 

@@ -16,6 +16,8 @@ from openant_tools.errors import HardwareFault
 
 if TYPE_CHECKING:
     from openant_tools.comms.body_camera import BodyCamera
+    from openant_tools.comms.camera_process import CameraProcess
+    from openant_tools.comms.tags import BodyPose
 
 __all__ = ["BodySensors"]
 
@@ -23,6 +25,8 @@ __all__ = ["BodySensors"]
 STEEP_RAD = np.pi / 4
 #: The IMU's port is left alone for so long before a cycle begins, where time does not wait for us.
 IMU_SLACK_S = 0.3e-3
+#: s; an older pose is not where the robot is now. A camera of 30 pictures a second and 0.1 s latency is within it.
+FRESH_S = 0.25
 _NAN = float("nan")
 
 
@@ -35,7 +39,9 @@ class BodySensors:
 
     def __init__(self) -> None:
         self.imu: BodyImu | None = None
-        self.camera: BodyCamera | None = None
+        self.camera: BodyCamera | CameraProcess | None = None
+        #: where the body was seen last; None where it was lost since
+        self._pose: BodyPose | None = None
         self._imu_calibrated = False
         self._slack_s = IMU_SLACK_S
         #: kind of the reason for which no pose is seen, as the recording was told; empty while poses come
@@ -53,10 +59,12 @@ class BodySensors:
             except HardwareFault as error:
                 notice(f"going on without the IMU: {error}")
         if config.camera is not None:
-            from openant_tools.comms.body_camera import BodyCamera  # OpenCV takes its time to load
+            # OpenCV takes its time to load.
+            from openant_tools.comms.body_camera import BodyCamera
+            from openant_tools.comms.camera_process import CameraProcess
 
             try:
-                self.camera = BodyCamera(config.camera, clock)
+                self.camera = BodyCamera(config.camera, clock) if clock.stepped else CameraProcess(config.camera)
                 for note in self.camera.notes:
                     notice(f"camera: {note}")
             except HardwareFault as error:
@@ -79,13 +87,14 @@ class BodySensors:
                 if recorder.writer is not None:
                     recorder.writer.picture(*picture)
 
-    def _take_poses(self, camera: BodyCamera, recorder: Recorder) -> None:
+    def _take_poses(self, camera: BodyCamera | CameraProcess, recorder: Recorder) -> None:
         from openant_tools.comms.tags import BodyPose
 
         lean = None if self.imu is None else self.imu.lean
         if lean is not None and self._may_lean(*lean[1:]):
             camera.lean(*lean)
         for seen in camera.poses():
+            self._pose = seen if isinstance(seen, BodyPose) else None
             if recorder.writer is None:
                 continue
             if isinstance(seen, BodyPose):
@@ -109,8 +118,10 @@ class BodySensors:
     def newest(self, t: float) -> tuple[float, ...]:
         """(12,) as of `t`: the IMU's rates and accelerations, the body's x, y, z and yaw, when each was measured."""
         body = (_NAN,) * 6 if self.imu is None else self.imu.newest(t)
-        base = (_NAN,) * 4 if self.camera is None else self.camera.newest(t)
-        taken = _NAN if self.imu is None else self.imu.taken_at, _NAN if self.camera is None else self.camera.taken_at
+        pose, base = self._pose, (_NAN,) * 4
+        if pose is not None and t - pose.t <= FRESH_S:
+            base = (*pose.position.tolist(), pose.yaw)
+        taken = _NAN if self.imu is None else self.imu.taken_at, _NAN if pose is None else pose.t
         return (*body, *base, *taken)
 
     def picture(self) -> NDArray[np.uint8] | None:

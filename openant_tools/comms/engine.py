@@ -54,7 +54,7 @@ __all__ = ["Engine", "main", "run"]
 
 #: s for which the parent may take its time to hear the last words
 LAST_WORDS_S = 0.5
-#: s for which the camera's thread may keep the interpreter from a cycle that is due; Python's own 5 ms are half a cycle
+#: s for which the recording's thread may keep the interpreter from a cycle that is due; Python's own 5 ms are half a cycle
 SWITCH_S = 2e-4
 #: s between two notes of what a virtual robot takes of this computer
 PROCESSOR_EVERY_S = 10.0

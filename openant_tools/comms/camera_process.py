@@ -1,0 +1,246 @@
+"""The overhead camera in a process of its own: whatever finding tags takes, no cycle of the bus waits for it.
+
+Run as `python -m openant_tools.comms.camera_process`, by `CameraProcess`. It says what it sees over a socket, each message a pickle after
+its length; the body's attitude comes, and the newest picture goes, through shared memory. So the bus's loop neither waits to say something
+nor for the rest of a message. It ends when the other end of its socket does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import select
+import socket
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openant_tools.comms.body_camera import WIDEST, BodyCamera, CameraConfig
+from openant_tools.comms.clock import RealClock
+from openant_tools.comms.ring import Ring
+from openant_tools.comms.tags import BodyLost, BodyPose
+from openant_tools.errors import BadInput, HardwareFault, OpenAntError
+from openant_tools.files import shared_memory
+from openant_tools.scheduling import gives_way
+
+__all__ = ["CameraProcess", "main"]
+
+#: s within which a camera is open, or has said why not: some telephones take 10 to wake up
+OPEN_TIMEOUT_S = 30.0
+#: s between two looks for a new picture: a fifteenth of a period at 30 Hz
+POLL_S = 0.002
+#: s between two pictures for somebody to look at
+SHOWN_EVERY_S = 0.1
+#: bytes of a message's length
+LENGTH = 4
+#: columns of what the engine tells: when the body leant how, s and rad, and whether pictures are kept
+TOLD = 4
+
+
+class CameraProcess:
+    """A `BodyCamera` in another process, with the same methods.
+
+    Attributes:
+        notes: what a builder should know of the camera.
+        keeping: whether pictures are kept for `kept`.
+
+    Raises:
+        HardwareFault: it cannot be opened or sends nothing.
+        BadInput: it was calibrated for pictures of another shape.
+    """
+
+    def __init__(self, config: CameraConfig) -> None:
+        self._told, self._shown = Ring(TOLD), _Shown()
+        self._socket, theirs = socket.socketpair()
+        fds = theirs.fileno(), self._told.fd, self._shown.fd
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "openant_tools.comms.camera_process", *map(str, fds)], pass_fds=fds, start_new_session=True
+        )  # fmt: skip
+        theirs.close()
+        self._buffer = bytearray()
+        self._poses: deque[BodyPose | BodyLost] = deque()
+        self._kept: deque[tuple[float, bytes]] = deque()
+        self._news: deque[str] = deque()
+        self._ended = False
+        self.keeping = False
+        self._lean: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+        try:
+            _send(self._socket, config)
+            self._socket.settimeout(OPEN_TIMEOUT_S)
+            kind, value = self._opened()
+        except OSError:
+            self.close()
+            raise HardwareFault(
+                "the camera's process does not answer",
+                where=config.settings.name,
+                remedy="try again, or go on without it",
+            ) from None
+        if kind == "fault":
+            self.close()
+            bad, what, where, remedy = value
+            raise (BadInput if bad else HardwareFault)(what, where=where, remedy=remedy)
+        self.notes: tuple[str, ...] = value
+        self._socket.setblocking(False)
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def lean(self, t: float, roll: float, pitch: float) -> None:
+        """The body's attitude at `t` by the IMU, rad; it steadies the pose of the picture taken then."""
+        self._lean = t, roll, pitch
+
+    def poses(self) -> list[BodyPose | BodyLost]:
+        """What was seen since the last call, oldest first."""
+        self._told.put((*self._lean, float(self.keeping)))
+        for kind, value in self._messages():
+            if kind == "pose":
+                self._poses.append(value)
+            elif kind == "kept":
+                self._kept.append(value)
+            else:
+                self._news.append(value)
+        return [self._poses.popleft() for _ in range(len(self._poses))]
+
+    def kept(self) -> list[tuple[float, bytes]]:
+        """The pictures kept since the last call: s when each was taken, and its JPEG."""
+        return [self._kept.popleft() for _ in range(len(self._kept))]
+
+    def picture(self) -> NDArray[np.uint8] | None:
+        """The newest picture, as `BodyCamera.picture`, up to a tenth of a second old."""
+        return self._shown.picture()
+
+    def news(self) -> str | None:
+        """What is wrong, once when it begins and from time to time while it lasts."""
+        return self._news.popleft() if self._news else None
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        self._socket.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(2.0)
+        self._process.kill()
+        self._process.wait()
+        self._told.close()
+        self._shown.close()
+
+    def _opened(self) -> tuple[str, Any]:
+        """The first message; raises OSError where there is none."""
+        while True:
+            self._buffer += _some(self._socket)
+            for kind, value in _whole(self._buffer):
+                return kind, value
+
+    def _messages(self) -> Iterator[tuple[str, Any]]:
+        """Those that are whole by now."""
+        try:
+            while not self._ended:
+                self._buffer += _some(self._socket)
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._ended = True
+            self._news.append(str(HardwareFault("the camera's process was ended from outside", remedy="start anew")))
+        yield from _whole(self._buffer)
+
+
+class _Shown:
+    """One picture in memory that two processes share. Odd counts say that it is being written (a seqlock)."""
+
+    def __init__(self, fd: int | None = None) -> None:
+        head = 3 * 8
+        self.fd, self._map = shared_memory(head + WIDEST * WIDEST * 3, fd)
+        self._head = np.frombuffer(self._map, np.uint64, 3)
+        self._bytes = np.frombuffer(self._map, np.uint8, offset=head)
+
+    def put(self, picture: NDArray[np.uint8]) -> None:
+        picture = picture[:WIDEST, :WIDEST]
+        self._head[0] += np.uint64(1)
+        self._head[1:] = picture.shape[:2]
+        self._bytes[: picture.size] = picture.ravel()
+        self._head[0] += np.uint64(1)
+
+    def picture(self) -> NDArray[np.uint8] | None:
+        """(height, width, 3) RGB; None before the first, or where it changes all the time."""
+        for _ in range(3):
+            count, height, width = self._head.tolist()
+            out = self._bytes[: height * width * 3].reshape(height, width, 3).copy()
+            if count and count % 2 == 0 and count == int(self._head[0]):
+                return out
+        return None
+
+    def close(self) -> None:
+        del self._head, self._bytes
+        self._map.close()
+        os.close(self.fd)
+
+
+def _send(to: socket.socket, message: object) -> None:
+    data = pickle.dumps(message)
+    to.sendall(len(data).to_bytes(LENGTH, "little") + data)
+
+
+def _some(of: socket.socket) -> bytes:
+    """Bytes that are there; raises OSError where nobody is at the other end."""
+    data = of.recv(2**18)
+    if not data:
+        raise ConnectionResetError
+    return data
+
+
+def _whole(buffer: bytearray) -> Iterator[Any]:
+    """Messages that are whole, which it takes out of the buffer."""
+    while len(buffer) >= LENGTH and len(buffer) >= (end := LENGTH + int.from_bytes(buffer[:LENGTH], "little")):
+        message = pickle.loads(bytes(buffer[LENGTH:end]))
+        del buffer[:end]
+        yield message
+
+
+def _serve(us: socket.socket, told: Ring, shown: _Shown) -> None:
+    """Look at pictures until the other end is gone, which an OSError tells."""
+    buffer = bytearray()
+    while not (found := list(_whole(buffer))):
+        buffer += _some(us)
+    try:
+        camera = BodyCamera(found[0], RealClock())
+    except OpenAntError as error:
+        _send(us, ("fault", (isinstance(error, BadInput), error.what, error.where, error.remedy)))
+        return
+    try:
+        _send(us, ("ready", camera.notes))
+        seen, shown_at = 0, -np.inf
+        while not select.select([us], [], [], POLL_S)[0]:
+            rows, seen = told.since(seen)
+            for t, roll, pitch, keeping in rows.tolist():
+                camera.keeping = bool(keeping)
+                if np.isfinite(t):
+                    camera.lean(t, roll, pitch)
+            for result in camera.poses():
+                _send(us, ("pose", result))
+                if result.t - shown_at > SHOWN_EVERY_S and (picture := camera.picture()) is not None:
+                    shown_at = result.t
+                    shown.put(picture)
+            for kept in camera.kept():
+                _send(us, ("kept", kept))
+            if (news := camera.news()) is not None:
+                _send(us, ("news", news))
+    finally:
+        camera.close()
+
+
+def main() -> None:
+    """Arguments: file descriptors of the socket, of what is told and of the picture. The config comes first over the socket."""
+    gives_way()
+    us, told, shown = map(int, sys.argv[1:])
+    with contextlib.suppress(OSError):
+        _serve(socket.socket(fileno=us), Ring(TOLD, told), _Shown(shown))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""The camera's own process: what it sees, tells and keeps, and that the engine outlives it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from test_doubtful_poses import CAMERA, HERE, PICTURES, jpeg, stream
+
+from openant_tools.comms.body_camera import CameraConfig
+from openant_tools.comms.camera import CameraSettings
+from openant_tools.comms.camera_process import CameraProcess
+from openant_tools.comms.intrinsics import Intrinsics
+from openant_tools.comms.tags import BodyLost, BodyPose, TagSetup
+from openant_tools.errors import BadInput, HardwareFault
+
+
+def config(url: str, lens: Intrinsics | None = None) -> CameraConfig:
+    return CameraConfig(CameraSettings(url, latency_s=0.05), TagSetup(), lens or CAMERA.intrinsics)
+
+
+@pytest.fixture
+def camera() -> Iterator[CameraProcess]:
+    data = [jpeg(picture) for picture in PICTURES]
+    with stream(lambda k: data[k % 4]) as url:
+        found = CameraProcess(config(url))
+        yield found
+        found.close()
+
+
+def seen(camera: CameraProcess, enough: Callable[[list[BodyPose | BodyLost]], bool]) -> list[BodyPose | BodyLost]:
+    results, give_up = list[BodyPose | BodyLost](), time.monotonic() + 20
+    while not enough(results) and time.monotonic() < give_up:
+        results += camera.poses()
+        time.sleep(0.01)
+    return results
+
+
+def test_poses_come_in_order_and_pictures_are_kept_when_asked(camera: CameraProcess) -> None:
+    results = seen(camera, lambda found: sum(isinstance(one, BodyPose) for one in found) > 10)
+    poses = [one for one in results if isinstance(one, BodyPose)]
+    assert np.all(np.diff([one.t for one in results]) > 0)
+    assert all(np.allclose(one.position, HERE.position, atol=0.01) for one in poses)
+    assert 0.0 < time.monotonic() - poses[-1].t < 5.0
+    assert camera.kept() == []
+    camera.keeping = True
+    kept: list[tuple[float, bytes]] = []
+    seen(camera, lambda found: bool(kept.extend(camera.kept()) or len(kept) > 1))
+    assert all(data.startswith(b"\xff\xd8") for _, data in kept)
+    picture = camera.picture()
+    assert picture is not None
+    assert picture.shape == (360, 640, 3)
+    assert abs(picture.astype(float).mean() - PICTURES[0].mean()) < 5
+
+
+def test_who_waits_for_a_camera_that_was_killed_is_told_and_goes_on(camera: CameraProcess) -> None:
+    seen(camera, bool)
+    os.kill(camera.pid, signal.SIGKILL)
+    give_up = time.monotonic() + 5
+    while (news := camera.news()) is None and time.monotonic() < give_up:
+        camera.poses()
+    assert news == "the camera's process was ended from outside → start anew"
+    assert camera.poses() == []
+    assert camera.news() is None
+
+
+def test_why_it_cannot_be_opened_is_told_as_without_a_process() -> None:
+    with stream(lambda k: b"no picture" * (k + 1)) as url, pytest.raises(HardwareFault, match="sends no picture"):
+        CameraProcess(config(url))
+    data = [jpeg(picture) for picture in PICTURES]
+    square = Intrinsics.from_diagonal_fov(480, 480, 60)
+    with stream(lambda k: data[k % 4]) as url, pytest.raises(BadInput):
+        CameraProcess(config(url, square))
