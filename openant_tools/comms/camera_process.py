@@ -1,21 +1,20 @@
 """The overhead camera in a process of its own: whatever finding tags takes, no cycle of the bus waits for it.
 
-Run as `python -m openant_tools.comms.camera_process`, by `CameraProcess`. It says what it sees over a socket, each message a pickle after
-its length; the body's attitude comes, and the newest picture goes, through shared memory. So the bus's loop neither waits to say something
-nor for the rest of a message. It ends when the other end of its socket does.
+Run as `python -m openant_tools.comms.camera_process`, by `CameraProcess`. It says what it sees over a socket, in messages that are small
+enough to come whole; the body's attitude comes, and the newest picture goes, through shared memory. So the bus's loop waits neither to say
+something nor for the rest of a message. It ends when the other end of its socket does.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-import pickle
-import select
 import socket
 import subprocess
 import sys
 from collections import deque
 from collections.abc import Iterator
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -37,8 +36,8 @@ OPEN_TIMEOUT_S = 30.0
 POLL_S = 0.002
 #: s between two pictures for somebody to look at
 SHOWN_EVERY_S = 0.1
-#: bytes of a message's length
-LENGTH = 4
+#: bytes of a part of a picture that is kept: what is much longer a connection sends after its length
+PART = 2**13
 #: columns of what the engine tells: when the body leant how, s and rad, and whether pictures are kept
 TOLD = 4
 
@@ -57,36 +56,37 @@ class CameraProcess:
 
     def __init__(self, config: CameraConfig) -> None:
         self._told, self._shown = Ring(TOLD), _Shown()
-        self._socket, theirs = socket.socketpair()
+        ours, theirs = socket.socketpair()
         fds = theirs.fileno(), self._told.fd, self._shown.fd
         self._process = subprocess.Popen(
             [sys.executable, "-m", "openant_tools.comms.camera_process", *map(str, fds)], pass_fds=fds, start_new_session=True
         )  # fmt: skip
         theirs.close()
-        self._buffer = bytearray()
+        self._connection = Connection(ours.detach())
         self._poses: deque[BodyPose | BodyLost] = deque()
         self._kept: deque[tuple[float, bytes]] = deque()
+        self._parts = bytearray()
         self._news: deque[str] = deque()
         self._ended = False
         self.keeping = False
         self._lean: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+        kind: str
+        value: Any
         try:
-            _send(self._socket, config)
-            self._socket.settimeout(OPEN_TIMEOUT_S)
-            kind, value = self._opened()
-        except OSError:
+            self._connection.send(config)
+            kind, value = self._connection.recv() if self._connection.poll(OPEN_TIMEOUT_S) else ("silent", None)
+        except (EOFError, OSError):
+            kind, value = "silent", None
+        if kind != "ready":
             self.close()
+        if kind == "silent":
             raise HardwareFault(
-                "the camera's process does not answer",
-                where=config.settings.name,
-                remedy="try again, or go on without it",
-            ) from None
+                "the camera's process does not answer", where=config.settings.name, remedy="try again, or go on without it"
+            )  # fmt: skip
         if kind == "fault":
-            self.close()
             bad, what, where, remedy = value
             raise (BadInput if bad else HardwareFault)(what, where=where, remedy=remedy)
         self.notes: tuple[str, ...] = value
-        self._socket.setblocking(False)
 
     @property
     def pid(self) -> int:
@@ -102,8 +102,11 @@ class CameraProcess:
         for kind, value in self._messages():
             if kind == "pose":
                 self._poses.append(value)
+            elif kind == "part":
+                self._parts += value
             elif kind == "kept":
-                self._kept.append(value)
+                self._kept.append((value, bytes(self._parts)))
+                self._parts.clear()
             else:
                 self._news.append(value)
         return [self._poses.popleft() for _ in range(len(self._poses))]
@@ -122,7 +125,7 @@ class CameraProcess:
 
     def close(self) -> None:
         """Let go of the camera."""
-        self._socket.close()
+        self._connection.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(2.0)
         self._process.kill()
@@ -130,24 +133,14 @@ class CameraProcess:
         self._told.close()
         self._shown.close()
 
-    def _opened(self) -> tuple[str, Any]:
-        """The first message; raises OSError where there is none."""
-        while True:
-            self._buffer += _some(self._socket)
-            for kind, value in _whole(self._buffer):
-                return kind, value
-
     def _messages(self) -> Iterator[tuple[str, Any]]:
-        """Those that are whole by now."""
+        """Those that are there."""
         try:
-            while not self._ended:
-                self._buffer += _some(self._socket)
-        except BlockingIOError:
-            pass
-        except OSError:
+            while not self._ended and self._connection.poll(0):
+                yield self._connection.recv()
+        except (EOFError, OSError):
             self._ended = True
             self._news.append(str(HardwareFault("the camera's process was ended from outside", remedy="start anew")))
-        yield from _whole(self._buffer)
 
 
 class _Shown:
@@ -181,55 +174,34 @@ class _Shown:
         os.close(self.fd)
 
 
-def _send(to: socket.socket, message: object) -> None:
-    data = pickle.dumps(message)
-    to.sendall(len(data).to_bytes(LENGTH, "little") + data)
-
-
-def _some(of: socket.socket) -> bytes:
-    """Bytes that are there; raises OSError where nobody is at the other end."""
-    data = of.recv(2**18)
-    if not data:
-        raise ConnectionResetError
-    return data
-
-
-def _whole(buffer: bytearray) -> Iterator[Any]:
-    """Messages that are whole, which it takes out of the buffer."""
-    while len(buffer) >= LENGTH and len(buffer) >= (end := LENGTH + int.from_bytes(buffer[:LENGTH], "little")):
-        message = pickle.loads(bytes(buffer[LENGTH:end]))
-        del buffer[:end]
-        yield message
-
-
-def _serve(us: socket.socket, told: Ring, shown: _Shown) -> None:
-    """Look at pictures until the other end is gone, which an OSError tells."""
-    buffer = bytearray()
-    while not (found := list(_whole(buffer))):
-        buffer += _some(us)
+def _serve(us: Connection, told: Ring, shown: _Shown) -> None:
+    """Look at pictures until the other end is gone."""
+    config = us.recv()
     try:
-        camera = BodyCamera(found[0], RealClock())
+        camera = BodyCamera(config, RealClock())
     except OpenAntError as error:
-        _send(us, ("fault", (isinstance(error, BadInput), error.what, error.where, error.remedy)))
+        us.send(("fault", (isinstance(error, BadInput), error.what, error.where, error.remedy)))
         return
     try:
-        _send(us, ("ready", camera.notes))
+        us.send(("ready", camera.notes))
         seen, shown_at = 0, -np.inf
-        while not select.select([us], [], [], POLL_S)[0]:
+        while not us.poll(POLL_S):  # nothing more is said: that is its end
             rows, seen = told.since(seen)
             for t, roll, pitch, keeping in rows.tolist():
                 camera.keeping = bool(keeping)
                 if np.isfinite(t):
                     camera.lean(t, roll, pitch)
             for result in camera.poses():
-                _send(us, ("pose", result))
+                us.send(("pose", result))
                 if result.t - shown_at > SHOWN_EVERY_S and (picture := camera.picture()) is not None:
                     shown_at = result.t
                     shown.put(picture)
-            for kept in camera.kept():
-                _send(us, ("kept", kept))
+            for taken, data in camera.kept():
+                for first in range(0, len(data), PART):
+                    us.send(("part", data[first : first + PART]))
+                us.send(("kept", taken))
             if (news := camera.news()) is not None:
-                _send(us, ("news", news))
+                us.send(("news", news))
     finally:
         camera.close()
 
@@ -238,8 +210,8 @@ def main() -> None:
     """Arguments: file descriptors of the socket, of what is told and of the picture. The config comes first over the socket."""
     gives_way()
     us, told, shown = map(int, sys.argv[1:])
-    with contextlib.suppress(OSError):
-        _serve(socket.socket(fileno=us), Ring(TOLD, told), _Shown(shown))
+    with contextlib.suppress(EOFError, OSError):
+        _serve(Connection(us), Ring(TOLD, told), _Shown(shown))
 
 
 if __name__ == "__main__":
