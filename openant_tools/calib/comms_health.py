@@ -80,7 +80,7 @@ def comms_health(bench: Bench) -> Procedure:
         problems.append("reads fail whatever the pause after a write → noise on the bus, or a bad cable")
     elif abs(gap - config.bus.write_read_gap_s) > 1e-6:
         # Never below what robots in the field were found to need.
-        bench.folder.update({"bus.write_read_gap_s": max(gap, 0.2e-3)}, provenance=Provenance("measured", COMMAND))
+        bench.folder.update({"bus.write_read_gap_s": max(gap, 0.2e-3)}, provenance=Provenance.measured(COMMAND))
     return Finding(
         "comms",
         not problems,

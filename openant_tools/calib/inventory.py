@@ -107,7 +107,7 @@ def inventory(bench: Bench) -> Procedure:
         evidence.append(
             Evidence("return delay", delay_s, "s", f"smallest of {len(DELAYS)} without a loss in {SWEEP_READS} reads")
         )
-        bench.folder.update({"bus.return_delay_s": delay_s}, provenance=Provenance("measured", COMMAND))
+        bench.folder.update({"bus.return_delay_s": delay_s}, provenance=Provenance.measured(COMMAND))
     if volts:
         evidence.append(Evidence("lowest supply", min(volts.values()), "V", "register 144 at rest"))
     bad = (

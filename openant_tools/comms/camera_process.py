@@ -40,6 +40,7 @@ SHOWN_EVERY_S = 0.1
 PART = 2**13
 #: columns of what the engine tells: when the body leant how, s and rad, and whether pictures are kept
 TOLD = 4
+NO_LEAN = (np.nan, np.nan, np.nan)
 
 
 class CameraProcess:
@@ -58,18 +59,25 @@ class CameraProcess:
         self._told, self._shown = Ring(TOLD), _Shown()
         ours, theirs = socket.socketpair()
         fds = theirs.fileno(), self._told.fd, self._shown.fd
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "openant_tools.comms.camera_process", *map(str, fds)], pass_fds=fds, start_new_session=True
-        )  # fmt: skip
-        theirs.close()
+        words = [sys.executable, "-m", "openant_tools.comms.camera_process", *map(str, fds)]
+        with theirs:
+            try:
+                self._process = subprocess.Popen(words, pass_fds=fds, start_new_session=True)
+            except OSError as error:
+                ours.close()
+                self._told.close()
+                self._shown.close()
+                raise HardwareFault(
+                    f"the camera's process cannot be started ({error.strerror})",
+                    remedy="make room on this computer: processes, memory",
+                ) from None
         self._connection = Connection(ours.detach())
-        self._poses: deque[BodyPose | BodyLost] = deque()
         self._kept: deque[tuple[float, bytes]] = deque()
         self._parts = bytearray()
         self._news: deque[str] = deque()
         self._ended = False
         self.keeping = False
-        self._lean: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+        self._lean = NO_LEAN
         kind: str
         value: Any
         try:
@@ -99,9 +107,10 @@ class CameraProcess:
     def poses(self) -> list[BodyPose | BodyLost]:
         """What was seen since the last call, oldest first."""
         self._told.put((*self._lean, float(self.keeping)))
+        self._lean, out = NO_LEAN, []
         for kind, value in self._messages():
             if kind == "pose":
-                self._poses.append(value)
+                out.append(value)
             elif kind == "part":
                 self._parts += value
             elif kind == "kept":
@@ -109,7 +118,7 @@ class CameraProcess:
                 self._parts.clear()
             else:
                 self._news.append(value)
-        return [self._poses.popleft() for _ in range(len(self._poses))]
+        return out
 
     def kept(self) -> list[tuple[float, bytes]]:
         """The pictures kept since the last call: s when each was taken, and its JPEG."""

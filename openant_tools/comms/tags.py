@@ -82,7 +82,7 @@ LEAN_APART_RAD = math.radians(25.0)
 #: Pictures without a tag after which it is asked why.
 ASK_WHY = 15
 #: s after which the whole picture is searched again, for a second sheet; meanwhile both tags are looked for where they were, in a box that is
-#: wider by so many edge lengths on each side: a tenth of the work, and of the time until a pose is known
+#: wider by so many edge lengths on each side: a fraction of the work, and of the time until a pose is known
 WHOLE_S, AROUND = 0.09, 1.5
 #: px that boxes begin at a multiple of: the detector's tiles lie as they do in the whole picture, however it is decimated
 TILE_PX = 24

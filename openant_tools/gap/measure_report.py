@@ -10,7 +10,7 @@ import numpy as np
 
 from openant_tools.gap.measure import UNITS, Measurement
 from openant_tools.gap.regime import Regime
-from openant_tools.gap.words import SIGNALS, part_words, restart_words
+from openant_tools.gap.words import LEAST_SHARE, SIGNALS, part_words, restart_words
 from openant_tools.numbers import number, percent
 from openant_tools.report import Figure, KeyFigure, Report, ReportSummary, Table, plots
 
@@ -22,8 +22,6 @@ __all__ = ["gap_report", "sentence", "table"]
 
 #: places that a terminal is told
 TOLD = 12
-#: of the excess, below which a place is not worth a line
-LEAST_SHARE = 0.005
 #: s shown around the worst moment
 WINDOW_S = 3.0
 #: letters of a line below a column of the picture

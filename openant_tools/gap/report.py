@@ -17,6 +17,7 @@ from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis,
 from openant_tools.gap.regime import Regime
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.words import (
+    LEAST_SHARE,
     SIGNALS,
     closed,
     rest_words,
@@ -47,8 +48,6 @@ Array = NDArray[np.float64]
 WINDOW_S = 3.0
 #: candidates, runners-up and places on the first page
 CANDIDATES, RUNNERS_UP, PLACES = 6, 3, 8
-#: of the excess, below which a place is not worth a line
-LEAST_SHARE = 0.005
 
 
 def diagnosis_report(found: Diagnosis, runs: Sequence[Run], held_out: Sequence[Run], model: Path) -> Report:

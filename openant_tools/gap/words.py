@@ -12,6 +12,7 @@ from openant_tools.numbers import exact, percent, span
 
 __all__ = [
     "BY_ITSELF",
+    "LEAST_SHARE",
     "SIGNALS",
     "closed",
     "part_words",
@@ -26,8 +27,8 @@ __all__ = [
 #: signal of a place → what it is called
 SIGNALS = {"pos": "position", "vel": "velocity"}
 BY_ITSELF = "by itself it closes"
-#: share from which a part is most of the whole
-MOST = 0.5
+#: share from which a part is most of the whole, and below which it is not worth a line
+MOST, LEAST_SHARE = 0.5, 0.005
 
 
 def part_words(share: float, joint: str, regime: Regime) -> str:

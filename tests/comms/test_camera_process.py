@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 
@@ -66,6 +67,14 @@ def test_who_waits_for_a_camera_that_was_killed_is_told_and_goes_on(camera: Came
     assert news == "the camera's process was ended from outside → start anew"
     assert camera.poses() == []
     assert camera.news() is None
+
+
+def test_a_computer_that_starts_no_process_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    before = len(os.listdir("/dev/fd"))
+    with pytest.raises(HardwareFault, match="camera's process cannot be started"):
+        CameraProcess(config("http://127.0.0.1:9/stream.mjpg"))
+    assert len(os.listdir("/dev/fd")) == before
 
 
 def test_why_it_cannot_be_opened_is_told_as_without_a_process() -> None:
