@@ -543,7 +543,7 @@ class Engine:
         recorder = self._recorder
         if recorder.writer is not None:
             raise BadInput(f"{recorder.writer.path} is being recorded", remedy="stop that recording first")
-        if command.pictures and self._sensors.camera is None:
+        if command.pictures and not self._sensors.has_camera:
             raise BadInput(
                 "no camera sends pictures that could be recorded", remedy="look at its cable, or record without"
             )

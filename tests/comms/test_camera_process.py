@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 
@@ -12,10 +13,16 @@ import numpy as np
 import pytest
 from test_doubtful_poses import CAMERA, HERE, PICTURES, jpeg, stream
 
+import openant_tools.comms.body_sensors as body_sensors
 from openant_tools.comms.body_camera import CameraConfig
+from openant_tools.comms.body_sensors import BodySensors
 from openant_tools.comms.camera import CameraSettings
 from openant_tools.comms.camera_process import CameraProcess
+from openant_tools.comms.clock import RealClock
+from openant_tools.comms.engine_port import EnginePort
 from openant_tools.comms.intrinsics import Intrinsics
+from openant_tools.comms.messages import EngineConfig
+from openant_tools.comms.recorder import Recorder
 from openant_tools.comms.tags import BodyLost, BodyPose, TagSetup
 from openant_tools.errors import BadInput, HardwareFault
 
@@ -84,3 +91,55 @@ def test_why_it_cannot_be_opened_is_told_as_without_a_process() -> None:
     square = Intrinsics.from_diagonal_fov(480, 480, 60)
     with stream(lambda k: data[k % 4]) as url, pytest.raises(BadInput):
         CameraProcess(config(url, square))
+
+
+def test_a_camera_that_wakes_up_late_is_taken_in_while_the_robot_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Connected anew while its camera is out, a robot is not blind for the rest of its day."""
+    monkeypatch.setattr(body_sensors, "RETRY_S", 0.1)
+    data, there = [jpeg(picture) for picture in PICTURES], False
+    sensors, said = BodySensors(), list[str]()
+    with stream(lambda k: data[k % 4] if there else b"no picture") as url:
+        engine = EngineConfig("/dev/null", (), camera=config(url))
+        recorder = Recorder(engine, EnginePort.__new__(EnginePort))
+        sensors.open(engine, RealClock(), said.append)
+        assert said[0].startswith(f"going on without the camera until it answers: {url}")
+        assert sensors.camera is None
+        assert sensors.has_camera
+        there, cycles, give_up = True, 0, time.monotonic() + 30
+        while not np.isfinite(sensors.newest(time.monotonic())[6]) and time.monotonic() < give_up:
+            sensors.take_until(time.monotonic(), recorder)
+            cycles += sensors.camera is None
+            said += sensors.news()
+            time.sleep(0.01)
+        assert sensors.newest(time.monotonic())[6] == pytest.approx(HERE.position[0], abs=0.01)
+        assert "the camera answers" in said
+        assert cycles > 3, "none waits for it to open"
+        sensors.close()
+
+
+def test_who_no_longer_waits_for_a_camera_leaves_none_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(body_sensors, "RETRY_S", 0.0)
+    opened, opening, go, closed = (threading.Event() for _ in range(4))
+
+    class Slow:
+        notes = ()
+
+        def __init__(self, config: CameraConfig) -> None:
+            if not opened.is_set():
+                opened.set()
+                raise HardwareFault("it sleeps")
+            opening.set()
+            go.wait(10)
+
+        def close(self) -> None:
+            closed.set()
+
+    monkeypatch.setattr("openant_tools.comms.camera_process.CameraProcess", Slow)
+    sensors = BodySensors()
+    sensors.open(EngineConfig("/dev/null", (), camera=config("x")), RealClock(), lambda words: None)
+    assert opening.wait(10)
+    sensors.close()
+    assert not closed.is_set()
+    go.set()
+    assert closed.wait(10)
+    assert sensors.camera is None
