@@ -219,7 +219,7 @@ class _Acting:
     def go(self, seed: int) -> None:
         """Until the run is long enough, or someone wants it to stop."""
         training, agent, learner, settings = self.training, self._agent, self._learner, self._settings
-        observation: Array | None = reset_or_stop(training.env, seed, training.stop)
+        observation = training.set_up(seed)
         told = time.monotonic()
         while observation is not None and training.going:
             learner.follow()

@@ -25,6 +25,8 @@ from numpy.typing import NDArray
 from openant_agents.runs import CurvePoint, TrainingRun
 from openant_env.metrics import AverageReward
 from openant_tools.errors import BadInput
+from openant_tools.files import json_text, read_json, reading, write_text
+from openant_tools.numbers import stored
 from openant_tools.scheduling import ACTS, in_time
 
 __all__ = [
@@ -46,6 +48,8 @@ Array = NDArray[np.float32]
 
 #: s of wall-clock time between checkpoints: a crash loses at most this much.
 CHECKPOINT_EVERY_S = 30.0
+#: of a run's folder, the centre of a circle that nobody chose
+CIRCLE = "circle.json"
 #: s of wall-clock time between calls of the progress report
 REPORT_EVERY_S = 0.25
 
@@ -187,9 +191,27 @@ class Training:
     def going(self) -> bool:
         return self.step < self.steps and not self.stop.is_set()
 
+    def set_up(self, seed: int) -> Array | None:
+        """The first observation, or None where someone wants to stop before there is one.
+
+        A robot whose circle lies where it stood first keeps it there where its run goes on, wherever it stands then.
+        """
+        env, path = self.env.unwrapped, self.run.folder / CIRCLE
+        unplaced = getattr(env, "origin", path) is None
+        if unplaced and path.is_file():
+            with reading(path, "this is no circle's centre", "delete it: the circle is where the robot stands then"):
+                x, y = map(float, read_json(path)["origin_m"])
+                if not math.isfinite(x + y):
+                    raise ValueError
+            env.origin = x, y
+        observation: Array | None = reset_or_stop(self.env, seed, self.stop)
+        if unplaced and env.origin is not None and not path.is_file():
+            self._write(write_text, path, json_text({"origin_m": [stored(value) for value in env.origin]}))
+        return observation
+
     def begin(self, seed: int) -> Array:
         """The first observation; raises KeyboardInterrupt where someone wants to stop before there is one."""
-        observation: Array | None = reset_or_stop(self.env, seed, self.stop)
+        observation = self.set_up(seed)
         if observation is None:
             raise KeyboardInterrupt
         return observation

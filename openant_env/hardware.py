@@ -142,10 +142,9 @@ class AntHardware(AntBase):
         if render_mode not in (None, "rgb_array"):
             raise BadInput(f"render mode {render_mode!r} does not exist here", remedy="use 'rgb_array' or None")
         self.render_mode = render_mode
-        centre = self.robot.arena.centre_m
         self._chosen_origin = "origin" in (task_options or {})
-        if isinstance(self.task, BackAndForth) and centre is not None and not self._chosen_origin:
-            (self.task.ox, self.task.oy), self._chosen_origin = centre, True
+        if self.robot.arena.centre_m is not None and not self._chosen_origin:
+            self.origin = self.robot.arena.centre_m
         self._tag_patience_s = float(tag_patience_s)
         self._patience_s = math.inf if patience_s is None else float(patience_s)
         if attended and unattended:
@@ -266,6 +265,16 @@ class AntHardware(AntBase):
 
     # ---------------------------------------------------------------------------------------------- reset and step
 
+    @property
+    def origin(self) -> tuple[float, float] | None:
+        """Where the circle's centre is, m; None where there is no circle, or nobody has chosen one and the robot has not stood yet."""
+        return (self.task.ox, self.task.oy) if self._chosen_origin and isinstance(self.task, BackAndForth) else None
+
+    @origin.setter
+    def origin(self, centre_m: tuple[float, float]) -> None:
+        if isinstance(self.task, BackAndForth):
+            (self.task.ox, self.task.oy), self._chosen_origin = centre_m, True
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
@@ -294,8 +303,8 @@ class AntHardware(AntBase):
             self.resume()
         self._stand_up()
         x, y, yaw = self._pose.tolist()
-        if not self._chosen_origin and isinstance(self.task, BackAndForth):
-            self.task.ox, self.task.oy, self._chosen_origin = x, y, True
+        if not self._chosen_origin:
+            self.origin = x, y
         self.task.reset(x, y, self.np_random, chosen.get("direction_rad"))
         self.average_reward.clear()
         self._seconds, self._cmd_t, self._reason = 0.0, math.nan, ""

@@ -85,7 +85,8 @@ class BodyCamera:
         # Nobody is missed before the first picture, however long the robot took to be opened.
         self._seen_at = np.inf
         self._lost = ""
-        self._said: tuple[str, float] = ("", -np.inf)
+        #: kind of what is wrong → when that was said last; reasons may change places with every picture
+        self._said: dict[str, float] = {}
         self._error: OpenAntError | None = None
 
     @property
@@ -139,7 +140,7 @@ class BodyCamera:
         return [self._kept.popleft() for _ in range(len(self._kept))]
 
     def news(self) -> str | None:
-        """What is wrong, once when it begins and from time to time while it lasts."""
+        """What is wrong, once when it begins and from time to time while it lasts or comes again."""
         fault: OpenAntError | None = self._error or self._camera.fault()
         now = self._clock.now()
         if fault is None and now - self._seen_at > LOST_S and self._lost:
@@ -153,12 +154,11 @@ class BodyCamera:
                 f"no pose of the robot for {number(now - self._seen_at, 's', decimals=1)}: {self._lost}", remedy=remedy
             )
         if fault is None:
-            self._said = ("", -np.inf)
             return None
         kind = re.sub(r"\d", "", fault.what)
-        if kind == self._said[0] and now - self._said[1] < REPEAT_S:
+        if now - self._said.get(kind, -np.inf) < REPEAT_S:
             return None
-        self._said = (kind, now)
+        self._said[kind] = now
         return str(fault)
 
     def close(self) -> None:

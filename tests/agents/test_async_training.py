@@ -148,6 +148,34 @@ def test_one_wish_to_stop_ends_waiting_for_a_robot(tmp_path, learn):
     assert load_checkpoint(tmp_path)["transitions"] == 30
 
 
+@pytest.mark.parametrize("learn", [train, train_async])
+def test_a_circle_stays_where_the_robot_stood_first_when_its_run_goes_on(tmp_path, learn):
+    class Placed(Robot):
+        """One whose circle nobody chose."""
+
+        def __init__(self, x, origin=None):
+            super().__init__(0.0)
+            self.x, self.origin = x, origin
+
+        def reset(self, *, seed=None, options=None):
+            self.origin = self.origin or (self.x, -0.3)
+            return super().reset(seed=seed)
+
+    def walked(folder, robot, steps):
+        learn(robot, folder=folder, steps=steps, seed=0, settings=SMALL)
+        return robot.origin
+
+    assert walked(tmp_path / "a", Placed(0.75), 5) == (0.75, -0.3)
+    assert walked(tmp_path / "a", Placed(0.2), 10) == (0.75, -0.3)
+    assert walked(tmp_path / "b", Placed(0.2), 5) == (0.2, -0.3), "another run has its own"
+    # Whoever has chosen is asked for nothing.
+    assert walked(tmp_path / "c", Placed(0.2, (0.1, 0.1)), 5) == (0.1, 0.1)
+    assert not (tmp_path / "c" / "circle.json").exists()
+    (tmp_path / "a" / "circle.json").write_text('{"origin_m": [1]}')
+    with pytest.raises(BadInput, match=r"circle.json.*no circle's centre.*delete it"):
+        walked(tmp_path / "a", Placed(0.2), 15)
+
+
 def rows_so_far(folder: Path) -> np.ndarray:
     data = (folder / "transitions.f32").read_bytes()
     return np.frombuffer(data[: len(data) // (4 * WIDTH) * 4 * WIDTH], np.float32).reshape(-1, WIDTH)

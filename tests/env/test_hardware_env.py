@@ -146,7 +146,7 @@ def test_it_has_the_spaces_and_words_of_the_simulation(walker: Walker, folder: R
     assert real.observation_space == simulated.observation_space
     assert real.action_space == simulated.action_space
     assert real.describe() == simulated.describe()
-    assert (real.task.ox, real.task.oy, real.task.radius_m) == (0.1, -0.05, 0.4)
+    assert (real.task.ox, real.task.oy, real.task.radius_m) == (*real.origin, 0.4) == (0.1, -0.05, 0.4)
     assert (simulated.task.ox, simulated.task.oy, simulated.task.radius_m) == (0.0, 0.0, 0.4)
     (first, before), (theirs, info) = real.reset(seed=3), simulated.reset(seed=3)
     assert before.keys() >= info.keys()
