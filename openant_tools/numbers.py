@@ -98,7 +98,8 @@ def number(
     """
     if value is None or not math.isfinite(value):
         return UNKNOWN
-    factor, unit = readable(value, unit, name)
+    # Where it is nothing, its interval says how finely that is known.
+    factor, unit = readable(value or high or 0.0, unit, name)
     shown, interval = factor * value, ""
     if low is not None and high is not None and math.isfinite(low) and math.isfinite(high):
         places = decimals_of(shown, 0.5 * factor * abs(high - low), unit) if decimals is None else decimals

@@ -205,16 +205,17 @@ class Table:
 
     def html(self, key: str) -> str:
         right = [self._is_numeric(column) for column in range(len(self.columns))]
+        shown = [_number if flag else _inline for flag in right]
         sides = [" class=num" if flag else "" for flag in right]
         head = "".join(f"<th{side}>{_inline(name)}</th>" for side, name in zip(sides, self.columns, strict=True))
         body = []
         for row in self.rows:
             cells = []
-            for side, cell in zip(sides, row, strict=True):
+            for side, html, cell in zip(sides, shown, row, strict=True):
                 if isinstance(cell, Mark):
                     cells.append(f'<td{side}><span class="mark {cell.tone}">{_inline(cell.text)}</span></td>')
                 else:
-                    cells.append(f"<td{side}>{_inline(_shown(cell))}</td>")
+                    cells.append(f"<td{side}>{html(_shown(cell))}</td>")
             body.append(f"<tr>{''.join(cells)}</tr>")
         # Outside of what is scrolled sideways, so that all of it is seen beside a wide table.
         caption = f'<p class=caption id="{key}-caption">{_inline(self.caption)}</p>' if self.caption else ""
@@ -324,6 +325,13 @@ class Details:
 _UNIT = re.compile(r"(?<=\d) (?=(?:%|°C|min|[mcµ]?[smAVW]|k?g|m?rad|k?Hz|K|h|N·m|cm/s)(?!\w))")
 #: characters of a command that stays on one line; a browser breaks after each of its dashes
 FEW, SHORT = 24, " class=short"
+
+
+def _number(text: str) -> str:
+    """A number as HTML: it is never broken, but its interval may go below it."""
+    value, interval, rest = text.partition(" (")
+    below = f" <span class=short>{_inline(interval.strip() + rest)}</span>" if interval else ""
+    return f"<span class=short>{_inline(value)}</span>{below}"
 
 
 def _inline(text: str) -> str:

@@ -79,7 +79,7 @@ def plan_report(plan: Plan) -> Report:
             [
                 one.name, Mark(one.verdict, _TONE[one.verdict]),
                 number(one.nominal, one.unit, one.low, one.high), span(one.prior_low, one.prior_high, one.unit),
-                f"{one.tied_to} ({number(one.correlation, sign=True, decimals=2)})" if one.tied_to else "",
+                f"{_beside(one)} ({number(one.correlation, sign=True, decimals=2)})" if one.tied_to else "",
             ]
             for one in plan.expectations
         ],
@@ -89,7 +89,7 @@ def plan_report(plan: Plan) -> Report:
         VERDICTS
         + f"\nExpected if a fit leaves {_error(residual.rad)} that last for {exact(residual.memory_s, 's')} on the stand, and "
         f"{_error(residual.floor_rad)} for {exact(residual.floor_memory_s, 's')} on the floor. **tied to** names the parameter of "
-        f"the largest correlation, where that is {number(TIED)} or more."
+        f"the largest correlation, of the same joint where no other is said, where that is {number(TIED, decimals=1)} or more."
     )
     for note in plan.notes:
         report.text(note)
@@ -125,6 +125,12 @@ def _open(plan: Plan) -> list[str]:
         f"{kind} ({f'all {of[kind]}' if len(labels) == of[kind] > 1 else ', '.join(labels)})"
         for kind, labels in left.items()
     ]
+
+
+def _beside(one: Expectation) -> str:
+    """What it is tied to; of the same joint only which parameter."""
+    kind, _, label = one.tied_to.partition(".")
+    return kind if label == one.name.partition(".")[2] else one.tied_to
 
 
 def _error(rad: float) -> str:

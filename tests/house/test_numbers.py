@@ -24,6 +24,7 @@ from openant_tools.procedure.journal import EepromWrite
         (12.03, "s", 11.0, 13.0, "to its limit", "12.0 s (11.0 to 13.0)"),
         (4.7213, "N·m/rad", 4.61, 4.84, "stiffness", "4.72 N·m/rad (4.61 to 4.84)"),
         (0.0, "1", None, None, "telemetry errors", "0"),
+        (0.0, "s", 0.0, 0.0011, "action delay", "0.0 ms (0.0 to 1.1)"),
         (1780.0, "", None, None, "answers asked for", "1780"),
         (0.93812, "1", None, None, "scale", "0.938"),
         (-0.04, "V", None, None, "", "−0.0400 V"),

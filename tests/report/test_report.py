@@ -207,8 +207,8 @@ def test_links_go_where_they_say_and_nothing_else_runs() -> None:
 
 def test_numbers_stand_to_the_right_and_missing_ones_are_a_dash() -> None:
     html = Table(["n", "word"], [[np.float64(-0.123456), "a"], [float("nan"), "b"], [12, True]]).html("t")
-    assert "<td class=num>−0.123</td>" in html
-    assert "<td class=num>–</td>" in html
+    assert "<td class=num><span class=short>−0.123</span></td>" in html
+    assert "<td class=num><span class=short>–</span></td>" in html
     assert "<td>yes</td>" in html
 
 
