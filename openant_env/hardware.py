@@ -231,7 +231,9 @@ class AntHardware(AntBase):
         self._t = self._cmd_t = self._pose_t = self._imu_t = math.nan
         #: s, the host's clock: when the newest observation was made
         self._observed_at = time.monotonic()
-        self._fallen_s = self._wound_rad = 0.0
+        #: s, for which it walks fallen, and for which it lies where it is waited for
+        self._fallen_s = self._lain_s = 0.0
+        self._wound_rad = 0.0
         #: turning back did not help
         self._tangled = False
         self._overruns = 0
@@ -632,6 +634,10 @@ class AntHardware(AntBase):
             if rows is None or not len(rows):
                 return "the robot does not answer"
             self._take(rows)
+            # A robot that is carried or set down is thrown about; one that lies does so in the next look, too.
+            up = rows[:, self.link.columns["acc.z"]]
+            lies = np.median(up[np.isfinite(up)]) < UPRIGHT_M_S2 if np.isfinite(up).any() else False
+            self._lain_s = self._lain_s + LOOK_S if lies else 0.0
             return self._trouble()
         except HardwareFault as fault:
             if _cause(fault) is StopCause.STORAGE:
@@ -646,7 +652,7 @@ class AntHardware(AntBase):
 
     @property
     def _lying(self) -> bool:
-        return bool(self._observation[self.layout.slices["acc"]][2] < UPRIGHT_M_S2) and self._on_fall != "ignore"
+        return self._lain_s > 0.0 and self._on_fall != "ignore"
 
     @property
     def _turns(self) -> float:
@@ -693,7 +699,8 @@ class AntHardware(AntBase):
         if self._lying:
             self.link.release()
             why = "the robot lies on its back or side: put it on its feet"
-            self._ended_by(StopCause.FALL, why)
+            if self._lain_s >= FALLEN_S:
+                self._ended_by(StopCause.FALL, why)
             return why
         unseen = self._unseen()
         if unseen is not None:

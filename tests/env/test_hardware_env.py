@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -315,6 +316,29 @@ def test_unattended_nobody_puts_a_robot_back_and_a_wait_has_an_end(
     with pytest.raises(BadInput, match="attended or unattended"):
         gymnasium.make("openant/AntHardware-v0", virtual="default", attended=True, unattended=True)
     walker._control.ask("put")
+
+
+def test_a_robot_that_is_shaken_while_it_is_waited_for_does_not_lie(
+    walker: Walker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Put back by hands it falls a little: that is no fall, after which a run that nobody attends would end."""
+    env, look, looks = walker.env, walker.env.link.look, list[float]()
+
+    def shaken(seconds: float) -> Any:
+        rows = look(seconds)
+        if rows is not None and len(looks) < 3:
+            looks.append(seconds)
+            rows = rows.copy()
+            # All of the first look, as one that is carried; the end of the next ones, as one that is set down.
+            rows[0 if len(looks) == 1 else -3 :, env.link.columns["acc.z"]] = 0.0
+        return rows
+
+    monkeypatch.setattr(env, "_unattended", True)
+    monkeypatch.setattr(env.link, "look", shaken)
+    env.link.let_down()
+    env.reset(seed=0)
+    assert walker.said[0].startswith("waiting: the robot lies on its back or side")
+    assert len(looks) == 3
 
 
 @pytest.mark.parametrize(
