@@ -79,10 +79,6 @@ class Closure:
         """nats by which what it was fitted to is likelier than by another."""
         return self.likelihood - other.likelihood
 
-    def beyond(self, other: Closure) -> float:
-        """The same, than by any robot of one build: a little of its cause is none."""
-        return self.likelihood - max(other.likelihood, self.within)
-
     def _less(self, squares: Array) -> float:
         rows = np.maximum(self.counts, 1.0)  # of a fold without any nothing is left
         each = np.log((squares / rows + self.known) / (self.squares / rows + self.known))

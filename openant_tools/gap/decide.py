@@ -155,7 +155,8 @@ def decide(rows: Sequence[Row], outside: float) -> Decision:
     """The verdict that costs least.
 
     Args:
-        rows: the hypotheses, one of them without causes; of several causes together what they leave. outside: probability, by the evidence, of something that no catalogue has.
+        rows: the hypotheses, one of them without causes; of several causes, which were found to be there together, what they
+            leave. outside: probability, by the evidence, of something that no catalogue has.
     """
     learned = weights()
     p = chances(rows, outside, learned)
@@ -174,7 +175,10 @@ def decide(rows: Sequence[Row], outside: float) -> Decision:
 
     best = next(row for row in rows if row.causes == (named[0],))
     if verdict == AMBIGUOUS:
-        return Decision(AMBIGUOUS, p[named[0]] + p[named[1]], p, (best,), (tuple(named[:2]),))
+        either = p[named[0]] + p[named[1]]
+        if any(set(named[:2]) <= set(row.causes) for row in rows):
+            return Decision(named[0], either, p, (best,))
+        return Decision(AMBIGUOUS, either, p, (best,), (tuple(named[:2]),))
     return Decision(verdict, p[verdict], p, (best,))
 
 

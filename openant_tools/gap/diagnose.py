@@ -20,7 +20,7 @@ from openant_tools.effects.catalogue import catalogue
 from openant_tools.errors import BadInput
 from openant_tools.gap.assess import Assessment, assess
 from openant_tools.gap.decide import Row, adds, decide, worth_fitting
-from openant_tools.gap.diagnosis import AMBIGUOUS, UNEXPLAINED, Diagnosis
+from openant_tools.gap.diagnosis import UNEXPLAINED, Diagnosis
 from openant_tools.gap.experiment import Experiment
 from openant_tools.gap.finding import Given, finding
 from openant_tools.gap.trials import Trials
@@ -80,13 +80,13 @@ def diagnose(
     trials, rows = hypotheses(experiment, prior, lambda share, words: tell(0.02 + 0.73 * share, words))
     assessment = trials.assessment
     decision = decide(rows, assessment.outside)
-    # Others are looked for also beside a cause than which something unknown is likelier so far.
+    # Others are looked for also beside a cause than which something unknown is likelier so far, or another cause as likely.
     chosen = (decision.likeliest,) if decision.verdict == UNEXPLAINED else decision.causes
     if chosen not in trials.closures:  # named by the evidence alone: held-out data do not tell of it
         trials.fit([(), chosen])
-    while decision.verdict != AMBIGUOUS and chosen in trials.closures and 0 < len(chosen) < CAUSES:
+    while chosen in trials.closures and 0 < len(chosen) < CAUSES:
         tell(0.8 + 0.05 * len(chosen), f"what acts beside {' and '.join(chosen)}")
-        further = _further(trials, chosen)
+        further = _further(trials, chosen, [name for group in decision.alike for name in group])
         trials.fit([chosen, *further])
         asked = [trials.row(causes, assessment.present[causes[-1]]) for causes in further]
         more = adds(asked, trials.closures[chosen].uneven)
@@ -94,9 +94,9 @@ def diagnose(
             break
         chosen = more.causes
         rows.append(more)
-    # What several causes explain together is not unexplained.
+    # What several causes explain together is not unexplained, and those that are both there are no alternatives.
     decision = decide(rows, assessment.outside)
-    if decision.verdict not in chosen:
+    if not set(decision.causes) & set(chosen):
         chosen = decision.causes
     tell(1.0, "decision")
     return finding(trials, Given(model, tuple(runs), tuple(hold_out), tuple(prior)), rows, decision, chosen)
@@ -131,13 +131,18 @@ def prepare(
     return assess(experiment.protocol, progress or (lambda share, words: None)).robots
 
 
-def _further(trials: Trials, chosen: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """What is chosen with one cause more: those that fit what it leaves, whose first steps promise most, and then one of random times."""
+def _further(trials: Trials, chosen: tuple[str, ...], alike: Sequence[str]) -> list[tuple[str, ...]]:
+    """What is chosen with one cause more: those that fit what it leaves, whose first steps promise most, and then one of random times.
+
+    Args:
+        alike: causes that are tried in any case: as likely as what is chosen, they may both be there.
+    """
     found = trials.further(chosen)
     told = [causes for causes in found if trials.tells(causes[-1])][:SECONDS]
     worth = worth_fitting(trials.assessment.present, trials.promise(told, chosen))
     random = [] if any(catalogue()[name].random for name in chosen) else [c for c in found if catalogue()[c[-1]].random]
-    return [*((*chosen, name) for name in worth[:FURTHER]), *random]
+    also = [name for name in alike if name not in chosen and trials.tells(name)]
+    return [*((*chosen, name) for name in dict.fromkeys([*also, *worth[:FURTHER]])), *random]
 
 
 def _expected(assessment: Assessment, prior: Sequence[str]) -> dict[str, float]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json
-from openant_tools.numbers import number, stored
+from openant_tools.numbers import stored
 
 __all__ = ["AMBIGUOUS", "NONE", "SCHEMA", "UNEXPLAINED", "Diagnosis", "Found", "Span", "read_diagnosis"]
 
@@ -25,9 +25,6 @@ class Span:
     value: float
     low: float
     high: float
-
-    def __str__(self) -> str:
-        return number(self.value, low=self.low, high=self.high)
 
 
 @dataclass(frozen=True)

@@ -118,6 +118,8 @@ class Fits:
             self._keep(one)
         out = []
         limited = self._within(descents, fitted)
+        if self._without(descents, limited, fitted):
+            limited = self._within(self._no_worse(descents, fitted), fitted)
         # What may be larger leaves no more: where it does, its descent has ended in a hollow.
         hollow = [n for n, one in enumerate(descents) if one.least - limited[n].least > 2 * LEAST_GAIN]
         self._anew(descents, {n: refit_at(limited[n].start, limited[n].at) for n in hollow}, fitted, base)
@@ -160,6 +162,21 @@ class Fits:
         bare = refit_at(first.start, first.at)
         self._anew(descents, {n: without_last(descents[n].start, bare) for n in worse}, fitted, first.start.hypothesis)
         return descents
+
+    def _without(self, descents: list[Descent], limited: Sequence[Descent], fitted: Sequence[int]) -> bool:
+        """Where robots of one build with a little of a cause leave less than without any, none at all from there; whether that leaves less.
+
+        Else each cause that leads out of a hollow would seem to be what the robot has.
+        """
+        first, best = descents[0], min(limited, key=lambda one: one.least)
+        if first.causes or first.least - best.least <= 2 * LEAST_GAIN:
+            return False
+        [again] = self._descend([Refit((), (), best.at[best.causes :])], fitted, ())
+        if first.least - again.least <= 2 * LEAST_GAIN:
+            return False
+        descents[0] = again
+        self._keep(again)
+        return True
 
     def _anew(
         self, descents: list[Descent], starts: Mapping[int, Refit], fitted: Sequence[int], base: Hypothesis

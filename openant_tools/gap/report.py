@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.effects.robot import Robot
 from openant_tools.gap.apply import robot_of
-from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
+from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis
 from openant_tools.gap.regime import Regime
 from openant_tools.gap.simulation import simulate
 from openant_tools.gap.words import (
@@ -23,6 +23,7 @@ from openant_tools.gap.words import (
     rest_words,
     restart_words,
     sentence,
+    sizes,
     standing,
     what_next,
     where_words,
@@ -139,10 +140,10 @@ def _details(report: Report, found: Diagnosis) -> None:
     report.details(
         "All effects considered",
         Table(
-            ["effect", "where", "how likely", "closes by itself", "interval", "parameters", "MuJoCo carries it"],
+            ["effect", "where", "how likely", "closes by itself", "interval", "size", "MuJoCo carries it"],
             [
                 [one.effect, where_words(one.joints), percent(one.probability, decimals=1), _percent(one.gap_closed),
-                 _between(one.gap_closed_low, one.gap_closed_high), _parameters(one), one.native]
+                 _between(one.gap_closed_low, one.gap_closed_high), sizes(one), one.native]
                 for one in found.effects
             ],
         ),
@@ -318,7 +319,3 @@ def _percent(value: float | None) -> str | None:
 
 def _between(low: float | None, high: float | None) -> str | None:
     return None if low is None or high is None else f"{percent(low)} … {percent(high)}"
-
-
-def _parameters(one: Found) -> str:
-    return ", ".join(f"{name} {span}" for name, span in one.parameters.items())

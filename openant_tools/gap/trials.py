@@ -90,12 +90,12 @@ class Trials:
     def _irregular(self, causes: Causes) -> float:
         """nats by which what others leave is likelier with a cause that acts at random times.
 
-        Beside whichever cause makes it least: where that explains more by itself, it is that cause's part.
+        Beside whichever cause makes it least: what that explains by itself, as much of it as every robot has included, is that cause's part.
         """
         effect, base = catalogue()[causes[-1]], self.closures[_simulated(causes)]
         alone = base.irregular.nats(effect)
         others = [] if _simulated(causes) else [one for known, one in self.closures.items() if len(known) == 1]
-        return min([alone, *(max(one.irregular.nats(effect), alone - max(one.beyond(base), 0.0)) for one in others)])
+        return min([alone, *(max(one.irregular.nats(effect), alone - max(one.likelier(base), 0.0)) for one in others)])
 
     def _at_random(self, causes: Causes) -> Closure:
         """What is closed beside causes that act at random times: as much as without them."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 
 from openant_tools.effects.catalogue import catalogue
 from openant_tools.gap.diagnosis import AMBIGUOUS, NONE, UNEXPLAINED, Diagnosis, Found
 from openant_tools.gap.regime import Regime
 from openant_tools.model.gap import share_closed
-from openant_tools.numbers import exact, percent, span
+from openant_tools.numbers import exact, number, percent, span
 
 __all__ = [
     "BY_ITSELF",
@@ -19,6 +20,7 @@ __all__ = [
     "rest_words",
     "restart_words",
     "sentence",
+    "sizes",
     "standing",
     "what_next",
     "where_words",
@@ -27,6 +29,12 @@ __all__ = [
 #: signal of a place → what it is called
 SIGNALS = {"pos": "position", "vel": "velocity"}
 BY_ITSELF = "by itself it closes"
+#: ends of the names of parameters in files → their unit
+UNITS = {
+    "rad": "rad", "rad_s": "rad/s", "nm": "N·m", "nm_rad": "N·m/rad", "n": "N", "n_s_m": "N·s/m", "m": "m", "kg": "kg", "s": "s",
+    "ohm": "Ω", "per_c": "1/°C",
+}  # fmt: skip
+_UNIT = re.compile(rf"(?<=.)_({'|'.join(sorted(UNITS, key=len, reverse=True))})$")
 #: share from which a part is most of the whole, and below which it is not worth a line
 MOST, LEAST_SHARE = 0.5, 0.005
 
@@ -56,7 +64,7 @@ def sentence(found: Diagnosis) -> str:
         words = f"The gap is real, but these runs cannot tell its causes apart: {candidates} ({sure})."
         if not found.selected:
             return words
-        return f"{words} With {found.selected[0]} in the model, {percent(closed(found))} of the gap closes on held-out runs."
+        return f"{words} With {' and '.join(found.selected)} in the model, {percent(closed(found))} of the gap closes on held-out runs."
     if found.verdict == UNEXPLAINED:
         best = _closest(found)
         closest = "" if best is None else f"; closest is {best.effect}" + (
@@ -83,6 +91,20 @@ def rest_words(found: Diagnosis) -> str:
     if rest["regressor"] is None:
         return f"{text}; there it follows nothing that was looked at."
     return f"{text}; there {percent(rest['coherence'])} of it follows {rest['regressor']}."
+
+
+def sizes(one: Found, *, interval: bool = True) -> str:
+    """How large an effect is: each parameter by its name and in the unit that people read, with its interval if that is asked for."""
+    effect = catalogue()[one.effect]
+    units = {"direction": "rad"}
+    units |= {q.name: q.unit for q in effect.quantities} | {p.name: p.unit for p in effect.parameters}
+    out = []
+    for name, found in one.parameters.items():
+        end = _UNIT.search(name)
+        unit = units.get(name) or (UNITS[end[1]] if end else "")
+        ends = (found.low, found.high) if interval else (None, None)
+        out.append(f"{re.sub(r'[._]', ' ', _UNIT.sub('', name))} {number(found.value, unit, *ends)}")
+    return ", ".join(out)
 
 
 def where_words(joints: tuple[str, ...] | str) -> str:

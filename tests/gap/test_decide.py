@@ -95,6 +95,19 @@ def test_two_that_share_what_is_likely_are_ambiguous() -> None:
     assert [row.causes[0] for row in found.selected] == [found.alike[0][0]], "the improved model has one of them"
 
 
+def test_two_of_which_both_are_there_are_no_alternatives() -> None:
+    alike = replace(DELAY, probability=0.45, support=LAG.support, foretold=LAG.foretold)
+    rows = [NOTHING, replace(LAG, probability=0.45), alike]
+    either = decide(rows, outside=0.05)
+    both = Row(("actuator_lag", "action_delay"), ((0,), (0,)), 0.5, support=1.0, foretold=1.0)
+    found = decide([*rows, both], outside=0.05)
+    assert found.verdict == either.alike[0][0]
+    assert found.alike == ()
+    assert found.confidence == pytest.approx(either.confidence)
+    other = replace(both, causes=("actuator_lag", "backlash"))
+    assert decide([*rows, other], outside=0.05).verdict == "ambiguous", "a third one says nothing of those two"
+
+
 def test_a_healthy_robot_has_nothing() -> None:
     rows = [
         replace(NOTHING, probability=0.9),
@@ -129,6 +142,26 @@ def test_the_weights_are_those_that_the_kept_robots_teach() -> None:
     sets = [judged(path) for path in sorted((ROOT / "benchmarks/gap_training/judged").glob("*.json"))]
     assert sum(map(len, sets)) == 64
     assert learned(sets) == pytest.approx(dict(weights()), rel=0.02)
+
+
+@pytest.mark.parametrize("times", [0.8, 1.25])
+@pytest.mark.parametrize("name", ["LEAST", "SURE", "WRONG", "MISSED", "OPEN", "EITHER"])
+def test_no_figure_hangs_on_a_number_that_was_set_by_hand(
+    name: str, times: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fifth less or a quarter more of any cost or limit, and as many kept robots are judged rightly, but for one in forty."""
+    sys.path.insert(0, str(ROOT))
+    import openant_tools.gap.decide as decision
+    from benchmarks.gap_training.decision import judged
+
+    robots = [one for path in sorted((ROOT / "benchmarks/gap_training/judged").glob("*.json")) for one in judged(path)]
+
+    def right() -> int:
+        return sum(decide(one.rows, one.outside).verdict in one.right for one in robots)
+
+    before = right()
+    monkeypatch.setattr(decision, name, times * getattr(decision, name))
+    assert abs(right() - before) <= len(robots) / 40
 
 
 def test_weights_speak_for_what_data_speak_for() -> None:

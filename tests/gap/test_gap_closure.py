@@ -32,6 +32,11 @@ from openant_tools.model.rollout import Rollouts
 T = 2.0 + np.arange(150) / 50
 
 
+def beyond_one_build(one: Closure, plain: Closure) -> float:
+    """nats by which a cause is likelier than a little of it, and than none."""
+    return one.likelihood - max(plain.likelihood, one.within)
+
+
 def protocol(folder: Path, *, kp: float, dry: float) -> RunSet:
     """Two sweeps of a robot with another stiffness and friction than its model's 8 N·m/rad and 0.03 N·m."""
     robot = mujoco.MjModel.from_xml_string(
@@ -126,7 +131,7 @@ def test_torque_that_goes_a_little_later_than_its_row_is_no_late_sensor(tmp_path
     plain, late = closures(fits, [fits.nothing(), fits.of([Part("sensor_delay", (0,))], [start])], [(0,), (1,)], [0, 1])
     u = dict(zip((one.name for one in predictions.names), plain.refit.nuisance, strict=True))
     assert u["switching"] == pytest.approx(later, abs=0.1)
-    assert late.beyond(plain) < descent.LEAST_GAIN
+    assert beyond_one_build(late, plain) < descent.LEAST_GAIN
     assert "switching" not in calibration_of(predictions, plain.refit, [0]), "it is none of the robot"
 
 
@@ -139,6 +144,24 @@ def test_a_cause_that_is_not_there_ends_at_nothing_and_not_beyond(name: str, tmp
     assert 0 <= found.refit.x[0][size] < start[size]
     assert found.support(plain) < 0.2, "held-out data do not speak for it"
     assert np.isfinite([found.before, found.floor, found.after, found.low, found.high, found.foretold]).all()
+
+
+def test_none_begins_anew_where_a_little_of_a_cause_has_led_out_of_a_hollow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else every cause of a healthy robot would seem to be what it has."""
+    fits = Fits(predictions := Predictions(protocol(tmp_path, kp=9.0, dry=0.03)))
+    best = fits.refit([fits.nothing()], [0, 1], ())[0]
+    # Slopes are not followed, so that all stay where they begin.
+    monkeypatch.setattr(fitting, "ITERATIONS", 1)
+    fits, part = Fits(predictions), Part("backlash", (0,))
+    hollow = Refit((), (), -0.9 * np.sign(best.whole.nuisance))
+    little = Refit((part,), (catalogue()["backlash"].starts(0.2)[0] | {"gap_rad": 1e-4},), best.whole.nuisance)
+    alone = fits.refit([hollow], [0, 1], ())[0]
+    none, some = fits.refit([hollow, little], [0, 1], ())
+    assert none.likelihood > alone.likelihood + 50
+    assert none.whole.nuisance == pytest.approx(best.whole.nuisance, abs=0.1)
+    assert some.likelihood - none.likelihood < 2 * descent.LEAST_GAIN
 
 
 @pytest.mark.parametrize(("gap_rad", "beyond"), [(0.005, False), (0.02, True)])
@@ -160,7 +183,7 @@ def test_a_cause_no_larger_than_robots_of_one_build_differ_by_is_none(
     plain, found = closures(fits, [fits.nothing(), fits.of([Part("backlash", (0,))], [start])], [(0,), (1,)], [0, 1])
     assert found.refit.x[0]["gap_rad"] == pytest.approx(gap_rad, abs=0.002)
     assert found.likelihood > plain.likelihood + 10
-    assert (found.beyond(plain) > 10) == beyond
+    assert (beyond_one_build(found, plain) > 10) == beyond
     # First steps begin at the best of several sizes.
     half = fits.of([Part("backlash", (0,))], [start | {"gap_rad": gap_rad / 2}])
     ((first, likelihood),) = fits.begun([half], [0, 1])
@@ -236,7 +259,7 @@ def test_a_board_that_sits_askew_is_told_by_what_it_reads(tmp_path: Path, monkey
     plain, askew, loaded = closures(fits, asked, [(0,), (1,)], [0, 1])
     assert askew.refit.x[0]["y_rad"] == pytest.approx(0.12, abs=0.025)
     assert askew.support(plain) > max(0.2, loaded.support(plain) + 0.2)
-    assert askew.beyond(plain) > max(10, loaded.beyond(plain) + 10)
+    assert beyond_one_build(askew, plain) > max(10, beyond_one_build(loaded, plain) + 10)
     assert askew.after == pytest.approx(plain.after, rel=0.05)
     # On a floor what leaves least goes on by slopes that are measured where it has come to.
     monkeypatch.setattr(fitting, "FINISHED", 0)

@@ -250,13 +250,13 @@ def _page(found: Diagnosis) -> Text:
 
 
 def _candidate(found: Diagnosis, one: Found) -> Text:
-    from openant_tools.gap.words import BY_ITSELF, standing, where_words
+    from openant_tools.gap.words import BY_ITSELF, sizes, standing, where_words
 
     unsure = any(one.effect in group for group in found.ambiguous_with)
     state: Name = "ok" if one.effect in found.selected else "warn" if unsure else "todo"
     text = Text.assemble(" ", marked(state, one.effect, 21))
     text.append_text(_bar(one.probability, BLUE)).append(f" {percent(one.probability):>5}\n")
-    values = ", ".join(f"{name} {number(span.value)}" for name, span in one.parameters.items())
+    values = sizes(one, interval=False)
     why = standing(found, one)
     alone = "" if one.gap_closed is None or BY_ITSELF in why else f"{BY_ITSELF} {percent(one.gap_closed)}; "
     text.append(spelled(f"   {where_words(one.joints)}{': ' if values else ''}{values}\n   {alone}{why}\n"))
