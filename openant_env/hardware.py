@@ -143,8 +143,9 @@ class AntHardware(AntBase):
             raise BadInput(f"render mode {render_mode!r} does not exist here", remedy="use 'rgb_array' or None")
         self.render_mode = render_mode
         self._chosen_origin = "origin" in (task_options or {})
-        if self.robot.arena.centre_m is not None and not self._chosen_origin:
-            self.origin = self.robot.arena.centre_m
+        centre = self.robot.arena.centre_m
+        if centre is not None and not self._chosen_origin:
+            self.origin = centre[0], centre[1]
         self._tag_patience_s = float(tag_patience_s)
         self._patience_s = math.inf if patience_s is None else float(patience_s)
         if attended and unattended:

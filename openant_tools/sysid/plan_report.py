@@ -79,7 +79,7 @@ def plan_report(plan: Plan) -> Report:
             [
                 one.name, Mark(one.verdict, _TONE[one.verdict]),
                 number(one.nominal, one.unit, one.low, one.high), span(one.prior_low, one.prior_high, one.unit),
-                f"{_beside(one)} ({number(one.correlation, sign=True, decimals=2)})" if one.tied_to else "",
+                _tie(one),
             ]
             for one in plan.expectations
         ],
@@ -127,10 +127,13 @@ def _open(plan: Plan) -> list[str]:
     ]
 
 
-def _beside(one: Expectation) -> str:
-    """What it is tied to; of the same joint only which parameter."""
+def _tie(one: Expectation) -> str:
+    """What it is tied to, and how much; of the same joint only which parameter."""
+    if one.tied_to is None:
+        return ""
     kind, _, label = one.tied_to.partition(".")
-    return kind if label == one.name.partition(".")[2] else one.tied_to
+    name = kind if label == one.name.partition(".")[2] else one.tied_to
+    return f"{name} ({number(one.correlation, sign=True, decimals=2)})"
 
 
 def _error(rad: float) -> str:
