@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from openant_tools.effects.catalogue import catalogue
 from openant_tools.errors import BadInput
 from openant_tools.files import read_json
 from openant_tools.numbers import stored
@@ -142,6 +143,12 @@ def read_diagnosis(path: Path) -> Diagnosis:
             f"is no diagnosis (schema {SCHEMA!r})", where=path, remedy="name the JSON of `openant gap diagnose`"
         )
     try:
+        for name in (one["effect"] for one in text["effects"]):
+            if name not in catalogue():
+                raise BadInput(
+                    f"it tells of an effect that is not known here: {name!r}", where=path,
+                    remedy="make it anew with `openant gap diagnose`",
+                )  # fmt: skip
         effects = tuple(
             Found(
                 effect=str(one["effect"]),

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from openant_tools.errors import BadInput
 from openant_tools.gap.diagnose import diagnose
 from openant_tools.gap.diagnosis import NONE, UNEXPLAINED, Diagnosis, Found, Span, read_diagnosis
-from openant_tools.gap.words import sentence, standing
+from openant_tools.gap.words import sentence, sizes, standing
 from openant_tools.recording.run import Run
 
 RATE_HZ = 50
@@ -127,6 +127,10 @@ def test_a_diagnosis_survives_its_json(tmp_path: Path) -> None:
     path.write_text(json.dumps(found.as_json()))
     again = read_diagnosis(path)
     assert again.as_json() == found.as_json()
+    assert sizes(again.effects[0]) == "delay 20.0 ms (18.0 to 22.0)"
+    path.write_text(path.read_text().replace('"effect": "action_delay"', '"effect": "gremlins"'))
+    with pytest.raises(BadInput, match=r"out.json.*not known here: 'gremlins'"):
+        read_diagnosis(path)
     path.write_text("{}")
     with pytest.raises(BadInput, match="no diagnosis"):
         read_diagnosis(path)
