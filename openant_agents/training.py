@@ -38,6 +38,7 @@ __all__ = [
     "event_writer",
     "finite_or_raise",
     "in_time_with",
+    "place_circle",
     "reset_or_stop",
     "run_facts",
     "stop_on_signal",
@@ -196,17 +197,11 @@ class Training:
 
         A robot whose circle lies where it stood first keeps it there where its run goes on, wherever it stands then.
         """
-        env, path = self.env.unwrapped, self.run.folder / CIRCLE
-        unplaced = getattr(env, "origin", path) is None
-        if unplaced and path.is_file():
-            with reading(path, "this is no circle's centre", "delete it: the circle is where the robot stands then"):
-                x, y = map(float, read_json(path)["origin_m"])
-                if not math.isfinite(x + y):
-                    raise ValueError
-            env.origin = x, y
+        env, unplaced = self.env.unwrapped, place_circle(self.env, self.run.folder)
         observation: Array | None = reset_or_stop(self.env, seed, self.stop)
-        if unplaced and env.origin is not None and not path.is_file():
-            self._write(write_text, path, json_text({"origin_m": [stored(value) for value in env.origin]}))
+        if unplaced and env.origin is not None:
+            centre = {"origin_m": [stored(value) for value in env.origin]}
+            self._write(write_text, self.run.folder / CIRCLE, json_text(centre))
         return observation
 
     def begin(self, seed: int) -> Array:
@@ -325,6 +320,25 @@ def stop_on_signal() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def place_circle(env: gymnasium.Env[Any, Any], folder: Path) -> bool:
+    """Put a robot's circle where its run had it, unless somebody has chosen where; whether nobody knows that yet.
+
+    Raises:
+        BadInput: the run's file says no place.
+    """
+    path = folder / CIRCLE
+    if getattr(env.unwrapped, "origin", path) is not None:
+        return False
+    if not path.is_file():
+        return True
+    with reading(path, "this is no circle's centre", "delete it: the circle is where the robot stands then"):
+        x, y = map(float, read_json(path)["origin_m"])
+        if not math.isfinite(x + y):
+            raise ValueError
+    env.unwrapped.origin = x, y
+    return False
 
 
 def in_time_with(env: gymnasium.Env[Any, Any]) -> AbstractContextManager[None]:

@@ -106,6 +106,7 @@ def eval_(
     from openant_agents.evaluate import LIKELIEST, SAMPLED, evaluate
     from openant_agents.policies import load_policy
     from openant_agents.runs import making_sense, read_facts
+    from openant_agents.training import place_circle
     from openant_env.rendering import NoOpenGL
     from openant_tools.files import json_text, write_text
 
@@ -113,6 +114,7 @@ def eval_(
     with making_sense(run):
         options = dict(facts["env"]["options"])
         name = {None: str(facts["env"]["id"]), "sim": SIMULATED_ID, "hardware": HARDWARE_ID}[where]
+        trained_on = options.get("robot")
     if ":" in name:  # Gymnasium would import what stands before it
         raise BadInput(f"its environment {name!r} names a module", where=run, remedy="train into another folder")
     if name == HARDWARE_ID:
@@ -150,6 +152,8 @@ def eval_(
     before = set((run / "recordings").glob("*.mcap"))
     with environment(name, options, run / "recordings", **more) as env:
         policy = load_policy(run, env)
+        if options.get("robot") == trained_on:
+            place_circle(env, run)
         found = []
         with Progress(console=aside(), transient=True) as bar:
             task = bar.add_task("walking", total=len(ways) * starts * seconds)
