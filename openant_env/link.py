@@ -344,7 +344,7 @@ class RobotLink:
 
     def put_back(self) -> bool:
         """Have a virtual robot on its floor set where it began, as a person would; False where there is none."""
-        if self._control is None:
+        if self._control is None or not self.virtual:
             return False
         try:
             self._control.ask("put")
