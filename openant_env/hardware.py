@@ -232,9 +232,9 @@ class AntHardware(AntBase):
         self._t = self._cmd_t = self._pose_t = self._imu_t = math.nan
         #: s, the host's clock: when the newest observation was made
         self._observed_at = time.monotonic()
-        #: s, for which it walks fallen, and for which it lies where it is waited for
-        self._fallen_s = self._lain_s = 0.0
-        self._wound_rad = 0.0
+        self._fallen_s = self._wound_rad = 0.0
+        #: on its back or side, by most of the last look at one that is waited for
+        self._lies = False
         #: turning back did not help
         self._tangled = False
         self._overruns = 0
@@ -635,10 +635,9 @@ class AntHardware(AntBase):
             if rows is None or not len(rows):
                 return "the robot does not answer"
             self._take(rows)
-            # A robot that is carried or set down is thrown about; one that lies does so in the next look, too.
+            # A robot that is set down is thrown about for a moment; one that lies does so for most of a look.
             up = rows[:, self.link.columns["acc.z"]]
-            lies = np.median(up[np.isfinite(up)]) < UPRIGHT_M_S2 if np.isfinite(up).any() else False
-            self._lain_s = self._lain_s + LOOK_S if lies else 0.0
+            self._lies = bool(np.isfinite(up).any() and np.nanmedian(up) < UPRIGHT_M_S2)
             return self._trouble()
         except HardwareFault as fault:
             if _cause(fault) is StopCause.STORAGE:
@@ -653,7 +652,7 @@ class AntHardware(AntBase):
 
     @property
     def _lying(self) -> bool:
-        return self._lain_s > 0.0 and self._on_fall != "ignore"
+        return self._lies and self._on_fall != "ignore"
 
     @property
     def _turns(self) -> float:
@@ -700,8 +699,7 @@ class AntHardware(AntBase):
         if self._lying:
             self.link.release()
             why = "the robot lies on its back or side: put it on its feet"
-            if self._lain_s >= FALLEN_S:
-                self._ended_by(StopCause.FALL, why)
+            self._ended_by(StopCause.FALL, why)
             return why
         unseen = self._unseen()
         if unseen is not None:
