@@ -980,6 +980,22 @@ def test_what_was_learned_is_evaluated_played_compared_and_diagnosed_from_its_sc
     assert told[2].startswith(f"openant gap diagnose {run / 'recordings' / 'b.mcap'} {there} --json ")
 
 
+def test_steps_that_are_no_number_are_said_and_stay_said(robot: RobotFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Process, "start", lambda self: pytest.fail("it started"))
+
+    async def look() -> None:
+        app = OpenAnt(robot.path, ticking=False)
+        async with app.run_test(size=(80, 24), notifications=True) as pilot:
+            await _go(pilot, "learn")
+            app.screen.query_one("#steps", Input).value = ""
+            app.screen.query_one("#choices", Choices).focus()
+            await pilot.press("enter")
+            await pilot.pause(0.2)
+            assert "steps and seed are whole numbers" in screen_text(app)
+
+    asyncio.run(look())
+
+
 def test_training_is_the_command_that_one_would_type(robot: RobotFolder) -> None:
     training = TrainingProcess("sac", robot.path, 2000, 1, robot.runs / "sac-1")
     assert (

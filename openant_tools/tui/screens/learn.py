@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import numpy as np
 from rich.text import Text
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
-from textual.widgets import Input, Label, OptionList, Static
+from textual.widget import Widget
+from textual.widgets import Input, Label, OptionList
 from textual.widgets.option_list import Option
 
 from openant_tools.bringup.gait import FIRST_STEPS, first_look, walks_at
@@ -37,6 +38,13 @@ BEFORE = (
     "the circle and untangled?"
 )
 _WORDS = {"sac": "soft actor-critic, as in the paper", "sarsa": "SARSA(lambda) with tile coding, as in the paper"}
+
+
+class HowItGoes(Widget):
+    """The run at hand with its curve, drawn into the room that there is whenever that changes."""
+
+    def render(self) -> Text:
+        return cast(LearnScreen, self.screen).progress(self.size.height)
 
 
 class LearnScreen(Page):
@@ -72,7 +80,7 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
                 yield Input("0", type="integer", id="seed")
                 yield Label("30000 steps are an hour of robot time", classes="after")
             yield Choices(id="choices")
-        yield Static(id="progress")
+        yield HowItGoes(id="progress")
 
     def _options(self) -> list[Option]:
         """What can be done now: one thing at a time runs, and the room of the rest is the curve's meanwhile."""
@@ -108,8 +116,6 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         self.set_interval(REFRESH_S, self.draw_progress)
         self._offer()
         self.query_one("#steps", Input).focus()
-        # The room for the curve is known once the screen is laid out.
-        self.call_after_refresh(self.draw_progress)
 
     def _offer(self) -> None:
         chooser = self.query_one("#choices", Choices)
@@ -205,16 +211,15 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
     def start(self, agent: str, where: Place = "sim", *, first: bool = False) -> None:
         """Train, or go on with the run of the same agent, place and seed; `first` as the demo does."""
         folder = self.session.folder
-        progress = self.query_one("#progress", Static)
         if folder is None:
-            progress.update(marked("fail", "there is no robot's folder: make one in Settings (s on the first screen)"))
+            self.notify("there is no robot's folder: make one in Settings (s on the first screen)", severity="error")
             return
         if self.session.learning:
-            progress.update(marked("warn", "one run is enough at a time: stop it first"))
+            self.notify("one run is enough at a time: stop it first", severity="warning")
             return
         steps, seed = (self.query_one(f"#{name}", Input).value for name in ("steps", "seed"))
         if not steps.isdigit() or int(steps) < 1 or not seed.isdigit():
-            progress.update(marked("fail", "steps and seed are whole numbers"))
+            self.notify("steps and seed are whole numbers", severity="error")
             return
         name = agent if where == "sim" else f"{agent}-{where}"
         length = int(steps)
@@ -229,11 +234,14 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         self.draw_progress()
 
     def draw_progress(self) -> None:
-        """From the files of the run."""
-        training, folder = self.session.training, self.session.folder
+        """Again, from the files of the run."""
         if self._offered_while != self.session.learning:
             self._offer()
-            self.call_after_refresh(self.draw_progress)  # into the room that there is then
+        self.query_one("#progress").refresh()
+
+    def progress(self, room: int) -> Text:
+        """How the run at hand goes, in so many lines."""
+        training, folder = self.session.training, self.session.folder
         text = Text()
         if training is not None:
             if training.running:
@@ -246,19 +254,19 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
                 )  # fmt: skip
             text.append(f"   {training.command}\n")
             if isinstance(training, TrainingProcess):
-                self._curve(text, training.folder, training.steps)
+                self._curve(text, training.folder, training.steps, room)
             else:
                 text.append("\n".join(training.said))
         elif folder is not None:
             run = self._newest()
             if run is not None:
                 text.append(f"{run.name}  ", "bold")
-                self._curve(text, run, None)
+                self._curve(text, run, None, room)
         if not text:
             text.append("No run yet.")
-        self.query_one("#progress", Static).update(text)
+        return text
 
-    def _curve(self, text: Text, run: Path, steps: int | None) -> None:
+    def _curve(self, text: Text, run: Path, steps: int | None, room: int) -> None:
         points = curve_so_far(run)
         if not points:
             text.append("  no point of the curve yet\n")
@@ -272,8 +280,8 @@ With the newest run: *evaluate* it from 15 starts, *play* it on the robot (it is
         text.append(f"; step {number(step[-1])}{share}, {minutes} min of robot time\n")
         stop = max(float(step[-1]), float(steps or 0.0))
         # Its axis takes two lines, what it is the last, and the command of what is under way a second one.
-        room = self.query_one("#progress").size.height - text.plain.count("\n") - (3 if steps is None else 4)
-        for line in curve_lines(step, 100 * reward, stop, level, self.size.width - 4, min(max(room, 3), MOST_ROWS)):
+        rows = min(max(room - text.plain.count("\n") - (3 if steps is None else 4), 3), MOST_ROWS)
+        for line in curve_lines(step, 100 * reward, stop, level, self.size.width - 4, rows):
             text.append_text(line).append("\n")
         text.append(
             f"mean of 120 s{f'; dotted: the paper, {words}' if words else ''}\n",
