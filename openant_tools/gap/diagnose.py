@@ -82,6 +82,7 @@ def diagnose(
     decision = decide(rows, assessment.outside)
     # Others are looked for also beside a cause than which something unknown is likelier so far, or another cause as likely.
     chosen = (decision.likeliest,) if decision.verdict == UNEXPLAINED else decision.causes
+    declined: list[Row] = []
     if chosen not in trials.closures:  # named by the evidence alone: held-out data do not tell of it
         trials.fit([(), chosen])
     while chosen in trials.closures and 0 < len(chosen) < CAUSES:
@@ -90,6 +91,7 @@ def diagnose(
         trials.fit([chosen, *further])
         asked = [trials.row(causes, assessment.present[causes[-1]]) for causes in further]
         more = adds(asked, trials.closures[chosen].uneven)
+        declined += [row for row in asked if row is not more]
         if more is None:
             break
         chosen = more.causes
@@ -99,7 +101,8 @@ def diagnose(
     if not set(decision.causes) & set(chosen):
         chosen = decision.causes
     tell(1.0, "decision")
-    return finding(trials, Given(model, tuple(runs), tuple(hold_out), tuple(prior)), rows, decision, chosen)
+    given = Given(model, tuple(runs), tuple(hold_out), tuple(prior))
+    return finding(trials, given, rows, declined, decision, chosen)
 
 
 def hypotheses(experiment: Experiment, prior: Sequence[str], progress: Progress) -> tuple[Trials, list[Row]]:

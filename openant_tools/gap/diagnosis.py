@@ -68,6 +68,7 @@ class Diagnosis:
         notes: what it rests on, and what more signals would add.
         sensors: what was found about signals, and whether they had a part in the verdict.
         rows: what was decided on, see `gap.decide.Row`; "outside" among them has no row of its own but its probability.
+        declined: in the same form what was asked for beside what had been chosen, and not added.
     """
 
     model: str
@@ -88,6 +89,7 @@ class Diagnosis:
     rest: Mapping[str, Any] = field(default_factory=dict)
     sensors: Sequence[Mapping[str, Any]] = ()
     rows: Sequence[Mapping[str, Any]] = ()
+    declined: Sequence[Mapping[str, Any]] = ()
 
     def as_json(self) -> dict[str, Any]:
         """As formats, section 2, has it; what is ours alone comes after."""
@@ -127,6 +129,7 @@ class Diagnosis:
             "refuted": dict(self.refuted),
             "notes": list(self.notes),
             "rows": [dict(row) for row in self.rows],
+            "declined": [dict(row) for row in self.declined],
         }
 
 
@@ -174,6 +177,7 @@ def read_diagnosis(path: Path) -> Diagnosis:
             calibration=text.get("calibration", {}), removal=text.get("removal", {}), notes=tuple(text.get("notes", ())),
             rest=text.get("rest", {}), sensors=tuple(text.get("sensors", ())), refuted=text.get("refuted", {}),
             rows=tuple(text.get("rows", ())),
+            declined=tuple(text.get("declined", ())),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise BadInput(

@@ -44,12 +44,18 @@ class Given:
 
 
 def finding(
-    trials: Trials, given: Given, rows: Sequence[Row], decision: Decision, chosen: tuple[str, ...]
+    trials: Trials,
+    given: Given,
+    rows: Sequence[Row],
+    declined: Sequence[Row],
+    decision: Decision,
+    chosen: tuple[str, ...],
 ) -> Diagnosis:
     """The diagnosis that is handed on.
 
     Args:
-        rows: the causes by themselves. chosen: causes that go into the improved model, the one that leads first.
+        rows: the causes by themselves, and what was added to one. declined: what was asked for beside one and not added. chosen: causes
+            that go into the improved model, the one that leads first.
     """
     experiment, predictions = trials.experiment, trials.fits.predictions
     best, plain = trials.closures.get(chosen), trials.closures[()]
@@ -97,15 +103,15 @@ def finding(
         notes=tuple(notes),
         rest={} if rest is None else rest.as_json(),
         sensors=_sensors(trials, given),
-        rows=_rows(trials, rows),
+        rows=(*map(_row, rows), _row(Row((OUTSIDE,), probability=trials.assessment.outside))),
+        declined=tuple(map(_row, declined)),
     )
 
 
-def _rows(trials: Trials, rows: Sequence[Row]) -> tuple[dict[str, Any], ...]:
-    """What was decided on, so that it can be decided anew and weights be learned from it."""
-    outside = Row((OUTSIDE,), probability=trials.assessment.outside)
+def _row(row: Row) -> dict[str, Any]:
+    """What is decided on, so that it can be decided anew and weights be learned from it."""
     kept = ("causes", "probability", "support", "foretold", "uneven", "likelier", "within", "irregular")
-    return tuple({name: getattr(row, name) for name in kept} for row in (*rows, outside))
+    return {name: getattr(row, name) for name in kept}
 
 
 def _rank(one: Found, decision: Decision, chosen: Sequence[str]) -> float:
