@@ -12,11 +12,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from openant_tools.blind.soak_tables import soak_table
 from openant_tools.blind.soaks import SoakAnswer, SoakMix, draw_soaks
 from openant_tools.cli.comms import comms
+from openant_tools.comms.dropouts import diagnose, measures
 from openant_tools.comms.dropouts.causes import CAUSES
-from openant_tools.comms.dropouts.diagnose import diagnose_dropouts
+from openant_tools.comms.dropouts.diagnose import diagnose_dropouts, judge
 from openant_tools.comms.dropouts.log import read_log
+from openant_tools.comms.dropouts.measures import measure
 from openant_tools.comms.dropouts.outcome import dropout_effects, dropouts_finding
 from openant_tools.comms.dropouts.report import dropouts_report
 from openant_tools.errors import BadInput
@@ -326,3 +329,23 @@ def test_a_blind_set_is_made_judged_and_scored(tmp_path: Path) -> None:
     assert scored.exit_code in (0, 1), scored.output
     assert "right cause first" in scored.output
     assert "## Every failure" in (tmp_path / "page.md").read_text()
+
+
+def test_no_verdict_hangs_on_a_number_that_was_set_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fifth less or a quarter more of it, and at most one of 24 soaks that tables draw is judged otherwise."""
+    mix = SoakMix(healthy=0.25, virtual=0.0, healthy_s=(60.0, 90.0), faulty_s=(60.0, 90.0))
+    drawn = [one for one in draw_soaks(60, 7, mix) if one.rate_hz < 60.0][:24]
+    logs = [read_log([soak_table(one, "soak")]) for one in drawn]
+
+    def judged() -> list[str]:
+        return [judge(measure(log)).verdict for log in logs]
+
+    first = judged()
+    assert sum(said == one.cause for said, one in zip(first, drawn, strict=True)) >= 22
+    by_hand = [(diagnose, name) for name in ("FLOOR", "TEMPER", "NAMED", "ENOUGH")]
+    by_hand += [(measures, name) for name in ("DIP_V", "SAG_V", "STALL_S", "RESET_MS")]
+    for module, name in by_hand:
+        for times in (0.8, 1.25):
+            with monkeypatch.context() as patch:
+                patch.setattr(module, name, times * getattr(module, name))
+                assert sum(said != was for said, was in zip(judged(), first, strict=True)) <= 1, (name, times)
