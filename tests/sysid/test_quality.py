@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from openant_tools.model.rollout import Rollouts
 from openant_tools.recording.run import Facts, Run
 from openant_tools.recording.tables import write_table
 from openant_tools.robot.mjcf import nominal_model_path
+from openant_tools.sysid import rules
 from openant_tools.sysid.quality import check_model, without_errors
 from openant_tools.sysid.rules import check_runs
 
@@ -193,6 +195,50 @@ def test_saturation_shows_without_duty_too(plant: Plant) -> None:
     held = np.where(np.arange(len(run.t)) % 2 == 0, 0.01, -0.01)
     message = refused(with_columns(cmd__hip_rr=run.column("cmd.hip_rr") + 2.0, pos__hip_rr=held), plant)
     assert "hip_rr works at its torque limit" in message
+
+
+def test_no_rule_hangs_on_a_number_that_was_set_by_hand(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fifth less or a quarter more of it, and the same is said of a good log and of one of each fault."""
+    run = good_run()
+    logs = [
+        run,
+        good_run(3.0),
+        with_columns(pos__knee_rr=np.full(300, -0.8)),
+        with_columns(pos__hip_rr=run.column("pos.hip_fr"), pos__hip_fr=run.column("pos.hip_rr")),
+        with_columns(pos__hip_fr=-run.column("pos.hip_fr")),
+        with_columns(pos__knee_fr=np.degrees(run.column("pos.knee_fr"))),
+        with_columns(cmd__hip_rr=run.column("pos.hip_rr"), pos__hip_rr=run.column("cmd.hip_rr")),
+        replace(run, t=1e3 * run.t),
+        replace(run, t=1e-3 * run.t),
+    ]
+
+    def said() -> list[str]:
+        return [_without_numbers(log, plant) for log in logs]
+
+    first = said()
+    assert len(set(first)) == len(logs) - 1, "of two good ones the same is said, of each fault something else"
+    for name in (
+        "MOVES_QUANTA",
+        "SATURATED",
+        "BETTER",
+        "LEADS",
+        "OTHER_UNIT",
+        "CREEPS_RAD_S",
+        "FLIES_RAD_S",
+        "SPARSE_S",
+    ):
+        for times in (0.8, 1.25):
+            with monkeypatch.context() as patch:
+                patch.setattr(rules, name, times * getattr(rules, name))
+                assert said() == first, (name, times)
+
+
+def _without_numbers(run: Run, plant: Plant) -> str:
+    try:
+        lines = check_runs([run], [plant])
+    except BadInput as error:
+        lines = [str(error)]
+    return re.sub(r"[\d.,]+", "#", "\n".join(lines))
 
 
 def test_joints_that_are_commanded_alike_are_not_called_swapped(plant: Plant) -> None:
